@@ -1,0 +1,158 @@
+"""Cityscapes: its label table, and image and label map pairs from the official or the thesis's flat layout."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from sklearn.model_selection import train_test_split
+
+from thesis_repro import InputError
+from thesis_repro.files import progress, read_gray
+
+# Tables 3.1 and 3.2; colours as the Cityscapes scripts draw them. "background" exists in the tables only:
+# the network has 35 outputs, and no label map holds 35 (audit: the tables list one category too many).
+# name, id, Dice weight, colour (red, green, blue)
+_TABLE = [
+    ("unlabeled", 0, 1.0, (0, 0, 0)),
+    ("ego vehicle", 1, 1.0, (0, 0, 0)),
+    ("rectification border", 2, 1.0, (0, 0, 0)),
+    ("out of roi", 3, 1.0, (0, 0, 0)),
+    ("static", 4, 1.0, (0, 0, 0)),
+    ("dynamic", 5, 1.0, (111, 74, 0)),
+    ("ground", 6, 1.0, (81, 0, 81)),
+    ("road", 7, 0.7, (128, 64, 128)),
+    ("sidewalk", 8, 1.1, (244, 35, 232)),
+    ("parking", 9, 2.2, (250, 170, 160)),
+    ("rail track", 10, 2.9, (230, 150, 140)),
+    ("building", 11, 0.8, (70, 70, 70)),
+    ("wall", 12, 2.2, (102, 102, 156)),
+    ("fence", 13, 2.2, (190, 153, 153)),
+    ("guard rail", 14, 4.0, (180, 165, 180)),
+    ("bridge", 15, 2.5, (150, 100, 100)),
+    ("tunnel", 16, 3.4, (150, 120, 90)),
+    ("pole", 17, 1.0, (153, 153, 153)),
+    ("pole group", 18, 5.0, (153, 153, 153)),
+    ("traffic light", 19, 2.5, (250, 170, 30)),
+    ("traffic sign", 20, 2.3, (220, 220, 0)),
+    ("vegetation", 21, 0.9, (107, 142, 35)),
+    ("terrain", 22, 1.0, (152, 251, 152)),
+    ("sky", 23, 1.2, (70, 130, 180)),
+    ("person", 24, 2.0, (220, 20, 60)),
+    ("rider", 25, 3.0, (255, 0, 0)),
+    ("car", 26, 1.0, (0, 0, 142)),
+    ("truck", 27, 2.3, (0, 0, 70)),
+    ("bus", 28, 2.3, (0, 60, 100)),
+    ("caravan", 29, 3.4, (0, 0, 90)),
+    ("trailer", 30, 3.5, (0, 0, 110)),
+    ("train", 31, 2.3, (0, 80, 100)),
+    ("motorcycle", 32, 3.2, (0, 0, 230)),
+    ("bicycle", 33, 2.3, (119, 11, 32)),
+    ("license plate", 34, 0.5, (0, 0, 142)),
+    ("background", 35, 0.5, (0, 0, 0)),
+]
+
+
+@dataclass(frozen=True)
+class Label:
+    name: str
+    id: int
+    weight: float
+    color: tuple
+
+
+LABELS = tuple(Label(*row) for row in _TABLE)
+N_CLASSES = 35  # Figure A.1: ids 0 to 34
+CLASS_WEIGHTS = np.array([label.weight for label in LABELS[:N_CLASSES]], np.float32)
+COLORS = np.array([label.color for label in LABELS], np.uint8)
+ID = {label.name: label.id for label in LABELS}
+
+VALIDATION_FRACTION = 0.2
+SPLIT_RANDOM_STATE = 0
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One image and its label map; `name` is what the two file names share."""
+
+    name: str
+    image: Path
+    label: Path
+
+
+def colorize(label_map):
+    """Colours of a label map: (height, width) ids to (height, width, 3) red, green, blue."""
+    return COLORS[np.minimum(label_map, len(COLORS) - 1)]
+
+
+def pairs(root, split):
+    """The image and label map pairs of one split ("train" or "val"), sorted by name.
+
+    Both layouts are read: the official one (leftImg8bit, gtFine) and the appendix's flat one (train, trainannot).
+    The appendix pairs two unsorted directory listings by position (A.2); here the names decide.
+
+    Raises InputError for a missing folder, an empty split or an image without its label map.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; CITYSCAPES must name the folder that holds leftImg8bit and gtFine, "
+                         "or train, trainannot, val and valannot")
+    images, labels, where = _listing(root, split)
+    if not images:
+        raise InputError(f"{where}: no PNG images; the {split} split must hold at least one")
+    lonely = sorted(images.keys() ^ labels.keys())
+    if lonely:
+        name = lonely[0]
+        here, missing = (images[name], "label map") if name in images else (labels[name], "image")
+        more = f" ({len(lonely)} such files)" if len(lonely) > 1 else ""
+        raise InputError(f"{here}: has no {missing}{more}; add the {missing} or remove the file")
+    return [Pair(name, images[name], labels[name]) for name in sorted(images)]
+
+
+def _listing(root, split):
+    if (root / "leftImg8bit").is_dir():
+        where = root / "leftImg8bit" / split
+        image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
+        images = {f.name.removesuffix(image_end): f for f in where.glob(f"*/*{image_end}")}
+        labels = {f.name.removesuffix(label_end): f for f in (root / "gtFine" / split).glob(f"*/*{label_end}")}
+    elif (root / split).is_dir():
+        where = root / split
+        images = {f.stem: f for f in where.glob("*.png")}
+        labels = {f.stem: f for f in (root / f"{split}annot").glob("*.png")}
+    else:
+        raise InputError(f"{root}: holds neither leftImg8bit/{split} nor {split}; see the README for the two layouts")
+    return images, labels, where
+
+
+def read_image(path, size):
+    """One gray image resized to size x size (A.2.1: bilinear), uint8 of shape (size, size)."""
+    return cv2.resize(read_gray(path), (size, size))
+
+
+def read_label_map(path):
+    """One label map of Cityscapes ids, uint8. Raises InputError where an id is 35 or more."""
+    label_map = read_gray(path)
+    if label_map.max() >= N_CLASSES:
+        raise InputError(f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; label maps must hold "
+                         "Cityscapes label ids (the files that end in labelIds.png), not train ids or colours")
+    return label_map
+
+
+def load(some_pairs, size, description="reading images"):
+    """Read pairs at size x size: images (n, size, size, 1) and label maps (n, size, size), both uint8 (A.2).
+
+    Label maps are resized with nearest neighbour, so that no id is invented.
+    """
+    images = np.empty((len(some_pairs), size, size, 1), np.uint8)
+    labels = np.empty((len(some_pairs), size, size), np.uint8)
+    for index, pair in enumerate(progress(some_pairs, description, unit="image")):
+        images[index, ..., 0] = read_image(pair.image, size)
+        labels[index] = cv2.resize(read_label_map(pair.label), (size, size), interpolation=cv2.INTER_NEAREST)
+    return images, labels
+
+
+def split_train_validation(some_pairs):
+    """The appendix's split of the training folder: 80 % and 20 %, random state 0 (A.2.3)."""
+    if len(some_pairs) < 2:
+        raise InputError(f"{len(some_pairs)} training image: at least 2 are needed to split off a validation set")
+    return train_test_split(some_pairs, test_size=VALIDATION_FRACTION, random_state=SPLIT_RANDOM_STATE)

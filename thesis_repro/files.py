@@ -1,0 +1,95 @@
+"""Reading images, writing files whole or not at all, and showing progress."""
+
+import os
+import struct
+import sys
+import zlib
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from thesis_repro import InputError
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def read_gray(path):
+    """Read one image as 8-bit gray, shape (height, width).
+
+    Raises InputError when the file is missing, empty, truncated, corrupt or no image.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such image; check the folder it should be in") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
+    if data.startswith(PNG_SIGNATURE) and not _png_is_whole(data):
+        raise InputError(f"{path}: the image is truncated or corrupt; copy or download it again")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    if image is None:
+        raise InputError(f"{path}: not an image that OpenCV can read; copy or download it again")
+    return image
+
+
+def _png_is_whole(data):
+    # OpenCV fills the missing rows of a damaged PNG and says nothing, so the chunks' checksums are read here.
+    position = len(PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        (length,) = struct.unpack(">I", data[position:position + 4])
+        end = position + 12 + length
+        if end > len(data):
+            return False
+        body = data[position + 4:end - 4]
+        if zlib.crc32(body) != struct.unpack(">I", data[end - 4:end])[0]:
+            return False
+        if body[:4] == b"IEND":
+            return True
+        position = end
+    return False
+
+
+@contextmanager
+def atomic(path):
+    """Yield a temporary path beside `path`; rename it when the block ends well, delete it when it does not."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path, text):
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_png(path, image):
+    """Write one 8-bit image, (height, width) or (height, width, 3) as BGR."""
+    with atomic(path) as temporary:
+        if not cv2.imwrite(str(temporary), image):
+            raise OSError(f"{path}: cannot be written")
+
+
+def progress(iterable=None, description="", total=None, unit="frame"):
+    """A progress bar on standard error, or on the file that THESIS_REPRO_PROGRESS names.
+
+    The variable is how a bar inside a notebook reaches the terminal that executes the notebook.
+    """
+    stream = sys.stderr
+    target = os.environ.get("THESIS_REPRO_PROGRESS")
+    if target:
+        try:
+            stream = open(target, "a")  # stays open as long as the bar
+        except OSError:
+            pass
+    live = stream.isatty()
+    return tqdm(iterable, desc=description, total=total, unit=unit, file=stream, dynamic_ncols=live,
+                mininterval=0.2 if live else 15, leave=live)
