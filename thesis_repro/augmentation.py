@@ -24,14 +24,9 @@ def transform_list(size, fill_mask=NOTHING):
     neighbour, so integer label maps give the same labels at a thirtieth of the memory, provided that what comes from
     outside of the image is no label at all; `fill_mask` is that value (0 where the masks are one-hot).
     """
-    with warnings.catch_warnings():
-        # the thesis's own name for the transform; the library would rather have it called Affine
-        warnings.simplefilter("ignore", UserWarning)
-        shift_and_scale = A.ShiftScaleRotate(scale_limit=0.5, rotate_limit=0, shift_limit=0.1, p=1, border_mode=0,
-                                             fill=0, fill_mask=fill_mask)
     return [
         A.HorizontalFlip(p=0.5),
-        shift_and_scale,
+        _shift_and_scale(fill_mask),
         A.PadIfNeeded(min_height=size, min_width=size, border_mode=0, fill=0, fill_mask=fill_mask),
         A.RandomCrop(height=size, width=size),
         A.GaussNoise(std_range=NOISE_STD, p=0.2),
@@ -47,6 +42,14 @@ def transform_list(size, fill_mask=NOTHING):
             A.MotionBlur(blur_limit=3, p=1),
         ], p=0.9),
     ]
+
+
+def _shift_and_scale(fill_mask):
+    with warnings.catch_warnings():
+        # the thesis's own name for the transform; the library would rather have it called Affine
+        warnings.simplefilter("ignore", UserWarning)
+        return A.ShiftScaleRotate(scale_limit=0.5, rotate_limit=0, shift_limit=0.1, p=1, border_mode=0,
+                                  fill=0, fill_mask=fill_mask)
 
 
 class Augmenter:
@@ -104,3 +107,14 @@ def image_seed(seed, index, epoch=0):
 def one_hot(label_maps, n_classes):
     """One-hot encode label maps (..., height, width) to float32 (..., n_classes); NOTHING becomes all zeros."""
     return (label_maps[..., None] == np.arange(n_classes, dtype=np.uint8)).astype(np.float32)
+
+
+def examples(image, label, seed):
+    """The panels of Figures 3.1 and 3.2: a dict of titles and (image, label map) pairs, the first the original.
+
+    The appendix's three transforms, the flip made certain so that it shows.
+    """
+    transforms = {"horizontal flip": A.HorizontalFlip(p=1), "affine transformation": _shift_and_scale(NOTHING),
+                  "random blur": A.Blur(blur_limit=3, p=1)}
+    return {"original": (image, label),
+            **{title: Augmenter([transform])(image, label, seed) for title, transform in transforms.items()}}

@@ -85,8 +85,10 @@ def colorize(label_map):
     return COLORS[np.minimum(label_map, len(COLORS) - 1)]
 
 
-def pairs(root, split):
+def pairs(root, split, limit=None):
     """The image and label map pairs of one split ("train" or "val"), sorted by name.
+
+    limit: at most so many of them, spread evenly over the split (its images are sorted by city); None for all.
 
     Both layouts are read: the official one (leftImg8bit, gtFine) and the appendix's flat one (train, trainannot).
     The appendix pairs two unsorted directory listings by position (A.2); here the names decide.
@@ -106,7 +108,10 @@ def pairs(root, split):
         here, missing = (images[name], "label map") if name in images else (labels[name], "image")
         more = f" ({len(lonely)} such files)" if len(lonely) > 1 else ""
         raise InputError(f"{here}: has no {missing}{more}; add the {missing} or remove the file")
-    return [Pair(name, images[name], labels[name]) for name in sorted(images)]
+    names = sorted(images)
+    if limit is not None and limit < len(names):
+        names = [names[index * len(names) // limit] for index in range(limit)]
+    return [Pair(name, images[name], labels[name]) for name in names]
 
 
 def _listing(root, split):

@@ -1,0 +1,122 @@
+# make figures KITTI=/path CITYSCAPES=/path PROFILE=smoke|demo|thesis; make help lists the rest.
+SHELL := /bin/bash
+.SHELLFLAGS := -o pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+PYTHON ?= python3
+PROFILE ?= demo
+BIN := .venv/bin
+
+# A misspelled setting must not pass for the default.
+KNOWN := KITTI CITYSCAPES PROFILE BUILD FIGURES JOBS PYTHON
+GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
+UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
+ifneq (,$(UNKNOWN))
+$(error $(firstword $(UNKNOWN)): unknown setting; known are $(KNOWN))
+endif
+
+# notebooks run in their own folder, so relative paths are made absolute here (and may hold spaces)
+absolute = $(if $(filter /% ~%,$(firstword $(1))),$(1),$(CURDIR)/$(1))
+
+export THESIS_REPRO_PROFILE := $(PROFILE)
+ifneq (,$(KITTI))
+export THESIS_REPRO_KITTI := $(call absolute,$(KITTI))
+endif
+ifneq (,$(CITYSCAPES))
+export THESIS_REPRO_CITYSCAPES := $(call absolute,$(CITYSCAPES))
+endif
+ifneq (,$(BUILD))
+export THESIS_REPRO_BUILD := $(call absolute,$(BUILD))
+endif
+ifneq (,$(FIGURES))
+export THESIS_REPRO_FIGURES := $(call absolute,$(FIGURES))
+endif
+ifneq (,$(JOBS))
+export THESIS_REPRO_JOBS := $(JOBS)
+endif
+DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)")
+# what the libraries would otherwise say or look up
+export SM_FRAMEWORK := tf.keras
+export NO_ALBUMENTATIONS_UPDATE := 1
+export TF_CPP_MIN_LOG_LEVEL := 3
+export TF_ENABLE_ONEDNN_OPTS := 0
+export PYTHONWARNINGS := ignore
+export PYDEVD_DISABLE_FILE_VALIDATION := 1
+
+.PHONY: help setup figures test lab clean check-data
+
+help:
+	@echo "make figures     every table and figure into figures/, on embedded data"
+	@echo "                 KITTI=/path CITYSCAPES=/path   on your own data"
+	@echo "                 PROFILE=smoke|demo|thesis      how large (demo)"
+	@echo "make test        unit tests, and every notebook on the smallest profile"
+	@echo "make lab         JupyterLab on the notebooks"
+	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path"
+	@echo "make setup       only .venv with the pinned packages"
+	@echo "make clean       removes .venv, build and the figures of other data and profiles"
+
+setup: .venv/ready
+
+.venv/ready: environment.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || { \
+	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1 | head -1): Python 3.11, 3.12 or 3.13 is needed; name one with PYTHON=/path" >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { \
+	  echo "$(PYTHON) has no venv module: install it (Debian and Ubuntu: apt-get install python3-venv)" >&2; exit 1; }
+	@echo "installing the pinned packages into .venv (2.3 GB, some minutes)"
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -r environment.txt 2> >(grep -v '^WARNING' >&2)
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . 2> >(grep -v '^WARNING' >&2)
+	@touch $@
+
+# The name of the run follows from the data and the profile; settings.py needs no package to say it.
+NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
+ifneq (,$(filter figures,$(MAKECMDGOALS)))
+RUN := $(shell $(PYTHON) -m thesis_repro.settings)
+ifeq (,$(RUN))
+$(error the settings above are wrong)
+endif
+EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
+SOURCES := $(wildcard thesis_repro/*.py thesis_repro/*.json thesis_repro/weights/*)
+DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
+        $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*))
+
+figures: $(EXECUTED)
+	@$(BIN)/python -m thesis_repro.settings figures
+
+$(RUN)/checked: .venv/ready $(DATA)
+	@mkdir -p $(@D)
+	@$(if $(KITTI)$(CITYSCAPES),$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS),true)
+	@touch $@
+
+# Each notebook needs the one before it: they hand results on through files.
+define execute
+$(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
+	@mkdir -p $$(@D); started=$$$$SECONDS; echo "$(basename $(1))"; \
+	if THESIS_REPRO_PROGRESS=/proc/$$$$$$$$/fd/2 $(BIN)/jupyter nbconvert --to notebook --execute \
+	  --ExecutePreprocessor.kernel_name=python3 --ExecutePreprocessor.timeout=-1 \
+	  --log-level=ERROR --output-dir $$(@D) --output .$(1) $$< 2> $$(@D)/$(basename $(1)).log; \
+	then mv $$(@D)/.$(1) $$@; echo "  done in $$$$((SECONDS - started)) s"; \
+	else echo "$(basename $(1)) failed:" >&2; \
+	  grep -E '^[A-Za-z_.]*(Error|Exception|Interrupt|Exit|Died)' $$(@D)/$(basename $(1)).log | tail -n 1 >&2; \
+	  echo "the whole report: $$(@D)/$(basename $(1)).log; the same command goes on from here" >&2; exit 1; fi
+endef
+previous :=
+$(foreach notebook,$(notdir $(NOTEBOOKS)),\
+  $(eval $(call execute,$(notebook),$(previous)))\
+  $(eval previous := $(RUN)/notebooks/$(notebook)))
+endif
+
+check-data: setup
+	@$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS)
+
+test: setup
+	@$(BIN)/python -m pytest -q
+
+lab: setup
+	@$(BIN)/jupyter lab notebooks
+
+clean:
+	rm -rf .venv build figures/*/ *.egg-info .pytest_cache
+	find . -name __pycache__ -prune -exec rm -rf {} +

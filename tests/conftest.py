@@ -1,0 +1,80 @@
+"""Fixtures that several test modules share."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
+os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
+
+import cv2
+import numpy as np
+import pytest
+
+SHARED = Path(__file__).resolve().parent.parent.parent / "shared"
+
+
+def _shared(*parts):
+    folder = SHARED.joinpath(*parts)
+    if not folder.is_dir():
+        pytest.skip(f"no real data: ../shared/{'/'.join(parts)} does not exist")
+    return folder
+
+
+@pytest.fixture
+def kitti_real():
+    """Excerpts of real KITTI sequences in the official layout."""
+    return _shared("data", "kitti")
+
+
+@pytest.fixture
+def camvid_real():
+    """Real street images with label maps in the flat layout."""
+    return _shared("data", "camvid")
+
+
+@pytest.fixture
+def reference():
+    """What PySLAM itself did on the real frames."""
+    return _shared("reference")
+
+
+@pytest.fixture(scope="session")
+def small_world(tmp_path_factory):
+    """A small embedded world: two sequences of 12 frames and a few street images."""
+    from thesis_repro import world
+    from thesis_repro.settings import PROFILES
+
+    folder = tmp_path_factory.mktemp("world")
+    world.write(folder / "world", **PROFILES["smoke"].world, seed=0)
+    return folder / "world"
+
+
+@pytest.fixture
+def tiny_kitti(tmp_path):
+    """Sequence 00 with four 64x48 frames of noise, written by hand, for tests of reading and of faults."""
+    root = tmp_path / "kitti"
+    images = root / "sequences" / "00" / "image_0"
+    images.mkdir(parents=True)
+    noise = np.random.default_rng(0).integers(0, 256, (48, 80), np.uint8)
+    for index in range(4):
+        cv2.imwrite(str(images / f"{index:06d}.png"), noise[:, index:index + 64])
+    (root / "sequences" / "00" / "calib.txt").write_text("P0: 50 0 32 0 0 50 24 0 0 0 1 0\n")
+    (root / "sequences" / "00" / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
+    (root / "poses").mkdir()
+    (root / "poses" / "00.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {index}\n" for index in range(4)))
+    return root
+
+
+@pytest.fixture
+def tiny_cityscapes(tmp_path):
+    """Four training and two validation pairs in the flat layout, 32x16, with ids 7, 11 and 23."""
+    root = tmp_path / "cityscapes"
+    for split, count in (("train", 4), ("val", 2)):
+        (root / split).mkdir(parents=True)
+        (root / f"{split}annot").mkdir()
+        for index in range(count):
+            label = np.repeat(np.array([23, 11, 7, 7], np.uint8), 4)[:, None].repeat(32, axis=1)
+            cv2.imwrite(str(root / f"{split}annot" / f"street_{index}.png"), label)
+            cv2.imwrite(str(root / split / f"street_{index}.png"), label * 10 + index)
+    return root

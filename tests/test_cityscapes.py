@@ -1,0 +1,75 @@
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro import InputError, cityscapes
+
+
+def test_tables_are_consistent():
+    assert [label.id for label in cityscapes.LABELS] == list(range(36))
+    assert cityscapes.CLASS_WEIGHTS.shape == (35,) and cityscapes.ID["sky"] == 23
+    # the column of Table 3.2 adds up to 69.2; "background" (0.5) has no output
+    assert cityscapes.CLASS_WEIGHTS.sum() == pytest.approx(68.7)
+
+
+def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
+    flat = cityscapes.pairs(tiny_cityscapes, "train")
+    official = tmp_path / "official"
+    for pair in flat:
+        for source, folder, end in ((pair.image, "leftImg8bit", "leftImg8bit"), (pair.label, "gtFine", "gtFine_labelIds")):
+            target = official / folder / "train" / "town" / f"{pair.name}_{end}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(source.read_bytes())
+    again = cityscapes.pairs(official, "train")
+    assert [pair.name for pair in again] == [pair.name for pair in flat] == [f"street_{i}" for i in range(4)]
+    for one, two in zip(cityscapes.load(flat, 16), cityscapes.load(again, 16)):
+        assert np.array_equal(one, two)
+
+
+def test_resizing_invents_no_label(tiny_cityscapes):
+    images, labels = cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 48)
+    assert images.shape == (4, 48, 48, 1) and images.dtype == labels.dtype == np.uint8
+    assert set(np.unique(labels)) == {7, 11, 23}
+
+
+def test_limit_is_spread_over_the_split(tiny_cityscapes):
+    assert [pair.name for pair in cityscapes.pairs(tiny_cityscapes, "train", limit=2)] == ["street_0", "street_2"]
+    assert len(cityscapes.pairs(tiny_cityscapes, "train", limit=99)) == 4
+
+
+def test_split_is_the_appendix_split():
+    # numpy's legacy generator with seed 0 is what scikit-learn's random_state=0 stands for
+    train, validation = cityscapes.split_train_validation(list(range(2975)))
+    order = np.random.RandomState(0).permutation(2975)
+    assert (len(train), len(validation)) == (2380, 595)
+    assert validation == order[:595].tolist() and train == order[595:].tolist()
+
+
+def test_faults_are_named(tiny_cityscapes, tmp_path):
+    with pytest.raises(InputError, match="no such folder; CITYSCAPES must name"):
+        cityscapes.pairs(tmp_path / "nowhere", "train")
+    with pytest.raises(InputError, match="holds neither leftImg8bit/test nor test"):
+        cityscapes.pairs(tiny_cityscapes, "test")
+    (tiny_cityscapes / "trainannot" / "street_2.png").unlink()
+    with pytest.raises(InputError, match="train/street_2.png: has no label map"):
+        cityscapes.pairs(tiny_cityscapes, "train")
+    with pytest.raises(InputError, match="1 training image: at least 2"):
+        cityscapes.split_train_validation([0])
+    for path in (tiny_cityscapes / "val").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="val: no PNG images"):
+        cityscapes.pairs(tiny_cityscapes, "val")
+
+
+def test_unknown_label_id_is_named(tiny_cityscapes):
+    path = tiny_cityscapes / "trainannot" / "street_1.png"
+    cv2.imwrite(str(path), np.full((16, 32), 35, np.uint8))
+    with pytest.raises(InputError, match="street_1.png: label id 35 is above 34"):
+        cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 16)
+
+
+@pytest.mark.real
+def test_reads_real_pairs(camvid_real):
+    assert len(cityscapes.pairs(camvid_real, "train")) == 367
+    _, labels = cityscapes.load(cityscapes.pairs(camvid_real, "val")[:5], 320)
+    assert set(np.unique(labels)) <= {0, 7, 8, 11, 13, 17, 20, 21, 23, 24, 25, 26}

@@ -1,0 +1,40 @@
+import pytest
+
+from thesis_repro import InputError
+from thesis_repro.settings import PROFILES, read_settings
+
+
+def test_default_run_keeps_its_figures_at_the_top():
+    settings = read_settings({})
+    assert settings.run == "embedded-demo" and settings.figures.name == "figures"
+    assert settings.kitti_is_embedded and settings.kitti == settings.world / "kitti"
+    assert "embedded world" in settings.data_note
+
+
+def test_thesis_profile_has_the_thesis_sizes():
+    sizes = PROFILES["thesis"]
+    assert (sizes.image_size, sizes.base_filters, sizes.batch_size, sizes.epochs, sizes.patience) == (320, 64, 16, 100, 5)
+    assert sizes.frames is None and sizes.training_images is None and sizes.widths == tuple(range(1, 16))
+
+
+def test_runs_of_other_data_and_profiles_never_meet(tmp_path):
+    one, two = tmp_path / "a" / "kitti", tmp_path / "b" / "kitti"
+    one.mkdir(parents=True), two.mkdir(parents=True)
+    environments = [{}, {"THESIS_REPRO_PROFILE": "smoke"}] + [
+        {"THESIS_REPRO_KITTI": str(kitti), **more} for kitti in (one, two)
+        for more in ({}, {"THESIS_REPRO_PROFILE": "smoke"}, {"THESIS_REPRO_CITYSCAPES": str(one)})]
+    runs = [read_settings(environment) for environment in environments]
+    assert len({settings.build for settings in runs}) == len({settings.figures for settings in runs}) == len(runs)
+    assert "embedded" not in runs[4].data_note
+
+
+@pytest.mark.parametrize("environment, says", [
+    ({"THESIS_REPRO_PROFILE": "huge"}, "PROFILE=huge: unknown profile; choose one of smoke, demo, thesis"),
+    ({"THESIS_REPRO_PROFIL": "demo"}, "THESIS_REPRO_PROFIL: unknown setting"),
+    ({"THESIS_REPRO_KITTI": "/no/such/folder"}, "KITTI=/no/such/folder: no such folder"),
+    ({"THESIS_REPRO_JOBS": "0"}, "JOBS=0: must be"),
+    ({"THESIS_REPRO_JOBS": "many"}, "JOBS=many: must be"),
+])
+def test_bad_settings_are_named(environment, says):
+    with pytest.raises(InputError, match=says):
+        read_settings(environment)

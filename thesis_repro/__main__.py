@@ -1,0 +1,149 @@
+"""The command line: python -m thesis_repro COMMAND."""
+
+import argparse
+import json
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+from thesis_repro import InputError
+
+
+def synthesize(options):
+    """write the embedded world: a rendered street world in KITTI's and Cityscapes' layouts"""
+    from thesis_repro import world
+    from thesis_repro.settings import PROFILES, SEED
+
+    world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
+    print(f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}")
+
+
+def check_data(options):
+    """say what is there, what is missing or wrong in a KITTI and a Cityscapes folder"""
+    from thesis_repro import check
+
+    if not options.kitti and not options.cityscapes:
+        raise InputError("nothing to check: name a folder with --kitti or --cityscapes "
+                         "(make check-data KITTI=... CITYSCAPES=...)")
+    problems = []
+    for root, look in ((options.kitti, check.check_kitti), (options.cityscapes, check.check_cityscapes)):
+        if root:
+            facts, wrong = look(root)
+            print("\n".join([str(root), *(f"  {fact}" for fact in facts)]))
+            problems += wrong
+    for problem in problems:
+        print(f"wrong: {problem}", file=sys.stderr)
+    return 1 if problems else 0
+
+
+def predict(options):
+    """write label maps (8-bit ids, 320x320 PNG, named like the frames) for a folder of images or a sequence"""
+    from thesis_repro import segmentation, training
+
+    images = options.images / "image_0" if (options.images / "image_0").is_dir() else options.images
+    if not images.is_dir():
+        raise InputError(f"{options.images}: no such folder; --images must name a folder of PNG images "
+                         "or a KITTI sequence folder that holds image_0")
+    paths = sorted(images.glob("*.png"))
+    if not paths:
+        raise InputError(f"{images}: holds no PNG images")
+    model = training.load_model(options.model) if options.model else segmentation.load_shipped()
+    segmentation.write_label_maps(model, paths, options.output)
+    print(f"{options.output}: {len(paths)} label maps")
+
+
+def odometry(options):
+    """run the visual odometry over one sequence and print its errors, keypoints and time"""
+    from thesis_repro import metrics, odometry
+    from thesis_repro.files import write_text
+    from thesis_repro.kitti import Sequence, write_kitti_poses
+    from thesis_repro.masks import LabelMasks, MaskFolder
+
+    if options.labels and options.dilation is None:
+        raise InputError("--labels: needs --dilation W, the width in pixels by which the boundaries are dilated")
+    if options.dilation is not None and not options.labels:
+        raise InputError("--dilation: needs --labels DIR, the label maps whose boundaries are dilated")
+    chosen = {name: value for name, value in vars(options).items() if value is not None
+              and name in {field.name for field in fields(odometry.OdometrySettings)}}
+    settings = replace(odometry.PRESETS[options.pyslam], **chosen)
+    sequence = Sequence(options.kitti, options.sequence)
+    masks = None
+    if options.masks:
+        masks = MaskFolder(options.masks, sequence)
+    elif options.labels:
+        masks = LabelMasks(options.labels, sequence, options.dilation)
+    result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
+    positions, truth = result.poses[:, :3, 3], sequence.poses[:, :3, 3]
+    summary = {
+        "sequence": sequence.name, "frames": len(sequence),
+        "rmse_m": metrics.rmse(positions, truth), "mae_m": metrics.mae(positions, truth),
+        "mean_keypoints": float(result.frames["detected"].mean()),
+        "ms_per_frame": 1000 * float(result.frames["seconds"].mean()),
+    }
+    if options.output:
+        write_kitti_poses(options.output, result.poses)
+    if options.frames_csv:
+        write_text(options.frames_csv, result.frames.to_csv(index=False))
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        print(f"sequence {sequence.name}, {len(sequence)} frames\n"
+              f"RMSE            {summary['rmse_m']:.6f} m\nMAE             {summary['mae_m']:.6f} m\n"
+              f"mean keypoints  {summary['mean_keypoints']:.1f}\ntime a frame    {summary['ms_per_frame']:.1f} ms")
+
+
+def build_parser():
+    parser = argparse.ArgumentParser(prog="python -m thesis_repro", description=sys.modules["thesis_repro"].__doc__)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(function):
+        sub = commands.add_parser(function.__name__.replace("_", "-"), help=function.__doc__,
+                                  description=function.__doc__)
+        sub.set_defaults(function=function)
+        return sub
+
+    sub = command(synthesize)
+    sub.add_argument("out", type=Path, metavar="OUT", help="folder to write, new or left unfinished before")
+    sub.add_argument("--profile", choices=("smoke", "demo", "thesis"), default="demo", help="size of the world (demo)")
+
+    sub = command(check_data)
+    sub.add_argument("--kitti", type=Path, metavar="ROOT", help="folder that holds sequences and poses")
+    sub.add_argument("--cityscapes", type=Path, metavar="ROOT",
+                     help="folder that holds leftImg8bit and gtFine, or train, trainannot, val and valannot")
+
+    sub = command(predict)
+    sub.add_argument("--images", type=Path, required=True, metavar="DIR_OR_SEQUENCE",
+                     help="folder of PNG images, or a KITTI sequence folder")
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the label maps")
+    sub.add_argument("--model", type=Path, metavar="FILE", help="a trained model (.keras, .hdf5); the shipped one")
+
+    sub = command(odometry)
+    sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
+    sub.add_argument("--sequence", required=True, metavar="NN", help="sequence, 00 to 10")
+    source = sub.add_mutually_exclusive_group()
+    source.add_argument("--masks", type=Path, metavar="DIR", help="one mask a frame, 255 keep, 0 ignore")
+    source.add_argument("--labels", type=Path, metavar="DIR", help="one label map a frame, with --dilation")
+    sub.add_argument("--dilation", type=int, metavar="W", help="dilation width in pixels of masks from label maps")
+    sub.add_argument("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")
+    sub.add_argument("--pyslam", choices=("2021", "2024"), default="2021",
+                     help="the preset: PySLAM of the thesis, or its later algorithm")
+    sub.add_argument("--output", type=Path, metavar="POSES.txt", help="estimated poses in KITTI's form")
+    sub.add_argument("--frames-csv", type=Path, metavar="FILE", help="one row a frame")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
+    return parser
+
+
+def main(arguments=None):
+    options = build_parser().parse_args(arguments)
+    try:
+        return options.function(options) or 0
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on where it can", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

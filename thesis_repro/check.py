@@ -1,0 +1,90 @@
+"""What is there, missing or wrong in the user's KITTI and Cityscapes folders."""
+
+import joblib
+import numpy as np
+
+from thesis_repro import InputError, cityscapes, kitti
+from thesis_repro.files import progress, read_gray
+
+
+def check_kitti(root):
+    """Check every sequence below an odometry root; returns (lines that describe, problems)."""
+    facts, problems = [], []
+    for name in kitti.sequences(root):
+        try:
+            sequence = kitti.Sequence(root, name)
+            height, width = sequence.size
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        problems += _failures(sequence.frame, range(len(sequence)), f"sequence {name}")
+        problems += _wrong_poses(sequence)
+        notes = []
+        expected = kitti.FRAME_COUNTS.get(name)
+        if expected and len(sequence) != expected:
+            notes.append(f"an excerpt: the complete sequence has {expected}")
+        camera = kitti.CAMERAS.get(name)
+        if camera and (width, height) == (camera.width, camera.height):
+            matrix = sequence.intrinsics
+            difference = np.abs(np.array([matrix[0, 0] - camera.fx, matrix[1, 1] - camera.fy,
+                                          matrix[0, 2] - camera.cx, matrix[1, 2] - camera.cy])).max()
+            if difference > 1e-3:
+                problems.append(f"{sequence.folder / 'calib.txt'}: P0 differs from the thesis's camera by "
+                                f"{difference:.4g} pixels; it must be the file of sequence {name}")
+            else:
+                notes.append("the thesis's camera")
+        elif camera:
+            notes.append(f"not the thesis's size of {camera.width}x{camera.height}")
+        facts.append(f"sequence {name}: {len(sequence)} frames of {width}x{height}"
+                     + "".join(f"; {note}" for note in notes))
+    return facts, problems
+
+
+def _wrong_poses(sequence):
+    rotations = sequence.poses[:, :3, :3]
+    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    path = sequence.root / "poses" / f"{sequence.name}.txt"
+    problems = [f"{path}, line {index + 1}: is no rotation (off by {error[index]:.2g}); the file is damaged"
+                for index in np.flatnonzero(error > 1e-3)[:1]]
+    if len(sequence) > 1 and (np.diff(sequence.times) <= 0).any():
+        line = int(np.flatnonzero(np.diff(sequence.times) <= 0)[0]) + 2
+        problems.append(f"{sequence.folder / 'times.txt'}, line {line}: time does not increase; the file is damaged")
+    return problems
+
+
+def check_cityscapes(root):
+    """Check the training and validation split; returns (lines that describe, problems)."""
+    facts, problems = [], []
+    for split in ("train", "val"):
+        try:
+            found = cityscapes.pairs(root, split)
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        ids = set()
+        problems += _failures(lambda pair: ids.update(_check_pair(pair)), found, f"split {split}")
+        names = ", ".join(f"{label.name} {label.id}" for label in cityscapes.LABELS if label.id in ids)
+        facts.append(f"split {split}: {len(found)} images with label maps; labels: {names}")
+    return facts, problems
+
+
+def _check_pair(pair):
+    image, label_map = read_gray(pair.image), cityscapes.read_label_map(pair.label)
+    if image.shape != label_map.shape:
+        raise InputError(f"{pair.label}: {label_map.shape[1]}x{label_map.shape[0]} pixels, but {pair.image.name} has "
+                         f"{image.shape[1]}x{image.shape[0]}; a label map must have the size of its image")
+    return np.unique(label_map)
+
+
+def _failures(check, items, description):
+    def problem(item):
+        try:
+            check(item)
+        except InputError as error:
+            return str(error)
+        return None
+
+    # decoding releases the interpreter, so threads are enough
+    results = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(
+        joblib.delayed(problem)(item) for item in items)
+    return [result for result in progress(results, description, total=len(items), unit="file") if result]

@@ -1,0 +1,86 @@
+"""One style for every figure and table, and the writing of both: SVG and PNG, CSV and Markdown.
+
+The functions that draw are in figures_methods (chapter 3, training, prediction, masks) and figures_results
+(the odometry of chapter 4). Each takes arrays or a table and returns a matplotlib figure.
+"""
+
+import json
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import pandas as pd
+
+from thesis_repro.files import atomic, write_text
+
+PAGE_WIDTH = 7.2  # inches
+STYLE = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "image.interpolation": "nearest",
+    "svg.fonttype": "none",
+    "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
+    "savefig.dpi": 160,
+}
+matplotlib.rcParams.update(STYLE)
+# Okabe and Ito's colours, distinguishable with any colour vision
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
+    "#000000", "#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
+TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # what each colour stands for in all of chapter 4
+_LINES = [(color, style) for style in ("-", "--", ":") for color in (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK)]
+
+REPORTED = json.loads((Path(__file__).parent / "reported.json").read_text(encoding="utf-8"))
+
+
+def line_style(index):
+    """Colour and dash of the index-th line of a figure with many lines (up to 21 differ)."""
+    color, style = _LINES[index % len(_LINES)]
+    return {"color": color, "linestyle": style}
+
+
+def new_figure(rows=1, columns=1, height=3.2, **options):
+    """A figure of page width with the project's style: (figure, axes)."""
+    return plt.subplots(rows, columns, figsize=(PAGE_WIDTH, height), layout="constrained", **options)
+
+
+def show_image(axes, image, title, **options):
+    """An image in its axes without ticks; gray where it has one channel."""
+    axes.imshow(image, cmap=options.pop("cmap", "gray"), **options)
+    axes.set_title(title)
+    axes.set_axis_off()
+
+
+def save_figure(figure, folder, name, note):
+    """Write folder/name.svg and .png with the data note at the foot; returns the SVG's path."""
+    folder = Path(folder)
+    figure.supxlabel(note, fontsize=6, color="#777777", x=0.995, ha="right")
+    for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
+        with atomic(folder / f"{name}{suffix}") as temporary:
+            figure.savefig(temporary, metadata=metadata)
+    return folder / f"{name}.svg"
+
+
+def save_table(table, folder, name, note):
+    """Write folder/name.csv and .md with the data note under the Markdown table; returns the table."""
+    folder = Path(folder)
+    write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
+    write_text(folder / f"{name}.md", f"{markdown(table)}\n{note}\n")
+    return table
+
+
+def markdown(table):
+    """A pandas table as a Markdown one; numbers are aligned to the right, missing values are empty."""
+    numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
+    rows = [list(table.columns), ["---:" if right else ":---" for right in numeric]]
+    rows += [["" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value) for value in row]
+             for row in table.itertuples(index=False)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

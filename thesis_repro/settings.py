@@ -1,0 +1,166 @@
+"""Where the data is, how big the run is and where results go: read once from the environment.
+
+Every variable starts with THESIS_REPRO_; `make figures KITTI=... CITYSCAPES=... PROFILE=...` sets them.
+"""
+
+import hashlib
+import os
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from thesis_repro import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+PREFIX = "THESIS_REPRO_"
+VARIABLES = {
+    "PROFILE": "size of the run: smoke, demo or thesis",
+    "KITTI": "folder of the KITTI odometry benchmark (sequences, poses)",
+    "CITYSCAPES": "folder of Cityscapes, in the official or in the flat layout",
+    "BUILD": "folder for everything that can be made again",
+    "FIGURES": "folder for the tables and figures",
+    "JOBS": "processes that work at once; as many as there are cores when not set",
+    "PROGRESS": "file or terminal that progress bars are written to",
+}
+ALL_WIDTHS = tuple(range(1, 16))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Sizes of a run; None stands for everything there is. Code paths never depend on the profile."""
+
+    image_size: int  # pixels, both ways, of the network's input
+    base_filters: int  # channels of the U-Net's first block
+    batch_size: int
+    epochs: int
+    patience: int  # epochs without a lower validation loss before training stops
+    training_images: int | None  # images taken from the training split
+    frames: int | None  # frames taken from the start of each sequence
+    widths: tuple  # dilation widths, pixels
+    # the embedded world
+    world_sequences: int
+    world_frames: int
+    world_scale: float  # of KITTI's 1241x376
+    world_training_images: int
+    world_validation_images: int
+
+    @property
+    def world(self):
+        """The sizes of the embedded world, as `world.write` takes them."""
+        return {"sequences": tuple(f"{number:02d}" for number in range(self.world_sequences)),
+                "frames": self.world_frames, "scale": self.world_scale,
+                "train_images": self.world_training_images, "validation_images": self.world_validation_images}
+
+
+PROFILES = {
+    "smoke": Profile(image_size=64, base_filters=4, batch_size=4, epochs=2, patience=5, training_images=16, frames=12,
+                     widths=(1, 5, 10, 15), world_sequences=2, world_frames=12, world_scale=0.3,
+                     world_training_images=12, world_validation_images=4),
+    "demo": Profile(image_size=160, base_filters=16, batch_size=8, epochs=20, patience=5, training_images=400,
+                    frames=200, widths=ALL_WIDTHS, world_sequences=11, world_frames=60, world_scale=0.5,
+                    world_training_images=100, world_validation_images=20),
+    "thesis": Profile(image_size=320, base_filters=64, batch_size=16, epochs=100, patience=5, training_images=None,
+                      frames=None, widths=ALL_WIDTHS, world_sequences=11, world_frames=300, world_scale=1.0,
+                      world_training_images=2975, world_validation_images=500),
+}
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings in force. `run` names the data and the profile; results of different runs never meet."""
+
+    profile: str
+    sizes: Profile
+    kitti: Path  # the user's folder, or the embedded world's
+    cityscapes: Path
+    kitti_is_embedded: bool
+    cityscapes_is_embedded: bool
+    run: str
+    build: Path  # results of this run that are not figures
+    figures: Path
+    world: Path  # where the embedded world is written
+    jobs: int
+    seed: int = SEED
+
+    @property
+    def data_note(self):
+        """One line for captions: which data the numbers come from."""
+        odometry = "embedded world (rendered)" if self.kitti_is_embedded else "the user's KITTI folder"
+        training = "embedded world (rendered)" if self.cityscapes_is_embedded else "the user's Cityscapes folder"
+        return f"odometry: {odometry}; training: {training}; profile {self.profile}"
+
+    def __str__(self):
+        rows = {"run": self.run, "odometry data": self.kitti, "training data": self.cityscapes,
+                "results": self.build, "figures": self.figures, "processes": self.jobs, "seed": self.seed,
+                **{key.replace("_", " "): value for key, value in asdict(self.sizes).items()
+                   if not key.startswith("world_") or self.kitti_is_embedded or self.cityscapes_is_embedded}}
+        return "\n".join(f"{key:24}{'all' if value is None else _short(value)}" for key, value in rows.items())
+
+
+def read_settings(environment=None):
+    """The settings from the environment's THESIS_REPRO_ variables.
+
+    Raises InputError for an unknown variable, an unknown profile, a missing data folder or a bad number.
+    """
+    environment = os.environ if environment is None else environment
+    given = {name[len(PREFIX):]: value for name, value in environment.items() if name.startswith(PREFIX) and value}
+    for name in sorted(given.keys() - VARIABLES.keys()):
+        raise InputError(f"{PREFIX}{name}: unknown setting; known are {', '.join(PREFIX + key for key in VARIABLES)}")
+    profile = given.get("PROFILE", "demo")
+    if profile not in PROFILES:
+        raise InputError(f"PROFILE={profile}: unknown profile; choose one of {', '.join(PROFILES)}")
+    jobs = given.get("JOBS", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()))
+    if not jobs.isdigit() or int(jobs) < 1:
+        raise InputError(f"JOBS={jobs}: must be a whole number of processes, 1 or more")
+    build = Path(given.get("BUILD", ROOT / "build")).absolute()
+    figures = Path(given.get("FIGURES", ROOT / "figures")).absolute()
+    world = build / f"world-{profile}"
+    kitti, cityscapes = (_data_folder(name, given.get(name)) for name in ("KITTI", "CITYSCAPES"))
+    data = "_".join(_short_name(name, path) for name, path in (("kitti", kitti), ("cityscapes", cityscapes)) if path)
+    run = f"{data or 'embedded'}-{profile}"
+    return Settings(
+        profile=profile, sizes=PROFILES[profile], kitti=kitti or world / "kitti",
+        cityscapes=cityscapes or world / "cityscapes", kitti_is_embedded=kitti is None,
+        cityscapes_is_embedded=cityscapes is None, run=run, build=build / run,
+        # the default run's figures are what visitors see; those of all others go into folders beside them
+        figures=figures if run == "embedded-demo" else figures / run,
+        world=world, jobs=int(jobs))
+
+
+def _data_folder(name, value):
+    if value is None:
+        return None
+    path = Path(value).expanduser().absolute()
+    if not path.is_dir():
+        raise InputError(f"{name}={value}: no such folder")
+    return path
+
+
+def _short_name(name, path):
+    # two folders of the same name must not share results
+    return f"{name}-{path.name}-{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:6]}"
+
+
+def _short(value):
+    if isinstance(value, Path):
+        try:
+            return value.relative_to(ROOT)
+        except ValueError:
+            return value
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value))
+    return value
+
+
+if __name__ == "__main__":
+    # for the Makefile: the folder of the run, or with "figures" where to look when it is done
+    try:
+        _settings = read_settings()
+    except InputError as error:
+        sys.exit(str(error))
+    if sys.argv[1:] == ["figures"]:
+        print(f"tables and figures: {_short(_settings.figures)}; executed notebooks: "
+              f"{_short(_settings.build / 'notebooks')}")
+    else:
+        print(_short(_settings.build))
