@@ -81,6 +81,12 @@ def test_faults_are_named(tiny_kitti, damage, says):
     assert "\n" not in str(error.value)
 
 
+def test_sequences_without_published_poses_are_left_out(tiny_kitti):
+    for name in ("03", "11"):
+        (tiny_kitti / "sequences" / name / "image_0").mkdir(parents=True)
+    assert sequences(tiny_kitti) == ["00", "03"]
+
+
 def test_missing_folders_are_named(tmp_path, tiny_kitti):
     with pytest.raises(InputError, match="holds no folder 'sequences'"):
         sequences(tmp_path)

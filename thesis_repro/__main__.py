@@ -73,12 +73,14 @@ def odometry(options):
     elif options.labels:
         masks = LabelMasks(options.labels, sequence, options.dilation)
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
-    positions, truth = result.poses[:, :3, 3], sequence.poses[:, :3, 3]
+    seconds = result.frames.filter(like="_seconds").sum(axis=1)
     summary = {
         "sequence": sequence.name, "frames": len(sequence),
-        "rmse_m": metrics.rmse(positions, truth), "mae_m": metrics.mae(positions, truth),
+        "rmse_m": metrics.rmse(result.poses, sequence.poses, settings.alignment),
+        "mae_m": metrics.mae(result.poses, sequence.poses, settings.alignment),
         "mean_keypoints": float(result.frames["detected"].mean()),
-        "ms_per_frame": 1000 * float(result.frames["seconds"].mean()),
+        "ms_per_frame": 1000 * float(seconds.mean()),
+        "flagged": {flag: int(count) for flag, count in result.flagged.items()},
     }
     if options.output:
         write_kitti_poses(options.output, result.poses)
@@ -90,6 +92,8 @@ def odometry(options):
         print(f"sequence {sequence.name}, {len(sequence)} frames\n"
               f"RMSE            {summary['rmse_m']:.6f} m\nMAE             {summary['mae_m']:.6f} m\n"
               f"mean keypoints  {summary['mean_keypoints']:.1f}\ntime a frame    {summary['ms_per_frame']:.1f} ms")
+        for flag, count in summary["flagged"].items():
+            print(f"{flag:16}{count} frame{'s' * (count > 1)}")
 
 
 def build_parser():

@@ -17,7 +17,7 @@ def figure_augmentation(examples):
     return figure
 
 
-def figure_3_6(frame, label_map, edge_image, mask, dilation_width):
+def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
     """A frame, its predicted label map, the Canny edges of the label map, and the edges dilated."""
     figure, axes = new_figure(2, 2, height=3.0)
     show_image(axes[0, 0], frame, "frame")
@@ -27,7 +27,7 @@ def figure_3_6(frame, label_map, edge_image, mask, dilation_width):
     return figure
 
 
-def figure_4_1(history):
+def figure_4_01(history):
     """Training and validation curves: F1 score, IoU score, loss; one point an epoch."""
     figure, axes = new_figure(1, 3, height=2.6)
     best = history["epoch"][history["val_loss"].idxmin()]
@@ -41,7 +41,7 @@ def figure_4_1(history):
     return figure
 
 
-def figure_4_2(image, label_map, prediction):
+def figure_4_02(image, label_map, prediction):
     """An image of the Cityscapes validation split, its label map and its prediction (Section 4.1)."""
     figure, axes = new_figure(1, 3, height=3.0)
     show_image(axes[0], image, "image")
@@ -51,7 +51,7 @@ def figure_4_2(image, label_map, prediction):
     return figure
 
 
-def figure_4_3(frame, prediction, title):
+def figure_4_03(frame, prediction, title):
     """A KITTI frame and its predicted label map at the network's size."""
     figure, axes = new_figure(2, 1, height=5.2)
     show_image(axes[0], frame, title)
@@ -60,7 +60,7 @@ def figure_4_3(frame, prediction, title):
     return figure
 
 
-def figure_4_4(frame, edge_image, keypoints, title):
+def figure_4_04(frame, edge_image, keypoints, title):
     """Keypoints, (n, 2) pixels, that the mask left along the predicted boundaries."""
     figure, axes = new_figure(height=2.9)
     overlay = np.dstack([frame] * 3)
@@ -70,7 +70,7 @@ def figure_4_4(frame, edge_image, keypoints, title):
     return figure
 
 
-def figure_4_5(frame, all_keypoints, prediction, mask, kept_keypoints, dilation_width, title):
+def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation_width, title):
     """The procedure in five panels: frame, all keypoints, prediction, dilated edges, kept keypoints."""
     height, width = frame.shape
     figure, axes = new_figure(5, 1, height=5 * (PAGE_WIDTH * 0.72 * height / width + 0.28))
@@ -84,7 +84,7 @@ def figure_4_5(frame, all_keypoints, prediction, mask, kept_keypoints, dilation_
     return figure
 
 
-def figure_a_1(rows, total, trainable):
+def figure_a_01(rows, total, trainable):
     """The model summary from the rows of `unet.summary_rows`."""
     figure, axes = new_figure(height=0.155 * (len(rows) + 5))
     axes.set_axis_off()

@@ -94,7 +94,7 @@ def figure_against_width(summary, column, label, title):
     return figure
 
 
-def figure_4_7(summary):
+def figure_4_07(summary):
     """Fraction of keypoints kept, relative to the baseline's mean number, against dilation width."""
     baseline = summary[summary["variant"] == "baseline"].set_index("sequence")["mean_keypoints"]
     kept = summary.assign(fraction=summary["mean_keypoints"] / summary["sequence"].map(baseline))

@@ -32,13 +32,21 @@ CAMERAS = {"00": _CAMERA_00, "01": _CAMERA_00, "02": _CAMERA_00, "03": _CAMERA_0
 FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201)))
 
 
+# The benchmark keeps the true poses of these to itself, and without them there is no scale.
+WITHOUT_TRUTH = frozenset(f"{number}" for number in range(11, 22))
+
+
 def sequences(root):
-    """Names of the sequences under root/sequences that hold image_0, sorted. Raises InputError when there are none."""
+    """Names of the sequences under root/sequences that hold image_0, sorted, less those without published poses.
+
+    Raises InputError when there are none.
+    """
     root = Path(root)
     if not (root / "sequences").is_dir():
         raise InputError(f"{root}: holds no folder 'sequences'; KITTI must name the folder that holds "
                          "sequences/NN/image_0 and poses/NN.txt")
-    names = sorted(folder.name for folder in (root / "sequences").iterdir() if (folder / "image_0").is_dir())
+    names = sorted(folder.name for folder in (root / "sequences").iterdir() if (folder / "image_0").is_dir()
+                   and (folder.name not in WITHOUT_TRUTH or (root / "poses" / f"{folder.name}.txt").is_file()))
     if not names:
         raise InputError(f"{root / 'sequences'}: no sequence holds a folder image_0; "
                          "the gray images of the odometry benchmark are needed")

@@ -1,0 +1,47 @@
+import re
+
+import cv2
+import numpy as np
+
+from thesis_repro.__main__ import main
+from thesis_repro.check import check_cityscapes, check_kitti
+
+
+def test_sound_data_has_no_problems(tiny_kitti, tiny_cityscapes):
+    facts, problems = check_kitti(tiny_kitti)
+    assert problems == [] and facts == ["sequence 00: 4 frames of 64x48; an excerpt: the complete sequence has 4541; "
+                                        "not the thesis's size of 1241x376"]
+    facts, problems = check_cityscapes(tiny_cityscapes)
+    assert problems == [] and facts[0] == ("split train: 4 images with label maps; "
+                                           "labels: road 7, building 11, sky 23")
+
+
+def test_every_problem_is_listed_and_the_exit_code_says_so(tiny_kitti, tiny_cityscapes, capsys):
+    frame = tiny_kitti / "sequences/00/image_0/000001.png"
+    frame.write_bytes(frame.read_bytes()[:100])
+    cv2.imwrite(str(tiny_kitti / "sequences/00/image_0/000003.png"), np.zeros((9, 9), np.uint8))
+    (tiny_kitti / "sequences/00/times.txt").write_text("0\n0.1\n0.1\n0.2\n")
+    (tiny_kitti / "poses/00.txt").write_text("1 0 0 0 0 2 0 0 0 0 1 0\n" * 4)
+    cv2.imwrite(str(tiny_cityscapes / "valannot/street_0.png"), np.full((16, 32), 200, np.uint8))
+    cv2.imwrite(str(tiny_cityscapes / "valannot/street_1.png"), np.full((8, 8), 7, np.uint8))
+    assert main(["check-data", "--kitti", str(tiny_kitti), "--cityscapes", str(tiny_cityscapes)]) == 1
+    problems = [line for line in capsys.readouterr().err.splitlines() if line.startswith("wrong: ")]
+    patterns = ["000001.png: the image is truncated", "000003.png: 9x9 pixels", "times.txt, line 3: time does not",
+                "00.txt, line 1: is no rotation", "street_0.png: label id 200", "street_1.png: 8x8 pixels, but"]
+    assert len(problems) == len(patterns)
+    for pattern in patterns:
+        assert any(re.search(pattern, problem) for problem in problems), pattern
+
+
+def test_wrong_camera_is_noticed(tiny_kitti):
+    for index in range(4):
+        cv2.imwrite(str(tiny_kitti / f"sequences/00/image_0/{index:06d}.png"), np.zeros((376, 1241), np.uint8))
+    _, problems = check_kitti(tiny_kitti)
+    assert len(problems) == 1 and "calib.txt: P0 differs from the thesis's camera by" in problems[0]
+
+
+def test_a_missing_folder_is_one_line(tmp_path, capsys):
+    assert main(["check-data", "--kitti", str(tmp_path / "nowhere")]) == 1
+    assert main(["check-data"]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert "nowhere: holds no folder 'sequences'" in first and "nothing to check" in second

@@ -1,0 +1,58 @@
+"""Every notebook, executed through `make figures` on the smallest profile."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
+TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
+FIGURES = [*(f"figure_3_{n:02d}" for n in (1, 2, 6)), *(f"figure_4_{n:02d}" for n in range(1, 8)),
+           *(f"figure_4_{n:02d}" for n in range(9, 18)), "figure_a_01"]
+
+
+def make_figures(tmp_path, *options):
+    # make's own variables would hand the outer make's options on to this one
+    environment = {name: value for name, value in os.environ.items()
+                   if not name.startswith(("MAKE", "MFLAGS", "THESIS_REPRO_"))}
+    return subprocess.run(["make", "figures", "PROFILE=smoke", f"BUILD={tmp_path / 'build'}",
+                           f"FIGURES={tmp_path / 'figures'}", *options],
+                          cwd=ROOT, env=environment, capture_output=True, text=True)
+
+
+def names(folder, suffix):
+    return sorted(path.stem for path in folder.rglob(f"*{suffix}"))
+
+
+@pytest.mark.notebooks
+def test_all_notebooks_run_and_leave_every_artefact(tmp_path):
+    first = make_figures(tmp_path)
+    assert first.returncode == 0, first.stdout + first.stderr
+    executed = tmp_path / "build" / "embedded-smoke" / "notebooks"
+    assert sorted(path.name for path in executed.glob("*.ipynb")) == NOTEBOOKS
+    figures = tmp_path / "figures" / "embedded-smoke"
+    assert names(figures, ".svg") == names(figures, ".png") == sorted(FIGURES)
+    assert names(figures, ".csv") == names(figures, ".md") == TABLES
+    assert all("embedded world" in (figures / f"{name}.md").read_text() for name in TABLES[2:])
+    assert all("embedded world" in (figures / f"{name}.svg").read_text() for name in FIGURES if name != "figure_a_01")
+    again = make_figures(tmp_path)
+    assert again.returncode == 0 and "load_images" not in again.stdout, again.stdout
+
+
+@pytest.mark.notebooks
+def test_bad_data_stops_before_the_notebooks_with_one_line(tmp_path, tiny_kitti):
+    (tiny_kitti / "poses" / "00.txt").unlink()
+    failed = make_figures(tmp_path, f"KITTI={tiny_kitti}")
+    assert failed.returncode != 0 and "poses/00.txt: no such file" in failed.stderr
+    assert not list((tmp_path / "build").rglob("*.ipynb"))
+    assert "PROFILE=huge: unknown profile" in make_figures(tmp_path, "PROFILE=huge").stderr
+    assert "PROFIL: unknown setting" in make_figures(tmp_path, "PROFIL=smoke").stderr
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebooks_in_git_hold_no_outputs(name):
+    cells = json.loads((ROOT / "notebooks" / name).read_text())["cells"]
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
