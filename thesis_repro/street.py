@@ -1,0 +1,734 @@
+"""Streets of the embedded world: a curved road and everything beside it, as faces for the rasteriser.
+
+A place on a street is (s, d): metres along the road's middle and metres to the right of it. The ground is flat, the
+road at y = 0 and the sidewalks a kerb higher; cars drive on the right.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thesis_repro import render, textures
+from thesis_repro.cityscapes import ID
+from thesis_repro.textures import FACADE_TILE, FACADES, PERSONS, PROFILES, SHOP_TILE, SIGNS, TILE, TREES, WIDTHS
+
+KERB = -render.GROUND_LEVELS[2]
+STEP = 0.25  # metres between the stored points of a track
+BEHIND, AHEAD = 30.0, 170.0  # metres of street behind the first and ahead of the last camera
+ROAD, SIDEWALK = 1, 2  # ground levels
+
+
+class Track:
+    """The middle line of a road: pieces (metres, degrees to the right) from `start`, repeated up to `stop`."""
+
+    def __init__(self, pieces, start, stop, origin=(0.0, 0.0), heading=0.0, smoothing=3.0, repeat=True):
+        count = int(np.ceil((stop - start) / STEP)) + 1
+        self.s = start + STEP * np.arange(count)
+        self.curvature = np.zeros(count)
+        self.corners = []
+        where = 0.0
+        while pieces and where < stop:
+            for length, degrees in pieces:
+                inside = (self.s >= where) & (self.s < where + length)
+                self.curvature[inside] = np.radians(degrees) / length
+                if abs(degrees) >= 60 and length < 25:
+                    self.corners.append(where)
+                where += length
+            if not repeat:
+                break
+        window = max(1, int(smoothing / STEP))  # a driver turns the wheel, the curvature does not jump
+        padded = np.pad(self.curvature, (window // 2, window - 1 - window // 2), mode="edge")
+        total = np.concatenate([[0.0], np.cumsum(padded)])
+        self.curvature = (total[window:] - total[:-window]) / window
+        first = int(round(-start / STEP))
+        turn = np.concatenate([[0.0], np.cumsum(0.5 * (self.curvature[1:] + self.curvature[:-1])) * STEP])
+        self.heading = heading + turn - turn[first]
+        middle = 0.5 * (self.heading[1:] + self.heading[:-1])
+        x = np.concatenate([[0.0], np.cumsum(np.sin(middle)) * STEP])
+        z = np.concatenate([[0.0], np.cumsum(np.cos(middle)) * STEP])
+        self.x, self.z = origin[0] + x - x[first], origin[1] + z - z[first]
+
+    def at(self, s, d=0.0):
+        """(x, z, heading) of places (s, d)."""
+        heading = np.interp(s, self.s, self.heading)
+        x = np.interp(s, self.s, self.x) + d * np.cos(heading)
+        z = np.interp(s, self.s, self.z) - d * np.sin(heading)
+        return x, z, heading
+
+
+@dataclass(frozen=True)
+class Style:
+    """What a street looks like; widths in metres."""
+
+    half: float = 3.5  # half of the road
+    road: str = "road"
+    parking: tuple = (0.0, 2.2)  # left, right
+    sidewalk: float = 2.6
+    zones: tuple = ("blocks", "houses", "park", "wall")
+    weights: tuple = (0.5, 0.25, 0.15, 0.1)
+    parked: float = 0.6  # part of the parking slots that are taken
+    trees: float = 0.5  # street trees
+    persons: float = 0.05  # for each metre of sidewalk
+    traffic: float = 0.01  # oncoming cars for each metre
+    sunny: bool = True
+    sun: tuple = (0.5, 0.8)  # azimuth the light comes from, elevation (radians)
+    sky: tuple = (150.0, 205.0, 0.4)  # zenith, horizon, clouds
+    haze: float = 0.003
+    leader: float = 0.0  # distance of a car driving ahead at the camera's pace
+    crossing: float = -1.0  # s of a crossing with cars that pass ahead of a waiting camera
+    bridge: float = -1.0  # s of a bridge over the road
+
+
+@dataclass
+class Mover:
+    """A car, rider or person that moves along a track at a steady pace (metres a frame)."""
+
+    faces: np.ndarray
+    track: Track
+    s: float
+    pace: float
+    d: float
+    turn: float = 0.0
+
+    def at(self, frame, followed):
+        # A leading car keeps its distance to the camera instead of an own pace.
+        s = self.s + (followed if self.pace == FOLLOWS else self.pace * frame)
+        x, z, heading = self.track.at(s, self.d)
+        return place(self.faces, x, z, heading + self.turn)
+
+
+FOLLOWS = -99.0
+
+
+class Faces:
+    """Rows of the face matrix in the making. Rectangles are seen from outside: s to the right, t up."""
+
+    def __init__(self, names):
+        self.names, self.rows = names, []
+
+    def add(self, corner, edge_s, edge_t, texture, label, repeats=(1.0, 1.0), uv=None, gain=1.0, triangle=0, ground=0,
+            casts=1, lit=1):
+        uv = uv or (0.0, repeats[0], 0.0, 1.0, 0.0, -repeats[1])
+        self.rows.append((*corner, *edge_s, *edge_t, *uv, self.names[texture], ID[label], gain, triangle, ground,
+                          casts, lit))
+
+    def box(self, x, y, z, texture, label, metres=1.0, gain=1.0, casts=1, top=None, front=None):
+        """An upright box between (low, high) of each axis; y low is the top. `metres` covers one repeat."""
+        (x0, x1), (top_y, bottom), (z0, z1) = x, y, z
+        w, h, l = x1 - x0, bottom - top_y, z1 - z0
+        up = (0, -h, 0)
+        settings = {"gain": gain, "casts": casts}
+        across, along = (w / metres, h / metres), (l / metres, h / metres)
+        if front:
+            self.add((x0, bottom, z0), (w, 0, 0), up, front, label, (1, 1), **settings)
+        else:
+            self.add((x0, bottom, z0), (w, 0, 0), up, texture, label, across, **settings)
+        self.add((x1, bottom, z1), (-w, 0, 0), up, texture, label, across, **settings)
+        self.add((x1, bottom, z0), (0, 0, l), up, texture, label, along, **settings)
+        self.add((x0, bottom, z1), (0, 0, -l), up, texture, label, along, **settings)
+        self.add((x0, top_y, z0), (w, 0, 0), (0, 0, l), top or texture, label, (w / metres, l / metres), **settings)
+
+    def matrix(self):
+        return np.array(self.rows, np.float64).reshape(-1, render.COLUMNS)
+
+
+def place(faces, x, z, yaw, y=0.0):
+    """Turn local faces by yaw (right positive) and move them to (x, y, z)."""
+    placed = faces.copy()
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    for start in (render.CORNER, render.EDGE_S, render.EDGE_T):
+        local_x, local_z = faces[:, start], faces[:, start + 2]
+        placed[:, start] = cosine * local_x + sine * local_z
+        placed[:, start + 2] = cosine * local_z - sine * local_x
+    placed[:, render.CORNER] += x
+    placed[:, render.CORNER + 1] += y
+    placed[:, render.CORNER + 2] += z
+    return placed
+
+
+_BODY = {"sedan": "FFPGPGPRR", "hatch": "FFPGPGRR", "estate": "FFPGPGRR", "van": "FFPGPGR", "truck": "FPGPPPPP",
+         "bus": "FPGPPPR"}
+_LABEL_OF = {"truck": "truck", "bus": "bus"}
+
+
+def vehicle(names, kind, paint):
+    """A vehicle that stands on the ground and looks along z, its middle at the origin.
+
+    The side view is cut out of two panels a side, the upper one leaning in; the skin between them follows its profile.
+    """
+    faces = Faces(names)
+    label = _LABEL_OF.get(kind, "car")
+    profile = np.array(PROFILES[kind])
+    length, top, half = profile[:, 0].max(), profile[:, 1].max() + 0.04, WIDTHS[kind] / 2
+    belt, lean = (0.96, 0.28) if label == "car" and kind != "van" else (1.2, 0.06)
+
+    def half_at(y):
+        return half - lean * max(0.0, y - belt)
+
+    side, split, z0 = f"{kind}{paint}", belt / top, -length / 2
+    inward = lean * (top - belt)
+    for sign in (1, -1):
+        z, s = (z0, length) if sign > 0 else (-z0, -length)
+        u = (0.0, 1.0) if sign > 0 else (1.0, -1.0)
+        faces.add((sign * half, 0, z), (0, 0, s), (0, -belt, 0), side, label, uv=(*u, 0, 1, 0, -split))
+        faces.add((sign * half, -belt, z), (0, 0, s), (-sign * inward, belt - top, 0), side, label,
+                  uv=(*u, 0, 1 - split, 0, split - 1))
+    body = _BODY[kind]
+    for index, material in enumerate(body):
+        (za, ya), (zb, yb) = profile[index], profile[index + 1]  # from front to rear over the roof
+        texture = {"F": f"front{paint}", "R": f"rear{paint}", "G": "glass", "P": f"paint{paint}"}[material]
+        v_top, v_bottom = 0.0, 1.0
+        if material in "FR" and body.count(material) == 2:  # one picture over two parts
+            upper = (material == "F") == (index > 0 and body[index - 1] == material)
+            v_top, v_bottom = (0.0, 0.5) if upper else (0.5, 1.0)
+        wa, wb = half_at(ya), half_at(yb)
+        va, vb = (v_bottom, v_top) if ya < yb else (v_top, v_bottom)
+        first = np.array((-wb, -yb, zb + z0))
+        faces.add(first, (2 * wb, 0, 0), np.array((-wa, -ya, za + z0)) - first, texture, label, triangle=1,
+                  uv=(0, 1, 0, vb, 0, va - vb))
+        second = np.array((wa, -ya, za + z0))
+        faces.add(second, (-2 * wa, 0, 0), np.array((wb, -yb, zb + z0)) - second, texture, label, triangle=1,
+                  uv=(1, -1, 0, va, 0, vb - va))
+    faces.add((-half, -0.32, z0), (2 * half, 0, 0), (0, 0, length), "bin", label, lit=0, gain=0.3)  # underside
+    return faces.matrix()
+
+
+def cut_out(names, texture, label, width, height, crossed=False, gain=1.0, base=0.0):
+    """An upright picture in front view, or two that cross."""
+    faces = Faces(names)
+    faces.add((-width / 2, -base, 0), (width, 0, 0), (0, -height, 0), texture, label, lit=0, gain=gain)
+    if crossed:
+        faces.add((0, -base, -width / 2), (0, 0, width), (0, -height, 0), texture, label, lit=0, gain=gain)
+    return faces.matrix()
+
+
+def cyclist(names):
+    faces = Faces(names)
+    faces.add((0, 0, -0.9), (0, 0, 1.8), (0, -1.05, 0), "bicycle", "bicycle", lit=0)
+    faces.add((0.02, -0.42, -0.62), (0, 0, 1.25), (0, -1.3, 0), "rider", "rider", lit=0)
+    return faces.matrix()
+
+
+def lamp(names, height, arm):
+    faces = Faces(names)
+    faces.box((-0.07, 0.07), (-height, 0), (-0.07, 0.07), "metal", "pole", 2.0)
+    faces.box((0, arm), (-height, -height + 0.09), (-0.05, 0.05), "metal", "pole", 2.0)
+    faces.box((arm, arm + 0.7), (-height - 0.05, -height + 0.12), (-0.14, 0.14), "metal", "pole", 2.0, gain=1.3)
+    return faces.matrix()
+
+
+def sign(names, kind, size, height, half_pole=0.035):
+    faces = Faces(names)
+    faces.box((-half_pole, half_pole), (-height - size / 2, 0), (0.01, 0.01 + 2 * half_pole), "metal", "pole", 2.0)
+    faces.add((-size / 2, -height, 0), (size, 0, 0), (0, -size, 0), f"sign{kind}", "traffic sign", lit=0, gain=1.05)
+    return faces.matrix()
+
+
+def traffic_light(names):
+    faces = Faces(names)
+    faces.box((-0.06, 0.06), (-2.4, 0), (0.02, 0.14), "metal", "pole", 2.0)
+    faces.box((-0.19, 0.19), (-3.3, -2.35), (-0.1, 0.15), "bin", "traffic light", 0.5, front="light")
+    return faces.matrix()
+
+
+def building(names, rng, width, depth, floors, pitched):
+    """A house whose front stands at z = 0 and looks at -z; the walls take whole bays of a facade."""
+    faces = Faces(names)
+    kind = int(rng.integers(0, FACADES))
+    ground, height = 3.5, 3.5 + 3.0 * floors
+    gain = rng.uniform(0.85, 1.12)
+    start, shop = rng.integers(0, 4) / 4.0, rng.integers(0, 4) / 4.0
+    for corner, edge, length in (((-width / 2, 0), (1, 0), width), ((width / 2, depth), (-1, 0), width),
+                                 ((width / 2, 0), (0, 1), depth), ((-width / 2, depth), (0, -1), depth)):
+        edge_s = (edge[0] * length, 0, edge[1] * length)
+        bays = max(1, round(length / (FACADE_TILE[0] / 4))) / 4
+        faces.add((corner[0], 0, corner[1]), edge_s, (0, -ground, 0), f"shop{kind}", "building",
+                  uv=(shop, bays, 0, 1, 0, -ground / SHOP_TILE[1]), gain=gain)
+        faces.add((corner[0], -ground, corner[1]), edge_s, (0, ground - height, 0), f"facade{kind}", "building",
+                  uv=(start, bays, 0, 1, 0, -floors / 2), gain=gain)
+    if pitched:
+        rise, over = depth * rng.uniform(0.3, 0.5), 0.4
+        lift = over * rise / (depth / 2)
+        ridge = (0, -rise - lift, depth / 2 + over)
+        across = width + 2 * over
+        tiles = (across / TILE["roof"][0], np.hypot(rise, depth / 2) / TILE["roof"][1])
+        faces.add((-width / 2 - over, -height + lift, -over), (across, 0, 0), ridge, "roof", "building", tiles)
+        faces.add((width / 2 + over, -height + lift, depth + over), (-across, 0, 0), (0, ridge[1], -ridge[2]), "roof",
+                  "building", tiles)
+        for x, z0, z1 in ((width / 2, 0, depth), (-width / 2, depth, 0)):
+            faces.add((x, -height, z0), (0, 0, z1 - z0), (0, -rise, (z1 - z0) / 2), f"facade{kind}", "building",
+                      uv=(0, 0.3, 0.15, 0.1, 0, -0.08), triangle=1, gain=gain)
+        chimney = rng.uniform(-0.3, 0.3) * width
+        faces.box((chimney - 0.35, chimney + 0.35), (-height - rise - 0.9, -height - rise * 0.6),
+                  (depth / 2 + 0.3, depth / 2 + 1.0), "stone", "building", 3.0, gain=0.8)
+    else:
+        faces.box((-width / 2 - 0.15, width / 2 + 0.15), (-height - 0.5, -height), (-0.15, depth + 0.15), "concrete",
+                  "building", 8.0, gain=gain * 0.8)
+    return faces.matrix()
+
+
+@dataclass
+class Street:
+    """A street that is ready to be rendered."""
+
+    textures: tuple
+    track: Track
+    style: Style
+    faces: np.ndarray
+    movers: list
+    environment: np.ndarray
+    horizon: np.ndarray
+    horizon_labels: np.ndarray
+    ground_label: int = ID["terrain"]
+    extra: dict = field(default_factory=dict)
+
+    def view(self, pose, intrinsics, size, frame=0, followed=0.0):
+        """Image (float32, before exposure and noise) and label map (uint8) from a 4x4 camera-to-world pose."""
+        moved = [mover.at(frame, followed) for mover in self.movers]
+        return render.render(np.concatenate([self.faces, *moved]), self.textures, pose, intrinsics, size,
+                             self.environment, self.horizon, self.horizon_labels, self.ground_label)
+
+
+class _Builder:
+    """Lays out one street. `roads` are the main road and the ones that leave it, each with half its width."""
+
+    def __init__(self, rng, bank, track, style):
+        self.rng, self.names, self.track, self.style = rng, bank[0], track, style
+        self.parts, self.movers, self.buildings = [], [], []
+        self.roads = [(track, style.half)]
+        for corner in track.corners:  # at a sharp turn the old direction goes on as a side road
+            if corner < track.s[-1] - 40:
+                x, z, heading = track.at(corner - 4.0)
+                self.roads.append((Track([], 0.0, 70.0, (x, z), heading), style.half * 0.9))
+        s = track.s[0] + 60
+        while s < track.s[-1] - 20 and style.road != "highway":
+            s += rng.uniform(35, 80)
+            if np.interp(s, track.s, np.abs(track.curvature)) < 0.01:
+                x, z, heading = track.at(s)
+                quarter = np.pi / 2 * rng.choice([-1, 1])
+                self.roads.append((Track([], 0.0, 70.0, (x, z), heading + quarter), style.half * 0.85))
+        if style.crossing >= 0:
+            x, z, heading = track.at(style.crossing)
+            crossing = Track([], -75.0, 75.0, (x, z), heading - np.pi / 2)
+            self.roads.append((crossing, style.half))
+            for k in range(14):
+                lane = 1 if k % 2 else -1
+                self._mover(crossing, -lane * (12.0 + 13.0 * k + rng.uniform(-3, 3)), lane * rng.uniform(0.6, 0.75),
+                            1.7 * lane, 0.0 if lane > 0 else np.pi)
+        middles = [np.stack([road.x, road.z], axis=1)[::2] for road, _ in self.roads]
+        self.middle = np.concatenate(middles)
+        self.halves = np.concatenate([np.full(len(m), half) for m, (_, half) in zip(middles, self.roads)])
+
+    def off_road(self, x, z):
+        """Distance of points to the nearest edge of any road; negative on a road."""
+        x, z = np.atleast_1d(x), np.atleast_1d(z)
+        result = np.empty(len(x))
+        for start in range(0, len(x), 256):
+            part = slice(start, start + 256)
+            dx = x[part, None] - self.middle[None, :, 0]
+            dz = z[part, None] - self.middle[None, :, 1]
+            result[part] = (np.sqrt(dx * dx + dz * dz) - self.halves).min(axis=1)
+        return result
+
+    def free(self, x, z, margin):
+        return self.off_road(x, z)[0] > margin and not any(b.covers(x, z, 0.5) for b in self.buildings)
+
+    def put(self, faces, x, z, yaw, y=-KERB, gain=1.0):
+        placed = place(faces, x, z, yaw, y)
+        placed[:, render.GAIN] *= gain
+        self.parts.append(placed)
+
+    def strip(self, road, s_from, s_to, d0, d1, y, texture, label, ground, keep_off=None, whole_width=False):
+        """A band of ground between d0 < d1; cells on another road are left out."""
+        step = 1.0 if ground == SIDEWALK or keep_off is not None else 2.0
+        s = np.arange(s_from, s_to + step / 2, step)
+        if len(s) < 2:
+            return
+        tile_u, tile_v = TILE[texture]
+        x0, z0, _ = road.at(s, d0)
+        x1, z1, _ = road.at(s, d1)
+        straight = np.abs(np.interp(s, road.s, road.curvature)) < 1e-6
+        rows = len(s) - 1
+        near, far = slice(0, rows), slice(1, rows + 1)
+        # Inside a tight bend the band would fold over.
+        ahead0 = (x0[far] - x0[near]) * np.sin(road.at(s[near])[2]) + (z0[far] - z0[near]) * np.cos(road.at(s[near])[2])
+        ahead1 = (x1[far] - x1[near]) * np.sin(road.at(s[near])[2]) + (z1[far] - z1[near]) * np.cos(road.at(s[near])[2])
+        keep = (ahead0 > 0.02) & (ahead1 > 0.02)
+        if keep_off is not None:
+            keep &= self.off_road((x0[near] + x1[far]) / 2, (z0[near] + z1[far]) / 2) > keep_off
+        u_width = 1.0 if whole_width else (d1 - d0) / tile_u
+        u0 = 0.0 if whole_width else d0 / tile_u
+        v, v_step = s / tile_v, step / tile_v
+        cells = np.zeros((rows, render.COLUMNS))
+        cells[:, 0], cells[:, 1], cells[:, 2] = x0[near], y, z0[near]
+        cells[:, 3], cells[:, 5] = x1[near] - x0[near], z1[near] - z0[near]
+        cells[:, 6], cells[:, 8] = x0[far] - x0[near], z0[far] - z0[near]
+        cells[:, 9], cells[:, 10], cells[:, 12], cells[:, 14] = u0, u_width, -v[near], -v_step
+        cells[:, render.TEXTURE], cells[:, render.LABEL] = self.names[texture], ID[label]
+        cells[:, render.GAIN], cells[:, render.GROUND], cells[:, render.LIT] = 1.0, ground, 1
+        bent = ~(straight[near] & straight[far])
+        cells[:, render.TRIANGLE] = bent
+        other = cells.copy()
+        other[:, 0], other[:, 2] = x1[far], z1[far]
+        other[:, 3], other[:, 5] = x0[far] - x1[far], z0[far] - z1[far]
+        other[:, 6], other[:, 8] = x1[near] - x1[far], z1[near] - z1[far]
+        other[:, 9], other[:, 10], other[:, 12], other[:, 14] = u0 + u_width, -u_width, -v[far], v_step
+        self.parts.append(cells[keep])
+        self.parts.append(other[keep & bent])
+
+    def _mover(self, track, s, pace, d, turn, kind=None):
+        kind = kind or str(self.rng.choice(["sedan", "hatch", "estate", "van", "truck", "bus"],
+                                           p=[0.32, 0.3, 0.2, 0.1, 0.05, 0.03]))
+        self.movers.append(Mover(self.any_vehicle(kind), track, s, pace, d, turn))
+
+    def any_vehicle(self, kind):
+        paint = int(self.rng.choice([0, 2])) if kind in ("truck", "bus") else int(self.rng.integers(0, 6))
+        return vehicle(self.names, kind, paint)
+
+    def ground(self):
+        style = self.style
+        for index, (road, half) in enumerate(self.roads):
+            drop = 0.012 * index
+            texture = style.road if index == 0 else "lane"
+            if index == 0:
+                # Where the street meets itself its later part runs a little lower, or the two would flicker.
+                for start in np.arange(road.s[0], road.s[-1], 20.0):
+                    self.strip(road, start, min(start + 20.0, road.s[-1]), -half, half, 1e-4 * (start + BEHIND),
+                               texture, "road", ROAD, whole_width=True)
+            else:
+                self.strip(road, road.s[0], road.s[-1], -half, half, 0.03 + drop, texture, "road", ROAD,
+                           whole_width=True)
+            if style.road == "highway":
+                continue
+            for side in (-1, 1):
+                edge = half
+                lane = style.parking[(side + 1) // 2] if index == 0 else 0.0
+                if lane:
+                    self.band(road, side, edge, edge + lane, 0.004, "parking", "parking", ROAD, -0.05)
+                    edge += lane
+                self.band(road, side, edge, edge + 0.15, -KERB - 0.002, "kerb", "sidewalk", SIDEWALK, 0.0)
+                self.riser(road, side, edge)
+                self.band(road, side, edge + 0.15, edge + style.sidewalk, -KERB + 0.001 * index, "sidewalk",
+                          "sidewalk", SIDEWALK, 0.1)
+        reach = 60.0
+        size = 30.0
+        cells = set()
+        for x, z in self.middle[::8]:
+            for i in range(int((x - reach) // size), int((x + reach) // size) + 1):
+                for j in range(int((z - reach) // size), int((z + reach) // size) + 1):
+                    cells.add((i, j))
+        faces = Faces(self.names)
+        tile = TILE["grass"][0]
+        for i, j in sorted(cells):
+            faces.add((i * size, 0.06, j * size), (size, 0, 0), (0, 0, size), "grass", "terrain",
+                      (size / tile, size / tile), ground=ROAD, casts=0)
+        self.parts.append(faces.matrix())
+
+    def band(self, road, side, near, far, y, texture, label, ground, keep_off, s_range=None):
+        d0, d1 = (near, far) if side > 0 else (-far, -near)
+        s_from, s_to = s_range or (road.s[0], road.s[-1])
+        self.strip(road, s_from, s_to, d0, d1, y, texture, label, ground, keep_off)
+
+    def riser(self, road, side, edge):
+        s = np.arange(road.s[0], road.s[-1], 2.0)
+        x, z, _ = road.at(s, side * edge)
+        keep = self.off_road((x[1:] + x[:-1]) / 2, (z[1:] + z[:-1]) / 2) > -0.05
+        faces = Faces(self.names)
+        for k in np.flatnonzero(keep):
+            a, b = (k, k + 1) if side < 0 else (k + 1, k)
+            faces.add((x[b], 0.0, z[b]), (x[a] - x[b], 0, z[a] - z[b]), (0, -KERB, 0), "kerb", "sidewalk",
+                      uv=(0.1, 0, 0.3, s[k] / 8, 0.25, 0), casts=0, gain=0.8)
+        self.parts.append(faces.matrix())
+
+    def edge(self, side, road_index=0):
+        """Distance of the building line from the road's middle."""
+        style = self.style
+        half = self.roads[road_index][1]
+        if style.road == "highway":
+            return half + 3.0
+        return half + (style.parking[(side + 1) // 2] if road_index == 0 else 0.0) + style.sidewalk
+
+    def sides(self):
+        rng, style = self.rng, self.style
+        for index, (road, _) in enumerate(self.roads):
+            for side in (-1, 1):
+                s = road.s[0]
+                while s < road.s[-1] - 5:
+                    length = min(rng.uniform(24, 60), road.s[-1] - s)
+                    zone = str(rng.choice(style.zones, p=style.weights))
+                    getattr(self, f"_zone_{zone}")(road, index, side, s, s + length)
+                    s += length
+        if style.road == "highway":
+            self._highway()
+        else:
+            for side in (-1, 1):
+                self._furniture(side)
+
+    def _house_row(self, road, index, side, s0, s1, gap, setback, floors, pitched):
+        rng = self.rng
+        s = s0
+        while s < s1 - 6:
+            width, depth = min(rng.uniform(9, 17), s1 - s), rng.uniform(8, 12)
+            if width < 6:
+                break
+            distance = self.edge(side, index) + setback * rng.uniform(0.8, 1.3) + 0.05
+            x, z, heading = road.at(s + width / 2, side * distance)
+            yaw = heading + side * np.pi / 2
+            footprint = Footprint(x, z, yaw, width / 2, depth)
+            px, pz = footprint.points()
+            if self.off_road(px, pz).min() > min(1.8, self.style.sidewalk) and not any(
+                    b.overlaps(footprint) for b in self.buildings):
+                faces = building(self.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched)
+                self.put(faces, x, z, yaw)
+                self.buildings.append(footprint)
+            s += width + (rng.uniform(*gap) if gap else 0.02)
+
+    def _yard(self, road, index, side, s0, s1, texture, label, depth=14.0):
+        edge = self.edge(side, index)
+        self.band(road, side, edge, edge + depth, -KERB + 0.02 + 0.002 * index, texture, label, SIDEWALK, 1.0,
+                  (s0, s1))
+
+    def _line(self, road, side, s0, s1, distance, texture, label, height, step=3.0, y=-KERB, margin=0.8, casts=1):
+        """An upright band along the road, as a fence or a guard rail."""
+        faces = Faces(self.names)
+        tile = TILE[texture][0]
+        s = np.arange(s0, s1 + 0.01, step)
+        x, z, _ = road.at(s, side * distance)
+        for k in range(len(s) - 1):
+            if self.off_road((x[k] + x[k + 1]) / 2, (z[k] + z[k + 1]) / 2)[0] > margin:
+                a, b = (k, k + 1) if side < 0 else (k + 1, k)
+                faces.add((x[b], y, z[b]), (x[a] - x[b], 0, z[a] - z[b]), (0, -height, 0), texture, label,
+                          uv=(s[k] / tile, step / tile, 0, 1, 0, -1), casts=casts)
+        self.parts.append(faces.matrix())
+
+    def _solid(self, road, side, s0, s1, distance, thickness, texture, label, height, step=4.0, lit=True):
+        """A wall or hedge along the road, box by box."""
+        s = np.arange(s0, s1 - step / 2, step)
+        tile = TILE[texture][0]
+        for start in s:
+            x, z, heading = road.at(start + step / 2, side * distance)
+            if not self.free(x, z, 1.2):
+                continue
+            faces = Faces(self.names)
+            faces.box((0, thickness), (-height, 0), (-step / 2 - 0.03, step / 2 + 0.03), texture, label, tile)
+            matrix = faces.matrix()
+            matrix[:, render.LIT] = lit
+            # Neighbouring boxes show different parts of the texture.
+            matrix[:, 9] += start / tile
+            self.put(matrix, x, z, heading if side > 0 else heading + np.pi)
+
+    def _tree(self, x, z, height=None, kind=None):
+        rng = self.rng
+        kind = int(rng.integers(0, TREES)) if kind is None else kind
+        height = height or rng.uniform(5, 9.5)
+        self.put(cut_out(self.names, f"tree{kind}", "vegetation", height * rng.uniform(0.85, 1.05), height, True,
+                         rng.uniform(0.85, 1.2)), x, z, rng.uniform(0, np.pi))
+
+    def _scatter(self, road, index, side, s0, s1, near, far, density, what):
+        for _ in range(int((s1 - s0) * density) + 1):
+            s, d = self.rng.uniform(s0, s1), self.edge(side, index) + self.rng.uniform(near, far)
+            x, z, _ = road.at(s, side * d)
+            if not self.free(x, z, 2.0):
+                continue
+            if what == "bush":
+                width = self.rng.uniform(1.4, 3.0)
+                self.put(cut_out(self.names, f"bush{self.rng.integers(0, 2)}", "vegetation", width, width * 0.55, True),
+                         x, z, self.rng.uniform(0, np.pi))
+            else:
+                self._tree(x, z)
+
+    def _zone_blocks(self, road, index, side, s0, s1):
+        self._yard(road, index, side, s0, s1, "gravel", "ground")
+        self._house_row(road, index, side, s0, s1, None, 0.0, (1, 5), 0.5)
+
+    def _zone_houses(self, road, index, side, s0, s1):
+        rng = self.rng
+        self._yard(road, index, side, s0, s1, "grass", "terrain")
+        self._house_row(road, index, side, s0, s1, (2, 6), 4.0, (0, 3), 0.85)
+        border = str(rng.choice(["picket", "wire", "hedge", "stone"]))
+        edge = self.edge(side, index) + 0.15
+        if border in ("picket", "wire"):
+            self._line(road, side, s0, s1 - 3, edge, border, "fence", TILE[border][1])
+        elif border == "hedge":
+            self._solid(road, side, s0, s1 - 4, edge, 0.7, "hedge", "vegetation", rng.uniform(1.0, 1.7), lit=False)
+        else:
+            self._solid(road, side, s0, s1 - 4, edge, 0.3, "stone", "wall", rng.uniform(0.8, 1.2))
+        self._scatter(road, index, side, s0, s1, 1.0, 3.0, 0.08, "bush")
+        self._scatter(road, index, side, s0, s1, 1.5, 12.0, 0.05, "tree")
+
+    def _zone_park(self, road, index, side, s0, s1):
+        self._yard(road, index, side, s0, s1, "grass", "terrain", 30.0)
+        self._scatter(road, index, side, s0, s1, 1.0, 26.0, 0.35, "tree")
+        self._scatter(road, index, side, s0, s1, 0.6, 12.0, 0.2, "bush")
+        if self.rng.random() < 0.4:
+            self._line(road, side, s0, s1 - 3, self.edge(side, index) + 0.15, "wire", "fence", 1.3)
+
+    def _zone_wall(self, road, index, side, s0, s1):
+        self._yard(road, index, side, s0, s1, "gravel", "ground")
+        texture = str(self.rng.choice(["stone", "concrete"]))
+        self._solid(road, side, s0, s1 - 4, self.edge(side, index) + 0.1, 0.35, texture, "wall",
+                    self.rng.uniform(1.8, 2.6))
+        self._scatter(road, index, side, s0, s1, 2.0, 12.0, 0.15, "tree")
+
+    def _zone_field(self, road, index, side, s0, s1):
+        self._yard(road, index, side, s0, s1, "grass", "terrain", 30.0)
+        self._scatter(road, index, side, s0, s1, 8.0, 40.0, 0.15, "tree")
+        self._scatter(road, index, side, s0, s1, 3.0, 20.0, 0.1, "bush")
+
+    def _highway(self):
+        rng, track, style = self.rng, self.track, self.style
+        for side in (-1, 1):
+            self._line(track, side, track.s[0], track.s[-1], style.half + 0.7, "rail", "guard rail", 0.8, 4.0, 0.0, 0.3)
+            s = track.s[0] + rng.uniform(5, 20)
+            while s < track.s[-1] - 10:
+                x, z, heading = track.at(s, side * (style.half + 2.2))
+                if rng.random() < 0.5:
+                    self.put(sign(self.names, 5, rng.uniform(1.6, 2.6), 2.2, 0.06), x, z, heading, 0.0)
+                else:
+                    self.put(lamp(self.names, 9.0, 2.5), x, z, heading + (0 if side < 0 else np.pi), 0.0)
+                s += rng.uniform(25, 55)
+        for k in range(int((track.s[-1] - track.s[0]) / 28)):
+            lane = (-4.6, 0.0, 4.6)[k % 3]
+            s = 25.0 + 26.0 * k + rng.uniform(-6, 6)
+            self._mover(track, s if lane else s + 35, rng.uniform(1.35, 1.75), lane, 0.0)
+        if style.bridge >= 0:
+            x, z, heading = track.at(style.bridge)
+            faces = Faces(self.names)
+            faces.box((-30, 30), (-7.0, -5.6), (-4, 4), "concrete", "bridge", 8.0, gain=0.85)
+            for pillar in (-style.half - 2.5, style.half + 1.5):
+                faces.box((pillar, pillar + 1.0), (-5.6, 0.06), (-3, 3), "concrete", "bridge", 8.0, gain=0.8)
+            self.put(faces.matrix(), x, z, heading, 0.0)
+
+    def _furniture(self, side):
+        """What stands on the sidewalk and at the kerb of the main road, and what moves there."""
+        rng, style, track = self.rng, self.style, self.track
+        lane = style.parking[(side + 1) // 2]
+        kerb = style.half + lane
+        front = 0.0 if side > 0 else np.pi
+
+        def along(step):
+            s = track.s[0] + rng.uniform(0, step)
+            while s < track.s[-1] - 3:
+                yield s
+                s += step * rng.uniform(0.75, 1.35)
+
+        for s in along(26.0):
+            x, z, heading = track.at(s, side * (kerb + 0.45))
+            if self.free(x, z, 0.3):
+                self.put(lamp(self.names, rng.uniform(5, 7), 1.4), x, z, heading + (np.pi if side > 0 else 0.0))
+        if style.trees:
+            for s in along(9.0 / style.trees):
+                x, z, _ = track.at(s, side * (kerb + 0.8))
+                if self.free(x, z, 0.6):
+                    self._tree(x, z, rng.uniform(4.5, 7.5), int(rng.integers(0, 4)))
+        for s in along(21.0):
+            x, z, heading = track.at(s, side * (kerb + 0.5))
+            if self.free(x, z, 0.3):
+                kind = int(rng.integers(0, SIGNS))
+                size = rng.uniform(0.6, 0.8) if kind < 5 else rng.uniform(0.9, 1.3)
+                self.put(sign(self.names, kind, size, rng.uniform(1.9, 2.4)), x, z,
+                         heading + (0.0 if side > 0 else np.pi) + rng.uniform(-0.15, 0.15))
+        for s in along(17.0):
+            x, z, heading = track.at(s, side * (kerb + style.sidewalk - 0.35))
+            if not self.free(x, z, 0.8):
+                continue
+            what = rng.integers(0, 4)
+            faces = Faces(self.names)
+            if what == 0:
+                faces.box((-0.3, 0.3), (-1.05, 0), (-0.3, 0.3), "bin", "dynamic", 0.6)
+            elif what == 1:
+                faces.box((-0.25, 0.25), (-0.5, -0.4), (-0.9, 0.9), "wood", "static", 2.0)
+                faces.box((-0.2, 0.2), (-0.4, 0), (-0.7, -0.6), "metal", "static", 2.0)
+                faces.box((-0.2, 0.2), (-0.4, 0), (0.6, 0.7), "metal", "static", 2.0)
+            elif what == 2:
+                faces.add((0, 0, -0.9), (0, 0, 1.8), (0, -1.05, 0), "bicycle", "bicycle", lit=0)
+            else:
+                faces.box((-0.4, 0.4), (-1.3, 0), (-0.2, 0.2), "concrete", "static", 2.0, gain=0.8)
+            self.put(faces.matrix(), x, z, heading + rng.uniform(-0.1, 0.1))
+        for _ in range(int((track.s[-1] - track.s[0]) * style.persons)):
+            s, d = rng.uniform(track.s[0], track.s[-1]), kerb + rng.uniform(0.6, style.sidewalk - 0.3)
+            x, z, heading = track.at(s, side * d)
+            if self.free(x, z, 0.5):
+                height = rng.uniform(1.6, 1.9)
+                faces = place(cut_out(self.names, f"person{rng.integers(0, PERSONS)}", "person", height / 2, height),
+                              0.0, 0.0, 0.0, -KERB)
+                pace = float(rng.choice([0.0, 0.12, -0.12]))
+                self.movers.append(Mover(faces, track, s, pace, side * d, rng.uniform(-0.5, 0.5)))
+        if lane:
+            s = track.s[0] + rng.uniform(0, 6)
+            while s < track.s[-1] - 6:
+                x, z, heading = track.at(s, side * (style.half + lane / 2))
+                kind = str(rng.choice(["sedan", "hatch", "estate", "van", "truck"], p=[0.33, 0.33, 0.22, 0.1, 0.02]))
+                if rng.random() < style.parked and self.off_road(x, z)[0] > 0.3:
+                    self.put(self.any_vehicle(kind), x, z, heading + front + rng.normal(0, 0.02), 0.0)
+                s += {"van": 6.6, "truck": 9.5}.get(kind, 5.8) + rng.exponential(0.5)
+        for corner in [*track.corners, *([style.crossing] if style.crossing >= 0 else [])]:
+            x, z, heading = track.at(corner - 7.0, side * (kerb + 0.4))
+            if self.free(x, z, 0.2):
+                self.put(traffic_light(self.names), x, z, heading)
+        if side < 0:  # oncoming
+            for s in along(1 / max(style.traffic, 1e-4)):
+                self._mover(track, s + 40, -rng.uniform(0.7, 1.1), -style.half / 2, np.pi)
+        elif style.leader:
+            self._mover(track, style.leader, FOLLOWS, style.half / 2, 0.0, "estate")
+        if rng.random() < 0.6:
+            s = rng.uniform(15, 45)
+            pace = 0.35 if side > 0 else -0.35
+            self.movers.append(Mover(cyclist(self.names), track, s, pace, side * (style.half - 0.5), front))
+
+
+@dataclass
+class Footprint:
+    """The ground plan of a building: middle of its front, yaw, half its width and its depth."""
+
+    x: float
+    z: float
+    yaw: float
+    half: float
+    depth: float
+
+    def points(self):
+        across, along = np.meshgrid(np.linspace(-self.half, self.half, 7), np.linspace(0.0, self.depth, 5))
+        across, along = across.ravel(), along.ravel()
+        return (self.x + np.cos(self.yaw) * across + np.sin(self.yaw) * along,
+                self.z - np.sin(self.yaw) * across + np.cos(self.yaw) * along)
+
+    def covers(self, x, z, margin=-0.3):
+        dx, dz = x - self.x, z - self.z
+        across = np.cos(self.yaw) * dx - np.sin(self.yaw) * dz
+        along = np.sin(self.yaw) * dx + np.cos(self.yaw) * dz
+        return bool(np.any((np.abs(across) < self.half + margin) & (along > -margin) & (along < self.depth + margin)))
+
+    def overlaps(self, other):
+        if np.hypot(self.x - other.x, self.z - other.z) > 45:
+            return False
+        return self.covers(*other.points()) or other.covers(*self.points())
+
+
+def _sky(rng, style):
+    environment = np.zeros(render.ENVIRONMENT)
+    azimuth, elevation = style.sun if style.sunny else (style.sun[0], 1.35)
+    environment[:3] = (-np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth))
+    # Under clouds the light comes from above and shadows are faint pools under things.
+    environment[render.AMBIENT], environment[render.DIRECT], environment[render.SHADOW] = (
+        (0.42, 0.62, 0.42) if style.sunny else (0.62, 0.26, 0.62))
+    environment[render.ZENITH], environment[render.HORIZON], environment[render.CLOUDS] = style.sky
+    environment[render.HAZE] = style.haze
+    columns = 2048
+    skyline = np.maximum(0.0, 0.035 + 0.022 * textures.noise(rng, (8, columns), 256, 5)[0])
+    labels = np.full(columns, ID["vegetation"], np.uint8)
+    for _ in range(int(rng.integers(3, 9))):  # distant houses
+        left, width = int(rng.integers(0, columns - 60)), int(rng.integers(12, 50))
+        skyline[left:left + width] = rng.uniform(0.04, 0.09)
+        labels[left:left + width] = ID["building"]
+    return environment, skyline.astype(np.float64), labels
+
+
+def build(rng, bank, track, style):
+    """Lay out a street along `track`; `bank` is what textures.build returned."""
+    builder = _Builder(rng, bank, track, style)
+    builder.ground()
+    builder.sides()
+    environment, horizon, horizon_labels = _sky(rng, style)
+    return Street(bank, track, style, np.ascontiguousarray(np.concatenate(builder.parts)), builder.movers, environment,
+                  horizon, horizon_labels)
