@@ -1,0 +1,141 @@
+"""Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2), for one run or shared by many."""
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numba import njit
+
+QUALITY = 0.01  # of the strongest corner (inside the mask)
+BLOCK_SIZE = 5
+TRACKER = {"winSize": (21, 21), "maxLevel": 3,
+           "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)}
+
+NO_POINTS = np.empty((0, 2), np.float32)
+
+
+def detect(frame, settings, mask=None):
+    """Keypoints of a frame (height, width), strongest first: (N, 2) float32, N = 0 where there are none.
+
+    `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the detector looks
+    inside the mask only and finds up to max_keypoints there; with "filter" it looks everywhere and what lies
+    outside is dropped.
+    """
+    inside = mask if settings.mask_mode == "detect" else None
+    if settings.detector == "orb":
+        points = cv2.KeyPoint_convert(_orb(settings.max_keypoints).detect(frame, inside))
+    else:
+        points = cv2.goodFeaturesToTrack(frame, settings.max_keypoints, QUALITY, settings.min_distance, mask=inside,
+                                         blockSize=BLOCK_SIZE)
+    return _inside(NO_POINTS if points is None else np.reshape(points, (-1, 2)).astype(np.float32, copy=False),
+                   settings, mask)
+
+
+def _inside(points, settings, mask):
+    if mask is None or settings.mask_mode == "detect" or not len(points):
+        return points
+    columns, rows = np.rint(points).astype(int).T
+    return points[mask[rows, columns] > 0]
+
+
+@lru_cache
+def _orb(max_keypoints):
+    return cv2.ORB_create(max_keypoints)
+
+
+def track(previous, current, points):
+    """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: found."""
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(previous, current, points, None, **TRACKER)
+    return tracked, status.ravel() == 1
+
+
+class SharedKeypoints:
+    """`detect` and `track` with the same results for many runs over one frame, at little more than the cost of one.
+
+    The corner strength does not depend on the mask (only its maximum and the choice do), and Lucas-Kanade tracks
+    every point on its own, so the first is computed once a frame and the second once for all points of all runs.
+    """
+
+    def __init__(self):
+        self._frame = self._strength = self._corners = None
+        self._pair = self._tracked = self._found = self._index = None
+
+    def expect(self, previous, current, many_points):
+        """Track the points of all runs, a list of (N, 2) arrays, that follow `previous` to `current`."""
+        keys = [_key(points) for points in many_points if len(points)]
+        self._pair = (previous, current)
+        if keys:
+            self._index = np.unique(np.concatenate(keys))
+            points = self._index.view(np.float32).reshape(-1, 2)
+            self._tracked, self._found = track(previous, current, points)
+
+    def track(self, previous, current, points):
+        if self._pair is None or previous is not self._pair[0] or current is not self._pair[1]:
+            return track(previous, current, points)
+        where = np.searchsorted(self._index, _key(points))
+        return self._tracked[where], self._found[where]
+
+    def detect(self, frame, settings, mask=None):
+        if settings.detector != "shi-tomasi" or settings.min_distance < 1:
+            return detect(frame, settings, mask)
+        if frame is not self._frame:
+            self._frame = frame
+            self._strength = cv2.cornerMinEigenVal(frame, BLOCK_SIZE)
+            self._corners = _ranked_maxima(self._strength, cv2.dilate(self._strength, None))
+        inside = mask if settings.mask_mode == "detect" else None
+        # As OpenCV compares: the limit in double precision, rounded to single.
+        limit = np.float32(cv2.minMaxLoc(self._strength, inside)[1] * QUALITY)
+        chosen = _spread(*self._corners, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
+                         settings.max_keypoints, settings.min_distance, *frame.shape)
+        return _inside(chosen, settings, mask)
+
+
+def _key(points):
+    return np.ascontiguousarray(points).view(np.int64).ravel()
+
+
+def _ranked_maxima(strength, largest_near):
+    """Rows, columns and strength of the local maxima inside the border, strongest first, of equals the last first."""
+    inner = np.flatnonzero((strength[1:-1, 1:-1] == largest_near[1:-1, 1:-1]) & (strength[1:-1, 1:-1] > 0))
+    rows, columns = np.divmod(inner, strength.shape[1] - 2)
+    values = strength[rows + 1, columns + 1]
+    order = np.argsort(values, kind="stable")[::-1]
+    return rows[order] + 1, columns[order] + 1, values[order]
+
+
+@njit(cache=True, nogil=True)
+def _spread(rows, columns, values, limit, mask, max_keypoints, min_distance, height, width):
+    """The strongest corners above `limit` inside the mask (if any) that keep `min_distance` from stronger ones.
+
+    Distances are looked at within the neighbouring cells of a grid of about min_distance, as in OpenCV; for a
+    fractional min_distance that is not quite the same as looking at all of them.
+    """
+    cell = int(np.rint(min_distance))
+    grid_rows, grid_columns = height // cell + 1, width // cell + 1
+    head = np.full((grid_rows, grid_columns), -1, np.int32)  # last corner taken in a cell
+    below = np.empty(len(rows), np.int32)  # the one taken before it in the same cell
+    taken = np.empty((len(rows) if max_keypoints <= 0 else min(len(rows), max_keypoints), 2), np.float32)
+    count = 0
+    for index in range(len(rows)):
+        if values[index] <= limit or count == len(taken):
+            break
+        y, x = rows[index], columns[index]
+        if mask.size and mask[y, x] == 0:
+            continue
+        cell_y, cell_x = y // cell, x // cell
+        free = True
+        for near_y in range(max(cell_y - 1, 0), min(cell_y + 2, grid_rows)):
+            for near_x in range(max(cell_x - 1, 0), min(cell_x + 2, grid_columns)):
+                other = head[near_y, near_x]
+                while other >= 0:
+                    dx, dy = x - taken[other, 0], y - taken[other, 1]
+                    if dx * dx + dy * dy < min_distance * min_distance:
+                        free = False
+                        break
+                    other = below[other]
+        if free:
+            taken[count, 0], taken[count, 1] = x, y
+            below[count] = head[cell_y, cell_x]
+            head[cell_y, cell_x] = count
+            count += 1
+    return taken[:count].copy()
