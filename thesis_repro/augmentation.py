@@ -65,7 +65,8 @@ class Augmenter:
         """Augment one image (height, width[, channels]) uint8 and its label map (height, width) uint8."""
         self._compose.set_random_seed(int(seed))
         result = self._compose(image=image, mask=label)
-        return result["image"].reshape(image.shape), result["mask"]
+        label = result["mask"]
+        return result["image"].reshape(label.shape[:2] + image.shape[2:]), label  # some transforms drop a lone channel
 
 
 def training_augmenter(size):
@@ -79,7 +80,11 @@ def validation_augmenter(size, full=False):
     A.3 draws Figure 3.1 between the two sets and leaves `transform` bound to the last thing drawn, the blur.
     `full` gives the validation set the transforms of the training set, as Section 3.5.2 says.
     """
-    return training_augmenter(size) if full else Augmenter([A.Blur(blur_limit=3, p=1)])
+    return training_augmenter(size) if full else Augmenter([_blur()])
+
+
+def _blur():
+    return A.Blur(blur_limit=3, p=1)
 
 
 def augment(image, label, seed):
@@ -115,6 +120,6 @@ def examples(image, label, seed):
     The appendix's three transforms, the flip made certain so that it shows.
     """
     transforms = {"horizontal flip": A.HorizontalFlip(p=1), "affine transformation": _shift_and_scale(NOTHING),
-                  "random blur": A.Blur(blur_limit=3, p=1)}
+                  "random blur": _blur()}
     return {"original": (image, label),
             **{title: Augmenter([transform])(image, label, seed) for title, transform in transforms.items()}}

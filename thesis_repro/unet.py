@@ -14,6 +14,8 @@ DEPTH = 4  # encoder blocks; each halves the image
 def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
     """The U-Net for images of input_shape (height, width, channels), with a softmax over n_classes (A.4).
 
+    A height or width of None leaves the size open: the network is convolutions from end to end.
+
     `base_filters` is the width of the first block: 64 in the thesis, doubled by each of the four encoder blocks.
 
     In the thesis both convolutions of a block read the block's input, so the first one leads nowhere and Figure A.1
@@ -22,7 +24,7 @@ def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
     Layer names are those of Figure A.1. Raises InputError where height or width is not a multiple of 16.
     """
     height, width, _ = input_shape
-    if height % 2**DEPTH or width % 2**DEPTH:
+    if (height or 0) % 2**DEPTH or (width or 0) % 2**DEPTH:
         raise InputError(f"image size {height}x{width}: the U-Net halves it {DEPTH} times, so height and width must be "
                          f"multiples of {2**DEPTH}")
     inputs = layers.Input(input_shape, name="input_2")
