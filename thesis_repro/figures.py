@@ -9,8 +9,10 @@ from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 
+from thesis_repro.cityscapes import colorize
 from thesis_repro.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
@@ -45,6 +47,16 @@ def line_style(index):
     """Colour and dash of the index-th line of a figure with many lines (up to 21 differ)."""
     color, style = _LINES[index % len(_LINES)]
     return {"color": color, "linestyle": style}
+
+
+KEYPOINT = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}  # how keypoints are drawn on a frame
+
+
+def label_colors(label_map, frame):
+    """A label map's colours at the frame's size, for looking at (the mask filter has its own enlargement)."""
+    rows = np.arange(frame.shape[0]) * label_map.shape[0] // frame.shape[0]
+    columns = np.arange(frame.shape[1]) * label_map.shape[1] // frame.shape[1]
+    return colorize(label_map[np.ix_(rows, columns)])
 
 
 def new_figure(rows=1, columns=1, height=3.2, **options):

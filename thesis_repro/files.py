@@ -78,18 +78,34 @@ def write_png(path, image):
             raise OSError(f"{path}: cannot be written")
 
 
-def progress(iterable=None, description="", total=None, unit="frame"):
+def progress(iterable=None, description="", total=None, unit="frame", initial=0):
     """A progress bar on standard error, or on the file that THESIS_REPRO_PROGRESS names.
 
-    The variable is how a bar inside a notebook reaches the terminal that executes the notebook.
+    The variable is how a bar inside a notebook reaches the terminal that executes the notebook. Where there is no
+    terminal, a line now and then takes the place of the bar.
     """
     stream = sys.stderr
     target = os.environ.get("THESIS_REPRO_PROGRESS")
     if target:
         try:
-            stream = open(target, "a")  # stays open as long as the bar
+            stream = open(target, "a", buffering=1)
         except OSError:
             pass
     live = stream.isatty()
-    return tqdm(iterable, desc=description, total=total, unit=unit, file=stream, dynamic_ncols=live,
-                mininterval=0.2 if live else 15, leave=live)
+    return tqdm(iterable, desc=description, total=total, unit=unit, initial=initial, dynamic_ncols=live,
+                file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live)
+
+
+class _Lines:
+    """A file for tqdm that holds lines, not carriage returns."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def write(self, text):
+        text = text.strip()
+        if text:
+            self._stream.write(text + "\n")
+
+    def flush(self):
+        self._stream.flush()
