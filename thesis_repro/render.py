@@ -38,13 +38,16 @@ LEVELS = 12  # sides up to 2048
 ALPHA_LEVELS = 5  # thinner than that, cut-outs flicker rather than vanish
 SUPERSAMPLING = 2
 OPAQUE = 128
+BLEND = 0.0
+SHARPNESS = 0.75  # part of a pixel that a texture is averaged over; the rest is contrast against a little aliasing
 
 
 def _jit(function):
+    # numpy's error model: no check for division by zero in the inner loops.
     try:
-        return numba.njit(cache=True)(function)
+        return numba.njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # no folder that numba may write its cache to
-        return numba.njit(function)
+        return numba.njit(error_model="numpy")(function)
 
 
 class Textures:
@@ -120,11 +123,11 @@ def _filtered(data, offsets, log_height, log_width, u, v, u_step, v_step):
     u_part = u_level - i if i < log_width else 0.0
     v_part = v_level - j if j < log_height else 0.0
     value = _sample(data, offsets[j, i], log_height - j, log_width - i, u, v)
-    if u_part > 0.0:
+    if u_part > BLEND:
         value += u_part * (_sample(data, offsets[j, i + 1], log_height - j, log_width - i - 1, u, v) - value)
-    if v_part > 0.0:
+    if v_part > BLEND:
         other = _sample(data, offsets[j + 1, i], log_height - j - 1, log_width - i, u, v)
-        if u_part > 0.0:
+        if u_part > BLEND:
             other += u_part * (_sample(data, offsets[j + 1, i + 1], log_height - j - 1, log_width - i - 1, u, v)
                                - other)
         value += v_part * (other - value)
@@ -142,20 +145,30 @@ def _steps(c, face, s, t, w):
 
 
 @_jit
-def _opaque(data, offsets, log_height, log_width, face, c, s, t, w):
-    u_step, v_step = _steps(c, face, s, t, w)
+def _alpha_level(sides, face, c, row, x):
+    """Levels (along v and u) of an alpha texture that suit one row of a face."""
+    w = c[6] + c[8] * row + c[7] * x
+    u_step, v_step = _steps(c, face, (c[0] + c[2] * row + c[1] * x) / w, (c[3] + c[5] * row + c[4] * x) / w, w)
     i = j = 0
-    u_step *= 1 << log_width
-    v_step *= 1 << log_height
-    while u_step > 1.5 and i < min(ALPHA_LEVELS - 1, log_width):
+    u_step *= 1 << sides[1]
+    v_step *= 1 << sides[0]
+    while u_step > 1.5 and i < min(ALPHA_LEVELS - 1, sides[1]):
         u_step *= 0.5
         i += 1
-    while v_step > 1.5 and j < min(ALPHA_LEVELS - 1, log_height):
+    while v_step > 1.5 and j < min(ALPHA_LEVELS - 1, sides[0]):
         v_step *= 0.5
         j += 1
+    return j, i
+
+
+@_jit
+def _opaque(data, offsets, sides, level, face, c, row, x, w):
+    s = (c[0] + c[2] * row + c[1] * x) / w
+    t = (c[3] + c[5] * row + c[4] * x) / w
     u = face[UV] + face[UV + 1] * s + face[UV + 2] * t
     v = face[UV + 3] + face[UV + 4] * s + face[UV + 5] * t
-    return _sample(data, offsets[j, i], log_height - j, log_width - i, u, v) >= OPAQUE
+    j, i = level
+    return _sample(data, offsets[j, i], sides[0] - j, sides[1] - i, u, v) >= OPAQUE
 
 
 @_jit
@@ -258,16 +271,21 @@ def _surfaces(faces, data, alpha, sides, rotation, position, focal, centre, size
         triangle = face[TRIANGLE] > 0
         for row in range(first_row, last_row + 1):
             start, stop = _span(c, triangle, row, size[1])
-            for x in range(start, stop + 1):
-                w = c[6] + c[8] * row + c[7] * x
-                if w > depth[row, x]:
-                    if cut_out:
-                        s = (c[0] + c[2] * row + c[1] * x) / w
-                        t = (c[3] + c[5] * row + c[4] * x) / w
-                        if not _opaque(data, alpha[texture], sides[texture, 0], sides[texture, 1], face, c, s, t, w):
-                            continue
-                    depth[row, x] = w
-                    nearest[row, x] = index
+            if stop < start:
+                continue
+            if cut_out:
+                level = _alpha_level(sides[texture], face, c, row, (start + stop) // 2)
+                for x in range(start, stop + 1):
+                    w = c[6] + c[8] * row + c[7] * x
+                    if w > depth[row, x] and _opaque(data, alpha[texture], sides[texture], level, face, c, row, x, w):
+                        depth[row, x] = w
+                        nearest[row, x] = index
+            else:
+                for x in range(start, stop + 1):
+                    w = c[6] + c[8] * row + c[7] * x
+                    if w > depth[row, x]:
+                        depth[row, x] = w
+                        nearest[row, x] = index
 
 
 @_jit
@@ -301,91 +319,113 @@ def _shadows(faces, data, alpha, sides, rotation, position, focal, centre, size,
             first_row, last_row = _set_up(corner, edge_s, edge_t, focal, centre, size, c)
             for row in range(first_row, last_row + 1):
                 start, stop = _span(c, triangle, row, size[1])
+                if stop < start:
+                    continue
+                if cut_out:
+                    steps = _alpha_level(sides[texture], face, c, row, (start + stop) // 2)
                 for x in range(start, stop + 1):
                     if shadow[row, x] or nearest[row, x] < 0 or faces[nearest[row, x], GROUND] != level:
                         continue
                     if cut_out:
                         w = c[6] + c[8] * row + c[7] * x
-                        s = (c[0] + c[2] * row + c[1] * x) / w
-                        t = (c[3] + c[5] * row + c[4] * x) / w
-                        if not _opaque(data, alpha[texture], sides[texture, 0], sides[texture, 1], face, c, s, t, w):
+                        if not _opaque(data, alpha[texture], sides[texture], steps, face, c, row, x, w):
                             continue
                     shadow[row, x] = True
 
 
 @_jit
+def _surface_value(face, c, row, column, spread, brightness, data, gray, sides):
+    """Shown texture of a face at a place (in samples) for a square of `spread` samples."""
+    w = c[6] + c[8] * row + c[7] * column
+    s = (c[0] + c[2] * row + c[1] * column) / w
+    t = (c[3] + c[5] * row + c[4] * column) / w
+    u_step, v_step = _steps(c, face, s, t, w)
+    u = face[UV] + face[UV + 1] * s + face[UV + 2] * t
+    v = face[UV + 3] + face[UV + 4] * s + face[UV + 5] * t
+    texture = int(face[TEXTURE])
+    return brightness * _filtered(data, gray[texture], sides[texture, 0], sides[texture, 1], u, v, u_step * spread,
+                                  v_step * spread)
+
+
+@_jit
+def _background(x, y, rotation, environment, horizon, horizon_labels, data, gray, sides, cloud_texture, leaf_texture,
+                ground_label):
+    """Value and label where no face is: the sky with its clouds, the skyline and the ground far away."""
+    right = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0]
+    down = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1]
+    ahead = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2]
+    azimuth = math.atan2(right, ahead)
+    elevation = -down / math.hypot(right, ahead)
+    place = (azimuth + math.pi) * len(horizon) / (2 * math.pi)
+    first = int(place) % len(horizon)
+    part = place - math.floor(place)
+    skyline = horizon[first] * (1 - part) + horizon[(first + 1) % len(horizon)] * part
+    sky = environment[HORIZON]
+    if elevation > skyline:
+        clouds = _sample(data, gray[cloud_texture, 0, 0], sides[cloud_texture, 0], sides[cloud_texture, 1],
+                         azimuth / math.pi, -elevation) - 128.0
+        blue = math.sqrt(min(1.0, elevation / 0.6))
+        return sky + (environment[ZENITH] - sky) * blue + clouds * environment[CLOUDS], 23
+    if elevation > -0.01:
+        leaves = _sample(data, gray[leaf_texture, 0, 0], sides[leaf_texture, 0], sides[leaf_texture, 1],
+                         azimuth * 3.0, -elevation * 3.0)
+        return 0.35 * leaves + 0.42 * sky, horizon_labels[first]
+    return 0.75 * sky, ground_label
+
+
+@_jit
 def _render(faces, brightness, data, gray, alpha, sides, rotation, position, focal, centre, height, width, environment,
             horizon, horizon_labels, cloud_texture, leaf_texture, ground_label):
-    rows, columns = height * SUPERSAMPLING, width * SUPERSAMPLING
-    size = (rows, columns)
+    size = (height * SUPERSAMPLING, width * SUPERSAMPLING)
     depth = np.full(size, 1.0 / FAR, np.float32)
     nearest = np.full(size, -1, np.int32)
     shadow = np.zeros(size, np.bool_)
     coefficients = np.empty((faces.shape[0], 9))
     _surfaces(faces, data, alpha, sides, rotation, position, focal, centre, size, coefficients, depth, nearest)
-    if environment[SHADOW] < 1.0:
-        _shadows(faces, data, alpha, sides, rotation, position, focal, centre, size, GROUND_LEVELS,
-                 environment[SUN:SUN + 3], nearest, shadow)
+    _shadows(faces, data, alpha, sides, rotation, position, focal, centre, size, GROUND_LEVELS,
+             environment[SUN:SUN + 3], nearest, shadow)
     image = np.empty((height, width), np.float32)
     label_map = np.empty((height, width), np.uint8)
-    sky, haze = environment[HORIZON], environment[HAZE]
-    labels, depths = np.empty(4, np.uint8), np.empty(4)
-    turn = len(horizon) / (2 * math.pi)
+    hits, labels, depths = np.empty(4, np.int64), np.empty(4, np.uint8), np.empty(4)
+    dark = 1.0 - environment[SHADOW]
     for i in range(height):
         for j in range(width):
-            total = 0.0
+            shaded = 0
             for k in range(4):
                 row, column = 2 * i + (k >> 1), 2 * j + (k & 1)
-                index = nearest[row, column]
+                hits[k] = nearest[row, column]
+                shaded += shadow[row, column]
+            total = 0.0
+            if hits[0] == hits[1] and hits[0] == hits[2] and hits[0] == hits[3]:
+                # Most pixels: one face, whose texture is read once for the whole pixel.
+                first, last, weight, spread = 0, 1, 4.0, 2.0 * SHARPNESS
+            else:
+                first, last, weight, spread = 0, 4, 1.0, 1.0
+            for k in range(first, last):
+                row, column = 2.0 * i + (k >> 1), 2.0 * j + (k & 1)
+                light = 1.0 - dark * shadow[2 * i + (k >> 1), 2 * j + (k & 1)]
+                if last == 1:
+                    row, column = 2.0 * i + 0.5, 2.0 * j + 0.5
+                    light = 1.0 - dark * shaded * 0.25
+                index = hits[k]
                 if index >= 0:
                     face, c = faces[index], coefficients[index]
+                    value = light * _surface_value(face, c, row, column, spread, brightness[index], data, gray, sides)
                     w = c[6] + c[8] * row + c[7] * column
-                    s = (c[0] + c[2] * row + c[1] * column) / w
-                    t = (c[3] + c[5] * row + c[4] * column) / w
-                    u_step, v_step = _steps(c, face, s, t, w)
-                    u = face[UV] + face[UV + 1] * s + face[UV + 2] * t
-                    v = face[UV + 3] + face[UV + 4] * s + face[UV + 5] * t
-                    texture = int(face[TEXTURE])
-                    value = _filtered(data, gray[texture], sides[texture, 0], sides[texture, 1], u, v, u_step, v_step)
-                    value *= brightness[index]
-                    if shadow[row, column]:
-                        value *= environment[SHADOW]
-                    clear = math.exp(-haze / w)
-                    total += value * clear + sky * (1 - clear)
+                    clear = math.exp(-environment[HAZE] / w)
+                    total += weight * (value * clear + environment[HORIZON] * (1 - clear))
                     labels[k], depths[k] = int(face[LABEL]), w
                 else:
-                    x, y = (column - centre[0]) / focal[0], (row - centre[1]) / focal[1]
-                    right = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0]
-                    down = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1]
-                    ahead = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2]
-                    azimuth = math.atan2(right, ahead)
-                    elevation = -down / math.hypot(right, ahead)
-                    place = (azimuth + math.pi) * turn
-                    bin0 = int(place) % len(horizon)
-                    bin1 = (bin0 + 1) % len(horizon)
-                    part = place - math.floor(place)
-                    skyline = horizon[bin0] * (1 - part) + horizon[bin1] * part
-                    if elevation > skyline:
-                        height_part = min(1.0, elevation / 0.6)
-                        clouds = _sample(data, gray[cloud_texture, 0, 0], sides[cloud_texture, 0],
-                                         sides[cloud_texture, 1], azimuth / math.pi, -elevation) - 128.0
-                        total += (sky + (environment[ZENITH] - sky) * math.sqrt(height_part)
-                                  + clouds * environment[CLOUDS])
-                        labels[k] = 23
-                    elif elevation > -0.01:
-                        leaves = _sample(data, gray[leaf_texture, 0, 0], sides[leaf_texture, 0],
-                                         sides[leaf_texture, 1], azimuth * 3.0, -elevation * 3.0)
-                        total += 0.35 * leaves + 0.42 * sky
-                        labels[k] = horizon_labels[bin0]
-                    else:
-                        total += 0.75 * sky
-                        labels[k] = ground_label
-                    depths[k] = 0.0
+                    value, label = _background((column - centre[0]) / focal[0], (row - centre[1]) / focal[1], rotation,
+                                               environment, horizon, horizon_labels, data, gray, sides, cloud_texture,
+                                               leaf_texture, ground_label)
+                    total += weight * value
+                    labels[k], depths[k] = label, 0.0
             image[i, j] = total * 0.25
             best, best_count, best_depth = labels[0], 0, -1.0
-            for k in range(4):
+            for k in range(first, last if last > 1 else 0):
                 count, closest = 0, 0.0
-                for m in range(4):
+                for m in range(first, last):
                     if labels[m] == labels[k]:
                         count += 1
                         closest = max(closest, depths[m])
@@ -412,6 +452,9 @@ def render(faces, textures, pose, intrinsics, size, environment, horizon, horizo
     whose centres have whole coordinates; horizon: elevation (tangent) of the skyline over the azimuth, with its labels.
     """
     names, packed = textures
+    # From near to far, so that most of what is hidden costs one comparison.
+    middle = faces[:, :3] + 0.5 * (faces[:, 3:6] + faces[:, 6:9]) - pose[:3, 3]
+    faces = faces[np.argsort((middle * middle).sum(axis=1), kind="stable")]
     focal = np.array([intrinsics[0, 0], intrinsics[1, 1]]) * SUPERSAMPLING
     # Sample 0 of pixel 0 lies a quarter pixel before its centre.
     centre = (np.array([intrinsics[0, 2], intrinsics[1, 2]]) + 0.5) * SUPERSAMPLING - 0.5

@@ -60,7 +60,7 @@ class Track:
 class Style:
     """What a street looks like; widths in metres."""
 
-    half: float = 3.5  # half of the road
+    half: float = 3.8  # half of the road
     road: str = "road"
     parking: tuple = (0.0, 2.2)  # left, right
     sidewalk: float = 2.6
@@ -221,6 +221,7 @@ def sign(names, kind, size, height, half_pole=0.035):
     faces = Faces(names)
     faces.box((-half_pole, half_pole), (-height - size / 2, 0), (0.01, 0.01 + 2 * half_pole), "metal", "pole", 2.0)
     faces.add((-size / 2, -height, 0), (size, 0, 0), (0, -size, 0), f"sign{kind}", "traffic sign", lit=0, gain=1.05)
+    faces.add((size / 2, -height, 0.005), (-size, 0, 0), (0, -size, 0), f"back{kind}", "traffic sign", lit=0)
     return faces.matrix()
 
 
@@ -354,8 +355,9 @@ class _Builder:
         ahead0 = (x0[far] - x0[near]) * np.sin(road.at(s[near])[2]) + (z0[far] - z0[near]) * np.cos(road.at(s[near])[2])
         ahead1 = (x1[far] - x1[near]) * np.sin(road.at(s[near])[2]) + (z1[far] - z1[near]) * np.cos(road.at(s[near])[2])
         keep = (ahead0 > 0.02) & (ahead1 > 0.02)
+        outside = np.ones(rows, bool)
         if keep_off is not None:
-            keep &= self.off_road((x0[near] + x1[far]) / 2, (z0[near] + z1[far]) / 2) > keep_off
+            outside = self.off_road((x0[near] + x1[far]) / 2, (z0[near] + z1[far]) / 2) > keep_off
         u_width = 1.0 if whole_width else (d1 - d0) / tile_u
         u0 = 0.0 if whole_width else d0 / tile_u
         v, v_step = s / tile_v, step / tile_v
@@ -373,8 +375,14 @@ class _Builder:
         other[:, 3], other[:, 5] = x0[far] - x1[far], z0[far] - z1[far]
         other[:, 6], other[:, 8] = x1[near] - x1[far], z1[near] - z1[far]
         other[:, 9], other[:, 10], other[:, 12], other[:, 14] = u0 + u_width, -u_width, -v[far], v_step
-        self.parts.append(cells[keep])
-        self.parts.append(other[keep & bent])
+        for part, shown in ((cells, keep), (other, keep & bent)):
+            self.parts.append(part[shown & outside])
+            asphalt = part[shown & ~outside]  # the gap between two roads that meet
+            asphalt[:, 1] = 0.05
+            asphalt[:, render.TEXTURE], asphalt[:, render.LABEL] = self.names["asphalt"], ID["road"]
+            asphalt[:, 9:15] *= (tile_u / TILE["asphalt"][0],) * 3 + (tile_v / TILE["asphalt"][1],) * 3
+            asphalt[:, render.GROUND] = ROAD
+            self.parts.append(asphalt)
 
     def _mover(self, track, s, pace, d, turn, kind=None):
         kind = kind or str(self.rng.choice(["sedan", "hatch", "estate", "van", "truck", "bus"],
@@ -671,10 +679,8 @@ class _Builder:
                 self._mover(track, s + 40, -rng.uniform(0.7, 1.1), -style.half / 2, np.pi)
         elif style.leader:
             self._mover(track, style.leader, FOLLOWS, style.half / 2, 0.0, "estate")
-        if rng.random() < 0.6:
-            s = rng.uniform(15, 45)
-            pace = 0.35 if side > 0 else -0.35
-            self.movers.append(Mover(cyclist(self.names), track, s, pace, side * (style.half - 0.5), front))
+        if side < 0 and rng.random() < 0.7:
+            self.movers.append(Mover(cyclist(self.names), track, rng.uniform(25, 60), -0.35, 0.5 - style.half, front))
 
 
 @dataclass
@@ -711,7 +717,7 @@ def _sky(rng, style):
     environment[:3] = (-np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth))
     # Under clouds the light comes from above and shadows are faint pools under things.
     environment[render.AMBIENT], environment[render.DIRECT], environment[render.SHADOW] = (
-        (0.42, 0.62, 0.42) if style.sunny else (0.62, 0.26, 0.62))
+        (0.36, 0.86, 0.36) if style.sunny else (0.70, 0.30, 0.62))
     environment[render.ZENITH], environment[render.HORIZON], environment[render.CLOUDS] = style.sky
     environment[render.HAZE] = style.haze
     columns = 2048

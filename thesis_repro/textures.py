@@ -26,22 +26,29 @@ TREES, PERSONS, CARS, SIGNS = 6, 6, 6, 6
 
 def noise(rng, shape, cell, octaves=4, persistence=0.6):
     """Periodic noise with unit deviation: octaves of smooth random grids, the first with `cell` pixels a knot."""
-    total = np.zeros(shape, np.float32)
+    rows, columns = max(1, shape[0] // cell), max(1, shape[1] // cell)
+    total = rng.standard_normal((rows, columns), dtype=np.float32)
     weight = 1.0
-    for _ in range(octaves):
-        rows, columns = max(1, shape[0] // cell), max(1, shape[1] // cell)
-        grid = rng.standard_normal((rows, columns)).astype(np.float32)
-        grid = np.pad(grid, 2, mode="wrap")
-        step_y, step_x = shape[0] // rows, shape[1] // columns
-        big = cv2.resize(grid, ((columns + 4) * step_x, (rows + 4) * step_y), interpolation=cv2.INTER_CUBIC)
-        total += weight * big[2 * step_y:2 * step_y + shape[0], 2 * step_x:2 * step_x + shape[1]]
+    for _ in range(octaves - 1):
+        rows, columns = min(2 * rows, shape[0]), min(2 * columns, shape[1])
         weight *= persistence
-        cell = max(1, cell // 2)
-    return total / max(float(total.std()), 1e-6)
+        total = _enlarged(total, (rows, columns)) + weight * rng.standard_normal((rows, columns), dtype=np.float32)
+    total = _enlarged(total, shape)
+    return total * np.float32(1 / max(float(total.std()), 1e-6))
+
+
+def _enlarged(image, shape):
+    """A periodic image resized smoothly by whole factors, periodic again."""
+    if image.shape == tuple(shape):
+        return image
+    step_y, step_x = shape[0] // image.shape[0], shape[1] // image.shape[1]
+    padded = np.pad(image, 2, mode="wrap")
+    big = cv2.resize(padded, (padded.shape[1] * step_x, padded.shape[0] * step_y), interpolation=cv2.INTER_CUBIC)
+    return big[2 * step_y:2 * step_y + shape[0], 2 * step_x:2 * step_x + shape[1]]
 
 
 def _speckle(rng, shape, sigma=1.0):
-    grain = rng.standard_normal(shape).astype(np.float32)
+    grain = rng.standard_normal(shape, dtype=np.float32)
     grain = cv2.GaussianBlur(np.pad(grain, 4, mode="wrap"), (0, 0), sigma)[4:-4, 4:-4] if sigma else grain
     return grain / grain.std()
 
@@ -239,6 +246,7 @@ def _tree(rng, kind, leaves):
         crown = 1.2 - np.abs(x - 256) / (20 + (y - 10) * 0.42) - np.maximum(0, y - 440) * 0.1
         crown[y < 14] = 0
         crown += 0.15 * np.sin(y / 9)
+        crown[np.abs(x - 256) > 40 + 0.42 * y] = 0
         threshold = 0.45
         top, bottom = 10, 450
     ragged = noise(rng, shape, 32, 5, 0.8)
@@ -253,8 +261,9 @@ def _tree(rng, kind, leaves):
     if kind < 4:
         for _ in range(7):
             y0 = int(rng.integers(240, 330))
-            end = (256 + int(rng.integers(-150, 150)), y0 - int(rng.integers(60, 160)))
+            end = (256 + int(rng.integers(-110, 110)), y0 - int(rng.integers(60, 140)))
             cv2.line(trunk, (256 + bend // 2, y0), end, 255, int(rng.integers(3, 7)))
+        trunk[(crown < 0.15) & (y < 350)] = 0  # no branch sticks out of the crown
     bark = 52 + 14 * noise(rng, shape, 16, 4) + np.linspace(-14, 14, 512, dtype=np.float32)[None] * 2
     wood = (trunk > 0) & ~mask
     image[wood] = bark[wood]
@@ -567,7 +576,9 @@ def build(seed):
     for kind, name in enumerate(("picket", "wire", "rail")):
         add(name, *_bars(rng, name))
     for kind in range(SIGNS):
-        add(f"sign{kind}", *_sign(rng, kind))
+        front, alpha = _sign(rng, kind)
+        add(f"sign{kind}", front, alpha)
+        add(f"back{kind}", 118 + 5 * noise(rng, front.shape, 32, 4), alpha[:, ::-1])
     add("light", _traffic_light(rng))
     add("metal", 92 + 7 * noise(rng, (128, 32), 16, 4) + np.linspace(35, -35, 32, dtype=np.float32)[None])
     add("bin", 62 + 9 * noise(rng, (64, 64), 16, 4) - 25 * (np.arange(64)[None] % 16 < 2))

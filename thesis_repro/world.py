@@ -184,7 +184,7 @@ def relative_to_first(poses):
 def _expose(rng, image, level, noise):
     """8-bit picture: automatic exposure (rounded, so that it is the same everywhere), vignette, sensor noise."""
     mean = float(np.mean(image, dtype=np.float64))
-    gain = round((level / max(mean, 1.0)) ** 0.6 * (1 + 0.01 * rng.standard_normal()) * 512) / 512
+    gain = round((level / max(mean, 1.0)) ** 0.8 * (1 + 0.01 * rng.standard_normal()) * 512) / 512
     rows, columns = image.shape
     y = np.linspace(-1, 1, rows, dtype=np.float32)[:, None]
     x = np.linspace(-1, 1, columns, dtype=np.float32)[None]
