@@ -4,7 +4,7 @@ A place on a street is (s, d): metres along the road's middle and metres to the 
 road at y = 0 and the sidewalks a kerb higher; cars drive on the right.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -281,7 +281,6 @@ class Street:
     horizon: np.ndarray
     horizon_labels: np.ndarray
     ground_label: int = ID["terrain"]
-    extra: dict = field(default_factory=dict)
 
     def view(self, pose, intrinsics, size, frame=0, followed=0.0):
         """Image (float32, before exposure and noise) and label map (uint8) from a 4x4 camera-to-world pose."""

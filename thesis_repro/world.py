@@ -7,7 +7,7 @@ its own name alone, so that neither the number of processes nor an interruption 
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -101,7 +101,6 @@ class Scene:
     driven: np.ndarray
     intrinsics: np.ndarray
     size: tuple
-    extra: dict = field(default_factory=dict)
 
 
 def _rng(*key):
@@ -152,13 +151,11 @@ def _pose(x, y, z, heading, pitch=0.0, roll=0.0):
     return pose
 
 
-@lru_cache(maxsize=2)
-def drive(name, frames, scale, seed):
-    """The scene of one sequence."""
+def way(name, frames, seed):
+    """One sequence's track, its camera-to-world poses in the street's coordinates, and the metres driven."""
     plan = DRIVES[name]
-    rng = _rng(seed, 1, int(name))
     track = Track(plan.pieces, -BEHIND, frames * plan.pace * 1.15 + AHEAD)
-    phase = rng.uniform(0, 2 * np.pi, 6)
+    phase = _rng(seed, 1, int(name)).uniform(0, 2 * np.pi, 6)
     driven = _driven(plan, track, frames, phase[0])
     # The body sways with the way driven, so that a standing car stands still.
     x, z, heading = track.at(driven, plan.lane + 0.06 * np.sin(driven / 6 + phase[1]))
@@ -166,8 +163,16 @@ def drive(name, frames, scale, seed):
     roll = np.radians(0.12) * np.sin(driven / 2.7 + phase[4])
     y = -CAMERA_HEIGHT + 0.008 * np.sin(driven / 1.3 + phase[5])
     poses = np.array([_pose(*values) for values in zip(x, y, z, heading, pitch, roll)])
+    return track, poses, driven
+
+
+@lru_cache(maxsize=2)
+def drive(name, frames, scale, seed):
+    """The scene of one sequence."""
+    track, poses, driven = way(name, frames, seed)
     size, intrinsics = scaled_camera(name, scale)
-    return Scene(street.build(rng, textures.build(seed), track, plan.style), poses, driven, intrinsics, size)
+    scene = street.build(_rng(seed, 4, int(name)), textures.build(seed), track, DRIVES[name].style)
+    return Scene(scene, poses, driven, intrinsics, size)
 
 
 def relative_to_first(poses):
@@ -271,16 +276,16 @@ def _write_some(some, frames, scale, seed):
 
 def _write_sequence_texts(root, name, frames, scale, seed):
     folder = root / "kitti" / "sequences" / name
-    scene = drive(name, frames, scale, seed)
+    _, intrinsics = scaled_camera(name, scale)
     lines = []
     for camera in range(4):
         projection = np.zeros((3, 4))
-        projection[:, :3] = scene.intrinsics
-        projection[0, 3] = -BASELINE * scene.intrinsics[0, 0] * (camera % 2)
+        projection[:, :3] = intrinsics
+        projection[0, 3] = -BASELINE * intrinsics[0, 0] * (camera % 2)
         lines.append(f"P{camera}: " + " ".join(f"{value:.12e}" for value in projection.ravel()))
     write_text(folder / "calib.txt", "\n".join(lines) + "\n")
     write_text(folder / "times.txt", "".join(f"{FRAME_TIME * k:.6e}\n" for k in range(frames)))
-    kitti.write_kitti_poses(root / "kitti" / "poses" / f"{name}.txt", relative_to_first(scene.poses))
+    kitti.write_kitti_poses(root / "kitti" / "poses" / f"{name}.txt", relative_to_first(way(name, frames, seed)[1]))
 
 
 def content_version():
