@@ -38,7 +38,6 @@ LEVELS = 12  # sides up to 2048
 ALPHA_LEVELS = 5  # thinner than that, cut-outs flicker rather than vanish
 SUPERSAMPLING = 2
 OPAQUE = 128
-BLEND = 0.0
 SHARPNESS = 0.75  # part of a pixel that a texture is averaged over; the rest is contrast against a little aliasing
 
 
@@ -123,11 +122,11 @@ def _filtered(data, offsets, log_height, log_width, u, v, u_step, v_step):
     u_part = u_level - i if i < log_width else 0.0
     v_part = v_level - j if j < log_height else 0.0
     value = _sample(data, offsets[j, i], log_height - j, log_width - i, u, v)
-    if u_part > BLEND:
+    if u_part > 0.0:
         value += u_part * (_sample(data, offsets[j, i + 1], log_height - j, log_width - i - 1, u, v) - value)
-    if v_part > BLEND:
+    if v_part > 0.0:
         other = _sample(data, offsets[j + 1, i], log_height - j - 1, log_width - i, u, v)
-        if u_part > BLEND:
+        if u_part > 0.0:
             other += u_part * (_sample(data, offsets[j + 1, i + 1], log_height - j - 1, log_width - i - 1, u, v)
                                - other)
         value += v_part * (other - value)
@@ -461,3 +460,12 @@ def render(faces, textures, pose, intrinsics, size, environment, horizon, horizo
     return _render(faces, brightness(faces, environment), *packed, np.ascontiguousarray(pose[:3, :3].T),
                    np.ascontiguousarray(pose[:3, 3]), focal, centre, size[0], size[1], environment, horizon,
                    horizon_labels, names["clouds"], names["leaves"], ground_label)
+
+
+def compile_for_all():
+    """Compile once and keep it on disk where possible, so that the processes started afterwards need not."""
+    nothing = np.zeros((0, COLUMNS))
+    packed = (np.zeros(1, np.uint8), np.zeros((1, LEVELS, LEVELS), np.int64), np.full((1, LEVELS, LEVELS), -1),
+              np.zeros((1, 2), np.int64))
+    render(nothing, ({"clouds": 0, "leaves": 0}, packed), np.eye(4), np.eye(3), (1, 1), np.ones(ENVIRONMENT),
+           np.zeros(2), np.zeros(2, np.uint8))

@@ -16,6 +16,7 @@ KERB = -render.GROUND_LEVELS[2]
 STEP = 0.25  # metres between the stored points of a track
 BEHIND, AHEAD = 30.0, 170.0  # metres of street behind the first and ahead of the last camera
 ROAD, SIDEWALK = 1, 2  # ground levels
+LAYER = 0.001  # metres that keep apart what lies on top of each other
 
 
 class Track:
@@ -318,20 +319,23 @@ class _Builder:
         middles = [np.stack([road.x, road.z], axis=1)[::2] for road, _ in self.roads]
         self.middle = np.concatenate(middles)
         self.halves = np.concatenate([np.full(len(m), half) for m, (_, half) in zip(middles, self.roads)])
+        self.halves_parked = self.halves.copy()
+        self.halves_parked[:len(middles[0])] += max(style.parking)
 
-    def off_road(self, x, z):
-        """Distance of points to the nearest edge of any road; negative on a road."""
+    def off_road(self, x, z, parked=False):
+        """Distance of points to the nearest edge of any road; negative on a road. `parked` adds its parking lanes."""
+        halves = self.halves_parked if parked else self.halves
         x, z = np.atleast_1d(x), np.atleast_1d(z)
         result = np.empty(len(x))
         for start in range(0, len(x), 256):
             part = slice(start, start + 256)
             dx = x[part, None] - self.middle[None, :, 0]
             dz = z[part, None] - self.middle[None, :, 1]
-            result[part] = (np.sqrt(dx * dx + dz * dz) - self.halves).min(axis=1)
+            result[part] = (np.sqrt(dx * dx + dz * dz) - halves).min(axis=1)
         return result
 
     def free(self, x, z, margin):
-        return self.off_road(x, z)[0] > margin and not any(b.covers(x, z, 0.5) for b in self.buildings)
+        return self.off_road(x, z)[0] > margin and not any(b.near(x, z) and b.covers(x, z, 0.5) for b in self.buildings)
 
     def put(self, faces, x, z, yaw, y=-KERB, gain=1.0):
         placed = place(faces, x, z, yaw, y)
@@ -356,11 +360,14 @@ class _Builder:
         keep = (ahead0 > 0.02) & (ahead1 > 0.02)
         outside = np.ones(rows, bool)
         if keep_off is not None:
-            outside = self.off_road((x0[near] + x1[far]) / 2, (z0[near] + z1[far]) / 2) > keep_off
+            outside = self.off_road((x0[near] + x1[far]) / 2, (z0[near] + z1[far]) / 2,
+                                    parked=road is not self.track) > keep_off
         u_width = 1.0 if whole_width else (d1 - d0) / tile_u
         u0 = 0.0 if whole_width else d0 / tile_u
         v, v_step = s / tile_v, step / tile_v
         cells = np.zeros((rows, render.COLUMNS))
+        # Where a street meets itself its later part lies a little lower, or the two would flicker.
+        y = y + LAYER / 100 * ((s[near] - road.s[0]) % 500)
         cells[:, 0], cells[:, 1], cells[:, 2] = x0[near], y, z0[near]
         cells[:, 3], cells[:, 5] = x1[near] - x0[near], z1[near] - z0[near]
         cells[:, 6], cells[:, 8] = x0[far] - x0[near], z0[far] - z0[near]
@@ -377,7 +384,7 @@ class _Builder:
         for part, shown in ((cells, keep), (other, keep & bent)):
             self.parts.append(part[shown & outside])
             asphalt = part[shown & ~outside]  # the gap between two roads that meet
-            asphalt[:, 1] = 0.05
+            asphalt[:, 1] = 0.04
             asphalt[:, render.TEXTURE], asphalt[:, render.LABEL] = self.names["asphalt"], ID["road"]
             asphalt[:, 9:15] *= (tile_u / TILE["asphalt"][0],) * 3 + (tile_v / TILE["asphalt"][1],) * 3
             asphalt[:, render.GROUND] = ROAD
@@ -395,27 +402,20 @@ class _Builder:
     def ground(self):
         style = self.style
         for index, (road, half) in enumerate(self.roads):
-            drop = 0.012 * index
+            lower = LAYER * index
             texture = style.road if index == 0 else "lane"
-            if index == 0:
-                # Where the street meets itself its later part runs a little lower, or the two would flicker.
-                for start in np.arange(road.s[0], road.s[-1], 20.0):
-                    self.strip(road, start, min(start + 20.0, road.s[-1]), -half, half, 1e-4 * (start + BEHIND),
-                               texture, "road", ROAD, whole_width=True)
-            else:
-                self.strip(road, road.s[0], road.s[-1], -half, half, 0.03 + drop, texture, "road", ROAD,
-                           whole_width=True)
+            self.strip(road, road.s[0], road.s[-1], -half, half, lower, texture, "road", ROAD, whole_width=True)
             if style.road == "highway":
                 continue
             for side in (-1, 1):
                 edge = half
                 lane = style.parking[(side + 1) // 2] if index == 0 else 0.0
                 if lane:
-                    self.band(road, side, edge, edge + lane, 0.004, "parking", "parking", ROAD, -0.05)
+                    self.band(road, side, edge, edge + lane, lower, "parking", "parking", ROAD, -0.05)
                     edge += lane
-                self.band(road, side, edge, edge + 0.15, -KERB - 0.002, "kerb", "sidewalk", SIDEWALK, 0.0)
+                self.band(road, side, edge, edge + 0.15, lower - KERB - 0.002, "kerb", "sidewalk", SIDEWALK, 0.0)
                 self.riser(road, side, edge)
-                self.band(road, side, edge + 0.15, edge + style.sidewalk, -KERB + 0.001 * index, "sidewalk",
+                self.band(road, side, edge + 0.15, edge + style.sidewalk, lower - KERB, "sidewalk",
                           "sidewalk", SIDEWALK, 0.1)
         reach = 60.0
         size = 30.0
@@ -429,6 +429,14 @@ class _Builder:
         for i, j in sorted(cells):
             faces.add((i * size, 0.06, j * size), (size, 0, 0), (0, 0, size), "grass", "terrain",
                       (size / tile, size / tile), ground=ROAD, casts=0)
+        for road, half in self.roads[1:]:  # no grass between the bends of a junction
+            reach = half + 4.0
+            x, z, heading = road.at(0.0)
+            corner = np.array([x, 0.05, z]) - reach * np.array([np.cos(heading) + np.sin(heading), 0,
+                                                                np.cos(heading) - np.sin(heading)])
+            faces.add(corner, 2 * reach * np.array([np.cos(heading), 0, -np.sin(heading)]),
+                      2 * reach * np.array([np.sin(heading), 0, np.cos(heading)]), "asphalt", "road",
+                      (2 * reach / 12, 2 * reach / 12), ground=ROAD, casts=0)
         self.parts.append(faces.matrix())
 
     def band(self, road, side, near, far, y, texture, label, ground, keep_off, s_range=None):
@@ -439,7 +447,7 @@ class _Builder:
     def riser(self, road, side, edge):
         s = np.arange(road.s[0], road.s[-1], 2.0)
         x, z, _ = road.at(s, side * edge)
-        keep = self.off_road((x[1:] + x[:-1]) / 2, (z[1:] + z[:-1]) / 2) > -0.05
+        keep = self.off_road((x[1:] + x[:-1]) / 2, (z[1:] + z[:-1]) / 2, parked=road is not self.track) > -0.05
         faces = Faces(self.names)
         for k in np.flatnonzero(keep):
             a, b = (k, k + 1) if side < 0 else (k + 1, k)
@@ -492,7 +500,7 @@ class _Builder:
 
     def _yard(self, road, index, side, s0, s1, texture, label, depth=14.0):
         edge = self.edge(side, index)
-        self.band(road, side, edge, edge + depth, -KERB + 0.02 + 0.002 * index, texture, label, SIDEWALK, 1.0,
+        self.band(road, side, edge, edge + depth, LAYER * index - KERB + 0.02, texture, label, SIDEWALK, 1.0,
                   (s0, s1))
 
     def _line(self, road, side, s0, s1, distance, texture, label, height, step=3.0, y=-KERB, margin=0.8, casts=1):
@@ -691,6 +699,9 @@ class Footprint:
     yaw: float
     half: float
     depth: float
+
+    def near(self, x, z):
+        return (x - self.x) ** 2 + (z - self.z) ** 2 < (self.half + self.depth + 1.0) ** 2
 
     def points(self):
         across, along = np.meshgrid(np.linspace(-self.half, self.half, 7), np.linspace(0.0, self.depth, 5))

@@ -188,7 +188,8 @@ def _shop(rng, kind):
                 cv2.rectangle(image, (px, py), (px + int(rng.integers(6, 30)), 213), float(rng.uniform(70, 200)), -1)
             cv2.rectangle(image, (x - 8, 14), (x + 208, 50), float(rng.choice([60.0, 225.0])), -1)
             for k in range(7):
-                cv2.rectangle(image, (x + 14 + k * 26, 22), (x + 28 + k * 26, 42), float(rng.choice([120.0, 160.0])), -1)
+                left = x + 14 + k * 26
+                cv2.rectangle(image, (left, 22), (left + 14, 42), float(rng.choice([120.0, 160.0])), -1)
         elif what == 1:  # door
             cv2.rectangle(image, (x + 60, 40), (x + 140, 254), 205.0, -1)
             cv2.rectangle(image, (x + 66, 46), (x + 134, 254), 62.0, -1)
@@ -326,7 +327,8 @@ def _rider(rng):
     shape = (256, 256)
     polygons = [[(0.34, 0.52), (0.46, 0.52), (0.66, 0.18), (0.5, 0.13)],  # back
                 [(0.56, 0.2), (0.64, 0.2), (0.76, 0.42), (0.7, 0.45)],  # arm
-                [(0.34, 0.5), (0.47, 0.5), (0.6, 0.7), (0.5, 0.74)], [(0.5, 0.68), (0.6, 0.69), (0.52, 0.97), (0.44, 0.97)]]
+                [(0.34, 0.5), (0.47, 0.5), (0.6, 0.7), (0.5, 0.74)],  # thigh and leg
+                [(0.5, 0.68), (0.6, 0.69), (0.52, 0.97), (0.44, 0.97)]]
     head = [(0.64, 0.1, 0.07, 0.085)]
     alpha = _outline(shape, polygons, head)
     image = np.full(shape, 60.0, np.float32)
@@ -562,7 +564,8 @@ def build(seed):
     add("leaves", leaves)
     add("hedge", cv2.resize(_leaves(rng, (512, 512), 30, 100, 5), (256, 256), interpolation=cv2.INTER_AREA))
     for kind in range(TREES):
-        add(f"tree{kind}", *_tree(rng, kind, np.roll(leaves, 83 * kind, axis=1) * (1, 0.85, 1.1, 0.95, 0.62, 0.7)[kind]))
+        tone = (1, 0.85, 1.1, 0.95, 0.62, 0.7)[kind]
+        add(f"tree{kind}", *_tree(rng, kind, np.roll(leaves, 83 * kind, axis=1) * tone))
     bush_shape = (128, 256)
     y, x = np.mgrid[0:128, 0:256].astype(np.float32)
     for kind in range(2):

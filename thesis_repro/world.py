@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from joblib import Parallel, cpu_count, delayed
 
-from thesis_repro import InputError, kitti, street, textures
+from thesis_repro import InputError, kitti, render, street, textures
 from thesis_repro.cityscapes import ID
 from thesis_repro.files import progress, write_png, write_text
 from thesis_repro.street import AHEAD, BEHIND, STEP, Style, Track
@@ -44,7 +44,9 @@ class Drive:
     level: float = 104.0  # the mean gray that the exposure aims at
 
 
-_CITY, _GREEN, _OPEN = ("blocks", "houses", "park", "wall"), ("houses", "park", "wall", "field"), ("field", "park", "houses")
+_CITY = ("blocks", "houses", "park", "wall")
+_GREEN = ("houses", "park", "wall", "field")
+_OPEN = ("field", "park", "houses")
 
 DRIVES = {
     # City with right-angled turns both ways.
@@ -255,7 +257,8 @@ def _jobs_of(root, sequences, frames, train_images, validation_images):
     for name in sequences:
         folder = root / "kitti" / "sequences" / name
         for index in range(frames):
-            yield "frame", name, index, folder / "image_0" / f"{index:06d}.png", folder / "labels_0" / f"{index:06d}.png"
+            picture = f"{index:06d}.png"
+            yield "frame", name, index, folder / "image_0" / picture, folder / "labels_0" / picture
     for split, count, cities in (("train", train_images, TRAIN_CITIES), ("val", validation_images, VALIDATION_CITIES)):
         for index in range(count):
             city, number = cities[index % len(cities)], index // len(cities)
@@ -358,6 +361,8 @@ def write(out, *, sequences=SEQUENCES, frames=60, scale=0.5, train_images=100, v
     for picture in missing:
         groups.setdefault((*picture[:2], picture[2] // 10), []).append(picture)
     workers = min(cpu_count() if jobs == -1 else jobs, 1 + len(missing) // 40)
+    if workers > 1:
+        render.compile_for_all()
     with progress(description="rendering the embedded world", total=len(missing), unit="picture") as bar:
         work = (delayed(_write_some)(group, frames, scale, seed) for group in groups.values())
         for count in Parallel(n_jobs=workers, return_as="generator_unordered")(work):
