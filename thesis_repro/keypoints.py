@@ -49,6 +49,16 @@ def track(previous, current, points):
     return tracked, status.ravel() == 1
 
 
+class Keypoints:
+    """`detect` and `track` for one run."""
+
+    detect = staticmethod(detect)
+    track = staticmethod(track)
+
+    def expect(self, frame, odometries):
+        """Nothing is shared, so nothing is prepared."""
+
+
 class SharedKeypoints:
     """`detect` and `track` with the same results for many runs over one frame, at little more than the cost of one.
 
@@ -60,17 +70,19 @@ class SharedKeypoints:
         self._frame = self._strength = self._corners = None
         self._pair = self._tracked = self._found = self._index = None
 
-    def expect(self, previous, current, many_points):
-        """Track the points of all runs, a list of (N, 2) arrays, that follow `previous` to `current`."""
-        keys = [_key(points) for points in many_points if len(points)]
-        self._pair = (previous, current)
-        if keys:
-            self._index = np.unique(np.concatenate(keys))
+    def expect(self, frame, odometries):
+        """Track to `frame` the points of all runs that come from the same previous frame (nearly always all)."""
+        odometries = [odometry for odometry in odometries if len(odometry.points)]
+        if odometries:
+            previous = odometries[0].previous
+            self._pair = (previous, frame)
+            self._index = np.unique(np.concatenate([_key(odometry.points) for odometry in odometries
+                                                    if odometry.previous is previous]))
             points = self._index.view(np.float32).reshape(-1, 2)
-            self._tracked, self._found = track(previous, current, points)
+            self._tracked, self._found = track(previous, frame, points)
 
     def track(self, previous, current, points):
-        if self._pair is None or previous is not self._pair[0] or current is not self._pair[1]:
+        if self._pair is None or previous is not self._pair[0] or current is not self._pair[1]:  # resumed, say
             return track(previous, current, points)
         where = np.searchsorted(self._index, _key(points))
         return self._tracked[where], self._found[where]

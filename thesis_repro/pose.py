@@ -88,7 +88,7 @@ def warm_up():
     """Load the compiled functions (compile them the first time ever), so that no frame's time holds that."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
     recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
-    refine(np.eye(3), np.array([0.0, 0.0, 1.0]), points, points, 1.0)
+    refine(np.eye(3), np.array([0.0, 0.0, 1.0]), points, points, np.ones(8, bool), 1.0)
 
 
 def _triangulate_and_count(current, previous, rotation, translation):
@@ -176,20 +176,35 @@ def _least_eigenvector(b):
 
 
 REFINE_STEPS = 10
+REFINE_ROUNDS = 3
 
 
-def refine(rotation, translation, current, previous, threshold):
-    """The motion (rotation 3x3, unit translation) fitted to all correspondences (N, 2) it is given.
+def refine(rotation, translation, current, previous, inliers, threshold):
+    """The motion (rotation 3x3, unit translation) fitted to all its inliers among correspondences (N, 2).
 
     Levenberg-Marquardt over the rotation and the two angles of the translation's direction, on Sampson distances with
     Cauchy weights at half the estimator's threshold: RANSAC's answer goes through five points, this one uses them all.
-    An essential matrix does not know the sign of the translation, so the sign that was voted for is kept.
+    It starts from `inliers` (N booleans), and twice fits again to what lies within two thresholds, so that the chance
+    by which RANSAC chose its inliers is gone as well. An essential matrix does not know the sign of the translation,
+    so the sign that was voted for is kept.
     """
-    if len(current) < MIN_CORRESPONDENCES:
-        return rotation, translation
-    better, direction = _refine(np.ascontiguousarray(rotation), np.ascontiguousarray(translation), current, previous,
-                                threshold / 2)
-    return better, direction if direction @ translation >= 0 else -direction
+    turned, direction, chosen = rotation, translation, inliers
+    for _ in range(REFINE_ROUNDS):
+        if chosen.sum() < MIN_CORRESPONDENCES:
+            break
+        turned, direction = _refine(turned, direction, current[chosen], previous[chosen], threshold / 2)
+        chosen = np.abs(_sampson_distances(turned, direction, current, previous)) < 2 * threshold
+    return turned, direction if direction @ translation >= 0 else -direction
+
+
+def _sampson_distances(rotation, translation, current, previous):
+    """Signed distances (N,) of correspondences from agreeing with a motion, in normalised coordinates."""
+    matrix = _skew(translation) @ rotation
+    lines = current @ matrix[:, :2].T + matrix[:, 2]  # E (x, y, 1), in the previous frame
+    others = previous @ matrix[:2, :2] + matrix[2, :2]  # E^T (u, v, 1), in the current frame, first two rows
+    algebraic = (previous * lines[:, :2]).sum(axis=1) + lines[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return algebraic / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (others ** 2).sum(axis=1))
 
 
 @njit(cache=True, nogil=True)
@@ -205,7 +220,7 @@ def _refine(rotation, translation, current, previous, scale):
         r_new, t_new = _moved(r, t, change)
         cost_new, hessian_new, gradient_new = _normal_equations(r_new, t_new, current, previous, scale)
         if cost_new < cost:
-            settled = cost - cost_new < 1e-9 * cost
+            settled = cost - cost_new < 1e-7 * cost
             r, t, cost, hessian, gradient = r_new, t_new, cost_new, hessian_new, gradient_new
             damping *= 0.1
             if settled:

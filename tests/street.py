@@ -1,0 +1,60 @@
+"""A street of noise for the odometry's tests, rendered with exact arithmetic: every machine gets the same pixels."""
+
+import cv2
+import numpy as np
+
+
+def street(count, step=0.4, size=(160, 480), start=0.0):
+    """Frames of a drive between two walls along z, turning a little: (frames, intrinsics, poses)."""
+    height, width = size
+    texture = np.random.RandomState(0).randint(0, 256, (512, 512)).astype(np.uint8)
+    texture = cv2.resize(texture, (2048, 2048), interpolation=cv2.INTER_LINEAR)
+    camera = np.array([[300.0, 0, (width - 1) / 2], [0, 300.0, (height - 1) / 2], [0, 0, 1]])
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    rays = np.stack([(u - camera[0, 2]) / 300, (v - camera[1, 2]) / 300, np.ones_like(u)], axis=-1)
+    frames, poses = [], np.tile(np.eye(4), (count, 1, 1))
+    for index in range(count):
+        half = 0.002 * index  # rational rotation about y: no sine, which machines may round differently
+        cosine, sine = (1 - half * half) / (1 + half * half), 2 * half / (1 + half * half)
+        poses[index, :3, :3] = [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
+        poses[index, :3, 3] = 0.1 * step * index, 0, start + step * index
+        x = cosine * rays[..., 0] + sine * rays[..., 2]
+        y = rays[..., 1]
+        z = -sine * rays[..., 0] + cosine * rays[..., 2]
+        centre = poses[index, :3, 3]
+        with np.errstate(divide="ignore"):
+            walls = np.where(x > 0, (4 - centre[0]) / x, (-4 - centre[0]) / x)
+            floor = np.where(y > 0, 1.6 / y, -5.0 / y)
+        depth = np.minimum(walls, np.minimum(floor, 200.0))
+        along = centre[2] + depth * z
+        across = np.where(walls < floor, depth * y, centre[0] + depth * x + 11.0)
+        image = cv2.remap(texture, ((along * 40) % 2040).astype(np.float32), ((across * 40) % 2040).astype(np.float32),
+                          cv2.INTER_LINEAR)
+        frames.append((128 + (image - 128.0) / (1 + depth / 20)).astype(np.uint8))
+    return frames, camera, poses
+
+
+class Street:
+    """What `run` needs of a sequence."""
+
+    name = "street"
+
+    def __init__(self, count=10, **options):
+        self.images, self.intrinsics, self.poses = street(count, **options)
+
+    def __len__(self):
+        return len(self.images)
+
+    def frame(self, index):
+        return self.images[index]
+
+
+class Stripes:
+    """A mask that keeps vertical stripes of a width in pixels, shifted by some with every frame."""
+
+    def __init__(self, width, size=(160, 480)):
+        self.width, self.size = width, size
+
+    def __getitem__(self, index):
+        columns = (np.arange(self.size[1]) + 5 * index) // self.width % 2 == 0
+        return np.repeat(columns[None] * np.uint8(255), self.size[0], axis=0)
