@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from thesis_repro import InputError
 
+BAR_DELAY = 1  # seconds before a bar shows: what is over sooner needs none
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -21,6 +22,15 @@ def read_gray(path):
 
     Raises InputError when the file is missing, empty, truncated, corrupt or no image.
     """
+    return _read(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_color(path):
+    """Read one image as 8-bit red, green, blue, shape (height, width, 3). Raises what `read_gray` raises."""
+    return cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def _read(path, flag):
     path = Path(path)
     try:
         data = path.read_bytes()
@@ -30,7 +40,7 @@ def read_gray(path):
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
     if data.startswith(PNG_SIGNATURE) and not _png_is_whole(data):
         raise InputError(f"{path}: the image is truncated or corrupt; copy or download it again")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flag) if data else None
     if image is None:
         raise InputError(f"{path}: not an image that OpenCV can read; copy or download it again")
     return image
@@ -93,7 +103,7 @@ def progress(iterable=None, description="", total=None, unit="frame", initial=0)
             pass
     live = stream.isatty()
     return tqdm(iterable, desc=description, total=total, unit=unit, initial=initial, dynamic_ncols=live,
-                file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live)
+                file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live, delay=BAR_DELAY)
 
 
 class _Lines:

@@ -14,7 +14,7 @@ import pandas as pd  # noqa: E402
 import segmentation_models as sm  # noqa: E402
 import tensorflow as tf  # noqa: E402
 
-from thesis_repro import InputError, augmentation, files  # noqa: E402
+from thesis_repro import InputError, augmentation, files, memory  # noqa: E402
 from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES  # noqa: E402
 from thesis_repro.unet import build_unet  # noqa: E402
 
@@ -128,6 +128,7 @@ def train(train_images, train_labels, validation_images, validation_labels, fold
         model = (build or _thesis_network(base_filters, corrected_blocks))(train_images.shape[1:], N_CLASSES)
         model.compile(keras.optimizers.Adam(learning_rate), total_loss(), metrics=metrics())
         model.optimizer.build(model.trainable_variables)
+    memory.require(model, batch_size, training=True)
     record = _Record(model, folder, settings, patience)
     if not record.finished(epochs):
         augmenter = augmentation.training_augmenter(size)
@@ -139,15 +140,11 @@ def train(train_images, train_labels, validation_images, validation_labels, fold
             augmentation.validation_augmenter(size, full_validation_augmentation), seed + 1, "augmenting")]
         batches = Batches(train_sets, batch_size, seed, augmenter if fresh_augmentation else None)
         validation = Batches(validation_sets, batch_size)
-        with files.progress(description="training", total=epochs * len(batches), unit="batch") as bar:
-            bar.initial = bar.n = record.epoch * len(batches)
-            try:
-                model.fit(batches.dataset(), validation_data=validation.dataset(), epochs=epochs,
-                          initial_epoch=record.epoch, verbose=0, shuffle=False,
-                          callbacks=[_Epochs(batches, bar), *callbacks, record])
-            except (MemoryError, tf.errors.ResourceExhaustedError):
-                raise InputError(f"batch_size={batch_size}: no memory for a batch of {batch_size} images of "
-                                 f"{size}x{size} with {base_filters} base filters; lower one of the three") from None
+        with files.progress(description="training", total=epochs * len(batches), unit="batch",
+                            initial=record.epoch * len(batches)) as bar:
+            model.fit(batches.dataset(), validation_data=validation.dataset(), epochs=epochs,
+                      initial_epoch=record.epoch, verbose=0, shuffle=False,
+                      callbacks=[_Epochs(batches, bar), *callbacks, record])
     return load_model(folder / MODEL)
 
 
