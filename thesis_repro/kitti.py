@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from thesis_repro import InputError
@@ -172,4 +173,15 @@ def read_poses(path):
 def write_kitti_poses(path, poses):
     """Write (n, 4, 4) poses as KITTI does: 12 numbers a line, row by row, all digits kept."""
     lines = (" ".join(repr(float(value)) for value in pose[:3].ravel()) for pose in poses)
+    write_text(path, "".join(f"{line}\n" for line in lines))
+
+
+def write_tum(path, poses, times):
+    """Write (n, 4, 4) poses with their times (n,), seconds, in TUM form: time, position, quaternion (x, y, z, w)."""
+    lines = []
+    for time, pose in zip(times, poses, strict=True):
+        turn = cv2.Rodrigues(np.asarray(pose[:3, :3], np.float64))[0].ravel()
+        angle = np.linalg.norm(turn)
+        quaternion = [*(turn / angle * np.sin(angle / 2) if angle > 0 else turn / 2), np.cos(angle / 2)]
+        lines.append(" ".join(repr(float(value)) for value in (time, *pose[:3, 3], *quaternion)))
     write_text(path, "".join(f"{line}\n" for line in lines))

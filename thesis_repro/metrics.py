@@ -1,6 +1,11 @@
 """How far an estimated path is from the true one: the thesis's RMSE and MAE (Section 3.4) and the field's measures."""
 
+import evo
 import numpy as np
+import pandas as pd
+from evo.core import metrics as evo_metrics
+from evo.core.trajectory import PosePath3D
+from evo.core.units import Unit
 
 from thesis_repro import InputError
 
@@ -26,13 +31,108 @@ def _differences(estimated, true, alignment):
     alignment: "position" shifts the estimate so that frame 1 agrees, as PySLAM's 2021 version does; "pose" also turns
     it so that the rotation of frame 1 agrees, as later versions do.
     """
+    estimated, true = _check(estimated, true)
+    positions = estimated[1:, :3, 3] - estimated[1, :3, 3]
+    if alignment == "pose":
+        positions = positions @ (true[1, :3, :3] @ estimated[1, :3, :3].T).T
+    return positions - (true[1:, :3, 3] - true[1, :3, 3])
+
+
+def _check(estimated, true):
     estimated, true = np.asarray(estimated), np.asarray(true)
     if estimated.shape != true.shape:
         raise InputError(f"the estimated path has {len(estimated)} poses and the true one {len(true)}; "
                          "one pose a frame is needed in both")
     if len(true) < 2:
         raise InputError("a path of one frame has no error; at least 2 frames are needed")
-    positions = estimated[1:, :3, 3] - estimated[1, :3, 3]
-    if alignment == "pose":
-        positions = positions @ (true[1, :3, :3] @ estimated[1, :3, :3].T).T
-    return positions - (true[1:, :3, 3] - true[1, :3, 3])
+    return estimated, true
+
+
+# The field's measures
+
+
+def ate(estimated, true, alignment="none"):
+    """Absolute trajectory error, metres, of two (n, 4, 4) paths over all frames: {rmse, mean, median, max, scale, note}.
+
+    alignment: "none", "se3" (the rotation and shift that fit best) or "sim3" (and the scale, returned as `scale`).
+    Where no alignment is determined (a straight or standing path), the numbers are NaN and `note` says so.
+    """
+    if alignment not in ("none", "se3", "sim3"):
+        raise InputError(f"alignment={alignment!r}: unknown; choose one of none, se3, sim3")
+    reference, estimate = _evo_paths(estimated, true)
+    scale = 1.0
+    if alignment != "none":
+        try:
+            _, _, scale = estimate.align(reference, correct_scale=alignment == "sim3")
+        except evo.EvoException:
+            return {**dict.fromkeys(("rmse", "mean", "median", "max", "scale"), np.nan),
+                    "note": f"no {alignment} alignment: the path is straight or does not move"}
+    error = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
+    error.process_data((reference, estimate))
+    return {**_statistics(error), "scale": float(scale), "note": ""}
+
+
+def rpe(estimated, true, frames=1):
+    """Relative pose error over `frames` frames: {translation_rmse, ..._mean, _median, _max} in metres, and
+    {rotation_rmse, ...} in degrees."""
+    if not 1 <= frames < len(true):
+        raise InputError(f"frames={frames}: a path of {len(true)} poses has relative poses over 1 to {len(true) - 1}")
+    result = {}
+    for name, relation in (("translation", evo_metrics.PoseRelation.translation_part),
+                           ("rotation", evo_metrics.PoseRelation.rotation_angle_deg)):
+        error = evo_metrics.RPE(relation, delta=frames, delta_unit=Unit.frames, all_pairs=True)
+        error.process_data(_evo_paths(estimated, true))
+        result.update({f"{name}_{key}": value for key, value in _statistics(error).items()})
+    return result
+
+
+def _evo_paths(estimated, true):
+    _check(estimated, true)
+    return tuple(PosePath3D(poses_se3=list(np.array(some, np.float64))) for some in (true, estimated))
+
+
+def _statistics(error):
+    values = error.get_all_statistics()
+    return {key: float(values[key]) for key in ("rmse", "mean", "median", "max")}
+
+
+KITTI_LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)  # metres
+KITTI_EVERY = 10  # frames between the starts of segments
+
+
+def kitti_segments(estimated, true, lengths=KITTI_LENGTHS):
+    """The KITTI odometry benchmark's segments: a data frame of first, last, length, translation and rotation error.
+
+    From every tenth frame, for each length, up to the first frame more than that many metres of true path away. The
+    translation error is in metres a metre, the rotation error in degrees a metre.
+    """
+    estimated, true = _check(estimated, true)
+    steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    rows = []
+    for first in range(0, len(true), KITTI_EVERY):
+        for length in lengths:
+            last = int(np.searchsorted(travelled, travelled[first] + length, side="right"))
+            if last == len(true):
+                continue
+            true_motion = np.linalg.inv(true[first]) @ true[last]
+            motion = np.linalg.inv(estimated[first]) @ estimated[last]
+            error = np.linalg.inv(motion) @ true_motion
+            angle = np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))
+            rows.append((first, last, length, np.linalg.norm(error[:3, 3]) / length, np.degrees(angle) / length))
+    return pd.DataFrame(rows, columns=["first", "last", "length", "translation", "rotation"])
+
+
+def kitti_errors(estimated, true, lengths=KITTI_LENGTHS):
+    """The KITTI benchmark's errors, means over `kitti_segments`:
+    {translation_percent, rotation_deg_per_m, segments, note}.
+
+    NaN, with a note, where the path is too short for a single segment; a zero would look like a perfect result.
+    """
+    segments = kitti_segments(estimated, true, lengths)
+    note = ""
+    if not len(segments):
+        path = np.linalg.norm(np.diff(np.asarray(true)[:, :3, 3], axis=0), axis=1).sum()
+        note = f"too short: {path:.1f} m, the shortest segment is {min(lengths)} m"
+    return {"translation_percent": float(segments["translation"].mean() * 100),
+            "rotation_deg_per_m": float(segments["rotation"].mean()), "segments": len(segments), "note": note}
