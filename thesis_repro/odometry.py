@@ -27,6 +27,7 @@ import pandas as pd
 
 from thesis_repro import InputError, keypoints, pose
 from thesis_repro.files import atomic, progress
+from thesis_repro.pose import Motion
 
 CHECKPOINT = 300  # frames
 SECONDS = ("detect", "track", "essential", "pose")
@@ -99,7 +100,8 @@ class Step:
     detected: int | None = None  # None: not detected on this frame
     previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
-    motion: pose.Motion = pose.Motion()
+    keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)  # that the next frame starts from
+    motion: Motion = Motion()
     pose: np.ndarray | None = None  # 4x4 camera to world, metres
     updated: bool = False
     flags: list = field(default_factory=list)
@@ -181,6 +183,7 @@ class Odometry:
             else:
                 step.flags.append("no keypoints")
         self.previous, self.points = frame, tracked
+        step.keypoints = tracked
         return step
 
     def estimate(self, step):
@@ -197,7 +200,7 @@ class Odometry:
         matrix, inliers, problem = pose.essential_matrix(current, previous, chosen.threshold, chosen.estimator)
         step.seconds["essential"] = time.perf_counter() - started
         if matrix is None:
-            step.motion = pose.Motion(problem=problem)
+            step.motion = Motion(problem=problem)
             return
         started = time.perf_counter()
         if chosen.pose == "all":
@@ -209,7 +212,7 @@ class Odometry:
         if order is not None:
             shuffled, inliers = inliers, np.empty_like(inliers)
             inliers[order] = shuffled
-        step.motion = pose.Motion(rotation, translation, inliers, votes)
+        step.motion = Motion(rotation, translation, inliers, votes)
         step.seconds["pose"] = time.perf_counter() - started
 
     def compose(self, step):
