@@ -73,7 +73,9 @@ setup: .venv/ready
 # The name of the run follows from the data and the profile; settings.py needs no package to say it.
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 ifneq (,$(filter figures,$(MAKECMDGOALS)))
-RUN := $(shell $(PYTHON) -m thesis_repro.settings)
+# ($(shell) of this make does not see what is exported.)
+RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES BUILD FIGURES JOBS,THESIS_REPRO_$(name)='$(THESIS_REPRO_$(name))') \
+         $(PYTHON) -m thesis_repro.settings)
 ifeq (,$(RUN))
 $(error the settings above are wrong)
 endif
@@ -99,7 +101,8 @@ $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 	  --log-level=ERROR --output-dir $$(@D) --output .$(1) $$< 2> $$(@D)/$(basename $(1)).log; \
 	then mv $$(@D)/.$(1) $$@; echo "  done in $$$$((SECONDS - started)) s"; \
 	else echo "$(basename $(1)) failed:" >&2; \
-	  grep -E '^[A-Za-z_.]*(Error|Exception|Interrupt|Exit|Died)' $$(@D)/$(basename $(1)).log | tail -n 1 >&2; \
+	  sed 's/\x1b\[[0-9;]*m//g' $$(@D)/$(basename $(1)).log | grep -E '^[A-Za-z_.]*(Error|Exception|Interrupt|Exit|Died)' | grep -v CellExecutionError \
+    | tail -n 1 >&2; \
 	  echo "the whole report: $$(@D)/$(basename $(1)).log; the same command goes on from here" >&2; exit 1; fi
 endef
 previous :=

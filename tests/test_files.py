@@ -47,5 +47,6 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
 
 def test_progress_goes_to_the_named_file(tmp_path, monkeypatch):
     monkeypatch.setenv("THESIS_REPRO_PROGRESS", str(tmp_path / "log"))
+    monkeypatch.setattr("thesis_repro.files.BAR_DELAY", 0)
     assert list(progress(range(3), "counting")) == [0, 1, 2]
     assert "counting" in (tmp_path / "log").read_text()

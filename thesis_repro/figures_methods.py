@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.patches import Patch
 
 from thesis_repro.cityscapes import LABELS, colorize
-from thesis_repro.figures import BLUE, KEYPOINT, ORANGE, PAGE_WIDTH, label_colors, line_style,
-                                   new_figure, show_image
+from thesis_repro.figures import (BLUE, KEYPOINT, ORANGE, PAGE_WIDTH, label_colors, line_style, new_figure,
+                                  show_image)
 
 
 def figure_augmentation(examples):

@@ -40,7 +40,6 @@ class Profile:
     # the embedded world
     world_sequences: int
     world_frames: int
-    world_scale: float  # of KITTI's 1241x376
     world_training_images: int
     world_validation_images: int
 
@@ -48,19 +47,19 @@ class Profile:
     def world(self):
         """The sizes of the embedded world, as `world.write` takes them."""
         return {"sequences": tuple(f"{number:02d}" for number in range(self.world_sequences)),
-                "frames": self.world_frames, "scale": self.world_scale,
+                "frames": self.world_frames,
                 "train_images": self.world_training_images, "validation_images": self.world_validation_images}
 
 
 PROFILES = {
     "smoke": Profile(image_size=64, base_filters=4, batch_size=4, epochs=2, patience=5, training_images=16, frames=12,
-                     widths=(1, 5, 10, 15), world_sequences=2, world_frames=12, world_scale=0.3,
+                     widths=(1, 5, 10, 15), world_sequences=2, world_frames=12,
                      world_training_images=12, world_validation_images=4),
     "demo": Profile(image_size=160, base_filters=16, batch_size=8, epochs=20, patience=5, training_images=400,
-                    frames=200, widths=ALL_WIDTHS, world_sequences=11, world_frames=60, world_scale=0.5,
+                    frames=200, widths=ALL_WIDTHS, world_sequences=11, world_frames=40,
                     world_training_images=100, world_validation_images=20),
     "thesis": Profile(image_size=320, base_filters=64, batch_size=16, epochs=100, patience=5, training_images=None,
-                      frames=None, widths=ALL_WIDTHS, world_sequences=11, world_frames=300, world_scale=1.0,
+                      frames=None, widths=ALL_WIDTHS, world_sequences=11, world_frames=300,
                       world_training_images=2975, world_validation_images=500),
 }
 SEED = 0

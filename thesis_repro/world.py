@@ -7,6 +7,7 @@ its own name alone, so that neither the number of processes nor an interruption 
 
 import hashlib
 import json
+import shutil
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -294,7 +295,7 @@ def _write_sequence_texts(root, name, frames, scale, seed):
 def content_version():
     """A short name for what this code renders: it changes when the code of the world does."""
     digest = hashlib.sha256()
-    for module in ("render", "textures", "street", "world"):
+    for module in ("render", "surfaces", "sprites", "textures", "props", "street", "world"):
         digest.update(Path(__file__).with_name(f"{module}.py").read_bytes())
     return digest.hexdigest()[:12]
 
@@ -311,7 +312,7 @@ def _check(sequences, frames, scale, train_images, validation_images, seed):
         raise InputError(f"scale: must lie between 0.1 and 1 (KITTI's full size), not {scale!r}")
 
 
-def _claim(out, parameters):
+def _claim(out, parameters, replace):
     """Make sure that `out` is new or holds this very world; returns whether it claims to be complete."""
     manifest = out / MANIFEST
     if out.exists() and not out.is_dir():
@@ -327,6 +328,9 @@ def _claim(out, parameters):
         raise InputError(f"{manifest}: is not a manifest of the embedded world; "
                          "remove the folder or choose another") from None
     differing = [key for key in parameters if other.get(key) != parameters[key]]
+    if differing and replace:
+        shutil.rmtree(out)
+        return False
     if differing:
         key = differing[0]
         raise InputError(f"{out}: holds an embedded world of other parameters ({key} {other.get(key)!r}, not "
@@ -334,11 +338,13 @@ def _claim(out, parameters):
     return complete
 
 
-def write(out, *, sequences=SEQUENCES, frames=60, scale=0.5, train_images=100, validation_images=20, seed=0, jobs=-1):
+def write(out, *, sequences=SEQUENCES, frames=60, scale=1.0, train_images=100, validation_images=20, seed=0, jobs=-1,
+          replace=False):
     """Write the embedded world to OUT/kitti and OUT/cityscapes; goes on where a stopped run left off.
 
     sequences: names among 00 to 10; frames: of each; scale: of KITTI's image size (and of 1024x512 for the training
     images); jobs: processes, -1 for one a core. A complete world of the same parameters is left as it is.
+    replace: delete an embedded world of other parameters first; nothing else is ever deleted.
     Raises InputError for a folder that holds something else, a world of other parameters, or a bad parameter.
     """
     out, sequences = Path(out), tuple(sequences)
@@ -346,7 +352,7 @@ def write(out, *, sequences=SEQUENCES, frames=60, scale=0.5, train_images=100, v
     parameters = {"sequences": list(sequences), "frames": int(frames), "scale": float(scale),
                   "train_images": int(train_images), "validation_images": int(validation_images), "seed": int(seed),
                   "content": content_version()}
-    complete = _claim(out, parameters)
+    complete = _claim(out, parameters, replace)
     pictures = list(_jobs_of(out, sequences, frames, train_images, validation_images))
     texts = [path for name in sequences for path in (out / "kitti" / "sequences" / name / "calib.txt",
                                                      out / "kitti" / "sequences" / name / "times.txt",
