@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, cityscapes, kitti, render, street, textures, world
+from thesis_repro import InputError, cityscapes, kitti, props, render, street, textures, world
 from thesis_repro.cityscapes import ID
 
 SMALL = {"sequences": ("00", "07"), "frames": 12, "scale": 0.2, "train_images": 2, "validation_images": 1, "jobs": 1}
@@ -119,7 +119,7 @@ def test_tracked_points_keep_to_the_true_poses():
 
 def one_square(z=10.0, half=2.0, texture="concrete", label="building"):
     names = textures.build(0)[0]
-    faces = street.Faces(names)
+    faces = props.Faces(names)
     faces.add((-half, half, z), (2 * half, 0, 0), (0, -2 * half, 0), texture, label)
     return faces.matrix()
 
@@ -168,7 +168,7 @@ def test_cut_out_is_labelled_exactly_where_it_is_opaque():
 
 def test_neighbouring_faces_leave_no_crack():
     names = textures.build(0)[0]
-    faces = street.Faces(names)
+    faces = props.Faces(names)
     rng = np.random.default_rng(3)
     ring = [np.array([3 * np.cos(a), 3 * np.sin(a), 10.0]) for a in np.linspace(0, 2 * np.pi, 40)]
     middle = np.array([*rng.uniform(-0.5, 0.5, 2), 10.0])
