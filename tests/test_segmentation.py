@@ -184,7 +184,7 @@ def test_quality_agrees_with_keras_and_with_a_plain_count(model):
     labels = np.random.default_rng(1).choice(np.array([7, 11, 23, 26], np.uint8), IMAGES.shape[:3])
     quality = segmentation.quality(model, IMAGES, labels, batch_size=3)
     batches = training.Batches([(IMAGES, labels)], 3)
-    model.compile("adam", training.total_loss(), metrics=training.metrics())
+    training.compile_model(model)
     expected = model.evaluate(batches.dataset(), verbose=0, return_dict=True)
     predicted = most_probable(model, IMAGES)
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 
+import keras
 import numpy as np
 import pandas as pd
 import pytest
@@ -78,13 +79,21 @@ def test_each_epoch_shows_each_image_once_in_an_order_of_its_own():
     assert np.array_equal(seen[1], again)
 
 
-def test_the_network_gets_raw_grey_levels_and_one_hot_labels():
-    labels = SETS[1].copy()
-    labels[0, 0] = augmentation.NOTHING
-    (images, encoded), *_ = training.Batches([(SETS[0], labels)], 4).dataset()
+def test_the_network_gets_raw_grey_levels():
+    (images, labels), *_ = training.Batches([SETS[:2]], 4).dataset()
 
     assert np.array_equal(images.numpy(), SETS[0][:4].astype(np.float32))
-    assert np.array_equal(encoded.numpy(), augmentation.one_hot(labels[:4], 35))
+    assert np.array_equal(labels.numpy(), SETS[1][:4])
+
+
+def test_label_maps_are_scored_as_their_one_hot_masks():
+    labels = SETS[1][:4].copy()
+    labels[0, 0] = augmentation.NOTHING
+    predicted = np.random.default_rng(0).dirichlet(np.ones(35), labels.shape).astype(np.float32)
+    for function in (training.total_loss(), *training.metrics()):
+        scores = [float(training.OnLabelMaps(function)(true, predicted))
+                  for true in (labels, augmentation.one_hot(labels, 35))]
+        assert scores[0] == scores[1] == pytest.approx(float(function(augmentation.one_hot(labels, 35), predicted)))
 
 
 def test_fresh_augmentation_differs_from_epoch_to_epoch():
@@ -166,7 +175,7 @@ def test_bad_sets(sets, message, tmp_path):
 
 def test_callbacks_of_the_caller_see_every_epoch(tmp_path):
     seen = []
-    callback = training.keras.callbacks.LambdaCallback(on_epoch_end=lambda epoch, logs: seen.append(logs["val_loss"]))
+    callback = keras.callbacks.LambdaCallback(on_epoch_end=lambda epoch, logs: seen.append(logs["val_loss"]))
     training.train(*SETS, tmp_path, **SMALL | dict(epochs=2), callbacks=[callback])
 
     assert seen == pytest.approx(pd.read_csv(tmp_path / "history.csv")["val_loss"].tolist())
@@ -175,10 +184,12 @@ def test_callbacks_of_the_caller_see_every_epoch(tmp_path):
 def test_the_appendixs_hdf5_loads(trained, tmp_path):
     model = training.load_model(trained / "model.keras")
     model.save(tmp_path / "model.hdf5")
-    loaded = training.load_model(tmp_path / "model.hdf5")
+    x, y = SETS[2].astype(np.float32), augmentation.one_hot(SETS[3], 35)
 
-    x = SETS[2].astype(np.float32)
-    assert np.array_equal(loaded(x), model(x))
+    # as in the appendix, loss and metrics included, and as everywhere else
+    with_loss = keras.models.load_model(tmp_path / "model.hdf5", custom_objects=training.custom_objects())
+    assert with_loss.evaluate(x, y, verbose=0) == pytest.approx(model.evaluate(x, y, verbose=0))
+    assert np.array_equal(training.load_model(tmp_path / "model.hdf5")(x), model(x))
 
 
 @pytest.mark.parametrize("suffix", [".keras", ".hdf5"])

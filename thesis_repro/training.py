@@ -31,17 +31,39 @@ def metrics():
     return [sm.metrics.IOUScore(threshold=0.5), sm.metrics.FScore(threshold=0.5)]
 
 
+class OnLabelMaps:
+    """A loss or metric of the library, which compares one-hot masks, for label maps as well.
+
+    The encoding then happens inside the compiled step: a one-hot batch is 140 times as large as its label maps.
+    """
+
+    def __init__(self, function):
+        self.function, self.name, self.__name__ = function, function.name, function.name
+
+    def __call__(self, true, predicted):
+        if len(true.shape) < len(predicted.shape):
+            true = tf.one_hot(tf.cast(true, tf.uint8), N_CLASSES)  # NOTHING becomes zeros
+        return self.function(true, predicted)
+
+
+def compile_model(model, learning_rate=0.001):
+    """Give a model the thesis's loss, metrics and optimizer (A.5), for label maps or one-hot masks as targets."""
+    model.compile(keras.optimizers.Adam(learning_rate), OnLabelMaps(total_loss()),
+                  metrics=[OnLabelMaps(metric) for metric in metrics()])
+
+
 def custom_objects():
     """What `keras.models.load_model` needs to load the loss and the metrics of the appendix's HDF5 file as well."""
-    loss = total_loss()
-    return {loss.name: loss, "dice_loss_plus_1focal_loss": loss} | {metric.name: metric for metric in metrics()}
+    loss = OnLabelMaps(total_loss())
+    return {loss.name: loss, "dice_loss_plus_1focal_loss": loss} | {
+        metric.name: OnLabelMaps(metric) for metric in metrics()}
 
 
 class Batches:
     """The input of the network: sets of images and label maps, of which every epoch shows each image once.
 
     Images (n, height, width, channels) and label maps (n, height, width) stay uint8, and the sets stay separate
-    arrays; an image becomes float and a label map one-hot in its batch only. At 5950 images of 320x320 that is 1.2 GB
+    arrays; an image becomes float in its batch, and a label map one-hot in the compiled step. At 5950 images of 320x320 that is 1.2 GB
     instead of 85 GB. Unlike a `tf.data` shuffle, the order depends on (seed, epoch) alone, so that a resumed run
     sees what an undisturbed one sees.
     """
@@ -80,18 +102,13 @@ class Batches:
         return images[within], labels[within]
 
     def dataset(self):
-        """The batches as a `tf.data.Dataset` of float images and one-hot label maps, made while the network works."""
+        """The batches as a `tf.data.Dataset` of float images and uint8 label maps, made while the network works."""
         shape = self.sets[0][0].shape[1:]
         signature = (tf.TensorSpec((None, *shape), tf.uint8), tf.TensorSpec((None, *shape[:2]), tf.uint8))
-        # prefetched while they are small; one-hot batches are 36 times as large, so there is one at a time
         batches = tf.data.Dataset.from_generator(lambda: iter(self), output_signature=signature).prefetch(2)
-        batches = batches.map(_network_input)
+        # grey levels stay 0 to 255: the appendix imports `normalize` and never calls it
+        batches = batches.map(lambda images, labels: (tf.cast(images, tf.float32), labels))
         return batches.apply(tf.data.experimental.assert_cardinality(len(self)))
-
-
-def _network_input(images, labels):
-    # grey levels stay 0 to 255: the appendix imports `normalize` and never calls it; 255 in a label map becomes zeros
-    return tf.cast(images, tf.float32), tf.one_hot(labels, N_CLASSES)
 
 
 def train(train_images, train_labels, validation_images, validation_labels, folder, *, base_filters=64, batch_size=16,
@@ -126,7 +143,7 @@ def train(train_images, train_labels, validation_images, validation_labels, fold
     keras.utils.set_random_seed(seed)
     with _strategy().scope():
         model = (build or _thesis_network(base_filters, corrected_blocks))(train_images.shape[1:], N_CLASSES)
-        model.compile(keras.optimizers.Adam(learning_rate), total_loss(), metrics=metrics())
+        compile_model(model, learning_rate)
         model.optimizer.build(model.trainable_variables)
     memory.require(model, batch_size, training=True)
     record = _Record(model, folder, settings, patience)
@@ -261,7 +278,7 @@ def load_model(path):
                          "copy it again or train anew") from None
     check_shape(model, path)
     # Keras cannot read the library's loss back from a .keras file, so it is given anew
-    model.compile("adam", total_loss(), metrics=metrics())
+    compile_model(model)
     return model
 
 
