@@ -52,8 +52,9 @@ def _check(estimated, true):
 
 
 def ate(estimated, true, alignment="none"):
-    """Absolute trajectory error, metres, of two (n, 4, 4) paths over all frames: {rmse, mean, median, max, scale, note}.
+    """Absolute trajectory error, metres, over all frames: {rmse, mean, median, max, scale, note}.
 
+    estimated, true: (n, 4, 4) poses.
     alignment: "none", "se3" (the rotation and shift that fit best) or "sim3" (and the scale, returned as `scale`).
     Where no alignment is determined (a straight or standing path), the numbers are NaN and `note` says so.
     """

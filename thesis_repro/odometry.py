@@ -3,16 +3,16 @@
 `run(sequence)` is the plain way in; `run_many` makes many runs over one sequence for little more than the cost of
 their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What PySLAM crashes on has a rule here:
 
-| frame                                        | rule                                                    | flag           |
-|----------------------------------------------|---------------------------------------------------------|----------------|
-| black, blown out, without contrast           | pose kept; frame skipped: the next one is compared with | flat frame     |
-|                                              | the last good one, at the sum of their scales           |                |
-| no keypoint found (an all-zero mask, say)    | the tracked points are kept and tracked on              | no keypoints   |
-| no point to track                            | pose kept; starts again from this frame's keypoints     | no points      |
-| fewer than five correspondences              | pose kept                                               | see pose.py    |
-| none or several essential matrices           | pose kept                                               | see pose.py    |
-| agreement no better than chance: a scene cut | pose kept                                               | no agreement   |
-| moved less than the gate (PySLAM's own rule) | pose kept                                               | stationary     |
+| frame                                       | flag and rule (the pose is kept, but for the second)                 |
+|---------------------------------------------|----------------------------------------------------------------------|
+| black, blown out, no contrast               | "flat frame": skipped; the next frame is measured from the last good |
+|                                             | one, over the sum of their scales                                    |
+| no keypoint found (an all-zero mask, say)   | "no keypoints": the tracked points are tracked on                    |
+| no point to track                           | "no points": starts again from this frame's keypoints                |
+| too few correspondences for a motion        | "fewer than five correspondences"                                    |
+| none or several essential matrices          | "no essential matrix", "several essential matrices"                  |
+| agreement no better than chance (scene cut) | "no agreement"                                                       |
+| moved less than the gate (PySLAM's rule)    | "stationary"                                                         |
 """
 
 import pickle
