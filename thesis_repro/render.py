@@ -38,6 +38,7 @@ LEVELS = 12  # sides up to 2048
 ALPHA_LEVELS = 5  # thinner than that, cut-outs flicker rather than vanish
 SUPERSAMPLING = 2
 OPAQUE = 128
+COUNTED = -2  # a sample that is dealt with; -1 is the background
 SHARPNESS = 0.75  # part of a pixel that a texture is averaged over; the rest is contrast against a little aliasing
 
 
@@ -103,9 +104,13 @@ class Textures:
 def _sample(data, offset, log_height, log_width, u, v):
     width, height = 1 << log_width, 1 << log_height
     x, y = u * width - 0.5, v * height - 0.5
-    x_floor, y_floor = math.floor(x), math.floor(y)
-    fx, fy = x - x_floor, y - y_floor
-    x0, y0 = int(x_floor) & (width - 1), int(y_floor) & (height - 1)
+    x0, y0 = int(x), int(y)
+    if x < x0:
+        x0 -= 1
+    if y < y0:
+        y0 -= 1
+    fx, fy = x - x0, y - y0
+    x0, y0 = x0 & (width - 1), y0 & (height - 1)
     x1, y1 = (x0 + 1) & (width - 1), (y0 + 1) & (height - 1)
     row0, row1 = offset + (y0 << log_width), offset + (y1 << log_width)
     top = data[row0 + x0] * (1 - fx) + data[row0 + x1] * fx
@@ -114,60 +119,71 @@ def _sample(data, offset, log_height, log_width, u, v):
 
 
 @_jit
-def _filtered(data, offsets, log_height, log_width, u, v, u_step, v_step):
+def _level(step, levels):
+    """Which reduced level suits a step of so many texels, and the part of the next one: log2, linear between powers."""
+    level = 0
+    while step >= 2.0 and level < levels:
+        step *= 0.5
+        level += 1
+    return level, (step - 1.0 if level < levels and step > 1.0 else 0.0)
+
+
+@_jit
+def _filtered(data, gray, texture, log_height, log_width, u, v, u_step, v_step):
     """Texture value for a sample that covers u_step by v_step repeats; blends neighbouring levels of both axes."""
-    u_level = math.log2(max(u_step * (1 << log_width), 1.0))
-    v_level = math.log2(max(v_step * (1 << log_height), 1.0))
-    i, j = min(int(u_level), log_width), min(int(v_level), log_height)
-    u_part = u_level - i if i < log_width else 0.0
-    v_part = v_level - j if j < log_height else 0.0
-    value = _sample(data, offsets[j, i], log_height - j, log_width - i, u, v)
+    i, u_part = _level(u_step * (1 << log_width), log_width)
+    j, v_part = _level(v_step * (1 << log_height), log_height)
+    value = _sample(data, gray[texture, j, i], log_height - j, log_width - i, u, v)
     if u_part > 0.0:
-        value += u_part * (_sample(data, offsets[j, i + 1], log_height - j, log_width - i - 1, u, v) - value)
+        value += u_part * (_sample(data, gray[texture, j, i + 1], log_height - j, log_width - i - 1, u, v) - value)
     if v_part > 0.0:
-        other = _sample(data, offsets[j + 1, i], log_height - j - 1, log_width - i, u, v)
+        other = _sample(data, gray[texture, j + 1, i], log_height - j - 1, log_width - i, u, v)
         if u_part > 0.0:
-            other += u_part * (_sample(data, offsets[j + 1, i + 1], log_height - j - 1, log_width - i - 1, u, v)
+            other += u_part * (_sample(data, gray[texture, j + 1, i + 1], log_height - j - 1, log_width - i - 1, u, v)
                                - other)
         value += v_part * (other - value)
     return value
 
 
 @_jit
-def _steps(c, face, s, t, w):
-    """How far u and v move from one sample to the next, the larger of both image directions."""
-    s_x, s_y = (c[1] - s * c[7]) / w, (c[2] - s * c[8]) / w
-    t_x, t_y = (c[4] - t * c[7]) / w, (c[5] - t * c[8]) / w
-    u_step = max(abs(face[UV + 1] * s_x + face[UV + 2] * t_x), abs(face[UV + 1] * s_y + face[UV + 2] * t_y))
-    v_step = max(abs(face[UV + 4] * s_x + face[UV + 5] * t_x), abs(face[UV + 4] * s_y + face[UV + 5] * t_y))
+def _steps(coefficients, faces, index, s, t, w):
+    """How far u and v move from one sample to the next, the larger of both image directions.
+
+    Whole matrices and an index: a row taken out of a matrix is counted as a reference, which costs more than the work.
+    """
+    c, f, n, z = coefficients, faces, index, 1.0 / w
+    s_x, s_y = (c[n, 1] - s * c[n, 7]) * z, (c[n, 2] - s * c[n, 8]) * z
+    t_x, t_y = (c[n, 4] - t * c[n, 7]) * z, (c[n, 5] - t * c[n, 8]) * z
+    u_step = max(abs(f[n, UV + 1] * s_x + f[n, UV + 2] * t_x), abs(f[n, UV + 1] * s_y + f[n, UV + 2] * t_y))
+    v_step = max(abs(f[n, UV + 4] * s_x + f[n, UV + 5] * t_x), abs(f[n, UV + 4] * s_y + f[n, UV + 5] * t_y))
     return u_step, v_step
 
 
 @_jit
-def _alpha_level(sides, face, c, row, x):
-    """Levels (along v and u) of an alpha texture that suit one row of a face."""
-    w = c[6] + c[8] * row + c[7] * x
-    u_step, v_step = _steps(c, face, (c[0] + c[2] * row + c[1] * x) / w, (c[3] + c[5] * row + c[4] * x) / w, w)
+def _alpha_level(sides, coefficients, faces, index, row, x):
+    """Levels (along v and u) of a face's alpha texture that suit one row of it."""
+    c, n, texture = coefficients, index, int(faces[index, TEXTURE])
+    w = c[n, 6] + c[n, 8] * row + c[n, 7] * x
+    u_step, v_step = _steps(c, faces, n, (c[n, 0] + c[n, 2] * row + c[n, 1] * x) / w,
+                            (c[n, 3] + c[n, 5] * row + c[n, 4] * x) / w, w)
     i = j = 0
-    u_step *= 1 << sides[1]
-    v_step *= 1 << sides[0]
-    while u_step > 1.5 and i < min(ALPHA_LEVELS - 1, sides[1]):
+    u_step *= 1 << sides[texture, 1]
+    v_step *= 1 << sides[texture, 0]
+    while u_step > 1.5 and i < min(ALPHA_LEVELS - 1, sides[texture, 1]):
         u_step *= 0.5
         i += 1
-    while v_step > 1.5 and j < min(ALPHA_LEVELS - 1, sides[0]):
+    while v_step > 1.5 and j < min(ALPHA_LEVELS - 1, sides[texture, 0]):
         v_step *= 0.5
         j += 1
     return j, i
 
 
 @_jit
-def _opaque(data, offsets, sides, level, face, c, row, x, w):
-    s = (c[0] + c[2] * row + c[1] * x) / w
-    t = (c[3] + c[5] * row + c[4] * x) / w
-    u = face[UV] + face[UV + 1] * s + face[UV + 2] * t
-    v = face[UV + 3] + face[UV + 4] * s + face[UV + 5] * t
-    j, i = level
-    return _sample(data, offsets[j, i], sides[0] - j, sides[1] - i, u, v) >= OPAQUE
+def _opaque(data, offset, log_height, log_width, face, c, row, x, w):
+    a, b, z = c[0] + c[2] * row + c[1] * x, c[3] + c[5] * row + c[4] * x, 1.0 / w
+    u = face[UV] + (face[UV + 1] * a + face[UV + 2] * b) * z
+    v = face[UV + 3] + (face[UV + 4] * a + face[UV + 5] * b) * z
+    return _sample(data, offset, log_height, log_width, u, v) >= OPAQUE
 
 
 @_jit
@@ -273,10 +289,11 @@ def _surfaces(faces, data, alpha, sides, rotation, position, focal, centre, size
             if stop < start:
                 continue
             if cut_out:
-                level = _alpha_level(sides[texture], face, c, row, (start + stop) // 2)
+                j, i = _alpha_level(sides, coefficients, faces, index, row, (start + stop) // 2)
+                offset, log_height, log_width = alpha[texture, j, i], sides[texture, 0] - j, sides[texture, 1] - i
                 for x in range(start, stop + 1):
                     w = c[6] + c[8] * row + c[7] * x
-                    if w > depth[row, x] and _opaque(data, alpha[texture], sides[texture], level, face, c, row, x, w):
+                    if w > depth[row, x] and _opaque(data, offset, log_height, log_width, face, c, row, x, w):
                         depth[row, x] = w
                         nearest[row, x] = index
             else:
@@ -292,9 +309,9 @@ def _shadows(faces, data, alpha, sides, rotation, position, focal, centre, size,
     """Mark the ground samples that a face shades: its parallel projection on each ground level, drawn as a face."""
     corner, edge_s, edge_t = np.empty(3), np.empty(3), np.empty(3)
     flat_corner, flat_s, flat_t = np.empty(3), np.empty(3), np.empty(3)
-    c = np.empty(9)
+    coefficients = np.empty((faces.shape[0], 9))
     for index in range(faces.shape[0]):
-        face = faces[index]
+        face, c = faces[index], coefficients[index]
         if face[CASTS] == 0:
             continue
         distance = math.hypot(face[CORNER] - position[0], face[CORNER + 2] - position[2])
@@ -321,29 +338,28 @@ def _shadows(faces, data, alpha, sides, rotation, position, focal, centre, size,
                 if stop < start:
                     continue
                 if cut_out:
-                    steps = _alpha_level(sides[texture], face, c, row, (start + stop) // 2)
+                    j, i = _alpha_level(sides, coefficients, faces, index, row, (start + stop) // 2)
+                    offset, log_height, log_width = alpha[texture, j, i], sides[texture, 0] - j, sides[texture, 1] - i
                 for x in range(start, stop + 1):
                     if shadow[row, x] or nearest[row, x] < 0 or faces[nearest[row, x], GROUND] != level:
                         continue
                     if cut_out:
                         w = c[6] + c[8] * row + c[7] * x
-                        if not _opaque(data, alpha[texture], sides[texture], steps, face, c, row, x, w):
+                        if not _opaque(data, offset, log_height, log_width, face, c, row, x, w):
                             continue
                     shadow[row, x] = True
 
 
 @_jit
-def _surface_value(face, c, row, column, spread, brightness, data, gray, sides):
-    """Shown texture of a face at a place (in samples) for a square of `spread` samples."""
-    w = c[6] + c[8] * row + c[7] * column
-    s = (c[0] + c[2] * row + c[1] * column) / w
-    t = (c[3] + c[5] * row + c[4] * column) / w
-    u_step, v_step = _steps(c, face, s, t, w)
-    u = face[UV] + face[UV + 1] * s + face[UV + 2] * t
-    v = face[UV + 3] + face[UV + 4] * s + face[UV + 5] * t
-    texture = int(face[TEXTURE])
-    return brightness * _filtered(data, gray[texture], sides[texture, 0], sides[texture, 1], u, v, u_step * spread,
-                                  v_step * spread)
+def _surface_value(faces, coefficients, index, row, column, w, spread, data, gray, sides):
+    """Texture of a face at a place (in samples), averaged over a square of `spread` samples."""
+    c, f, n, texture = coefficients, faces, index, int(faces[index, TEXTURE])
+    s = (c[n, 0] + c[n, 2] * row + c[n, 1] * column) / w
+    t = (c[n, 3] + c[n, 5] * row + c[n, 4] * column) / w
+    u_step, v_step = _steps(c, f, n, s, t, w)
+    u = f[n, UV] + f[n, UV + 1] * s + f[n, UV + 2] * t
+    v = f[n, UV + 3] + f[n, UV + 4] * s + f[n, UV + 5] * t
+    return _filtered(data, gray, texture, sides[texture, 0], sides[texture, 1], u, v, u_step * spread, v_step * spread)
 
 
 @_jit
@@ -373,6 +389,21 @@ def _background(x, y, rotation, environment, horizon, horizon_labels, data, gray
 
 
 @_jit
+def _most(labels, counts, depths, found):
+    """The label of most samples; where two have as many, that of the nearer surface."""
+    best, best_count, best_depth = labels[0], 0.0, -1.0
+    for k in range(found):
+        count, closest = 0.0, 0.0
+        for m in range(found):
+            if labels[m] == labels[k]:
+                count += counts[m]
+                closest = max(closest, depths[m])
+        if count > best_count or (count == best_count and closest > best_depth):
+            best, best_count, best_depth = labels[k], count, closest
+    return best
+
+
+@_jit
 def _render(faces, brightness, data, gray, alpha, sides, rotation, position, focal, centre, height, width, environment,
             horizon, horizon_labels, cloud_texture, leaf_texture, ground_label):
     size = (height * SUPERSAMPLING, width * SUPERSAMPLING)
@@ -385,52 +416,45 @@ def _render(faces, brightness, data, gray, alpha, sides, rotation, position, foc
              environment[SUN:SUN + 3], nearest, shadow)
     image = np.empty((height, width), np.float32)
     label_map = np.empty((height, width), np.uint8)
-    hits, labels, depths = np.empty(4, np.int64), np.empty(4, np.uint8), np.empty(4)
+    hits, counts, labels, depths = np.empty(4, np.int64), np.empty(4), np.empty(4, np.uint8), np.empty(4)
     dark = 1.0 - environment[SHADOW]
     for i in range(height):
         for j in range(width):
-            shaded = 0
+            # The texture of each face in the pixel is read once, in the middle of its samples.
+            found, total = 0, 0.0
             for k in range(4):
-                row, column = 2 * i + (k >> 1), 2 * j + (k & 1)
-                hits[k] = nearest[row, column]
-                shaded += shadow[row, column]
-            total = 0.0
-            if hits[0] == hits[1] and hits[0] == hits[2] and hits[0] == hits[3]:
-                # Most pixels: one face, whose texture is read once for the whole pixel.
-                first, last, weight, spread = 0, 1, 4.0, 2.0 * SHARPNESS
-            else:
-                first, last, weight, spread = 0, 4, 1.0, 1.0
-            for k in range(first, last):
-                row, column = 2.0 * i + (k >> 1), 2.0 * j + (k & 1)
-                light = 1.0 - dark * shadow[2 * i + (k >> 1), 2 * j + (k & 1)]
-                if last == 1:
-                    row, column = 2.0 * i + 0.5, 2.0 * j + 0.5
-                    light = 1.0 - dark * shaded * 0.25
+                hits[k] = nearest[2 * i + (k >> 1), 2 * j + (k & 1)]
+            for k in range(4):
                 index = hits[k]
+                if index == COUNTED:
+                    continue
+                count, row, column, shaded = 0, 0, 0, 0
+                for m in range(k, 4):
+                    if hits[m] == index:
+                        count += 1
+                        row += 2 * i + (m >> 1)
+                        column += 2 * j + (m & 1)
+                        shaded += shadow[2 * i + (m >> 1), 2 * j + (m & 1)]
+                        hits[m] = COUNTED
+                y, x = row / count, column / count
                 if index >= 0:
-                    face, c = faces[index], coefficients[index]
-                    value = light * _surface_value(face, c, row, column, spread, brightness[index], data, gray, sides)
-                    w = c[6] + c[8] * row + c[7] * column
+                    w = coefficients[index, 6] + coefficients[index, 8] * y + coefficients[index, 7] * x
+                    spread = SHARPNESS * math.sqrt(count)
+                    value = _surface_value(faces, coefficients, index, y, x, w, spread, data, gray, sides)
+                    value *= brightness[index] * (1.0 - dark * shaded / count)
                     clear = math.exp(-environment[HAZE] / w)
-                    total += weight * (value * clear + environment[HORIZON] * (1 - clear))
-                    labels[k], depths[k] = int(face[LABEL]), w
+                    value = value * clear + environment[HORIZON] * (1 - clear)
+                    label = int(faces[index, LABEL])
                 else:
-                    value, label = _background((column - centre[0]) / focal[0], (row - centre[1]) / focal[1], rotation,
+                    value, label = _background((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], rotation,
                                                environment, horizon, horizon_labels, data, gray, sides, cloud_texture,
                                                leaf_texture, ground_label)
-                    total += weight * value
-                    labels[k], depths[k] = label, 0.0
+                    w = 0.0
+                total += count * value
+                labels[found], counts[found], depths[found] = label, count, w
+                found += 1
             image[i, j] = total * 0.25
-            best, best_count, best_depth = labels[0], 0, -1.0
-            for k in range(first, last if last > 1 else 0):
-                count, closest = 0, 0.0
-                for m in range(first, last):
-                    if labels[m] == labels[k]:
-                        count += 1
-                        closest = max(closest, depths[m])
-                if count > best_count or (count == best_count and closest > best_depth):
-                    best, best_count, best_depth = labels[k], count, closest
-            label_map[i, j] = best
+            label_map[i, j] = _most(labels, counts, depths, found)
     return image, label_map
 
 
