@@ -41,11 +41,10 @@ DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscape
 export SM_FRAMEWORK := tf.keras
 export NO_ALBUMENTATIONS_UPDATE := 1
 export TF_CPP_MIN_LOG_LEVEL := 3
-export TF_ENABLE_ONEDNN_OPTS := 0
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 
-.PHONY: help setup figures test lab clean check-data
+.PHONY: help setup figures test lab bench weights clean check-data
 
 help:
 	@echo "make figures     every table and figure into figures/, on embedded data"
@@ -54,6 +53,8 @@ help:
 	@echo "make test        unit tests, and every notebook on the smallest profile"
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path"
+	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
+	@echo "make weights     trains the model that ships anew, CITYSCAPES=/path/to/camvid"
 	@echo "make setup       only .venv with the pinned packages"
 	@echo "make clean       removes .venv, build and the figures of other data and profiles"
 
@@ -119,6 +120,14 @@ test: setup
 
 lab: setup
 	@$(BIN)/jupyter lab notebooks
+
+bench: setup
+	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
+	@$(BIN)/python -m thesis_repro.bench --kitti "$(or $(KITTI),build/world-demo/kitti)" --output build/bench.json
+
+weights: setup
+	@$(if $(CITYSCAPES),,echo "CITYSCAPES must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
+	@$(BIN)/python -m thesis_repro.shipped "$(CITYSCAPES)" build/weights
 
 clean:
 	rm -rf .venv build figures/*/ *.egg-info .pytest_cache

@@ -47,6 +47,9 @@ def predict(options):
     paths = sorted(images.glob("*.png"))
     if not paths:
         raise InputError(f"{images}: holds no PNG images")
+    if options.output.resolve() == images.resolve():
+        raise InputError(f"{options.output}: is the folder of the images; label maps have the same names, "
+                         "so name another folder")
     model = training.load_model(options.model) if options.model else segmentation.load_shipped()
     segmentation.write_label_maps(model, paths, options.output)
     print(f"{options.output}: {len(paths)} label maps")
@@ -54,9 +57,9 @@ def predict(options):
 
 def odometry(options):
     """run the visual odometry over one sequence and print its errors, keypoints and time"""
-    from thesis_repro import metrics, odometry
+    from thesis_repro import metrics, odometry, video
     from thesis_repro.files import write_text
-    from thesis_repro.kitti import Sequence, write_kitti_poses
+    from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder
 
     if options.labels and options.dilation is None:
@@ -84,6 +87,10 @@ def odometry(options):
     }
     if options.output:
         write_kitti_poses(options.output, result.poses)
+    if options.tum:
+        write_tum(options.tum, result.poses, sequence.times)
+    if options.video:
+        video.write_video(options.video, sequence, settings, masks, description="video")
     if options.frames_csv:
         write_text(options.frames_csv, result.frames.to_csv(index=False))
     if options.json:
@@ -128,10 +135,20 @@ def build_parser():
     source.add_argument("--masks", type=Path, metavar="DIR", help="one mask a frame, 255 keep, 0 ignore")
     source.add_argument("--labels", type=Path, metavar="DIR", help="one label map a frame, with --dilation")
     sub.add_argument("--dilation", type=int, metavar="W", help="dilation width in pixels of masks from label maps")
-    sub.add_argument("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")
     sub.add_argument("--pyslam", choices=("2021", "2024"), default="2021",
-                     help="the preset: PySLAM of the thesis, or its later algorithm")
+                     help="the preset: PySLAM of the thesis (default), or its later algorithm; what follows changes it")
+    sub.add_argument("--pose", metavar="all|inliers|refined",
+                     help="who votes on the motion: all points (PySLAM), RANSAC's inliers, or these and then a fit")
+    sub.add_argument("--permute", type=int, metavar="SEED", help="shuffle the correspondences before RANSAC")
+    sub.add_argument("--mask-mode", metavar="detect|filter",
+                     help="give the mask to the detector (default), or drop what it found outside")
+    sub.add_argument("--estimator", metavar="ransac|usac|usac-accurate|usac-magsac", help="of the essential matrix")
+    sub.add_argument("--detector", metavar="shi-tomasi|orb", help="of keypoints; they are tracked all the same")
+    sub.add_argument("--min-distance", type=float, metavar="PIXELS", help="between keypoints (3)")
+    sub.add_argument("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")
     sub.add_argument("--output", type=Path, metavar="POSES.txt", help="estimated poses in KITTI's form")
+    sub.add_argument("--tum", type=Path, metavar="FILE", help="estimated poses in TUM's form")
+    sub.add_argument("--video", type=Path, metavar="OUT.mp4", help="what the odometry sees and where it goes")
     sub.add_argument("--frames-csv", type=Path, metavar="FILE", help="one row a frame")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
     return parser
