@@ -15,6 +15,11 @@ def test_reads_a_sequence(tiny_kitti):
     assert np.array_equal(sequence.frame(1)[:, :63], sequence.frame(0)[:, 1:])
 
 
+def test_what_a_killed_run_left_is_no_frame(tiny_kitti):
+    (tiny_kitti / "sequences/00/image_0/.000002.4711.png").write_bytes(b"half")
+    assert len(Sequence(tiny_kitti, "00")) == 4
+
+
 def test_subset_is_the_start_and_never_longer(tiny_kitti):
     sequence = Sequence(tiny_kitti, "00")
     short = sequence.subset(2)

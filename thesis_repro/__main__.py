@@ -39,12 +39,13 @@ def check_data(options):
 def predict(options):
     """write label maps (8-bit ids, 320x320 PNG, named like the frames) for a folder of images or a sequence"""
     from thesis_repro import segmentation, training
+    from thesis_repro.files import listed
 
     images = options.images / "image_0" if (options.images / "image_0").is_dir() else options.images
     if not images.is_dir():
         raise InputError(f"{options.images}: no such folder; --images must name a folder of PNG images "
                          "or a KITTI sequence folder that holds image_0")
-    paths = sorted(images.glob("*.png"))
+    paths = listed(images)
     if not paths:
         raise InputError(f"{images}: holds no PNG images")
     if options.output.resolve() == images.resolve():

@@ -8,7 +8,7 @@ import numpy as np
 from sklearn.model_selection import train_test_split
 
 from thesis_repro import InputError
-from thesis_repro.files import progress, read_gray
+from thesis_repro.files import listed, progress, read_gray
 
 # Tables 3.1 and 3.2; colours as the Cityscapes scripts draw them. "background" exists in the tables only:
 # the network has 35 outputs, and no label map holds 35 (audit: the tables list one category too many).
@@ -118,12 +118,12 @@ def _listing(root, split):
     if (root / "leftImg8bit").is_dir():
         where = root / "leftImg8bit" / split
         image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
-        images = {f.name.removesuffix(image_end): f for f in where.glob(f"*/*{image_end}")}
-        labels = {f.name.removesuffix(label_end): f for f in (root / "gtFine" / split).glob(f"*/*{label_end}")}
+        images = {f.name.removesuffix(image_end): f for f in listed(where, f"*/*{image_end}")}
+        labels = {f.name.removesuffix(label_end): f for f in listed(root / "gtFine" / split, f"*/*{label_end}")}
     elif (root / split).is_dir():
         where = root / split
-        images = {f.stem: f for f in where.glob("*.png")}
-        labels = {f.stem: f for f in (root / f"{split}annot").glob("*.png")}
+        images = {f.stem: f for f in listed(where)}
+        labels = {f.stem: f for f in listed(root / f"{split}annot")}
     else:
         raise InputError(f"{root}: holds neither leftImg8bit/{split} nor {split}; see the README for the two layouts")
     return images, labels, where

@@ -63,6 +63,11 @@ def _png_is_whole(data):
     return False
 
 
+def listed(folder, pattern="*.png"):
+    """Files of a folder that match, sorted; hidden ones are left out: a killed run may leave a half-written one."""
+    return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
+
+
 @contextmanager
 def atomic(path):
     """Yield a temporary path beside `path`; rename it when the block ends well, delete it when it does not."""

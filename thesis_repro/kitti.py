@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from thesis_repro import InputError
-from thesis_repro.files import read_gray, write_text
+from thesis_repro.files import listed, read_gray, write_text
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Sequence:
         images = self.folder / "image_0"
         if not images.is_dir():
             raise InputError(f"{images}: no such folder; sequence {self.name} must hold its gray frames there")
-        self.frame_paths = sorted(images.glob("*.png"))
+        self.frame_paths = listed(images)
         if not self.frame_paths:
             raise InputError(f"{images}: holds no PNG frames; sequence {self.name} is empty")
         self.intrinsics = _read_intrinsics(self.folder / "calib.txt")

@@ -11,7 +11,7 @@ import numpy as np
 
 from thesis_repro import InputError
 from thesis_repro.cityscapes import read_label_map
-from thesis_repro.files import read_gray
+from thesis_repro.files import listed, read_gray
 
 CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
 BOUNDARIES = ("canny", "exact")
@@ -111,7 +111,7 @@ def _files_of_frames(folder, sequence, what):
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence {sequence.name}")
-    present = {path.name for path in folder.glob("*.png")}
+    present = {path.name for path in listed(folder)}
     missing = [path.name for path in sequence.frame_paths if path.name not in present]
     if missing:
         raise InputError(f"{folder / missing[0]}: no such {what} ({len(missing)} of {len(sequence)} frames of sequence "
