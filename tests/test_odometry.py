@@ -15,6 +15,7 @@ from thesis_repro.files import read_gray
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import PYSLAM_2024, THESIS, Odometry
 
+SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {"points": "n_kps_to_lk", "detected": "n_detected", "tracked": "n_tracked", "inliers": "n_inliers_E",
           "pose_inliers": "n_inliers_recoverPose"}
 
@@ -132,7 +133,7 @@ def test_a_threaded_opencv_changes_no_bit(drive):
         results = []
         for count in (1, 4):
             cv2.setNumThreads(count)
-            results.append(odometry.run(drive).poses)
+            results.append(odometry.run(Changed(drive, frames=4)).poses)
     finally:
         cv2.setNumThreads(threads)
     np.testing.assert_array_equal(*results)
@@ -173,11 +174,11 @@ def test_vote_is_opencvs_to_the_last_bit(drive, kind):
 class Changed:
     """A sequence with some of its frames replaced."""
 
-    def __init__(self, sequence, frames=None, poses=None):
+    def __init__(self, sequence, replaced=None, poses=None, frames=None):
         self.name, self.intrinsics = sequence.name, sequence.intrinsics
-        self.poses = sequence.poses if poses is None else poses
-        self.images = list(sequence.images)
-        for index, image in (frames or {}).items():
+        self.poses = (sequence.poses if poses is None else poses)[:frames]
+        self.images = list(sequence.images)[:frames]
+        for index, image in (replaced or {}).items():
             self.images[index] = image
 
     def __len__(self):
@@ -288,7 +289,7 @@ def test_masks_in_the_detector_refill_the_quota_and_filters_do_not(drive):
 
 
 def test_permutations_vary_the_path_and_repeat_by_seed(drive):
-    first, again, other, plain = (odometry.run(drive, replace(THESIS, permute=seed)).poses for seed in (0, 0, 1, None))
+    first, again, other, plain = (odometry.run(Changed(drive, frames=4), replace(SMALL, permute=seed)).poses for seed in (0, 0, 1, None))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-6 and np.abs(first - plain).max() > 1e-6
 
@@ -308,7 +309,8 @@ def test_permuted_inliers_belong_to_their_correspondences(drive):
 
 
 def test_refinement_is_closer_to_the_truth_and_varies_less(drive):
-    errors = {choice: [metrics.rmse(odometry.run(drive, replace(THESIS, pose=choice, permute=seed)).poses, drive.poses)
+    few = Changed(drive, frames=6)
+    errors = {choice: [metrics.rmse(odometry.run(few, replace(THESIS, pose=choice, permute=seed)).poses, few.poses)
                        for seed in range(3)] for choice in ("inliers", "refined")}
     assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
     assert np.std(errors["refined"]) < 0.5 * np.std(errors["inliers"])
@@ -343,9 +345,10 @@ def test_inliers_alone_decide_the_sign():
 
 @pytest.mark.parametrize("estimator", ["usac", "usac-accurate", "usac-magsac"])
 def test_other_estimators_find_the_way(drive, estimator):
-    result = odometry.run(drive, replace(THESIS, estimator=estimator))
-    assert metrics.rmse(result.poses, drive.poses) < 0.05
-    assert np.abs(result.poses - odometry.run(drive).poses).max() > 1e-9
+    few = Changed(drive, frames=5)
+    result = odometry.run(few, replace(THESIS, estimator=estimator))
+    assert metrics.rmse(result.poses, few.poses) < 0.05
+    assert np.abs(result.poses - odometry.run(few).poses).max() > 1e-9
 
 
 def test_orb_keypoints_find_the_way(drive):
@@ -361,12 +364,12 @@ def test_minimum_distance_thins_the_keypoints_out(drive):
 
 
 def test_the_later_pyslam_turns_first_and_gates_on_the_shift_of_points(drive):
-    frames = odometry.run(drive, PYSLAM_2024).frames
-    assert frames["updated"][1:].all()
-    gated = odometry.run(drive, replace(PYSLAM_2024, shift_gate=50.0)).frames
+    few = Changed(drive, frames=4)
+    assert odometry.run(few, PYSLAM_2024).frames["updated"][1:].all()
+    gated = odometry.run(few, replace(PYSLAM_2024, shift_gate=50.0)).frames
     assert (gated["flag"][1:] == "stationary").all()
-    late = odometry.run(drive, replace(THESIS, rotate_first=True))
-    early = odometry.run(drive)
+    start = Changed(drive, frames=2)
+    late, early = odometry.run(start, replace(THESIS, rotate_first=True)), odometry.run(start)
     expected = early.poses[0][:3, 3] + early.frames["scale"][1] * (
         late.poses[1][:3, :3] @ (early.poses[1][:3, 3] / early.frames["scale"][1]))
     np.testing.assert_allclose(late.poses[1][:3, 3], expected, atol=1e-12)
@@ -376,12 +379,12 @@ def test_the_later_pyslam_turns_first_and_gates_on_the_shift_of_points(drive):
 
 
 def variants():
-    runs = {f"stripes-{width}": (THESIS, Stripes(width)) for width in (7, 20, 40)}
+    runs = {f"stripes-{width}": (SMALL, Stripes(width)) for width in (7, 20)}
     runs["all"] = (THESIS, None)
     runs["reduced"] = (replace(THESIS, max_keypoints=300), None)
-    runs["kept"] = (replace(THESIS, redetect_below=800, max_keypoints=1000), None)  # tracks fractional positions on
-    runs["filter"] = (replace(THESIS, mask_mode="filter", min_distance=4.5), Stripes(40))
-    runs["orb"] = (replace(THESIS, detector="orb"), Stripes(40))
+    runs["kept"] = (replace(SMALL, redetect_below=450), None)  # tracks fractional positions on
+    runs["filter"] = (replace(SMALL, mask_mode="filter", min_distance=4.5), Stripes(40))
+    runs["orb"] = (replace(SMALL, detector="orb"), Stripes(40))
     runs["empty"] = (THESIS, [np.zeros((160, 480), np.uint8)] * 10)
     return runs
 
@@ -393,7 +396,7 @@ def assert_same(one, other):
 
 
 def test_many_runs_in_one_pass_give_the_bits_of_separate_runs(drive):
-    bad = Changed(drive, {5: np.zeros_like(drive.frame(0))})
+    bad = Changed(drive, {4: np.zeros_like(drive.frame(0))}, frames=7)
     together = odometry.run_many(bad, variants())
     threaded = odometry.run_many(bad, variants(), workers=3)
     for name, (settings, masks) in variants().items():
@@ -439,11 +442,11 @@ def test_a_killed_pass_goes_on_with_the_same_bits(drive, tmp_path, monkeypatch):
             self.asked.append(index)
             return super().frame(index)
 
-    resumed = odometry.run_many(Remembering(drive), runs, checkpoint=file)
+    resumed = odometry.run_many(Remembering(drive), runs, description="street", checkpoint=file)
     assert Remembering.asked == [4, 5, 6, 7, 8, 9]
     for name, (settings, masks) in runs.items():
         assert_same(resumed[name], odometry.run(drive, settings, masks))
-    # another kind of run, or a damaged file, starts from the beginning
+    # another kind of run (its settings differ), or a damaged file, starts from the beginning
     Remembering.asked.clear()
     odometry.run(Remembering(drive), checkpoint=file)
     assert Remembering.asked == list(range(10))
@@ -451,6 +454,16 @@ def test_a_killed_pass_goes_on_with_the_same_bits(drive, tmp_path, monkeypatch):
     Remembering.asked.clear()
     odometry.run(Remembering(drive), checkpoint=file)
     assert Remembering.asked == list(range(10))
+
+
+def test_what_fails_in_a_thread_stops_the_pass(drive, monkeypatch):
+    def broken(*arguments):
+        raise ValueError("broken")
+
+    monkeypatch.setattr(pose, "recover_pose", broken)
+    with pytest.raises(ValueError, match="broken"):
+        odometry.run_many(drive, {"all": (THESIS, None), "reduced": (replace(THESIS, max_keypoints=50), None)},
+                          workers=2)
 
 
 # Bad input

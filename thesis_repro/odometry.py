@@ -330,8 +330,8 @@ def _run(sequence, runs, features, description, checkpoint, workers):
     rows = {name: [] for name in runs}
     metres = scales(sequence)
     # Everything that has to be the same for a checkpoint to go on from
-    kind = (sequence.name, len(sequence), sequence.intrinsics.tobytes(), sequence.poses.tobytes(), cv2.__version__,
-            {name: settings for name, (settings, _) in runs.items()})
+    kind = (COLUMNS, sequence.name, len(sequence), sequence.intrinsics.tobytes(), sequence.poses.tobytes(),
+            cv2.__version__, {name: settings for name, (settings, _) in runs.items()})
     done = _resume(checkpoint, kind, odometries, rows)
     with ThreadPoolExecutor(workers) as pool:
         waiting = []
@@ -349,16 +349,13 @@ def _run(sequence, runs, features, description, checkpoint, workers):
                 job = pool.submit(odometry.estimate, step) if workers > 1 else odometry.estimate(step)
                 observed.append((name, step, job, mask_seconds))
             # What is tracked next does not depend on the pose, so the estimators may be one frame behind.
-            for entry in waiting:
-                _finish(odometries, rows, *entry)
+            _finish(waiting, odometries, rows)
             waiting = observed
             if checkpoint and (index + 1) % CHECKPOINT == 0:
-                for entry in waiting:
-                    _finish(odometries, rows, *entry)
+                _finish(waiting, odometries, rows)
                 waiting = []
                 _store(checkpoint, kind, index + 1, odometries, rows)
-        for entry in waiting:
-            _finish(odometries, rows, *entry)
+        _finish(waiting, odometries, rows)
     return {name: _result(table, runs[name][0]) for name, table in rows.items()}
 
 
@@ -366,11 +363,12 @@ def _with_bar(indices, description, total):
     return indices if description is None else progress(indices, description, total=total, initial=indices.start)
 
 
-def _finish(odometries, rows, name, step, job, mask_seconds):
-    if job is not None:
-        job.result()  # raises what the thread raised
-    row = odometries[name].compose(step).row()
-    rows[name].append((*row.values(), mask_seconds))
+def _finish(waiting, odometries, rows):
+    for name, step, job, mask_seconds in waiting:
+        if job is not None:
+            job.result()  # raises what the thread raised
+        row = odometries[name].compose(step).row()
+        rows[name].append((*row.values(), mask_seconds))
 
 
 def _store(checkpoint, kind, done, odometries, rows):
