@@ -1,8 +1,8 @@
-import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import keras
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 from thesis_repro import InputError, augmentation, training
 from thesis_repro.unet import build_unet
 
+ROOT = Path(__file__).parent.parent
 SIZE = 32
 SMALL = dict(base_filters=2, batch_size=4, epochs=3, learning_rate=0.01)
 
@@ -107,9 +108,12 @@ def test_fresh_augmentation_differs_from_epoch_to_epoch():
     assert len(changed[0]) == len(changed[1]) == 9 and not changed[0] & changed[1]
 
 
-def test_same_seed_same_model(trained, tmp_path):
-    training.train(*SETS, tmp_path, **SMALL)
+def test_same_seed_same_model_and_callbacks_see_every_epoch(trained, tmp_path):
+    seen = []
+    callback = keras.callbacks.LambdaCallback(on_epoch_end=lambda epoch, logs: seen.append(logs["val_loss"]))
+    training.train(*SETS, tmp_path, **SMALL, callbacks=[callback])
 
+    assert seen == pytest.approx(pd.read_csv(tmp_path / "history.csv")["val_loss"].tolist())
     for a, b in zip(weights_of(tmp_path / "model.keras"), weights_of(trained / "model.keras"), strict=True):
         assert np.array_equal(a, b)
 
@@ -118,7 +122,7 @@ def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path):
     code = ("import sys; sys.path.insert(0, 'tests'); import test_training as t; "
             f"t.training.train(*t.SETS, {str(tmp_path)!r}, **t.SMALL)")
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL,
-                               cwd=os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+                               cwd=ROOT)
     deadline = time.monotonic() + 120
     while not (tmp_path / "state.npz").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -131,6 +135,19 @@ def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path):
     assert (tmp_path / "history.csv").read_text() == (trained / "history.csv").read_text()
     for a, b in zip(weights_of(tmp_path / "model.keras"), weights_of(trained / "model.keras"), strict=True):
         assert np.array_equal(a, b)
+
+
+def test_several_devices_share_each_batch(tmp_path):
+    code = ("import sys; import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
+            "tf.config.set_logical_device_configuration(cpu, [tf.config.LogicalDeviceConfiguration()] * 2); "
+            "sys.path.insert(0, 'tests'); import test_training as t; "
+            "t.training._strategy = lambda: tf.distribute.MirroredStrategy(['CPU:0', 'CPU:1']); "
+            f"[t.training.train(*t.SETS, {str(tmp_path)!r}, **t.SMALL | dict(epochs=n)) for n in (1, 2)]")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300)
+
+    assert done.returncode == 0, done.stderr[-2000:]
+    history = pd.read_csv(tmp_path / "history.csv")  # the second epoch was resumed
+    assert history["epoch"].tolist() == [1, 2] and history["loss"].iloc[1] < history["loss"].iloc[0]
 
 
 def test_a_finished_training_is_loaded(trained):
@@ -171,14 +188,6 @@ def test_a_damaged_state(trained, tmp_path):
 def test_bad_sets(sets, message, tmp_path):
     with pytest.raises(InputError, match=message):
         training.train(*sets, tmp_path, **SMALL)
-
-
-def test_callbacks_of_the_caller_see_every_epoch(tmp_path):
-    seen = []
-    callback = keras.callbacks.LambdaCallback(on_epoch_end=lambda epoch, logs: seen.append(logs["val_loss"]))
-    training.train(*SETS, tmp_path, **SMALL | dict(epochs=2), callbacks=[callback])
-
-    assert seen == pytest.approx(pd.read_csv(tmp_path / "history.csv")["val_loss"].tolist())
 
 
 def test_the_appendixs_hdf5_loads(trained, tmp_path):

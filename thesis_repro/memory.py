@@ -1,13 +1,39 @@
-"""Whether a batch fits into memory, asked beforehand: a process that runs out of it is killed without a word."""
+"""Memory for batches: whether one fits, asked beforehand, and how the system's allocator is to treat them.
 
+A process that runs out of memory is killed without a word, so nobody would know what to change.
+"""
+
+import ctypes
 import math
+import sys
 from pathlib import Path
 
 from thesis_repro import InputError
 
 FLOAT = 4  # bytes
+GRADIENTS = 1.4  # training's peak over the sum of all outputs; 1.5 to 1.9 were measured on U-Nets of 16 to 64 filters
 _CGROUPS = (("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
             ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"))
+
+# glibc's names for what `keep_freed` sets, and the values
+_MALLOC_OPTIONS = {"M_ARENA_MAX": (-8, 1), "M_MMAP_MAX": (-4, 0), "M_TRIM_THRESHOLD": (-1, 2**31 - 1),
+                   "M_TOP_PAD": (-2, 2**28)}
+
+
+def keep_freed():
+    """Have the C library keep freed memory for the next batch instead of giving it back to the system.
+
+    TensorFlow on a CPU allocates every tensor anew. By default glibc asks the system for each large one, which hands
+    it over page by page, zeroed: half the time of a training step. Does nothing where there is no glibc.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError):  # another C library
+        return
+    for option, value in _MALLOC_OPTIONS.values():
+        mallopt(ctypes.c_int(option), ctypes.c_int(value))
 
 
 def available():
@@ -36,11 +62,12 @@ def available():
 def needed(model, batch_size, training):
     """Bytes that a batch takes at the least.
 
-    Training keeps the output of every layer until the way back; prediction needs one layer's input and output.
+    Training keeps the output of every layer until the way back, where gradients come on top; prediction needs one
+    layer's input and output.
     """
     sizes = {layer.name: _values(layer.output) for layer in model.layers}
     if training:
-        return batch_size * FLOAT * sum(sizes.values())
+        return int(GRADIENTS * batch_size * FLOAT * sum(sizes.values()))
     return batch_size * FLOAT * max(_values(layer.input) + sizes[layer.name] for layer in model.layers)
 
 

@@ -130,6 +130,7 @@ def _claim(model, targets, output_dir, batch_size):
 def _compiled(model):
     """A compiled function from uint8 images to uint8 label maps. `model.predict` costs two to three times as much:
     it sets up anew for each call, hands over 35 probabilities a pixel, and normalises where a convolution could."""
+    memory.keep_freed()
     network = folded(model)
     signature = tf.TensorSpec((None, *model.input_shape[1:]), tf.uint8)
 

@@ -146,6 +146,7 @@ def train(train_images, train_labels, validation_images, validation_labels, fold
         compile_model(model, learning_rate)
         model.optimizer.build(model.trainable_variables)
     memory.require(model, batch_size, training=True)
+    memory.keep_freed()
     record = _Record(model, folder, settings, patience)
     if not record.finished(epochs):
         augmenter = augmentation.training_augmenter(size)
