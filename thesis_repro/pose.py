@@ -188,23 +188,31 @@ def refine(rotation, translation, current, previous, inliers, threshold):
     by which RANSAC chose its inliers is gone as well. An essential matrix does not know the sign of the translation,
     so the sign that was voted for is kept.
     """
-    turned, direction, chosen = rotation, translation, inliers
+    turned, direction, chosen = np.ascontiguousarray(rotation), np.ascontiguousarray(translation), inliers
     for _ in range(REFINE_ROUNDS):
         if chosen.sum() < MIN_CORRESPONDENCES:
             break
         turned, direction = _refine(turned, direction, current[chosen], previous[chosen], threshold / 2)
-        chosen = np.abs(_sampson_distances(turned, direction, current, previous)) < 2 * threshold
+        chosen = _near(turned, direction, current, previous, 2 * threshold)
     return turned, direction if direction @ translation >= 0 else -direction
 
 
-def _sampson_distances(rotation, translation, current, previous):
-    """Signed distances (N,) of correspondences from agreeing with a motion, in normalised coordinates."""
-    matrix = _skew(translation) @ rotation
-    lines = current @ matrix[:, :2].T + matrix[:, 2]  # E (x, y, 1), in the previous frame
-    others = previous @ matrix[:2, :2] + matrix[2, :2]  # E^T (u, v, 1), in the current frame, first two rows
-    algebraic = (previous * lines[:, :2]).sum(axis=1) + lines[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return algebraic / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (others ** 2).sum(axis=1))
+@njit(cache=True, nogil=True)
+def _near(r, t, current, previous, limit):
+    """N booleans: the correspondences whose Sampson distance from the motion is below the limit."""
+    e = np.dot(_skew(t), r)
+    near = np.empty(len(current), np.bool_)
+    for index in range(len(current)):
+        x, y = current[index, 0], current[index, 1]
+        u, v = previous[index, 0], previous[index, 1]
+        l0 = e[0, 0] * x + e[0, 1] * y + e[0, 2]
+        l1 = e[1, 0] * x + e[1, 1] * y + e[1, 2]
+        l2 = e[2, 0] * x + e[2, 1] * y + e[2, 2]
+        m0 = e[0, 0] * u + e[1, 0] * v + e[2, 0]
+        m1 = e[0, 1] * u + e[1, 1] * v + e[2, 1]
+        algebraic = u * l0 + v * l1 + l2
+        near[index] = algebraic * algebraic < limit * limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+    return near
 
 
 @njit(cache=True, nogil=True)
@@ -220,7 +228,7 @@ def _refine(rotation, translation, current, previous, scale):
         r_new, t_new = _moved(r, t, change)
         cost_new, hessian_new, gradient_new = _normal_equations(r_new, t_new, current, previous, scale)
         if cost_new < cost:
-            settled = cost - cost_new < 1e-7 * cost
+            settled = cost - cost_new < 1e-6 * cost
             r, t, cost, hessian, gradient = r_new, t_new, cost_new, hessian_new, gradient_new
             damping *= 0.1
             if settled:
@@ -304,6 +312,9 @@ def _normal_equations(r, t, current, previous, scale):
         cost += np.log(1 + ratio * ratio)
         for k in range(5):
             gradient[k] += weight * residual * jacobian[k]
-            for j in range(5):
+            for j in range(k + 1):
                 hessian[k, j] += weight * jacobian[k] * jacobian[j]
+    for k in range(5):
+        for j in range(k):
+            hessian[j, k] = hessian[k, j]
     return cost, hessian, gradient
