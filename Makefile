@@ -21,21 +21,9 @@ endif
 absolute = $(if $(filter /% ~%,$(firstword $(1))),$(1),$(CURDIR)/$(1))
 
 export THESIS_REPRO_PROFILE := $(PROFILE)
-ifneq (,$(KITTI))
-export THESIS_REPRO_KITTI := $(call absolute,$(KITTI))
-endif
-ifneq (,$(CITYSCAPES))
-export THESIS_REPRO_CITYSCAPES := $(call absolute,$(CITYSCAPES))
-endif
-ifneq (,$(BUILD))
-export THESIS_REPRO_BUILD := $(call absolute,$(BUILD))
-endif
-ifneq (,$(FIGURES))
-export THESIS_REPRO_FIGURES := $(call absolute,$(FIGURES))
-endif
-ifneq (,$(JOBS))
-export THESIS_REPRO_JOBS := $(JOBS)
-endif
+$(foreach name,KITTI CITYSCAPES BUILD FIGURES,$(if $($(name)),\
+  $(eval export THESIS_REPRO_$(name) := $(call absolute,$($(name))))))
+$(if $(JOBS),$(eval export THESIS_REPRO_JOBS := $(JOBS)))
 DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)")
 # what the libraries would otherwise say or look up
 export SM_FRAMEWORK := tf.keras

@@ -152,6 +152,8 @@ def figure_a_01(rows, total, trainable):
 
 
 def _class_legend(figure, *label_maps):
-    present = np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps]))
-    handles = [Patch(color=np.array(LABELS[i].color) / 255, label=LABELS[i].name) for i in present]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=7)
+    names = {}  # Cityscapes gives several labels one colour
+    for index in np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps])):
+        names.setdefault(LABELS[index].color, []).append(LABELS[index].name)
+    handles = [Patch(color=np.array(color) / 255, label=", ".join(some)) for color, some in names.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7)

@@ -55,7 +55,7 @@ PROFILES = {
     "smoke": Profile(image_size=64, base_filters=4, batch_size=4, epochs=2, patience=5, training_images=16, frames=12,
                      widths=(1, 5, 10, 15), world_sequences=2, world_frames=12,
                      world_training_images=12, world_validation_images=4),
-    "demo": Profile(image_size=160, base_filters=8, batch_size=4, epochs=25, patience=5, training_images=400,
+    "demo": Profile(image_size=160, base_filters=8, batch_size=4, epochs=25, patience=5, training_images=200,
                     frames=200, widths=ALL_WIDTHS, world_sequences=11, world_frames=40,
                     world_training_images=100, world_validation_images=20),
     "thesis": Profile(image_size=320, base_filters=64, batch_size=16, epochs=100, patience=5, training_images=None,
