@@ -60,16 +60,50 @@ def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, label
     lost.unlink()
     again = experiments.run(jobs, small_world / "kitti", labels, folder)
     assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost}
-    pd.testing.assert_frame_equal(again.drop(columns="seconds"), summary.drop(columns="seconds"))
+    pd.testing.assert_frame_equal(again, summary)
 
 
 def test_a_failing_run_is_reported_and_stops_no_other(small_world, labels, tmp_path, capsys):
     jobs = [Job("00", "baseline"), Job("00", "masked", dilation_width=0)]
     summary = experiments.run(jobs, small_world / "kitti", labels, tmp_path)
     assert list(summary["run"]) == ["baseline"]
-    assert "sequence 00, masked: failed: InputError: dilation width 0" in capsys.readouterr().out
-    with pytest.raises(InputError, match="all 1 odometry runs failed; the first: InputError: dilation width 0"):
+    assert "sequence 00, masked: failed: dilation width 0" in capsys.readouterr().out
+    with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
         experiments.run(jobs[1:], small_world / "kitti", labels, tmp_path)
+
+
+def test_a_killed_pass_goes_on_from_its_checkpoint(small_world, labels, finished, tmp_path, monkeypatch):
+    folder, jobs, _ = finished
+    jobs = [job for job in jobs if job.sequence == "00" and job.variant != "reduced"]
+    monkeypatch.setattr(odometry, "CHECKPOINT", 5)
+    read = []
+
+    def frame(self, index, original=Sequence.frame):
+        read.append(index)
+        if index == 8 and len(read) < 12:
+            raise OSError("pulled the plug")
+        return original(self, index)
+
+    monkeypatch.setattr(Sequence, "frame", frame)
+    with pytest.raises(InputError, match="pulled the plug"):
+        experiments.run(jobs, small_world / "kitti", labels, tmp_path)
+    assert [path.name for path in (tmp_path / "00").glob("*") if path.suffix != ".json"] == ["checkpoint"]
+    read.extend([None] * 12)
+    experiments.run(jobs, small_world / "kitti", labels, tmp_path)
+    assert read[-7:] == list(range(5, 12))
+    for job in jobs:
+        one, two = (pd.read_csv(root / "00" / f"{job.name}.csv") for root in (folder, tmp_path))
+        exact = [column for column in one if not column.endswith("seconds")]
+        pd.testing.assert_frame_equal(one[exact], two[exact], check_exact=True)
+
+
+def test_runs_are_timed_once_and_on_their_own(small_world, labels, finished, monkeypatch):
+    folder, jobs, _ = finished
+    first = [job for job in jobs if job.variant != "reduced"]
+    timed = experiments.time_runs(first, small_world / "kitti", labels, folder, frames=4)
+    assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
+    again = experiments.time_runs(first, small_world / "kitti", labels, folder, frames=4)
+    pd.testing.assert_frame_equal(timed, again)
 
 
 def made_up(changes):

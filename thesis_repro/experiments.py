@@ -3,6 +3,7 @@
 Each finished run is one CSV file, so that a stopped or failed series goes on where it was.
 """
 
+import time
 from dataclasses import asdict, dataclass, replace
 
 import cv2
@@ -13,10 +14,8 @@ import pandas as pd
 from thesis_repro import InputError, metrics, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks
+from thesis_repro.masks import LabelMasks, forget_edges
 
-# Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
-TIMED = ("mask", "detect", "track", "essential", "pose")
 CODE = ("experiments", "keypoints", "kitti", "masks", "odometry", "pose")  # what a finished run depends on
 
 
@@ -57,50 +56,115 @@ def reduced_jobs(summary):
 
 
 def run(jobs, kitti, labels, folder, *, frames=None, processes=1, settings=odometry.THESIS):
-    """Run the jobs that have no result yet, `processes` at a time; returns the summary of all that succeeded.
+    """Run the jobs that have no result yet; returns the summary of all that succeeded, one row a job.
 
-    kitti: the odometry root. labels: folder with one folder of label maps a sequence. folder: where results are kept.
-    frames: how many of each sequence, None for all. A job that fails is printed with its reason and stops no other.
+    The jobs of one sequence go over it together (`odometry.run_many`: the bits of separate runs at a third of the
+    cost), and `processes` sequences at a time. kitti: the odometry root. labels: folder with one folder of label maps
+    a sequence. folder: where results are kept. frames: how many of each sequence, None for all.
+    A job that fails is printed with its reason and does not stop the others.
     """
-    names = sorted({job.sequence for job in jobs})
-    sequences = {name: Sequence(kitti, name).subset(frames) for name in names}
-    for name, sequence in sequences.items():
-        stages.stage(folder / name, code=stages.code(*CODE), frames=stages.listing(sequence.frame_paths),
-                     poses=stages.content(sequence.root / "poses" / f"{name}.txt"), opencv=cv2.__version__,
-                     labels=stages.made_from(labels / name), settings=asdict(settings))
-    waiting = [job for job in jobs if not _result(folder, job).is_file()]
+    sequences = _open(jobs, kitti, labels, folder, frames, settings)
+    waiting = {name: [job for job in jobs if job.sequence == name and not _result(folder, job).is_file()]
+               for name in sequences}
     # the longest first, so that no process works alone at the end
-    waiting.sort(key=lambda job: -len(sequences[job.sequence]))
+    names = sorted((name for name in waiting if waiting[name]), key=lambda name: -len(sequences[name]))
+    threads = -(-processes // max(1, len(names)))
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")(
-        joblib.delayed(_run_job)(job, sequences[job.sequence], labels, folder, settings) for job in waiting)
+        joblib.delayed(_run_jobs)(waiting[name], sequences[name], labels, folder, settings, threads) for name in names)
     failures = {}
-    for job, failure in progress(work, "odometry", total=len(waiting), unit="run"):
-        if failure:
-            failures[job] = failure
-            print(f"sequence {job.sequence}, {job.name}: failed: {failure}")
+    for failed in progress(work, "odometry", total=len(names), unit="sequence"):
+        failures.update(failed)
+    for job, reason in failures.items():
+        print(f"sequence {job.sequence}, {job.name}: failed: {reason}")
     done = [job for job in jobs if job not in failures]
     if not done:
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
     return pd.DataFrame([_summarize(job, sequences[job.sequence], folder) for job in done])
 
 
+def _open(jobs, kitti, labels, folder, frames, settings):
+    """The jobs' sequences by name; what the folder holds of other data, settings or code is deleted."""
+    sequences = {name: Sequence(kitti, name).subset(frames) for name in sorted({job.sequence for job in jobs})}
+    for name, sequence in sequences.items():
+        stages.stage(folder / name, code=stages.code(*CODE), frames=stages.listing(sequence.frame_paths),
+                     poses=stages.content(sequence.root / "poses" / f"{name}.txt"), opencv=cv2.__version__,
+                     labels=stages.made_from(labels / name), settings=asdict(settings))
+    return sequences
+
+
 def _result(folder, job):
     return folder / job.sequence / f"{job.name}.csv"
 
 
-def _run_job(job, sequence, labels, folder, settings):
-    cv2.setNumThreads(1)  # the processes already use every core, and one thread makes times comparable
+def _variant(job, sequence, labels, settings):
+    """What the odometry needs to know of a job: (settings, masks)."""
+    if job.max_keypoints:
+        settings = replace(settings, max_keypoints=job.max_keypoints)
+    masked = job.variant == "masked"
+    return settings, LabelMasks(labels / job.sequence, sequence, job.dilation_width) if masked else None
+
+
+def _run_jobs(jobs, sequence, labels, folder, settings, threads):
+    """Run the jobs of one sequence in one pass; returns {job: reason} of those that failed."""
+    cv2.setNumThreads(1)  # the processes already use every core
+    variants, failures = {}, {}
+    for job in jobs:
+        try:
+            variants[job] = _variant(job, sequence, labels, settings)
+        except InputError as error:
+            failures[job] = str(error)
+    if not variants:
+        return failures
+    checkpoint = folder / sequence.name / "checkpoint"
     try:
-        masks = None
-        if job.variant == "masked":
-            masks = LabelMasks(labels / job.sequence, sequence, job.dilation_width)
-        if job.max_keypoints:
-            settings = replace(settings, max_keypoints=job.max_keypoints)
-        result = odometry.run(sequence, settings, masks)
-    except Exception as error:  # whatever it is, the other runs go on and the reason is reported
-        return job, f"{type(error).__name__}: {error}"
-    write_text(_result(folder, job), result.frames.to_csv(index=False))
-    return job, None
+        results = odometry.run_many(sequence, {job.name: variant for job, variant in variants.items()},
+                                    checkpoint=checkpoint, workers=threads)
+    except Exception as error:  # whatever it is, the other sequences go on and the reason is reported
+        return failures | {job: f"{type(error).__name__}: {error}" for job in variants}
+    for job in variants:
+        write_text(_result(folder, job), results[job.name].frames.to_csv(index=False))
+    checkpoint.unlink(missing_ok=True)
+    return failures
+
+
+def time_runs(jobs, kitti, labels, folder, *, frames, processes=1, settings=odometry.THESIS):
+    """What each job costs as a run of its own: a table of sequence, run, variant, dilation_width and seconds.
+
+    Only the first `frames` frames are timed; the first two steps are left out, since they load compiled code. The jobs
+    of a sequence take turns at every frame, so that what else the machine does falls on all of them alike.
+    To be called after `run`, whose folder it shares.
+    """
+    files = {name: folder / name / f"seconds-{frames}.csv" for name in sorted({job.sequence for job in jobs})}
+    waiting = [name for name in files if not files[name].is_file()]
+    work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")(
+        joblib.delayed(_time_jobs)([job for job in jobs if job.sequence == name],
+                                   Sequence(kitti, name).subset(frames), labels, files[name], settings)
+        for name in waiting)
+    for _ in progress(work, "timing", total=len(waiting), unit="sequence"):
+        pass
+    return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in files.values()], ignore_index=True)
+
+
+def _time_jobs(jobs, sequence, labels, path, settings):
+    cv2.setNumThreads(1)  # one thread makes times comparable
+    scales = odometry.scales(sequence)
+    variants = {job: _variant(job, sequence, labels, settings) for job in jobs}
+    runs = {job: odometry.Odometry(sequence.intrinsics, chosen) for job, (chosen, _) in variants.items()}
+    seconds = dict.fromkeys(jobs, 0.0)
+    for index in range(len(sequence)):
+        frame = sequence.frame(index)
+        for job, (_, masks) in variants.items():
+            forget_edges()  # each run of its own would have to make them
+            started = time.perf_counter()
+            mask = None if masks is None else masks[index]
+            mask_seconds = time.perf_counter() - started
+            step = runs[job].step(frame, scales[index], mask)
+            if index > 1:
+                # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
+                seconds[job] += mask_seconds + sum(step.seconds.values())
+    table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "variant": job.variant,
+                           "dilation_width": job.dilation_width, "seconds": seconds[job]} for job in jobs])
+    write_text(path, table.to_csv(index=False))
 
 
 def _summarize(job, sequence, folder):
@@ -113,7 +177,6 @@ def _summarize(job, sequence, folder):
         "max_keypoints": job.max_keypoints, "frames": len(frames),
         "rmse": metrics.rmse(poses, sequence.poses), "mae": metrics.mae(poses, sequence.poses),
         "mean_keypoints": frames["detected"].mean(),
-        "seconds": frames[[f"{part}_seconds" for part in TIMED]].to_numpy().sum(),
         "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
     }
 

@@ -1,7 +1,7 @@
 """Figures 4.6, 4.7, 4.9 to 4.17 and Tables 4.1 to 4.3, from the tables that experiments.py leaves on disk.
 
 `summary` has one row a run: sequence, run, variant (baseline, masked, reduced), dilation_width, frames, rmse, mae
-(metres), mean_keypoints, seconds (of the whole sequence), flagged (frames whose pose was not estimated).
+(metres), mean_keypoints, flagged (frames whose pose was not estimated).
 """
 
 import numpy as np
@@ -149,19 +149,20 @@ def figure_breakdown(summary, metric):
     return figure
 
 
-def time_savings(summary):
-    """Equation 4.2 for each dilation width: percent by which the total time of all sequences changes.
+def time_savings(seconds):
+    """Equation 4.2 for each dilation width, from the table of `experiments.time_runs`: percent by which the total
+    time of all sequences changes.
 
     Negative where time is saved, as the thesis defines it. Mask making is included, prediction is not.
     """
-    baseline = summary[summary["variant"] == "baseline"]["seconds"].sum()
-    masked = summary[summary["variant"] == "masked"].groupby("dilation_width")["seconds"].sum()
+    baseline = seconds[seconds["variant"] == "baseline"]["seconds"].sum()
+    masked = seconds[seconds["variant"] == "masked"].groupby("dilation_width")["seconds"].sum()
     return percent_change(masked, baseline)
 
 
-def figure_4_17(summary):
+def figure_4_17(seconds):
     """Percent time savings of each dilation width (Equation 4.2)."""
-    savings = time_savings(summary)
+    savings = time_savings(seconds)
     figure, axes = new_figure(height=3.0)
     axes.bar(savings.index.astype(int), savings, color=MASKED)
     axes.axhline(0, color="black", linewidth=0.8)

@@ -86,6 +86,11 @@ def _edges_of_file(path, size, boundaries):
     return edges(read_label_map(path), size, boundaries)
 
 
+def forget_edges():
+    """Drop the edges that LabelMasks keeps for its next width, so that the making of a mask can be timed."""
+    _edges_of_file.cache_clear()
+
+
 class MaskFolder:
     """Masks of a sequence read from a folder of images named like the frames: masks[i] for frame i.
 

@@ -36,6 +36,7 @@ class Profile:
     patience: int  # epochs without a lower validation loss before training stops
     training_images: int | None  # images taken from the training split
     frames: int | None  # frames taken from the start of each sequence
+    timed_frames: int  # frames from the start of each sequence on which the cost of each width is timed
     widths: tuple  # dilation widths, pixels
     # the embedded world
     world_sequences: int
@@ -53,13 +54,13 @@ class Profile:
 
 PROFILES = {
     "smoke": Profile(image_size=64, base_filters=4, batch_size=4, epochs=2, patience=5, training_images=16, frames=12,
-                     widths=(1, 5, 10, 15), world_sequences=2, world_frames=12,
+                     timed_frames=5, widths=(1, 5, 10, 15), world_sequences=2, world_frames=12,
                      world_training_images=12, world_validation_images=4),
     "demo": Profile(image_size=160, base_filters=8, batch_size=4, epochs=25, patience=5, training_images=200,
-                    frames=200, widths=ALL_WIDTHS, world_sequences=11, world_frames=40,
+                    frames=200, timed_frames=12, widths=ALL_WIDTHS, world_sequences=11, world_frames=40,
                     world_training_images=100, world_validation_images=20),
     "thesis": Profile(image_size=320, base_filters=64, batch_size=16, epochs=100, patience=5, training_images=None,
-                      frames=None, widths=ALL_WIDTHS, world_sequences=11, world_frames=300,
+                      frames=None, timed_frames=200, widths=ALL_WIDTHS, world_sequences=11, world_frames=300,
                       world_training_images=2975, world_validation_images=500),
 }
 SEED = 0
