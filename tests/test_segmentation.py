@@ -227,7 +227,7 @@ def test_backbones_predict_like_any_model(name, tmp_path):
 def test_a_backbone_trains(tmp_path):
     labels = np.where(IMAGES[..., 0] > 127, 7, 11).astype(np.uint8)
     model = training.train(IMAGES, labels, IMAGES[:2], labels[:2], tmp_path, batch_size=4, epochs=1,
-                           build=backbones.backbone_unet("mobilenetv2"))
+                           build=backbones.backbone_unet("resnet18"))
 
     assert segmentation.predict(model, IMAGES[:1]).shape == (1, SIZE, SIZE)
 

@@ -167,9 +167,11 @@ def test_early_stopping_keeps_the_best(tmp_path):
     assert losses.idxmin() == len(losses) - 3
 
 
-def test_other_settings_in_the_same_folder(trained):
+def test_other_settings_or_data_in_the_same_folder(trained):
     with pytest.raises(InputError, match="base_filters=2, not 4"):
         training.train(*SETS, trained, **SMALL | dict(base_filters=4))
+    with pytest.raises(InputError, match="data_checksum"):
+        training.train(SETS[0] // 2, *SETS[1:], trained, **SMALL)
 
 
 def test_a_damaged_state(trained, tmp_path):

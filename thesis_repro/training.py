@@ -3,6 +3,7 @@
 import json
 import os
 import zipfile
+import zlib
 from pathlib import Path
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
@@ -136,8 +137,10 @@ def train(train_images, train_labels, validation_images, validation_labels, fold
                          f"{train_images.shape[1:]}; read both at one size")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    data = zlib.crc32(b"".join(zlib.crc32(np.ascontiguousarray(array)).to_bytes(4, "big") for array in (
+        train_images, train_labels, validation_images, validation_labels)))
     settings = {"images": list(train_images.shape), "validation_images": list(validation_images.shape),
-                "base_filters": base_filters, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed,
+                "data_checksum": data, "base_filters": base_filters, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed,
                 "corrected_blocks": corrected_blocks, "full_validation_augmentation": full_validation_augmentation,
                 "fresh_augmentation": fresh_augmentation}
     keras.utils.set_random_seed(seed)
