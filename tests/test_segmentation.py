@@ -137,13 +137,15 @@ def test_two_images_of_one_name(model, frames, tmp_path):
 
 
 def test_no_memory_for_the_batch(model, monkeypatch, tmp_path):
-    need = memory.needed(model, 7, training=False)
-    monkeypatch.setattr(memory, "available", lambda: need - 1)
-    with pytest.raises(InputError, match="batch_size=7: no memory for a batch of 7 images of 64x64"):
-        segmentation.predict(model, IMAGES)
+    labels = IMAGES[..., 0] // 8
+    monkeypatch.setattr(memory, "available", lambda: memory.needed(model, 3, training=False) - 1)
+    with pytest.raises(InputError, match="batch_size=3: no memory for a batch of 3 images of 64x64"):
+        segmentation.predict(model, IMAGES, batch_size=3)
     with pytest.raises(InputError, match="batch_size=7: no memory"):
-        training.train(IMAGES, IMAGES[..., 0] // 8, IMAGES, IMAGES[..., 0] // 8, tmp_path, batch_size=7)
-    assert segmentation.predict(model, IMAGES, batch_size=6).shape == (7, SIZE, SIZE)
+        segmentation.quality(model, IMAGES, labels, batch_size=7)
+    with pytest.raises(InputError, match="batch_size=7: no memory"):
+        training.train(IMAGES, labels, IMAGES, labels, tmp_path, batch_size=7)
+    assert segmentation.predict(model, IMAGES, batch_size=2).shape == (7, SIZE, SIZE)
 
 
 def test_memory_available_follows_the_limit_of_the_process():

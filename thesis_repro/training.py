@@ -65,8 +65,8 @@ class Batches:
 
     Images (n, height, width, channels) and label maps (n, height, width) stay uint8, and the sets stay separate
     arrays; an image becomes float in its batch, and a label map one-hot in the compiled step. At 5950 images of
-    320x320 that is 1.3 GB instead of 85 GB. Unlike a `tf.data` shuffle, the order depends on (seed, epoch) alone, so that a resumed run
-    sees what an undisturbed one sees.
+    320x320 that is 1.3 GB instead of 85 GB. Unlike a `tf.data` shuffle, the order depends on (seed, epoch) alone, so
+    that a resumed run sees what an undisturbed one sees.
     """
 
     def __init__(self, sets, batch_size, seed=None, augmenter=None):
