@@ -10,7 +10,7 @@ PROFILE ?= demo
 BIN := .venv/bin
 
 # A misspelled setting must not pass for the default.
-KNOWN := KITTI CITYSCAPES PROFILE BUILD FIGURES JOBS PYTHON
+KNOWN := KITTI CITYSCAPES CAMVID PROFILE BUILD FIGURES JOBS PYTHON
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
@@ -42,7 +42,7 @@ help:
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path"
 	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
-	@echo "make weights     trains the model that ships anew, CITYSCAPES=/path/to/camvid"
+	@echo "make weights     trains the model that ships anew, CAMVID=/path/to/camvid"
 	@echo "make setup       only .venv with the pinned packages"
 	@echo "make clean       removes .venv, build and the figures of other data and profiles"
 
@@ -112,10 +112,11 @@ lab: setup
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
 	@$(BIN)/python -m thesis_repro.bench --kitti "$(or $(KITTI),build/world-demo/kitti)" --output build/bench.json
+	@$(BIN)/python -m thesis_repro.bench_segmentation
 
 weights: setup
-	@$(if $(CITYSCAPES),,echo "CITYSCAPES must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.shipped "$(CITYSCAPES)" build/weights
+	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
+	@$(BIN)/python -m thesis_repro.shipped "$(CAMVID)" build/shipped
 
 clean:
 	rm -rf .venv build figures/*/ *.egg-info .pytest_cache

@@ -38,7 +38,7 @@ def check_data(options):
 
 def predict(options):
     """write label maps (8-bit ids, 320x320 PNG, named like the frames) for a folder of images or a sequence"""
-    from thesis_repro import segmentation, training
+    from thesis_repro import backbones, segmentation, training
     from thesis_repro.files import listed
 
     images = options.images / "image_0" if (options.images / "image_0").is_dir() else options.images
@@ -51,7 +51,8 @@ def predict(options):
     if options.output.resolve() == images.resolve():
         raise InputError(f"{options.output}: is the folder of the images; label maps have the same names, "
                          "so name another folder")
-    model = training.load_model(options.model) if options.model else segmentation.load_shipped()
+    models = [training.load_model(path) for path in options.model] or [segmentation.load_shipped()]
+    model = models[0] if len(models) == 1 else backbones.ensemble(models)
     segmentation.write_label_maps(model, paths, options.output)
     print(f"{options.output}: {len(paths)} label maps")
 
@@ -127,7 +128,9 @@ def build_parser():
     sub.add_argument("--images", type=Path, required=True, metavar="DIR_OR_SEQUENCE",
                      help="folder of PNG images, or a KITTI sequence folder")
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the label maps")
-    sub.add_argument("--model", type=Path, metavar="FILE", help="a trained model (.keras, .hdf5); the shipped one")
+    sub.add_argument("--model", type=Path, nargs="+", default=[], metavar="FILE",
+                     help="a trained model (.keras, .hdf5), several for the mean of their probabilities; "
+                          "without it the model in the package")
 
     sub = command(odometry)
     sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
