@@ -50,7 +50,7 @@ def frames(tmp_path_factory):
 
 
 def contents(folder):
-    return {path.name: path.read_bytes() for path in sorted(Path(folder).glob("*.png"))}
+    return {path.name: path.read_bytes() for path in files.listed(folder)}
 
 
 def test_predict_gives_the_most_probable_class(model):
