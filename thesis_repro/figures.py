@@ -74,7 +74,7 @@ def show_image(axes, image, title, **options):
 def save_figure(figure, folder, name, note):
     """Write folder/name.svg and .png with the data note at the foot."""
     folder = Path(folder)
-    figure.text(1, -0.18 / figure.get_figheight(), note, fontsize=6, color="#777777", ha="right", va="top")
+    figure.text(0.5, -0.12 / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
     for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
         with atomic(folder / f"{name}{suffix}") as temporary:
             figure.savefig(temporary, metadata=metadata, bbox_inches="tight", pad_inches=0.04)
