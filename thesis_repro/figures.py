@@ -74,7 +74,9 @@ def show_image(axes, image, title, **options):
 def save_figure(figure, folder, name, note):
     """Write folder/name.svg and .png with the data note at the foot."""
     folder = Path(folder)
-    figure.text(0.5, -0.12 / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
+    figure.draw_without_rendering()  # settles where everything is; legends may hang below the figure's edge
+    bottom = figure.get_tightbbox().y0 - 0.06  # inches
+    figure.text(0.5, bottom / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
     for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
         with atomic(folder / f"{name}{suffix}") as temporary:
             figure.savefig(temporary, metadata=metadata, bbox_inches="tight", pad_inches=0.04)
