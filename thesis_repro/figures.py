@@ -74,9 +74,15 @@ def show_image(axes, image, title, **options):
 def save_figure(figure, folder, name, note):
     """Write folder/name.svg and .png with the data note at the foot."""
     folder = Path(folder)
-    figure.draw_without_rendering()  # settles where everything is; legends may hang below the figure's edge
-    bottom = figure.get_tightbbox().y0 - 0.06  # inches
-    figure.text(0.5, bottom / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
+    # A tight box lets legends at the figure's edge slip down onto the note, so they are pinned where the layout put them.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for legend in figure.legends:
+        box = legend.get_window_extent().transformed(figure.transFigure.inverted())
+        legend.borderaxespad = 0
+        legend.set_loc("lower left")
+        legend.set_bbox_to_anchor((box.x0, box.y0), transform=figure.transFigure)
+    figure.text(0.5, -0.08 / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
     for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
         with atomic(folder / f"{name}{suffix}") as temporary:
             figure.savefig(temporary, metadata=metadata, bbox_inches="tight", pad_inches=0.04)
