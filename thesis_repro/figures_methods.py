@@ -1,11 +1,10 @@
-"""Figures of chapter 3, 4.1 to 4.5, 4.8 and A.1: augmentation, the network, training, prediction and masks."""
+"""Figures 3.1, 3.2, 3.6, 4.1 to 4.5 and A.1: augmentation, the network, training, prediction and masks."""
 
 import numpy as np
 from matplotlib.patches import Patch
 
 from thesis_repro.cityscapes import LABELS, colorize
-from thesis_repro.figures import (BLUE, KEYPOINT, ORANGE, PAGE_WIDTH, label_colors, line_style, new_figure,
-                                  show_image)
+from thesis_repro.figures import BLUE, KEYPOINT, ORANGE, PAGE_WIDTH, label_colors, new_figure, show_image
 
 
 def figure_augmentation(examples):
@@ -13,45 +12,6 @@ def figure_augmentation(examples):
     figure, axes = new_figure(2, 2, height=7.0)
     for panel, (title, image) in zip(axes.flat, examples.items(), strict=True):
         show_image(panel, image, title)
-    return figure
-
-
-def figure_3_03(label_map, prediction, label):
-    """Intersection and union of a prediction and its label map for one class, with the IoU (Equation 3.1)."""
-    true, predicted = label_map == label.id, prediction == label.id
-    both, either = true & predicted, true | predicted
-    figure, axes = new_figure(1, 3, height=2.7)
-    show_image(axes[0], colorize(label_map), "label map")
-    show_image(axes[1], colorize(prediction), "prediction")
-    picture = np.full((*label_map.shape, 3), 235, np.uint8)
-    picture[either], picture[both] = (86, 180, 233), (0, 114, 178)
-    show_image(axes[2], picture, f"{label.name}: IoU {both.sum() / max(either.sum(), 1):.2f}")
-    figure.legend(handles=[Patch(color="#0072b2", label=f"intersection, {both.sum()} pixels"),
-                           Patch(color="#56b4e9", label=f"rest of the union, {either.sum() - both.sum()} pixels")],
-                  loc="outside lower center", ncols=2)
-    return figure
-
-
-def figure_3_04(alpha=1.0):
-    """Focal loss against the probability of the true class for several gamma (Equation 3.7)."""
-    p = np.linspace(0.005, 1, 400)
-    figure, axes = new_figure(height=2.8)
-    for index, gamma in enumerate((0, 0.5, 1, 2, 5)):
-        axes.plot(p, -alpha * (1 - p) ** gamma * np.log(p), label=f"gamma {gamma:g}", **line_style(index))
-    axes.set(xlabel="probability of the true class", ylabel="loss", ylim=(0, 5))
-    axes.legend()
-    return figure
-
-
-def figure_3_05(counts, n_images):
-    """Pixels of each category in the training data at hand; counts: (35,) by label id."""
-    present = [label for label in LABELS[:len(counts)] if counts[label.id]]
-    figure, axes = new_figure(height=3.2)
-    axes.bar([label.name for label in present], [counts[label.id] for label in present],
-             color=[np.array(label.color) / 255 for label in present], edgecolor="#555555", linewidth=0.4)
-    axes.set(yscale="log", ylabel="pixels", title=f"Pixels of each category in {n_images} training label maps")
-    axes.tick_params(axis="x", rotation=60)
-    axes.grid(axis="x", visible=False)
     return figure
 
 
@@ -105,18 +65,6 @@ def figure_4_04(frame, edge_image, keypoints, title):
     overlay[edge_image > 0] = (255, 140, 0)
     show_image(axes, overlay, title)
     axes.scatter(*keypoints.T, **KEYPOINT)
-    return figure
-
-
-def figure_4_08(crops, title):
-    """Keypoints of one object in consecutive frames: a list of (crop, edges of the crop, keypoints, text)."""
-    figure, axes = new_figure(1, len(crops), height=2.9)
-    for panel, (crop, edge_image, keypoints, text) in zip(axes, crops, strict=True):
-        overlay = np.dstack([crop] * 3)
-        overlay[edge_image > 0] = (255, 140, 0)
-        show_image(panel, overlay, text)
-        panel.scatter(*keypoints.T, **{**KEYPOINT, "s": 14})
-    figure.suptitle(title, fontsize=9)
     return figure
 
 
