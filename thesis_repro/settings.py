@@ -88,6 +88,8 @@ class Settings:
         """One line for captions: which data the numbers come from."""
         odometry = "embedded world (rendered)" if self.kitti_is_embedded else "the user's KITTI folder"
         training = "embedded world (rendered)" if self.cityscapes_is_embedded else "the user's Cityscapes folder"
+        if self.cityscapes_is_embedded and not self.kitti_is_embedded:  # see notebook 5
+            odometry += ", label maps by the model in the package"
         return f"odometry: {odometry}; training: {training}; profile {self.profile}"
 
     def __str__(self):
