@@ -87,11 +87,6 @@ def _blur():
     return A.Blur(blur_limit=3, p=1)
 
 
-def augment(image, label, seed):
-    """Augment one image (size, size[, 1]) and its label map (size, size) with the transforms of A.3."""
-    return training_augmenter(label.shape[0])(image, label, seed)
-
-
 def augment_set(images, labels, augmenter, seed, description="augmenting"):
     """Augment every image of a set once (A.3): images (n, size, size, channels) and labels (n, size, size), uint8.
 
