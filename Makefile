@@ -10,7 +10,7 @@ PROFILE ?= demo
 BIN := .venv/bin
 
 # A misspelled setting must not pass for the default.
-KNOWN := KITTI CITYSCAPES CAMVID PROFILE BUILD FIGURES JOBS PYTHON
+KNOWN := KITTI CITYSCAPES CAMVID PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
@@ -23,7 +23,7 @@ absolute = $(if $(filter /% ~%,$(firstword $(1))),$(1),$(CURDIR)/$(1))
 export THESIS_REPRO_PROFILE := $(PROFILE)
 $(foreach name,KITTI CITYSCAPES BUILD FIGURES,$(if $($(name)),\
   $(eval export THESIS_REPRO_$(name) := $(call absolute,$($(name))))))
-$(if $(JOBS),$(eval export THESIS_REPRO_JOBS := $(JOBS)))
+$(foreach name,JOBS DASK_SCHEDULER,$(if $($(name)),$(eval export THESIS_REPRO_$(name) := $($(name)))))
 DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)")
 # what the libraries would otherwise say or look up
 export SM_FRAMEWORK := tf.keras

@@ -20,6 +20,7 @@ VARIABLES = {
     "BUILD": "folder for everything that can be made again",
     "FIGURES": "folder for the tables and figures",
     "JOBS": "processes that work at once; as many as there are cores when not set",
+    "DASK_SCHEDULER": "address of a Dask scheduler (tcp://host:8786) that the odometry runs are sent to",
     "PROGRESS": "file or terminal that progress bars are written to",
 }
 ALL_WIDTHS = tuple(range(1, 16))
@@ -38,6 +39,7 @@ class Profile:
     frames: int | None  # frames taken from the start of each sequence
     timed_frames: int  # frames from the start of each sequence on which the cost of each width is timed
     widths: tuple  # dilation widths, pixels
+    repetitions: int  # of each run, with the correspondences in another order each time
     # the embedded world
     world_sequences: int
     world_frames: int
@@ -54,14 +56,14 @@ class Profile:
 
 PROFILES = {
     "smoke": Profile(image_size=64, base_filters=4, batch_size=4, epochs=2, patience=5, training_images=16, frames=12,
-                     timed_frames=5, widths=(1, 5, 10, 15), world_sequences=2, world_frames=12,
+                     timed_frames=5, widths=(1, 5, 10, 15), repetitions=2, world_sequences=2, world_frames=12,
                      world_training_images=12, world_validation_images=4),
     "demo": Profile(image_size=160, base_filters=8, batch_size=4, epochs=18, patience=5, training_images=200,
-                    frames=200, timed_frames=7, widths=ALL_WIDTHS, world_sequences=11, world_frames=30,
+                    frames=200, timed_frames=7, widths=ALL_WIDTHS, repetitions=5, world_sequences=11, world_frames=30,
                     world_training_images=100, world_validation_images=20),
     "thesis": Profile(image_size=320, base_filters=64, batch_size=16, epochs=100, patience=5, training_images=None,
-                      frames=None, timed_frames=200, widths=ALL_WIDTHS, world_sequences=11, world_frames=300,
-                      world_training_images=2975, world_validation_images=500),
+                      frames=None, timed_frames=200, widths=ALL_WIDTHS, repetitions=5,
+                      world_sequences=11, world_frames=300, world_training_images=2975, world_validation_images=500),
 }
 SEED = 0
 
@@ -81,6 +83,7 @@ class Settings:
     figures: Path
     world: Path  # where the embedded world is written
     jobs: int
+    scheduler: str | None = None  # of a Dask cluster
     seed: int = SEED
 
     @property
@@ -127,7 +130,7 @@ def read_settings(environment=None):
         cityscapes_is_embedded=cityscapes is None, run=run, build=build / run,
         # the default run's figures are what visitors see; those of all others go into folders beside them
         figures=figures if run == "embedded-demo" else figures / run,
-        world=world, jobs=int(jobs))
+        world=world, jobs=int(jobs), scheduler=given.get("DASK_SCHEDULER"))
 
 
 def _data_folder(name, value):
