@@ -406,6 +406,27 @@ def test_many_runs_in_one_pass_give_the_bits_of_separate_runs(drive):
     assert together["all"].frames["track_seconds"].isna().all()
 
 
+def test_runs_that_differ_after_the_tracking_share_masks_keypoints_and_essential_matrices(drive, monkeypatch):
+    class Counted(Stripes):
+        asked = 0
+
+        def __getitem__(self, index):
+            Counted.asked += 1
+            return super().__getitem__(index)
+
+    stripes = Counted(20)
+    runs = {(order, way): (replace(THESIS, permute=order, pose=way), stripes)
+            for order in (None, 1, 2) for way in ("all", "refined")}
+    estimated = []
+    monkeypatch.setattr(pose, "essential_matrix",
+                        lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1])
+    together = odometry.run_many(drive, runs, workers=2)
+    assert Counted.asked == len(drive) and len(estimated) == 3 * (len(drive) - 1)
+    for name, (settings, masks) in runs.items():
+        assert_same(together[name], odometry.run(drive, settings, masks))
+    assert len({together[name].poses.tobytes() for name in runs}) == len(runs)  # they do differ
+
+
 @pytest.mark.parametrize("mask", [None, "stripes", "nothing", "specks"])
 def test_shared_detection_is_opencvs_to_the_last_bit(drive, mask):
     frame = drive.frame(3)

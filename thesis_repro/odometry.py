@@ -18,7 +18,7 @@ their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What 
 import pickle
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -30,6 +30,9 @@ from thesis_repro.files import atomic, progress
 from thesis_repro.pose import Motion
 
 CHECKPOINT = 300  # frames
+# What the observed points depend on, and what the essential matrix depends on besides: runs that agree share the work
+OBSERVED = ("detector", "max_keypoints", "min_distance", "mask_mode", "redetect_below")
+ESTIMATED = ("estimator", "threshold", "permute")
 SECONDS = ("detect", "track", "essential", "pose")
 ROTATION = [f"r{i}{j}" for i in range(3) for j in range(3)]
 FLAT = 4.0  # gray levels: a standard deviation below it is no picture of a street (real frames: above 50)
@@ -111,6 +114,10 @@ class Step:
     def inliers(self):
         return np.zeros(len(self.current), bool) if self.motion.inliers is None else self.motion.inliers
 
+    def copy(self):
+        """The same observation, for another estimate."""
+        return replace(self, flags=list(self.flags), seconds=dict(self.seconds))
+
     def row(self):
         """One row of Result.frames."""
         tracked = None if self.points is None else len(self.current)
@@ -124,6 +131,7 @@ class Step:
 
 
 COLUMNS = tuple(Step(0, pose=np.eye(4)).row())
+NUMBERS = [*(column for column in COLUMNS if column != "flag"), "mask_seconds"]
 
 
 class Odometry:
@@ -186,34 +194,31 @@ class Odometry:
         step.keypoints = tracked
         return step
 
-    def estimate(self, step):
-        """The motion from the step's correspondences. Safe in threads: reads nothing that later steps change."""
+    def estimate(self, step, essential=None):
+        """The motion from the step's correspondences; returns the essential matrix with what it was made from.
+
+        essential: what another Odometry with the same settings but for `pose` returned for the same correspondences.
+        Safe in threads: reads nothing that later steps change.
+        """
         if not step.points:
-            return
-        chosen, started = self.settings, time.perf_counter()
-        current = pose.normalise(step.current, self.intrinsics)
-        previous = pose.normalise(step.previous, self.intrinsics)
-        order = None
-        if chosen.permute is not None:
-            order = np.random.default_rng((chosen.permute, step.frame)).permutation(len(current))
-            current, previous = current[order], previous[order]
-        matrix, inliers, problem = pose.essential_matrix(current, previous, chosen.threshold, chosen.estimator)
-        step.seconds["essential"] = time.perf_counter() - started
-        if matrix is None:
-            step.motion = Motion(problem=problem)
-            return
+            return None
+        chosen = self.settings
+        found = essential or _essential(step, chosen, self.intrinsics)
+        step.seconds["essential"] = found.seconds
+        if found.matrix is None:
+            step.motion = Motion(problem=found.problem)
+            return found
         started = time.perf_counter()
+        current, previous, inliers = found.current, found.previous, found.inliers
         if chosen.pose == "all":
-            votes, rotation, translation = pose.recover_pose(matrix, current, previous)
+            votes, rotation, translation = pose.recover_pose(found.matrix, current, previous)
         else:
-            votes, rotation, translation = pose.recover_pose(matrix, current[inliers], previous[inliers])
+            votes, rotation, translation = pose.recover_pose(found.matrix, current[inliers], previous[inliers])
         if chosen.pose == "refined":
             rotation, translation = pose.refine(rotation, translation, current, previous, inliers, chosen.threshold)
-        if order is not None:
-            shuffled, inliers = inliers, np.empty_like(inliers)
-            inliers[order] = shuffled
-        step.motion = Motion(rotation, translation, inliers, votes)
+        step.motion = Motion(rotation, translation, found.in_order(), votes)
         step.seconds["pose"] = time.perf_counter() - started
+        return found
 
     def compose(self, step):
         """Move the pose by the step's motion, where it has one that can be believed."""
@@ -259,6 +264,39 @@ class Odometry:
         if self.previous is not None and frame.shape != self.previous.shape:
             raise InputError(f"frame {self.count}: shape {frame.shape}, the frames before {self.previous.shape}; "
                              "all frames must have one size")
+
+
+@dataclass(frozen=True)
+class _Essential:
+    """An essential matrix and the normalised correspondences (N, 2) that it was estimated from."""
+
+    current: np.ndarray
+    previous: np.ndarray
+    order: np.ndarray | None  # in which they were fed
+    matrix: np.ndarray | None
+    inliers: np.ndarray  # (N,) booleans, as fed
+    problem: str
+    seconds: float
+
+    def in_order(self):
+        """The inliers in the order of the step's points."""
+        if self.order is None:
+            return self.inliers
+        inliers = np.empty_like(self.inliers)
+        inliers[self.order] = self.inliers
+        return inliers
+
+
+def _essential(step, settings, intrinsics):
+    started = time.perf_counter()
+    current = pose.normalise(step.current, intrinsics)
+    previous = pose.normalise(step.previous, intrinsics)
+    order = None
+    if settings.permute is not None:
+        order = np.random.default_rng((settings.permute, step.frame)).permutation(len(current))
+        current, previous = current[order], previous[order]
+    found = pose.essential_matrix(current, previous, settings.threshold, settings.estimator)
+    return _Essential(current, previous, order, *found, time.perf_counter() - started)
 
 
 def _by_chance(inliers):
@@ -313,7 +351,9 @@ def run_many(sequence, runs, description=None, checkpoint=None, workers=1):
     """Many runs over one sequence, {name: (settings, masks)}, as {name: Result}: the bits of separate runs.
 
     Frames are decoded, corner strengths computed and points tracked once for all runs, so the times of detection and
-    tracking belong to no run and are blank. workers: threads for the estimators, which are most of what remains.
+    tracking belong to no run and are blank. Runs with the same masks (one object) and settings that differ only after
+    the tracking also share their masks and keypoints, and those that differ only in `pose` their essential matrices.
+    workers: threads for the estimators, which are most of what remains.
     checkpoint: a file to keep the state in, every CHECKPOINT frames; a killed run that is started again with the same
     file, sequence and settings goes on from there. Whoever names the file deletes it once the results are stored,
     and gives other masks another file.
@@ -327,76 +367,106 @@ def run_many(sequence, runs, description=None, checkpoint=None, workers=1):
 def _run(sequence, runs, features, description, checkpoint, workers):
     odometries = {name: Odometry(sequence.intrinsics, settings, start_pose(sequence), features)
                   for name, (settings, _) in runs.items()}
-    rows = {name: [] for name in runs}
+    groups = _groups(runs)
+    leaders = [odometries[group[0][0]] for group in groups]
+    # numbers alone, since a long sequence has a million rows
+    tables = {name: (np.full((len(sequence), len(NUMBERS)), np.nan), {}) for name in runs}
     metres = scales(sequence)
     # Everything that has to be the same for a checkpoint to go on from
     kind = (COLUMNS, sequence.name, len(sequence), sequence.intrinsics.tobytes(), sequence.poses.tobytes(),
             cv2.__version__, {name: settings for name, (settings, _) in runs.items()})
-    done = _resume(checkpoint, kind, odometries, rows)
+    done = _resume(checkpoint, kind, odometries, tables)
     with ThreadPoolExecutor(workers) as pool:
         waiting = []
         indices = range(done, len(sequence))
         for index in _with_bar(indices, description, len(sequence)):
             frame = sequence.frame(index)
-            features.expect(frame, odometries.values())
+            features.expect(frame, leaders)
             observed = []
-            for name, odometry in odometries.items():
+            for leader, group in zip(leaders, groups):
                 started = time.perf_counter()
-                masks = runs[name][1]
+                masks = runs[group[0][0]][1]
                 mask = None if masks is None else masks[index]
                 mask_seconds = time.perf_counter() - started
-                step = odometry.observe(frame, metres[index], mask)
-                job = pool.submit(odometry.estimate, step) if workers > 1 else odometry.estimate(step)
-                observed.append((name, step, job, mask_seconds))
+                step = leader.observe(frame, metres[index], mask)
+                for names in group:
+                    pairs = [(odometries[name], step.copy()) for name in names]
+                    job = pool.submit(_estimate, pairs) if workers > 1 else _estimate(pairs)
+                    observed.append((names, pairs, job, mask_seconds))
             # What is tracked next does not depend on the pose, so the estimators may be one frame behind.
-            _finish(waiting, odometries, rows)
+            _finish(waiting, tables)
             waiting = observed
             if checkpoint and (index + 1) % CHECKPOINT == 0:
-                _finish(waiting, odometries, rows)
+                _finish(waiting, tables)
                 waiting = []
-                _store(checkpoint, kind, index + 1, odometries, rows)
-        _finish(waiting, odometries, rows)
-    return {name: _result(table, runs[name][0]) for name, table in rows.items()}
+                _store(checkpoint, kind, index + 1, odometries, tables)
+        _finish(waiting, tables)
+    return {name: _result(*table, runs[name][0]) for name, table in tables.items()}
+
+
+def _groups(runs):
+    """The runs' names: a list for each set of keypoints, in it a list for each essential matrix."""
+    groups = {}
+    for name, (settings, masks) in runs.items():
+        seen = (id(masks), *(getattr(settings, key) for key in OBSERVED))
+        estimated = tuple(getattr(settings, key) for key in ESTIMATED)
+        groups.setdefault(seen, {}).setdefault(estimated, []).append(name)
+    return [list(group.values()) for group in groups.values()]
+
+
+def _estimate(pairs):
+    essential = None
+    for odometry, step in pairs:
+        essential = odometry.estimate(step, essential)
 
 
 def _with_bar(indices, description, total):
     return indices if description is None else progress(indices, description, total=total, initial=indices.start)
 
 
-def _finish(waiting, odometries, rows):
-    for name, step, job, mask_seconds in waiting:
+def _finish(waiting, tables):
+    for names, pairs, job, mask_seconds in waiting:
         if job is not None:
             job.result()  # raises what the thread raised
-        row = odometries[name].compose(step).row()
-        rows[name].append((*row.values(), mask_seconds))
+        for name, (odometry, step) in zip(names, pairs):
+            row = odometry.compose(step).row()
+            numbers, flags = tables[name]
+            flag = row.pop("flag")
+            numbers[step.frame] = [np.nan if value is None else value for value in (*row.values(), mask_seconds)]
+            if flag:
+                flags[step.frame] = flag
 
 
-def _store(checkpoint, kind, done, odometries, rows):
+def _store(checkpoint, kind, done, odometries, tables):
     states = {name: odometry.state() for name, odometry in odometries.items()}
-    with atomic(checkpoint) as temporary:
-        temporary.write_bytes(pickle.dumps((kind, done, states, rows)))
+    rows = {name: (numbers[:done], flags) for name, (numbers, flags) in tables.items()}
+    with atomic(checkpoint) as temporary, open(temporary, "wb") as file:
+        pickle.dump((kind, done, states, rows), file, pickle.HIGHEST_PROTOCOL)
 
 
-def _resume(checkpoint, kind, odometries, rows):
+def _resume(checkpoint, kind, odometries, tables):
     """Number of frames done according to the checkpoint, 0 where there is none for this kind of run."""
     if not checkpoint or not Path(checkpoint).is_file():
         return 0
     try:
-        stored, done, states, table = pickle.loads(Path(checkpoint).read_bytes())
+        stored, done, states, rows = pickle.loads(Path(checkpoint).read_bytes())
     except Exception:  # of an older version of this package, or not a checkpoint at all: start from the beginning
         return 0
     if stored != kind:
         return 0
     for name, odometry in odometries.items():
         odometry.restore(states[name])
-    rows.update(table)
+        numbers, flags = tables[name]
+        numbers[:done] = rows[name][0]
+        flags.update(rows[name][1])
     return done
 
 
-def _result(rows, settings):
-    frames = pd.DataFrame(rows, columns=[*COLUMNS, "mask_seconds"])
+def _result(numbers, flags, settings):
+    frames = pd.DataFrame(numbers, columns=NUMBERS)
+    frames.insert(COLUMNS.index("flag"), "flag", [flags.get(index, "") for index in range(len(frames))])
     counts = ["points", "detected", "tracked", "inliers", "pose_inliers"]
-    frames[counts] = frames[counts].astype("Int64")
+    frames = frames.astype({"frame": int, "updated": bool, **dict.fromkeys(counts, "Int64")})
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = frames[ROTATION].to_numpy().reshape(-1, 3, 3)
     poses[:, :3, 3] = frames[["x", "y", "z"]]
