@@ -9,7 +9,7 @@ from thesis_repro.figures import markdown
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks
 
-WIDTHS = (5, 15)
+WIDTHS = (5, 10, 15)
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +35,12 @@ def finished(small_world, labels, tmp_path_factory):
 
 def test_a_run_is_the_odometry_of_its_sequence(small_world, labels, finished):
     folder, _, summary = finished
-    assert len(summary) == 8
+    assert len(summary) == 10
     sequence = Sequence(small_world / "kitti", "01")
     alone = odometry.run(sequence, masks=LabelMasks(labels / "01", sequence, 15))
-    row = summary.set_index(["sequence", "run"]).loc["01", "masked-15"]
+    row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
     assert row["rmse"] == metrics.rmse(alone.poses, sequence.poses)
-    assert np.array_equal(experiments.paths(summary, folder)["01", "masked-15"], alone.poses[:, :3, 3])
+    assert np.array_equal(experiments.paths(summary, folder)["01", "masked-15-0"], alone.poses[:, :3, 3])
 
 
 def test_reduced_runs_have_the_keypoints_of_the_best_width(finished):
@@ -56,7 +56,7 @@ def test_reduced_runs_have_the_keypoints_of_the_best_width(finished):
 def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, labels, finished, monkeypatch):
     folder, jobs, summary = finished
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
-    lost = folder / "00" / "masked-05.csv"
+    lost = folder / "00" / "masked-05-0.csv"
     lost.unlink()
     again = experiments.run(jobs, small_world / "kitti", labels, folder)
     assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost}
@@ -66,8 +66,8 @@ def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, label
 def test_a_failing_run_is_reported_and_stops_no_other(small_world, labels, tmp_path, capsys):
     jobs = [Job("00", "baseline"), Job("00", "masked", dilation_width=0)]
     summary = experiments.run(jobs, small_world / "kitti", labels, tmp_path)
-    assert list(summary["run"]) == ["baseline"]
-    assert "sequence 00, masked: failed: dilation width 0" in capsys.readouterr().out
+    assert list(summary["run"]) == ["baseline-0"]
+    assert "sequence 00, masked-00-0: failed: dilation width 0" in capsys.readouterr().out
     with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
         experiments.run(jobs[1:], small_world / "kitti", labels, tmp_path)
 

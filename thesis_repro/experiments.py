@@ -1,4 +1,5 @@
-"""The odometry runs behind chapter 4: every sequence with all keypoints, with masks of each width, and plainly reduced.
+"""The odometry runs behind chapter 4: every sequence with all keypoints, with masks of each width, and plainly reduced;
+and the controls, which ask whether it is the segmentation that helps.
 
 Each finished run is one CSV file, so that a stopped or failed series goes on where it was.
 """
@@ -11,51 +12,112 @@ import joblib
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, metrics, odometry, stages
+from thesis_repro import InputError, controls, metrics, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, forget_edges
 
-CODE = ("experiments", "keypoints", "kitti", "masks", "odometry", "pose")  # what a finished run depends on
+CODE = ("controls", "experiments", "keypoints", "kitti", "masks", "odometry", "pose")  # a finished run depends on them
+CONTROL_WIDTH = 10  # pixels: the width of A.8 and Figure 3.6, chosen before any run
+POSES = ("all", "refined")  # the thesis's estimator, and the one with the far smaller spread
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of the odometry over one sequence."""
+    """One run of the odometry over one sequence. What is None or left out is as in the thesis.
+
+    variant: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
+    dilation_width: pixels, of masks. max_keypoints, min_distance: of the detector.
+    pose: "all" or "refined", see OdometrySettings.
+    repetition: 0 takes the correspondences in the order in which they come, which is the thesis's single run; any
+    other number is the seed that shuffles them.
+    """
 
     sequence: str
-    variant: str  # baseline, masked or reduced
-    dilation_width: int | None = None  # of masked runs
-    max_keypoints: int | None = None  # of reduced runs
+    variant: str
+    dilation_width: int | None = None
+    max_keypoints: int | None = None
+    min_distance: float | None = None
+    pose: str = "all"
+    repetition: int = 0
 
     @property
     def name(self):
-        size = self.dilation_width or self.max_keypoints
-        return f"{self.variant}-{size:02d}" if size else self.variant
+        """Unique in its sequence, and the stem of its file: masked-05-0, mirrored-10-refined-1, spread-7.5-0."""
+        width = None if self.dilation_width is None else f"{self.dilation_width:02d}"
+        distance = None if self.min_distance is None else f"{self.min_distance:g}"
+        pose = None if self.pose == "all" else self.pose
+        parts = (self.variant, width, self.max_keypoints, distance, pose, self.repetition)
+        return "-".join(str(part) for part in parts if part is not None)
 
 
-def first_jobs(names, widths):
-    """The runs that depend on no other: baseline and masks of every width, for each sequence."""
-    return [job for name in names
-            for job in (Job(name, "baseline"), *(Job(name, "masked", dilation_width=width) for width in widths))]
+def first_jobs(names, widths, repetitions=1):
+    """The thesis's runs that depend on no other: baseline and masks of every width, for each sequence."""
+    return [Job(name, variant, width, repetition=repetition) for name in names
+            for variant, width in (("baseline", None), *(("masked", width) for width in widths))
+            for repetition in range(repetitions)]
+
+
+def mask_control_jobs(kitti, names, repetitions=1):
+    """The controls that depend on no other run, under both estimators; baseline and masks under the refined one.
+
+    The true label maps take part where a sequence has them, in a folder labels_0 beside its frames.
+    """
+    jobs = []
+    for name in names:
+        jobs += [Job(name, variant, width, pose="refined", repetition=repetition)
+                 for variant, width in (("baseline", None), ("masked", CONTROL_WIDTH))
+                 for repetition in range(repetitions)]
+        jobs += [Job(name, variant, CONTROL_WIDTH, pose=pose, repetition=repetition)
+                 for variant in controls.MASKS
+                 if variant != "true-labels" or controls.true_labels(kitti, name).is_dir()
+                 for pose in POSES for repetition in range(repetitions)]
+    return jobs
 
 
 def best_widths(summary):
-    """The row of `summary` with the lowest RMSE of each sequence, as the thesis chooses its width (Section 4.2).
+    """The width with the lowest RMSE of each sequence, as the thesis chooses it (Section 4.2), and its means.
 
+    One row a sequence: dilation_width, frames, rmse, mae, mean_keypoints, means over the repetitions.
     The width is chosen by its error on the very sequence it is then judged on: a best of 15, not a test.
     """
-    masked = summary[summary["variant"] == "masked"]
-    return masked.loc[masked.groupby("sequence")["rmse"].idxmin()].set_index("sequence").sort_index()
+    masked = summary[(summary["variant"] == "masked") & (summary["pose"] == "all")]
+    means = masked.groupby(["sequence", "dilation_width"])[["frames", "rmse", "mae", "mean_keypoints"]].mean()
+    best = means.loc[means.groupby("sequence")["rmse"].idxmin()].reset_index("dilation_width")
+    return best.astype({"dilation_width": int, "frames": int}).sort_index()
 
 
 def reduced_jobs(summary):
     """The detector limited to each sequence's mean number of keypoints at its best width (Figure 4.12)."""
-    return [Job(name, "reduced", max_keypoints=max(1, round(row["mean_keypoints"])))
-            for name, row in best_widths(summary).iterrows()]
+    return [Job(name, "reduced", max_keypoints=_whole(row["mean_keypoints"]), repetition=repetition)
+            for name, row in best_widths(summary).iterrows() for repetition in _repetitions(summary)]
 
 
-def run(jobs, kitti, labels, folder, *, frames=None, processes=1, settings=odometry.THESIS):
+def keypoint_control_jobs(summary, kitti, frames=None):
+    """As many keypoints as the masks of CONTROL_WIDTH leave, without a mask: the strongest, or spread out.
+
+    "fewer" limits their number; "spread" keeps them farther apart.
+    """
+    masked = summary[(summary["variant"] == "masked") & (summary["dilation_width"] == CONTROL_WIDTH)]
+    jobs = []
+    for name, number in masked.groupby("sequence")["mean_keypoints"].mean().items():
+        distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
+        jobs += [Job(name, variant, pose=pose, repetition=repetition, **setting)
+                 for variant, setting in (("fewer", {"max_keypoints": _whole(number)}),
+                                          ("spread", {"min_distance": distance}))
+                 for pose in POSES for repetition in _repetitions(summary)]
+    return jobs
+
+
+def _whole(number):
+    return max(1, round(number))  # 0 would lift the detector's limit
+
+
+def _repetitions(summary):
+    return sorted({int(repetition) for repetition in summary["repetition"]})
+
+
+def run(jobs, kitti, labels, folder, *, frames=None, processes=1, scheduler=None, settings=odometry.THESIS):
     """Run the jobs that have no result yet; returns the summary of all that succeeded, one row a job.
 
     The jobs of one sequence go over it together (`odometry.run_many`: the bits of separate runs at a third of the
@@ -96,23 +158,41 @@ def _result(folder, job):
     return folder / job.sequence / f"{job.name}.csv"
 
 
-def _variant(job, sequence, labels, settings):
-    """What the odometry needs to know of a job: (settings, masks)."""
-    if job.max_keypoints:
-        settings = replace(settings, max_keypoints=job.max_keypoints)
-    masked = job.variant == "masked"
-    return settings, LabelMasks(labels / job.sequence, sequence, job.dilation_width) if masked else None
+def _settings(job, settings):
+    changes = {"max_keypoints": job.max_keypoints, "min_distance": job.min_distance,
+               "permute": job.repetition or None, "pose": job.pose}
+    return replace(settings, **{name: value for name, value in changes.items() if value is not None})
+
+
+def _masks(job, sequence, labels):
+    if job.variant == "masked":
+        return LabelMasks(labels / job.sequence, sequence, job.dilation_width)
+    if job.variant in controls.MASKS:
+        return controls.masks(job.variant, labels / job.sequence, sequence, job.dilation_width)
+    return None
+
+
+def _variants(jobs, sequence, labels, settings):
+    """What the odometry needs to know of each job, {job: (settings, masks)}, and {job: reason} of those it cannot run.
+
+    Jobs with the same masks get the same object: so `run_many` knows that they share the work.
+    """
+    made, variants, failures = {}, {}, {}
+    for job in jobs:
+        masks = (job.variant, job.dilation_width)
+        try:
+            if masks not in made:
+                made[masks] = _masks(job, sequence, labels)
+            variants[job] = _settings(job, settings), made[masks]
+        except InputError as error:
+            failures[job] = str(error)
+    return variants, failures
 
 
 def _run_jobs(jobs, sequence, labels, folder, settings, threads):
     """Run the jobs of one sequence in one pass; returns {job: reason} of those that failed."""
     cv2.setNumThreads(1)  # the processes already use every core
-    variants, failures = {}, {}
-    for job in jobs:
-        try:
-            variants[job] = _variant(job, sequence, labels, settings)
-        except InputError as error:
-            failures[job] = str(error)
+    variants, failures = _variants(jobs, sequence, labels, settings)
     if not variants:
         return failures
     checkpoint = folder / sequence.name / "checkpoint"
@@ -148,7 +228,7 @@ def time_runs(jobs, kitti, labels, folder, *, frames, processes=1, settings=odom
 def _time_jobs(jobs, sequence, labels, path, settings):
     cv2.setNumThreads(1)  # one thread makes times comparable
     scales = odometry.scales(sequence)
-    variants = {job: _variant(job, sequence, labels, settings) for job in jobs}
+    variants, _ = _variants(jobs, sequence, labels, settings)
     runs = {job: odometry.Odometry(sequence.intrinsics, chosen) for job, (chosen, _) in variants.items()}
     seconds = dict.fromkeys(jobs, 0.0)
     for index in range(len(sequence)):
@@ -174,7 +254,8 @@ def _summarize(job, sequence, folder):
     poses[:, :3, 3] = frames[["x", "y", "z"]]
     return {
         "sequence": job.sequence, "run": job.name, "variant": job.variant, "dilation_width": job.dilation_width,
-        "max_keypoints": job.max_keypoints, "frames": len(frames),
+        "max_keypoints": job.max_keypoints, "min_distance": job.min_distance, "pose": job.pose,
+        "repetition": job.repetition, "frames": len(frames),
         "rmse": metrics.rmse(poses, sequence.poses), "mae": metrics.mae(poses, sequence.poses),
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
