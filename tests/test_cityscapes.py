@@ -26,6 +26,16 @@ def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
         assert np.array_equal(one, two)
 
 
+def test_colour_is_read_where_it_is_asked_for(tiny_cityscapes):
+    some = cityscapes.pairs(tiny_cityscapes, "train")
+    cv2.imwrite(str(some[0].image), np.full((16, 32, 3), (10, 100, 200), np.uint8))
+    images, labels = cityscapes.load(some, 16, channels=3)
+    assert images.shape == (4, 16, 16, 3) and images[0, 5, 5].tolist() == [200, 100, 10]
+    gray, same = cityscapes.load(some, 16)
+    assert gray.shape == (4, 16, 16, 1) and np.array_equal(labels, same)
+    assert np.array_equal(images[1, ..., :1], gray[1])  # a gray file has three equal channels
+
+
 def test_resizing_invents_no_label(tiny_cityscapes):
     images, labels = cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 48)
     assert images.shape == (4, 48, 48, 1) and images.dtype == labels.dtype == np.uint8

@@ -8,7 +8,7 @@ import numpy as np
 from sklearn.model_selection import train_test_split
 
 from thesis_repro import InputError
-from thesis_repro.files import listed, progress, read_gray
+from thesis_repro.files import listed, progress, read_color, read_gray
 
 # Tables 3.1 and 3.2; colours as the Cityscapes scripts draw them. "background" exists in the tables only:
 # the network has 35 outputs, and no label map holds 35 (audit: the tables list one category too many).
@@ -129,9 +129,13 @@ def _listing(root, split):
     return images, labels, where
 
 
-def read_image(path, size):
-    """One gray image resized to size x size (A.2.1: bilinear), uint8 of shape (size, size)."""
-    return cv2.resize(read_gray(path), (size, size))
+def read_image(path, height, width, channels=1):
+    """One image stretched to height x width (A.2.1: bilinear), uint8 (height, width, channels).
+
+    channels: 1 for gray, as the thesis has it, 3 for red, green, blue.
+    """
+    image = read_gray(path) if channels == 1 else read_color(path)
+    return cv2.resize(image, (width, height)).reshape(height, width, channels)
 
 
 def read_label_map(path):
@@ -143,15 +147,15 @@ def read_label_map(path):
     return label_map
 
 
-def load(some_pairs, size, description="reading images"):
-    """Read pairs at size x size: images (n, size, size, 1) and label maps (n, size, size), both uint8 (A.2).
+def load(some_pairs, size, channels=1, description="reading images"):
+    """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size), both uint8 (A.2).
 
     Label maps are resized with nearest neighbour, so that no id is invented.
     """
-    images = np.empty((len(some_pairs), size, size, 1), np.uint8)
+    images = np.empty((len(some_pairs), size, size, channels), np.uint8)
     labels = np.empty((len(some_pairs), size, size), np.uint8)
     for index, pair in enumerate(progress(some_pairs, description, unit="image")):
-        images[index, ..., 0] = read_image(pair.image, size)
+        images[index] = read_image(pair.image, size, size, channels)
         labels[index] = cv2.resize(read_label_map(pair.label), (size, size), interpolation=cv2.INTER_NEAREST)
     return images, labels
 

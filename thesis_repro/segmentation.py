@@ -17,7 +17,7 @@ import pandas as pd  # noqa: E402
 import tensorflow as tf  # noqa: E402
 
 from thesis_repro import InputError, files, memory, training  # noqa: E402
-from thesis_repro.cityscapes import LABELS, N_CLASSES  # noqa: E402
+from thesis_repro.cityscapes import LABELS, N_CLASSES, read_image  # noqa: E402
 
 SIZE = 320  # pixels, both ways, of written label maps
 SHIPPED = Path(__file__).parent / "weights" / "camvid.keras"
@@ -95,9 +95,7 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
 
 def read_input(path, input_shape):
     """One image file as a model's input: uint8, stretched to (height, width), gray or red, green, blue."""
-    *_, height, width, channels = input_shape
-    image = files.read_gray(path) if channels == 1 else files.read_color(path)
-    return cv2.resize(image, (width, height)).reshape(height, width, channels)
+    return read_image(path, *input_shape[-3:])
 
 
 def _decode(paths, input_shape):
