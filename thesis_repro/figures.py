@@ -1,7 +1,7 @@
 """One style for every figure and table, and the writing of both: SVG and PNG, CSV and Markdown.
 
-The functions that draw are in figures_methods (chapter 3, training, prediction, masks) and figures_results
-(the odometry of chapter 4). Each takes arrays or a table and returns a matplotlib figure.
+The functions that draw are in figures_background (chapter 2), figures_methods (chapter 3, training, prediction,
+masks) and figures_results (the odometry of chapter 4). Each takes arrays or a table and returns a matplotlib figure.
 """
 
 import json
@@ -25,6 +25,7 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.axisbelow": True,
     "grid.color": "#dddddd",
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.4,
@@ -39,6 +40,8 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
     "#000000", "#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # what each colour stands for in all of chapter 4
 _LINES = [(color, style) for style in ("-", "--", ":") for color in (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK)]
+
+DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"  # the note where no data is shown
 
 REPORTED = json.loads((Path(__file__).parent / "reported.json").read_text(encoding="utf-8"))
 
@@ -62,6 +65,14 @@ def label_colors(label_map, frame):
 def new_figure(rows=1, columns=1, height=3.2, **options):
     """A figure of page width with the project's style: (figure, axes)."""
     return plt.subplots(rows, columns, figsize=(PAGE_WIDTH, height), layout="constrained", **options)
+
+
+def frame_panels(frame, rows=1, columns=1, width=PAGE_WIDTH):
+    """A figure with panels of a frame's shape, titles above them and nothing wasted: (figure, list of axes)."""
+    height, long = frame.shape[:2]
+    figure, axes = plt.subplots(rows, columns, layout="constrained", squeeze=False, figsize=(
+        width, rows * (width / columns * height / long + 0.27)))
+    return figure, list(axes.flat)
 
 
 def show_image(axes, image, title, **options):

@@ -1,10 +1,14 @@
-"""Figures 3.1, 3.2, 3.6, 4.1 to 4.5 and A.1: augmentation, the network, training, prediction and masks."""
+"""Figures of chapter 3, 4.1 to 4.5, 4.8 and A.1: augmentation, the network, training, prediction and masks."""
 
 import numpy as np
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from thesis_repro.cityscapes import LABELS, colorize
-from thesis_repro.figures import BLUE, KEYPOINT, ORANGE, PAGE_WIDTH, label_colors, new_figure, show_image
+from thesis_repro.figures import (BLUE, KEYPOINT, ORANGE, PAGE_WIDTH, PINK, SKY, frame_panels, label_colors, line_style,
+                                  new_figure, show_image)
+
+EDGE = (255, 140, 0)  # red, green, blue of edges drawn on a frame
 
 
 def figure_augmentation(examples):
@@ -15,13 +19,62 @@ def figure_augmentation(examples):
     return figure
 
 
+def figure_3_03(image, label_map, prediction, label):
+    """Intersection and union of a prediction and its label map for one class, with the IoU (Equation 3.1)."""
+    true, predicted = label_map == label.id, prediction == label.id
+    both, either = (true & predicted).sum(), (true | predicted).sum()
+    figure, axes = new_figure(1, 3, height=3.0)
+    dimmed = np.dstack([image] * 3) // 3 + 150
+    for panel, where, title in ((axes[0], true, f"label map: {true.sum():,} pixels"),
+                                (axes[1], predicted, f"prediction: {predicted.sum():,} pixels")):
+        picture = dimmed.copy()
+        picture[where] = _rgb(BLUE)
+        show_image(panel, picture, title)
+    picture = dimmed.copy()
+    picture[true & ~predicted], picture[predicted & ~true] = _rgb(ORANGE), _rgb(SKY)
+    picture[true & predicted] = _rgb(BLUE)
+    show_image(axes[2], picture, f"IoU = {both:,} / {either:,} = {both / max(either, 1):.2f}")
+    figure.legend(handles=[Patch(color=BLUE, label="intersection"), Patch(color=ORANGE, label="only in the label map"),
+                           Patch(color=SKY, label="only in the prediction")],
+                  title=f"class {label.name}; the three colours together are the union", title_fontsize=8,
+                  loc="outside lower center", ncols=3)
+    return figure
+
+
+def figure_3_04(alpha=1.0):
+    """Focal loss against the probability of the true class for several gamma (Equation 3.7)."""
+    p = np.linspace(0.005, 1, 400)
+    figure, axes = new_figure(height=3.0)
+    for index, gamma in enumerate((0, 0.5, 1, 2, 5)):
+        name = f"γ = {gamma:g}" + (" (cross-entropy)" if gamma == 0 else "")
+        axes.plot(p, -alpha * (1 - p) ** gamma * np.log(p), label=name, **line_style(index))
+    axes.set(xlabel="probability p of the true class (no unit)", ylabel=f"focal loss, α = {alpha:g} (no unit)",
+             xlim=(0, 1), ylim=(0, 5))
+    axes.legend()
+    return figure
+
+
+def figure_3_05(counts, n_images):
+    """Pixels of each category in the training data at hand; counts: (35,) by label id."""
+    present = sorted((label for label in LABELS[:len(counts)] if counts[label.id]), key=lambda label: -counts[label.id])
+    figure, axes = new_figure(height=3.4)
+    axes.bar([label.name for label in present], [counts[label.id] for label in present],
+             color=[np.array(label.color) / 255 for label in present], edgecolor="#555555", linewidth=0.5)
+    axes.set(yscale="log", ylabel="pixels", xlabel="category", title=f"{n_images} training label maps")
+    axes.set_xticks(range(len(present)), [label.name for label in present], rotation=45, ha="right",
+                    rotation_mode="anchor", fontsize=8)
+    axes.margins(x=0.01)
+    axes.grid(axis="x", visible=False)
+    return figure
+
+
 def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
     """A frame, its predicted label map, the Canny edges of the label map, and the edges dilated."""
-    figure, axes = new_figure(2, 2, height=3.0)
-    show_image(axes[0, 0], frame, "frame")
-    show_image(axes[0, 1], label_colors(label_map, frame), "predicted label map")
-    show_image(axes[1, 0], edge_image, "Canny edges (5, 15) of the label map")
-    show_image(axes[1, 1], mask, f"edges dilated by {dilation_width}x{dilation_width}")
+    figure, axes = frame_panels(frame, 2, 2)
+    show_image(axes[0], frame, "frame")
+    show_image(axes[1], label_colors(label_map, frame), "predicted label map")
+    show_image(axes[2], edge_image, "Canny edges (5, 15) of the label map")
+    show_image(axes[3], mask, f"edges dilated by {dilation_width}x{dilation_width}")
     return figure
 
 
@@ -33,8 +86,8 @@ def figure_4_01(history):
                                              ("loss", "(c) loss")), strict=True):
         panel.plot(history["epoch"], history[column], color=BLUE, label="training")
         panel.plot(history["epoch"], history[f"val_{column}"], color=ORANGE, linestyle="--", label="validation")
-        panel.axvline(best, color="#999999", linewidth=0.8, linestyle=":", label=f"lowest validation loss ({best})")
-        panel.set(title=title, xlabel="epoch")
+        panel.axvline(best, color="#666666", linewidth=1.2, linestyle=":", label=f"lowest validation loss ({best})")
+        panel.set(title=title, xlabel="epoch", ylabel=f"{title[4:]} (no unit)")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 
@@ -51,7 +104,8 @@ def figure_4_02(image, label_map, prediction):
 
 def figure_4_03(frame, prediction, title):
     """A KITTI frame and its predicted label map at the network's size."""
-    figure, axes = new_figure(2, 1, height=5.2)
+    figure, axes = frame_panels(frame, 2)
+    figure.set_figheight(figure.get_figheight() + 0.45)  # the legend's
     show_image(axes[0], frame, title)
     show_image(axes[1], label_colors(prediction, frame), "prediction")
     _class_legend(figure, prediction)
@@ -60,18 +114,15 @@ def figure_4_03(frame, prediction, title):
 
 def figure_4_04(frame, edge_image, keypoints, title):
     """Keypoints, (n, 2) pixels, that the mask left along the predicted boundaries."""
-    figure, axes = new_figure(height=2.9)
-    overlay = np.dstack([frame] * 3)
-    overlay[edge_image > 0] = (255, 140, 0)
-    show_image(axes, overlay, title)
+    figure, (axes,) = frame_panels(frame)
+    show_image(axes, _with_edges(frame, edge_image), title)
     axes.scatter(*keypoints.T, **KEYPOINT)
     return figure
 
 
 def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation_width, title):
     """The procedure in five panels: frame, all keypoints, prediction, dilated edges, kept keypoints."""
-    height, width = frame.shape
-    figure, axes = new_figure(5, 1, height=5 * (PAGE_WIDTH * 0.72 * height / width + 0.28))
+    figure, axes = frame_panels(frame, 5, width=0.78 * PAGE_WIDTH)
     show_image(axes[0], frame, f"(a) {title}")
     show_image(axes[1], frame, f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints")
     axes[1].scatter(*all_keypoints.T, **KEYPOINT)
@@ -79,6 +130,28 @@ def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation
     show_image(axes[3], mask, f"(d) Canny edges dilated by {dilation_width}x{dilation_width}")
     show_image(axes[4], frame, f"(e) the {len(kept_keypoints)} keypoints that the mask keeps")
     axes[4].scatter(*kept_keypoints.T, **KEYPOINT)
+    return figure
+
+
+def figure_4_08(views, title):
+    """One object in consecutive frames and how its keypoints jump: views of `flicker.follow`."""
+    figure, axes = new_figure(1, len(views), height=3.4)
+    for panel, view in zip(axes, views, strict=True):
+        text = f"frame {view.frame}: {len(view.keypoints)} keypoints"
+        if view.expected is not None:
+            text += f",\n{view.jumped} of {len(view.expected)} of before gone"
+        show_image(panel, _with_edges(view.crop, view.edges), text)
+        panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
+        if view.expected is not None:
+            panel.scatter(*view.expected.T, s=34, facecolors="none", edgecolors=PINK, linewidths=1.1)
+        # a ring at the rim must not stretch the panel
+        panel.set(xlim=(-0.5, view.crop.shape[1] - 0.5), ylim=(view.crop.shape[0] - 0.5, -0.5))
+    figure.legend(handles=[
+        Patch(color=np.array(EDGE) / 255, label="edges of the predicted label map"),
+        Line2D([], [], linestyle="none", marker="o", markersize=4, color=KEYPOINT["color"], label="keypoints"),
+        Line2D([], [], linestyle="none", marker="o", markersize=6, markerfacecolor="none", color=PINK,
+               label="keypoints of the frame before, tracked to here")], loc="outside lower center", ncols=3)
+    figure.suptitle(title, fontsize=9)
     return figure
 
 
@@ -97,6 +170,16 @@ def figure_a_01(rows, total, trainable):
     axes.axhline(1 - 1 / len(lines), color="black", linewidth=0.8)
     axes.set(xlim=(0, 1), ylim=(0, 1))
     return figure
+
+
+def _with_edges(frame, edge_image):
+    picture = np.dstack([frame] * 3)
+    picture[edge_image > 0] = EDGE
+    return picture
+
+
+def _rgb(color):
+    return tuple(int(color[index:index + 2], 16) for index in (1, 3, 5))
 
 
 def _class_legend(figure, *label_maps):

@@ -1,10 +1,14 @@
 """How much label maps flicker from frame to frame: the thesis blames its errors on it (Section 5.1)."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, files
+from thesis_repro import InputError, files, keypoints, masks
+from thesis_repro.cityscapes import ID
+from thesis_repro.odometry import THESIS
 
 CONSISTENT = 1.0  # pixels; forward and backward flow must cancel to this, or the pixel is left out
 
@@ -48,3 +52,100 @@ def _compare(old, new, forward, backward):
     warped = cv2.remap(old, *came_from, cv2.INTER_NEAREST)
     changed = (warped != new) & compared
     return changed.sum() / max(compared.sum(), 1), compared.mean()
+
+
+OBJECTS = [ID[name] for name in ("pole", "traffic light", "traffic sign", "vegetation", "person", "rider", "car", "truck",
+                                 "bus", "motorcycle", "bicycle")]
+SAME = 2.0  # pixels; a keypoint this near to where it was tracked to is the same one
+FEW = 8  # keypoints; an object with fewer shows nothing
+
+
+@dataclass(frozen=True)
+class View:
+    """One object in one frame: crop (h, w), its edges (h, w), and points (n, 2) in pixels of the crop."""
+
+    frame: int
+    crop: np.ndarray
+    edges: np.ndarray
+    keypoints: np.ndarray
+    expected: np.ndarray | None  # where the keypoints of the frame before are now; None for the first frame
+    jumped: int  # how many of these have no keypoint of this frame within SAME pixels
+
+
+def follow(frames, label_maps, dilation_width, first=0):
+    """How the masked keypoints of one object jump between consecutive frames (Section 4.2): a list of Views.
+
+    frames: (height, width) uint8 each; label_maps: (h, w) uint8 each, any size, as many; first: number of the first
+    frame. The object is the connected patch of a label, away from the image's border, from which most keypoints jump
+    from the first to the second frame; the window follows the median motion of its keypoints. Where no label map holds
+    such a patch, the window is the middle of the frame.
+    """
+    shape = frames[0].shape
+    edge_images = [masks.edges(label_map, shape) for label_map in label_maps]
+    points = [keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
+              for frame, edge_image in zip(frames, edge_images, strict=True)]
+    moved = [keypoints.track(before, after, some) if len(some) else (some, np.zeros(0, bool))
+             for before, after, some in zip(frames, frames[1:], points)]
+    boxes = [box for box in _boxes(label_maps[0], shape) if _inside(points[0], box).sum() >= FEW]
+    half, jumping = min(shape) // 8, _far(moved[0][0], points[1]) & moved[0][1]
+    center = np.array(shape[::-1]) / 2
+    if boxes:
+        left, top, right, bottom = max(boxes, key=lambda box: (_inside(points[0], box) & jumping).sum())
+        center = np.array([left + right, top + bottom]) / 2
+        half = int(np.clip(0.65 * max(right - left, bottom - top), half, min(shape) // 2))
+    views, expected = [], None
+    for index, frame in enumerate(frames):
+        corner = np.clip(np.round(center - half).astype(int), 0, np.array(shape[::-1]) - 2 * half)
+        box = (*corner, *(corner + 2 * half))
+        if index:
+            tracked, found = moved[index - 1]
+            expected = tracked[found & inside]
+            expected = expected[_inside(expected, box)]
+        window = np.s_[box[1]:box[3], box[0]:box[2]]
+        inside = _inside(points[index], box)
+        views.append(View(
+            first + index, frame[window], edge_images[index][window], points[index][inside] - corner,
+            None if expected is None else expected - corner,
+            0 if expected is None else int(_far(expected, points[index]).sum())))
+        if index < len(moved) and (inside & moved[index][1]).any():
+            used = inside & moved[index][1]
+            center = center + np.median(moved[index][0][used] - points[index][used], axis=0)
+    return views
+
+
+def _boxes(label_map, shape):
+    """(left, top, right, bottom) of the patches of objects in a label map at the frame's shape."""
+    enlarged = cv2.resize(label_map, shape[::-1], interpolation=cv2.INTER_NEAREST)
+    for label in OBJECTS:
+        _, _, boxes, _ = cv2.connectedComponentsWithStats((enlarged == label).astype(np.uint8))
+        for left, top, width, height, _ in boxes[1:]:
+            if left > 0 and top > 0 and left + width < shape[1] and top + height < shape[0] and (
+                    min(shape) // 8 <= max(width, height) <= 0.7 * min(shape)):
+                yield left, top, left + width, top + height
+
+
+def _inside(points, box):
+    left, top, right, bottom = box
+    return (points >= (left, top)).all(axis=1) & (points < (right, bottom)).all(axis=1)
+
+
+def _far(points, others):
+    """Which points have none of the others within SAME pixels."""
+    if not len(points) or not len(others):
+        return np.ones(len(points), bool)
+    return np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1) > SAME
+
+
+def found_again(first, second, settings=THESIS):
+    """Which keypoints of a frame are found again in a later one: arrays of (n, 2) pixels.
+
+    Returns those found again where they lie in the first and in the second frame, those of the first frame that are
+    lost, and those of the second that are new. Found again is what Lucas-Kanade tracks to within SAME pixels of a
+    keypoint of the second frame.
+    """
+    before, after = keypoints.detect(first, settings), keypoints.detect(second, settings)
+    if not len(before):
+        return before, before, before, after
+    tracked, found = keypoints.track(first, second, before)
+    kept = found & ~_far(tracked, after)
+    return before[kept], tracked[kept], before[~kept], after[_far(after, tracked[kept])]
