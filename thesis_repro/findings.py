@@ -43,12 +43,15 @@ def _about(summary, data):
     text = (f"**What was run.** Data: {data}. {_number(len(frames), 'sequence')} ({', '.join(frames.index)}), "
             f"{_from_to(frames)} frames each, {_number(baseline['repetition'].nunique(), 'repetition')} of every run "
             "with the correspondences in another order. Changes are Equation 4.1, of means over the repetitions, "
-            f"negative where the error is smaller; brackets hold the {LEVEL} % bootstrap interval of their mean over "
-            "sequences. A difference is called one only where its interval excludes zero, which one comparison in "
-            "twenty does by chance.")
+            "negative where the error is smaller.")
+    if len(frames) >= results.FEWEST:
+        text += f" Brackets hold the {LEVEL} % bootstrap interval of their mean over sequences."
     if len(frames) < ENOUGH:
         text += (f" With fewer than {ENOUGH} sequences even changes of one sign in all of them are no rare chance, so "
                  "nothing here is said of sequences in general.")
+    else:
+        text += (" A difference is called one only where its interval excludes zero, which one comparison in twenty "
+                 "does by chance.")
     return text
 
 
@@ -93,7 +96,8 @@ def _changes(table, choice):
 
 def _judged(changes):
     said = {-1: "is smaller than", 0: SAME, 1: "is larger than"}[verdict(changes)]
-    return f"{said} that of all keypoints ({_mean(changes)}, {_improved(changes)})"
+    return (f"{said} that of all keypoints ({_mean(changes)}, median {_signed(changes.median())} %, "
+            f"{_improved(changes)})")
 
 
 def _against_controls(summary, pose):
