@@ -69,11 +69,14 @@ ifeq (,$(RUN))
 $(error the settings above are wrong)
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
-SOURCES := $(wildcard thesis_repro/*.py thesis_repro/*.json thesis_repro/weights/*)
+# (the page shows what the notebooks leave, so they need not run again for it)
+SOURCES := $(filter-out thesis_repro/page.py thesis_repro/captions.py,\
+             $(wildcard thesis_repro/*.py thesis_repro/*.json thesis_repro/weights/*))
 DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
         $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*))
 
 figures: $(EXECUTED)
+	@$(BIN)/python -m thesis_repro.page
 	@$(BIN)/python -m thesis_repro.settings figures
 
 $(RUN)/checked: .venv/ready $(DATA)

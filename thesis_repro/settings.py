@@ -165,7 +165,7 @@ if __name__ == "__main__":
     except InputError as error:
         sys.exit(str(error))
     if sys.argv[1:] == ["figures"]:
-        print(f"tables and figures: {_short(_settings.figures)}; executed notebooks: "
-              f"{_short(_settings.build / 'notebooks')}")
+        print(f"tables and figures: open {_short(_settings.figures / 'index.html')} in a browser; "
+              f"executed notebooks: {_short(_settings.build / 'notebooks')}")
     else:
         print(_short(_settings.build))

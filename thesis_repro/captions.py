@@ -1,0 +1,137 @@
+"""What every table and figure shows, in the order of the thesis, and what the thesis reports where it gives a number.
+
+Frames and numbers are those of the data at hand; where the thesis shows a certain frame that other data does not have,
+the figure's own title says which one is shown instead.
+"""
+
+import json
+from pathlib import Path
+
+REPORTED = json.loads((Path(__file__).parent / "reported.json").read_text(encoding="utf-8"))
+
+# The 36 figures and 5 tables: chapter, then name of the file: title, caption.
+CHAPTERS = {
+    "Chapter 2: background": {
+        "figure_2_01": ("Basic CNN", "The stages of a convolutional network that classifies: convolution, activation, "
+                        "pooling, dense layer, softmax. A diagram."),
+        "figure_2_02": ("One convolution, in numbers", "A patch of an image, one kernel of the trained U-Net's first "
+                        "layer, the feature map it gives, and what is left of it after the activation. A marked "
+                        "neighbourhood and the kernel give the marked value."),
+        "figure_2_03": ("Sigmoid and ReLU", "Both activation functions and their derivatives. The sigmoid's derivative "
+                        "vanishes on both sides, which is what slows training; that of ReLU does not."),
+        "figure_2_04": ("Max pooling", "A 4x4 array under 2x2 max pooling with stride 2: of every block the largest "
+                        "value is kept."),
+        "figure_2_05": ("Dense layer and softmax", "A feature vector, weighted and summed for each class, becomes "
+                        "scores; softmax turns them into probabilities that sum to one."),
+        "figure_2_06": ("Stochastic gradient descent", "Steps down a loss surface with two valleys. Each follows a "
+                        "gradient that is known only roughly, so the path trembles."),
+        "figure_2_07": ("U-Net", "The network drawn from the Keras model itself: sizes and channels of every stage, "
+                        "the way down, the way up, and the skip connections between them."),
+        "figure_2_08": ("Poses and relative motions", "Camera poses C of one sequence seen from above, with the "
+                        "relative transforms T that lead from one to the next (Equations 2.2 and 2.3). Visual odometry "
+                        "estimates each T and multiplies them."),
+        "figure_2_09": ("ORB matches", "Keypoints found by ORB in two frames of one sequence and matched by their "
+                        "descriptors; the closest matches are drawn."),
+        "figure_2_10": ("Drift", "An estimated path leaves the true one, and the distance between them along the "
+                        "way: each step adds its own error to all later positions."),
+        "figure_2_11": ("Keypoints change with the viewpoint", "The same scene from two places: keypoints that are "
+                        "found again, and those that are lost or new."),
+        "figure_2_12": ("Keypoints on a frame and on its label map", "Shi-Tomasi on a frame covers every texture; on "
+                        "the label map of that frame it finds far fewer points, all of them where classes meet. This "
+                        "is the idea of the thesis."),
+    },
+    "Chapter 3: method": {
+        "table_3_1": ("Cityscapes categories", "Categories and label ids as the thesis lists them. There are 36, and "
+                      "the network has 35 outputs."),
+        "figure_3_01": ("Augmentation of an image", "An image as it is, flipped from left to right, shifted and "
+                        "scaled, and blurred."),
+        "figure_3_02": ("Augmentation of its label map", "The same transforms of the label map of Figure 3.1. Blur "
+                        "changes no label."),
+        "figure_3_03": ("Intersection over union", "A label map and a prediction of it for one class, what they share, "
+                        "and what either of them covers; the IoU (Equation 3.1) is the ratio of the two areas."),
+        "figure_3_04": ("Focal loss", "Focal loss against the probability that the network gives the true class, for "
+                        "five values of γ (Equation 3.7). The larger γ, the less an easy pixel counts."),
+        "figure_3_05": ("Pixels per category", "How often each category occurs in the label maps that the network is "
+                        "trained on here. The scale is logarithmic."),
+        "table_3_2": ("Class weights", "The weight of each category in the Dice loss, as the thesis lists them."),
+        "figure_3_06": ("From a prediction to a mask", "A frame, its predicted label map, the edges that Canny finds "
+                        "in the label map, and the edges dilated: keypoints are allowed where the mask is white."),
+    },
+    "Chapter 4: results": {
+        "figure_4_01": ("Training and validation curves", "F1 score, IoU score and loss of every epoch, as the library "
+                        "measures them: the mean over 35 classes in each batch, where a class that is neither "
+                        "present nor predicted scores 1. This is not the mIoU of the Cityscapes benchmark."),
+        "figure_4_02": ("Prediction on a validation image", "An image of the validation split, its label map, and the "
+                        "trained network's prediction. The thesis calls the split its test images."),
+        "figure_4_03": ("Prediction on an odometry frame", "A frame of the odometry data and its predicted label map. "
+                        "The thesis shows sequence 10, frame 192; the title says which frame this is."),
+        "figure_4_04": ("Keypoints along predicted boundaries", "The edges of the predicted label map, and the "
+                        "keypoints that the mask around them leaves."),
+        "figure_4_05": ("The procedure", "Frame, all Shi-Tomasi keypoints, prediction, dilated edges, and the "
+                        "keypoints that are kept. The thesis shows sequence 10, frame 637; the title says which "
+                        "frame this is."),
+        "figure_4_06": ("Paths with all keypoints", "Estimated against true path of every sequence, seen from above, "
+                        "without masks."),
+        "figure_4_07": ("Keypoints kept", "The part of the keypoints that masks of increasing dilation width leave, "
+                        "one line a sequence."),
+        "figure_4_08": ("Keypoints that jump", "One object in consecutive frames: the predicted boundary moves, and "
+                        "the keypoints along it with it. The thesis sees in this a cause of its errors."),
+        "figure_4_09": ("RMSE against dilation width", "Root mean square distance from the true path (Equation 3.5), "
+                        "one line a sequence. Where runs were repeated, bands or bars span the repetitions."),
+        "figure_4_10": ("MAE against dilation width", "Mean absolute error (Equation 3.6), drawn as Figure 4.9."),
+        "table_4_1": ("Best dilation width", "The width with the lowest RMSE on each sequence, and the mean number of "
+                      "keypoints that it leaves. The width is chosen on the sequence that it is judged on."),
+        "figure_4_11": ("Paths with each sequence's best width", "Estimated against true paths with the masks of Table "
+                        "4.1."),
+        "figure_4_12": ("Paths with plainly fewer keypoints", "No masks: the detector is limited to the mean number of "
+                        "keypoints of Table 4.1."),
+        "figure_4_13": ("RMSE of the three variants", "All keypoints, masks of the best width, and plainly fewer "
+                        "keypoints, every sequence."),
+        "figure_4_14": ("RMSE of each sequence", "The errors of Figure 4.13, one panel a sequence with its own scale."),
+        "figure_4_15": ("MAE of the three variants", "As Figure 4.13, for the mean absolute error."),
+        "figure_4_16": ("MAE of each sequence", "As Figure 4.14, for the mean absolute error."),
+        "table_4_2": ("Change of RMSE", "Percent change from all keypoints (Equation 4.1; negative is better). The "
+                      "thesis's aggregate is the sum of the sequences' percentages; mean and median stand below it."),
+        "table_4_3": ("Change of MAE", "As Table 4.2, for the mean absolute error."),
+        "figure_4_17": ("Time saved", "Change of the total time of all sequences for each dilation width (Equation "
+                        "4.2; negative is time saved). Masks are counted, the network that predicts the label maps is "
+                        "not, as in the thesis; the budget below counts everything."),
+    },
+    "Appendix": {
+        "figure_a_01": ("Model summary", "Every layer of the thesis's network at its full size, 320x320 with 64 "
+                        "filters in the first block, as built here."),
+    },
+}
+
+# What is not in the thesis: (kind, name of the file), title, caption.
+ADDED = {
+    ("text", "findings"): ("What the runs show", ""),
+    ("table", "widths"): ("A fair choice of width", "The thesis's best width of each sequence beside one width for all "
+                          "and the width that the other sequences choose, as changes in percent from all keypoints; "
+                          "and how far the best width is chance."),
+    ("figure", "controls"): ("Controls", "Masks from the segmentation against masks and limits that know nothing of "
+                             "it, under the thesis's estimator and under the refined one. If a control does as well, "
+                             "it is not the segmentation that helps."),
+    ("table", "controls"): ("Controls, in numbers", "Mean changes in percent from all keypoints under the same "
+                            "estimator, and what masks do better (negative) or worse than each control."),
+    ("figure", "budget"): ("Time of a frame, whole", "What one frame costs from reading it to its pose, the network "
+                           "included, against the ten frames a second that KITTI's camera takes."),
+    ("table", "budget"): ("Time of a frame, in numbers", "Milliseconds of each stage, and the frames a second that "
+                          "they allow one after another and with the next frame segmented meanwhile."),
+}
+
+_FACTORS = [2000 / row["mean_keypoints"] for row in REPORTED["table_4_1"]]
+_SCORES = "; ".join(f"{name} loss {scores['loss']}, F1 {scores['f1']}, IoU {scores['iou']}"
+                    for name, scores in REPORTED["segmentation_results"].items())
+
+# Numbers that the thesis reports and no table here has beside its own. Those of "runs" come from the complete KITTI
+# sequences, those of "training" from Cityscapes; those of "model" depend on no data.
+REPORTS = {
+    "figure_4_01": ("training", f"{REPORTED['training']['epochs_run']} epochs, the best was "
+                    f"{REPORTED['training']['best_epoch']}; {_SCORES}."),
+    "figure_4_07": ("runs", "fewer keypoints by a factor of {} to {}; its Table 4.1 gives {:.1f} to {:.1f} times "
+                    "fewer than 2000.".format(*REPORTED["headline_claims"]["keypoint_reduction_factor"],
+                                              min(_FACTORS), max(_FACTORS))),
+    "figure_4_17": ("runs", "{} to {} % of the time saved.".format(*REPORTED["headline_claims"]["time_savings_percent"])),
+    "figure_a_01": ("model", f"{REPORTED['figure_a1_model_summary']['total']:,} parameters."),
+}
