@@ -217,6 +217,7 @@ def figure_2_08(poses, title):
 
     poses: a few (n, 4, 4) camera-to-world poses, metres. A wedge opens to where the camera looks.
     """
+    poses = np.linalg.inv(poses[0]) @ poses  # the first camera is where the path starts and looks ahead
     positions = poses[:, [0, 2], 3]
     forward, right = poses[:, [0, 2], 2], poses[:, [0, 2], 0]
     extent = np.ptp(positions, axis=0)
@@ -249,8 +250,8 @@ def figure_2_08(poses, title):
                       lay((start + end) / 2), (18 + 6 * abs(side[1])) * side, textcoords="offset points", ha=horizontal,
                       va="bottom" if side[1] > 0.3 else "top" if side[1] < -0.3 else "center", fontsize=8, color=RED)
     axes.plot(*lay(positions).T, linestyle="none", marker="o", markersize=3.5, color="black")
-    names = ("z, ahead at the start (m)", "x, to the right (m)") if upright else ("x (m)", "z (m)")
-    axes.set(xlabel=names[0], ylabel=names[1], title=title)
+    names = ["x, to the right of the first camera (m)", "z, ahead of the first camera (m)"]
+    axes.set(xlabel=names[1] if upright else names[0], ylabel=names[0] if upright else names[1], title=title)
     if upright:
         axes.yaxis.set_inverted(True)
     axes.set_aspect("equal", adjustable="datalim")

@@ -20,11 +20,14 @@ def figure_augmentation(examples):
 
 
 def figure_3_03(image, label_map, prediction, label):
-    """Intersection and union of a prediction and its label map for one class, with the IoU (Equation 3.1)."""
+    """Intersection and union of a prediction and its label map for one class, with the IoU (Equation 3.1).
+
+    image: (h, w) gray or (h, w, 3) colours.
+    """
     true, predicted = label_map == label.id, prediction == label.id
     both, either = (true & predicted).sum(), (true | predicted).sum()
     figure, axes = new_figure(1, 3, height=3.0)
-    dimmed = np.dstack([image] * 3) // 3 + 150
+    dimmed = np.dstack([image] * 3)[..., :3] // 3 + 150
     for panel, where, title in ((axes[0], true, f"label map: {true.sum():,} pixels"),
                                 (axes[1], predicted, f"prediction: {predicted.sum():,} pixels")):
         picture = dimmed.copy()

@@ -136,14 +136,14 @@ def _far(points, others):
     return np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1) > SAME
 
 
-def found_again(first, second, settings=THESIS):
+def found_again(first, second, first_mask=None, second_mask=None, settings=THESIS):
     """Which keypoints of a frame are found again in a later one: arrays of (n, 2) pixels.
 
     Returns those found again where they lie in the first and in the second frame, those of the first frame that are
     lost, and those of the second that are new. Found again is what Lucas-Kanade tracks to within SAME pixels of a
-    keypoint of the second frame.
+    keypoint of the second frame. The masks are for the detector, (height, width) uint8.
     """
-    before, after = keypoints.detect(first, settings), keypoints.detect(second, settings)
+    before, after = keypoints.detect(first, settings, first_mask), keypoints.detect(second, settings, second_mask)
     if not len(before):
         return before, before, before, after
     tracked, found = keypoints.track(first, second, before)
