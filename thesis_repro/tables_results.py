@@ -63,7 +63,8 @@ def table_of_change(summary, metric, reported_as):
     below = _below(changes.assign(**{theirs: np.nan}))
     below[theirs] = _below(reported.to_frame()).to_numpy()[:, 0]  # of all that the thesis reports
     table = pd.concat([errors.join(changes), below])[[*errors.columns, *changes.columns]]
-    return table.round(dict.fromkeys(changes, 2)).rename_axis("sequence").reset_index()
+    digits = {name: 2 if name in ("change (%)", theirs) else 1 for name in changes}  # the thesis prints two
+    return table.round(digits).rename_axis("sequence").reset_index()
 
 
 def _below(changes):
