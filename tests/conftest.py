@@ -50,6 +50,20 @@ def small_world(tmp_path_factory):
     return folder / "world"
 
 
+@pytest.fixture(scope="session")
+def small_labels(small_world, tmp_path_factory):
+    """Label maps of the small world as notebook 5 leaves them, one folder a sequence: here the true ones, 320x320."""
+    from thesis_repro import stages
+
+    root = tmp_path_factory.mktemp("labels")
+    for name in ("00", "01"):
+        stages.stage(root / name, model="none")
+        for path in (small_world / "kitti" / "sequences" / name / "labels_0").glob("*.png"):
+            true = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            cv2.imwrite(str(root / name / path.name), cv2.resize(true, (320, 320), interpolation=cv2.INTER_NEAREST))
+    return root
+
+
 @pytest.fixture
 def tiny_kitti(tmp_path):
     """Sequence 00 with four 64x48 frames of noise, written by hand, for tests of reading and of faults."""

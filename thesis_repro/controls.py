@@ -15,6 +15,7 @@ from thesis_repro.keypoints import SharedKeypoints
 from thesis_repro.masks import LabelMasks, dilate
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
+CLOSE = 0.002  # of the frame: a difference of coverage that is none
 SAMPLE = 12  # frames on which a distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
 
@@ -34,6 +35,7 @@ class OtherFrame:
 
     def __init__(self, labels, sequence, dilation_width):
         self.masks = LabelMasks(labels, sequence, dilation_width)
+        self.paths = self.masks.paths
 
     def __len__(self):
         return len(self.masks)
@@ -59,22 +61,19 @@ class RandomLines(OtherFrame):
 
     def __getitem__(self, index):
         mask = self.masks[index]
-        wanted, number = np.count_nonzero(mask), 64
-        while True:
+        wanted = np.count_nonzero(mask)
+        for number in (2**8, 2**11, 2**14):
             first = self._first_segments(index, number, mask.shape)
             covered = np.cumsum(np.bincount(first.ravel(), minlength=number + 1))[:number]
-            if covered[-1] >= wanted or number > 2**14:
+            if covered[-1] >= wanted:
                 break
-            number *= 4
-        covered = np.concatenate([[0], covered])
-        count = np.abs(covered - wanted).argmin()
+        count = np.abs(np.concatenate([[0], covered]) - wanted).argmin()
         return np.where(first < count, np.uint8(255), np.uint8(0))
 
     def _first_segments(self, index, number, shape):
         """The number of the first of the dilated segments that covers a pixel, `number` where none does."""
         random = np.random.default_rng((self.seed, index))
         height, width = shape
-        # one segment at a time, so that more of them begin with the same ones
         start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
         length = length * height / 2
         start = np.column_stack([start_x * width, start_y * height])
@@ -94,16 +93,22 @@ class ImageEdges(OtherFrame):
 
     def __getitem__(self, index):
         frame, wanted = self.sequence.frame(index), np.count_nonzero(self.masks[index])
-        across, down = cv2.Sobel(frame, cv2.CV_16S, 1, 0), cv2.Sobel(frame, cv2.CV_16S, 0, 1)
-        low, high = 0, LARGEST_GRADIENT  # thresholds that cover too much, and not enough
+        across, down = cv2.spatialGradient(frame)
+        low, high = 1, LARGEST_GRADIENT  # thresholds that cover too much, and not enough
+        covered_low, covered_high = frame.size, 0
         best, miss = np.zeros_like(frame), wanted
-        while high - low > 1:
-            threshold = (low + high) // 2
+        while high - low > 1 and miss > CLOSE * frame.size:
+            # interpolated, but never so near an end that the other one could stay for ever
+            share = np.clip((covered_low - wanted) / (covered_low - covered_high), 0.1, 0.9)
+            threshold = int(np.clip(low * (high / low) ** share, low + 1, high - 1))
             mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), self.masks.dilation_width)
             covered = cv2.countNonZero(mask)
             if abs(covered - wanted) < miss:
                 best, miss = mask, abs(covered - wanted)
-            low, high = (threshold, high) if covered > wanted else (low, threshold)
+            if covered > wanted:
+                low, covered_low = threshold, covered
+            else:
+                high, covered_high = threshold, covered
         return best
 
 

@@ -4,21 +4,27 @@ and the controls, which ask whether it is the segmentation that helps.
 Each finished run is one CSV file, so that a stopped or failed series goes on where it was.
 """
 
+import hashlib
+import json
+import math
 import time
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 
 import cv2
 import joblib
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, controls, metrics, odometry, stages
-from thesis_repro.files import progress, write_text
+from thesis_repro import InputError, cluster, controls, metrics, odometry, stages
+from thesis_repro.cityscapes import read_label_map
+from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, forget_edges
 
 CODE = ("controls", "experiments", "keypoints", "kitti", "masks", "odometry", "pose")  # a finished run depends on them
 CONTROL_WIDTH = 10  # pixels: the width of A.8 and Figure 3.6, chosen before any run
+PIECES = 4  # passes for each of several workers, at the least
 POSES = ("all", "refined")  # the thesis's estimator, and the one with the far smaller spread
 
 
@@ -120,38 +126,103 @@ def _repetitions(summary):
 def run(jobs, kitti, labels, folder, *, frames=None, processes=1, scheduler=None, settings=odometry.THESIS):
     """Run the jobs that have no result yet; returns the summary of all that succeeded, one row a job.
 
-    The jobs of one sequence go over it together (`odometry.run_many`: the bits of separate runs at a third of the
-    cost), and `processes` sequences at a time. kitti: the odometry root. labels: folder with one folder of label maps
-    a sequence. folder: where results are kept. frames: how many of each sequence, None for all.
-    A job that fails is printed with its reason and does not stop the others.
+    kitti: the odometry root. labels: folder with one folder of label maps a sequence. folder: where results are kept.
+    frames: how many of each sequence, None for all. processes: how many work at once on this machine.
+    scheduler: address of a Dask scheduler ("tcp://host:8786"); its workers do the work then, with the same results.
+    They need this package, and the three folders under the same paths. One thread a worker is best.
+
+    Jobs over one sequence go over it together (`odometry.run_many`: the bits of separate runs at a fraction of the
+    cost), in as many passes as it takes to keep everyone busy. A job that fails is printed with its reason and does
+    not stop the others. What was running when everything stopped goes on from its checkpoint.
     """
+    jobs = list(dict.fromkeys(jobs))
     sequences = _open(jobs, kitti, labels, folder, frames, settings)
-    waiting = {name: [job for job in jobs if job.sequence == name and not _result(folder, job).is_file()]
-               for name in sequences}
-    # the longest first, so that no process works alone at the end
-    names = sorted((name for name in waiting if waiting[name]), key=lambda name: -len(sequences[name]))
-    threads = -(-processes // max(1, len(names)))
-    work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")(
-        joblib.delayed(_run_jobs)(waiting[name], sequences[name], labels, folder, settings, threads) for name in names)
     failures = {}
-    for failed in progress(work, "odometry", total=len(names), unit="sequence"):
-        failures.update(failed)
-    for job, reason in failures.items():
-        print(f"sequence {job.sequence}, {job.name}: failed: {reason}")
-    done = [job for job in jobs if job not in failures]
+    with cluster.open_pool(processes, scheduler) as pool:
+        passes = _passes(jobs, sequences, folder, pool.size)
+        threads = -(-pool.size // max(1, len(passes)))
+        calls = [(one, kitti, labels, folder, frames, settings, stages.made_from(folder / one[0].sequence), threads)
+                 for one in passes]
+        for one, failed in progress(pool.run(_run_pass, calls), "odometry", total=len(passes), unit="pass"):
+            failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[one], failed)
+    for (name, reason), names in _by_reason(failures).items():
+        more = f" and {len(names) - 3} more" * (len(names) > 3)
+        print(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}")
+    done = [job for job in jobs if _result(folder, job).is_file()]
     if not done:
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
     return pd.DataFrame([_summarize(job, sequences[job.sequence], folder) for job in done])
+
+
+def _by_reason(failures):
+    names = {}
+    for job, reason in failures.items():
+        names.setdefault((job.sequence, reason), []).append(job.name)
+    return names
 
 
 def _open(jobs, kitti, labels, folder, frames, settings):
     """The jobs' sequences by name; what the folder holds of other data, settings or code is deleted."""
     sequences = {name: Sequence(kitti, name).subset(frames) for name in sorted({job.sequence for job in jobs})}
     for name, sequence in sequences.items():
-        stages.stage(folder / name, code=stages.code(*CODE), frames=stages.listing(sequence.frame_paths),
-                     poses=stages.content(sequence.root / "poses" / f"{name}.txt"), opencv=cv2.__version__,
-                     labels=stages.made_from(labels / name), settings=asdict(settings))
+        true_labels = controls.true_labels(kitti, name)
+        stages.stage(folder / name, **_versions(), frames=stages.listing(sequence.frame_paths),
+                     poses=stages.content(sequence.root / "poses" / f"{name}.txt"),
+                     labels=stages.made_from(labels / name), settings=asdict(settings),
+                     true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None)
     return sequences
+
+
+def _versions():
+    return {"code": stages.code(*CODE), "opencv": cv2.__version__}
+
+
+def _passes(jobs, sequences, folder, workers):
+    """What is to be run, as lists of jobs, each for one pass over its sequence; the longest first.
+
+    A pass that has a checkpoint goes on as it was. The rest is cut into pieces of at most 1 / PIECES of a worker's
+    share, so that no worker is alone at the end; jobs with the same keypoints stay together, since they share most.
+    A worker on its own takes each sequence whole.
+    """
+    passes, groups = [], {}
+    for name in sequences:
+        of_name = {job.name: job for job in jobs if job.sequence == name}
+        waiting = {key: job for key, job in of_name.items() if not _result(folder, job).is_file()}
+        for path in sorted((folder / name).glob("pass-*.json")):
+            keys = json.loads(path.read_text(encoding="utf-8"))
+            if waiting.keys().isdisjoint(keys):
+                if of_name.keys() >= set(keys):  # all have their results
+                    _forget_pass(path)
+            elif _state(path).is_file() and of_name.keys() >= set(keys):
+                passes.append([of_name[key] for key in keys])
+                waiting = {key: job for key, job in waiting.items() if key not in keys}
+        groups[name] = {}
+        for job in waiting.values():
+            groups[name].setdefault(replace(job, pose="", repetition=0), []).append(job)
+    everything = sum(len(groups[name]) * len(sequences[name]) for name in groups)
+    for name, of_name in groups.items():
+        of_name = list(of_name.values())
+        share = len(of_name) * len(sequences[name]) / max(everything, 1)
+        pieces = min(len(of_name), math.ceil(share * (PIECES * workers if workers > 1 else 1)))
+        for index in range(pieces):
+            start, stop = (index * len(of_name) // pieces, (index + 1) * len(of_name) // pieces)
+            passes.append([job for group in of_name[start:stop] for job in group])
+    return sorted(passes, key=lambda one: -len(one) * len(sequences[one[0].sequence]))
+
+
+def _pass_file(jobs, folder):
+    """The list of what goes over a sequence together; beside it lies the checkpoint."""
+    digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
+    return folder / jobs[0].sequence / f"pass-{digest}.json"
+
+
+def _state(pass_file):
+    return pass_file.with_suffix(".state")
+
+
+def _forget_pass(pass_file):
+    _state(pass_file).unlink(missing_ok=True)
+    pass_file.unlink(missing_ok=True)
 
 
 def _result(folder, job):
@@ -179,32 +250,62 @@ def _variants(jobs, sequence, labels, settings):
     """
     made, variants, failures = {}, {}, {}
     for job in jobs:
-        masks = (job.variant, job.dilation_width)
-        try:
-            if masks not in made:
-                made[masks] = _masks(job, sequence, labels)
-            variants[job] = _settings(job, settings), made[masks]
-        except InputError as error:
-            failures[job] = str(error)
+        source = (job.variant, job.dilation_width)
+        if source not in made:
+            try:
+                made[source] = _masks(job, sequence, labels)
+                for path in [] if made[source] is None else made[source].paths:
+                    _check_label_map(path)  # here, since in the middle of a pass it would stop all of it
+            except InputError as error:
+                made[source] = error
+        if isinstance(made[source], InputError):
+            failures[job] = str(made[source])
+        else:
+            variants[job] = _settings(job, settings), made[source]
+    _check_label_map.cache_clear()
     return variants, failures
 
 
-def _run_jobs(jobs, sequence, labels, folder, settings, threads):
-    """Run the jobs of one sequence in one pass; returns {job: reason} of those that failed."""
+@lru_cache(maxsize=None)
+def _check_label_map(path):
+    read_label_map(path)
+
+
+def _run_pass(jobs, kitti, labels, folder, frames, settings, record, threads):
+    """Run jobs of one sequence in one pass, here or on a machine of a cluster; returns {job: reason} of those failed."""
     cv2.setNumThreads(1)  # the processes already use every core
-    variants, failures = _variants(jobs, sequence, labels, settings)
-    if not variants:
-        return failures
-    checkpoint = folder / sequence.name / "checkpoint"
+    name, pass_file, failures = jobs[0].sequence, _pass_file(jobs, folder), {}
     try:
+        _check_machine(folder / name, record)
+        sequence = Sequence(kitti, name).subset(frames)
+        variants, failures = _variants(_waiting(jobs, pass_file, folder), sequence, labels, settings)
+        write_text(pass_file, json.dumps([job.name for job in jobs]))
         results = odometry.run_many(sequence, {job.name: variant for job, variant in variants.items()},
-                                    checkpoint=checkpoint, workers=threads)
-    except Exception as error:  # whatever it is, the other sequences go on and the reason is reported
-        return failures | {job: f"{type(error).__name__}: {error}" for job in variants}
-    for job in variants:
-        write_text(_result(folder, job), results[job.name].frames.to_csv(index=False))
-    checkpoint.unlink(missing_ok=True)
+                                    checkpoint=_state(pass_file), workers=threads)
+        for job in variants:
+            if not _result(folder, job).is_file():
+                write_text(_result(folder, job), results.pop(job.name).frames.to_csv(index=False))
+        _forget_pass(pass_file)
+    except Exception as error:  # whatever it is, the others go on and the reason is reported
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        failures = dict.fromkeys((job for job in jobs if not _result(folder, job).is_file()), reason) | failures
     return failures
+
+
+def _waiting(jobs, pass_file, folder):
+    """The jobs without a result; all of them where a checkpoint of all of them is there to go on from."""
+    if _state(pass_file).is_file():
+        return jobs
+    return [job for job in jobs if not _result(folder, job).is_file()]
+
+
+def _check_machine(folder, record):
+    if not (folder / stages.RECORD).is_file() or stages.made_from(folder) != record:
+        raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
+                         "folders under the same paths")
+    made_from = json.loads((folder / stages.RECORD).read_text(encoding="utf-8"))
+    if any(made_from[key] != value for key, value in _versions().items()):
+        raise InputError("this worker has another version of thesis_repro or of OpenCV; install the same on all")
 
 
 def time_runs(jobs, kitti, labels, folder, *, frames, processes=1, settings=odometry.THESIS):
@@ -215,11 +316,12 @@ def time_runs(jobs, kitti, labels, folder, *, frames, processes=1, settings=odom
     To be called after `run`, whose folder it shares.
     """
     files = {name: folder / name / f"seconds-{frames}.csv" for name in sorted({job.sequence for job in jobs})}
-    waiting = [name for name in files if not files[name].is_file()]
+    waiting = {name: [job for job in jobs if job.sequence == name] for name in files}
+    waiting = {name: of_name for name, of_name in waiting.items() if not files[name].is_file()
+               or not {job.name for job in of_name} <= set(pd.read_csv(files[name])["run"])}
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")(
-        joblib.delayed(_time_jobs)([job for job in jobs if job.sequence == name],
-                                   Sequence(kitti, name).subset(frames), labels, files[name], settings)
-        for name in waiting)
+        joblib.delayed(_time_jobs)(of_name, Sequence(kitti, name).subset(frames), labels, files[name], settings)
+        for name, of_name in waiting.items())
     for _ in progress(work, "timing", total=len(waiting), unit="sequence"):
         pass
     return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in files.values()], ignore_index=True)
@@ -230,7 +332,7 @@ def _time_jobs(jobs, sequence, labels, path, settings):
     scales = odometry.scales(sequence)
     variants, _ = _variants(jobs, sequence, labels, settings)
     runs = {job: odometry.Odometry(sequence.intrinsics, chosen) for job, (chosen, _) in variants.items()}
-    seconds = dict.fromkeys(jobs, 0.0)
+    seconds = dict.fromkeys(variants, 0.0)
     for index in range(len(sequence)):
         frame = sequence.frame(index)
         for job, (_, masks) in variants.items():
@@ -243,7 +345,8 @@ def _time_jobs(jobs, sequence, labels, path, settings):
                 # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
                 seconds[job] += mask_seconds + sum(step.seconds.values())
     table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "variant": job.variant,
-                           "dilation_width": job.dilation_width, "seconds": seconds[job]} for job in jobs])
+                           "dilation_width": job.dilation_width, "seconds": value} for job, value in seconds.items()],
+                         columns=["sequence", "run", "variant", "dilation_width", "seconds"])
     write_text(path, table.to_csv(index=False))
 
 

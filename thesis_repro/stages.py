@@ -9,7 +9,7 @@ from pathlib import Path
 from thesis_repro.files import write_text
 
 _PACKAGE = Path(__file__).parent
-_RECORD = "made-from.json"
+RECORD = "made-from.json"
 
 
 def stage(folder, **inputs):
@@ -19,7 +19,7 @@ def stage(folder, **inputs):
     """
     folder = Path(folder)
     wanted = json.dumps(inputs, indent=1, sort_keys=True, default=str)
-    record = folder / _RECORD
+    record = folder / RECORD
     if not record.is_file() or record.read_text(encoding="utf-8") != wanted:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -29,7 +29,7 @@ def stage(folder, **inputs):
 
 def made_from(folder):
     """A digest of what the results in a stage's folder were made from."""
-    return content(Path(folder) / _RECORD)
+    return content(Path(folder) / RECORD)
 
 
 def code(*modules):
