@@ -105,6 +105,18 @@ def odometry(options):
             print(f"{flag:16}{count} frame{'s' * (count > 1)}")
 
 
+def plan(options):
+    """say how long all runs over a KITTI folder would take here, and their memory and disk, from a short calibration"""
+    from thesis_repro import plan
+
+    if options.repetitions < 1 or min(options.cores) < 1:
+        raise InputError("--repetitions and --cores: need whole numbers of 1 or more")
+    frames = plan.counts(options.kitti, options.complete)
+    calibration = plan.calibrate(options.kitti, options.repetitions)
+    planned = plan.make(options.kitti, frames, calibration, options.repetitions, options.cores)
+    print(plan.text(options.kitti, planned, calibration, options.repetitions, options.complete))
+
+
 def build_parser():
     parser = argparse.ArgumentParser(prog="python -m thesis_repro", description=sys.modules["thesis_repro"].__doc__)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -155,6 +167,14 @@ def build_parser():
     sub.add_argument("--video", type=Path, metavar="OUT.mp4", help="what the odometry sees and where it goes")
     sub.add_argument("--frames-csv", type=Path, metavar="FILE", help="one row a frame")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
+
+    sub = command(plan)
+    sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
+    sub.add_argument("--complete", action="store_true",
+                     help="plan for the complete benchmark, 23,201 frames, even where ROOT holds less")
+    sub.add_argument("--repetitions", type=int, default=5, metavar="N", help="of every run (5)")
+    sub.add_argument("--cores", type=int, nargs="+", default=[1, 4, 8, 16, 64], metavar="N",
+                     help="numbers of cores to plan for (1 4 8 16 64)")
     return parser
 
 
