@@ -61,7 +61,8 @@ def test_max_pooling_keeps_the_largest_of_each_block():
 
 
 def test_softmax_scores_add_up_to_one():
-    scores = [float(text.split(": ")[1]) for text in texts(figures_background.figure_2_05()) if text.startswith("class")]
+    shown = texts(figures_background.figure_2_05())
+    scores = [float(text.split(": ")[1]) for text in shown if text.startswith("class")]
     assert len(scores) == 3 and sum(scores) == pytest.approx(1, abs=0.011)
 
 
@@ -103,6 +104,10 @@ def test_a_pure_shift_is_found_again():
     in_first, _, lost, new = flicker.found_again(first, blank)
     assert len(in_first) == len(new) == 0 and len(lost)
     assert all(len(points) == 0 for points in flicker.found_again(blank, blank))
+    left = np.zeros_like(first)
+    left[:, :100] = 255
+    in_first, in_second, lost, new = flicker.found_again(first, second, left, left)
+    assert max(in_first[:, 0].max(), lost[:, 0].max(), new[:, 0].max()) < 100 and len(in_first) > len(lost)
     figure = figures_background.figure_2_11(first, second, *_grouped(first, second), ("first", "second"))
     assert any(text.startswith("first: ") and "found again" in text for text in texts(figure))
 
@@ -136,8 +141,8 @@ def test_matches_of_a_frame_without_corners_are_none():
 def test_the_same_figure_gives_the_same_files_with_its_note(tmp_path):
     for folder in ("one", "two"):
         figures.save_figure(figures_background.figure_2_06(), tmp_path / folder, "figure", "a note")
-    for suffix in (".svg", ".png"):
-        assert (tmp_path / "one" / f"figure{suffix}").read_bytes() == (tmp_path / "two" / f"figure{suffix}").read_bytes()
+    for name in ("figure.svg", "figure.png"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
     assert "a note" in (tmp_path / "one" / "figure.svg").read_text()
 
 

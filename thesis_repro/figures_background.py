@@ -198,9 +198,9 @@ def figure_2_07(model):
             axes.text(x + width / 2, y - height / 2 - 0.08, f"{side}x{side}", ha="center", va="top", fontsize=7)
         x += width + 0.26
     for name, sources in skips.items():
-        source = min(sources, key=lambda other: places[other][0])
-        _arrow(axes, (places[source][1] + 0.05, places[source][2]), (places[name][0] - 0.05, places[name][2]), color=GRAY,
-               zorder=0)  # it passes behind what it is joined with
+        _, right, y = min(places[source] for source in sources)
+        left, _, level = places[name]
+        _arrow(axes, (right + 0.05, y), (left - 0.05, level), GRAY, zorder=0)  # behind what it is joined with
     order = [place for _, place in sorted(places.items(), key=lambda item: item[1])]
     for (_, right, y), (left, _, below) in zip(order, order[1:]):
         axes.plot((right, left), (y, below), color="#bbbbbb", linewidth=0.8, zorder=0)
@@ -262,9 +262,10 @@ def figure_2_08(poses, title):
 def figure_2_09(first, second, title, matches_shown=60):
     """ORB matches between two frames of one sequence, the best ones (smallest descriptor distance)."""
     orb = cv2.ORB_create(1000)
-    (points, descriptors), (others, other_descriptors) = (orb.detectAndCompute(image, None) for image in (first, second))
+    points, descriptors = orb.detectAndCompute(first, None)
+    others, other_descriptors = orb.detectAndCompute(second, None)
     matches = []
-    if descriptors is not None and other_descriptors is not None:
+    if points and others:
         matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors, other_descriptors)
     best = sorted(matches, key=lambda match: match.distance)[:matches_shown]
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)

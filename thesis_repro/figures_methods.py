@@ -91,6 +91,7 @@ def figure_4_01(history):
         panel.plot(history["epoch"], history[f"val_{column}"], color=ORANGE, linestyle="--", label="validation")
         panel.axvline(best, color="#666666", linewidth=1.2, linestyle=":", label=f"lowest validation loss ({best})")
         panel.set(title=title, xlabel="epoch", ylabel=f"{title[4:]} (no unit)")
+        panel.xaxis.get_major_locator().set_params(integer=True)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 

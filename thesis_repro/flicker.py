@@ -54,8 +54,8 @@ def _compare(old, new, forward, backward):
     return changed.sum() / max(compared.sum(), 1), compared.mean()
 
 
-OBJECTS = [ID[name] for name in ("pole", "traffic light", "traffic sign", "vegetation", "person", "rider", "car", "truck",
-                                 "bus", "motorcycle", "bicycle")]
+OBJECTS = [ID[name] for name in ("pole", "traffic light", "traffic sign", "vegetation", "person", "rider", "car",
+                                 "truck", "bus", "motorcycle", "bicycle")]
 SAME = 2.0  # pixels; a keypoint this near to where it was tracked to is the same one
 FEW = 8  # keypoints; an object with fewer shows nothing
 
