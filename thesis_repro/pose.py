@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numba import njit
 
+from thesis_repro import ransac
+
 PROBABILITY = 0.999  # of RANSAC
 MAX_DEPTH = 50.0  # in units of the translation: recoverPose lets no point beyond it vote
 MIN_CORRESPONDENCES = 5
@@ -50,8 +52,11 @@ def essential_matrix(current, previous, threshold, estimator="ransac"):
     if len(current) < MIN_CORRESPONDENCES:
         return None, none, "fewer than five correspondences"
     try:
-        matrix, inliers = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0),
-                                               method=ESTIMATORS[estimator], prob=PROBABILITY, threshold=threshold)
+        if estimator == "ransac":
+            matrix, inliers = ransac.find(current, previous, threshold, PROBABILITY)
+        else:
+            matrix, inliers = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0),
+                                                   method=ESTIMATORS[estimator], prob=PROBABILITY, threshold=threshold)
     except cv2.error:  # the USAC estimators raise on degenerate points
         matrix = None
     if matrix is None or not np.isfinite(matrix).all():
@@ -87,6 +92,7 @@ def recover_pose(matrix, current, previous):
 def warm_up():
     """Load the compiled functions (compile them the first time ever), so that no frame's time holds that."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
+    essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
     recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
     refine(np.eye(3), np.array([0.0, 0.0, 1.0]), points, points, np.ones(8, bool), 1.0)
 

@@ -1,0 +1,463 @@
+"""cv2.findEssentialMat with RANSAC to the last bit, several times faster.
+
+Nearly all of OpenCV's time goes into the five-point solver (Nister 2004: An efficient solution to the five-point
+relative pose problem), most of it into finding all ten complex roots of a polynomial by Durand and Kerner's iteration,
+which runs to its last round although the roots settled long before. Of all these solutions RANSAC keeps one. So a
+solver of our own, not the same to the last bit but with a bound on the difference, says of each sample of five how
+many correspondences agree with its best solution; OpenCV itself solves those samples for which the bound leaves open
+whether they are better than the best so far, and the winner. Should the winner's inliers not be as many as foretold,
+OpenCV does everything. Samples are drawn with OpenCV's generator of random numbers.
+"""
+
+import math
+
+import cv2
+import numpy as np
+from numba import njit
+
+MAX_SAMPLES = 1000
+SAMPLE = 5
+FEWEST = 8  # correspondences: below, the few samples there are go to OpenCV
+SEED = 2**64 - 1  # of OpenCV's RANSAC
+BLOCK = 128  # correspondences scored between two looks at whether the best can still be beaten
+ERROR = 1e-12  # by which all equations are changed, at random, to see what rounding does to their solutions
+SAFETY = 10.0  # times that change, and more where elimination is ill-conditioned, is granted to OpenCV's solutions
+LEAST_MARGIN, LARGEST_MARGIN = 1e-9, 1e-3  # of a unit-norm essential matrix
+
+FAST = njit(cache=True, nogil=True, error_model="numpy")
+
+
+def find(current, previous, threshold, probability):
+    """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability, threshold): (E, mask).
+
+    Correspondences are (N, 2) float64 in normalised coordinates. E is 3x3, or OpenCV's stack of solutions for N = 5,
+    or None; mask is (N, 1) uint8 as OpenCV returns it.
+    """
+    count = len(current)
+    current, previous = np.ascontiguousarray(current, float), np.ascontiguousarray(previous, float)
+    if count < FEWEST or not (np.isfinite(current).all() and np.isfinite(previous).all()):
+        return _opencv(current, previous, threshold, probability)
+    columns = np.ascontiguousarray(np.hstack([current, previous]).T)
+    limit = np.float32(threshold * threshold)
+
+    def solve_now(winner):
+        return _solved(columns, winner, threshold, probability, limit)
+
+    # The best so far has between `low` and `high` inliers; which of them matters only when another comes near it, or
+    # when it decides whether the search ends.
+    state, sample, low, high, winner, solution = SEED, 0, SAMPLE - 1, SAMPLE - 1, None, None
+    while True:
+        enough = _samples_needed(probability, (count - high) / count)
+        state, sample, chosen, fewest, most = _next_better(columns, float(limit), np.uint64(state), sample, enough, low)
+        if most > low and fewest > high:
+            low, high, winner, solution = fewest, most, chosen, None
+            continue
+        if winner is not None and solution is None:
+            solution = solve_now(winner)
+            if not low <= solution[0] <= high:
+                return _opencv(current, previous, threshold, probability)
+            low = high = solution[0]
+        elif most == 0:
+            break
+        if most > low:
+            new = solve_now(chosen)
+            if new[0] > low:
+                low, high, winner, solution = new[0], new[0], chosen, new
+    return _opencv(current, previous, threshold, probability) if solution is None else solution[1:]
+
+
+def _opencv(current, previous, threshold, probability):
+    return cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=probability,
+                                threshold=threshold)
+
+
+def _solved(columns, chosen, threshold, probability, limit):
+    """OpenCV's first best solution for five correspondences: its inliers among all, the matrix, the mask."""
+    five = np.ascontiguousarray(columns[:, chosen].T)
+    stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
+    best = 0, None, None
+    for start in range(0, 0 if stack is None else len(stack), 3):
+        mask = _agree(stack[start:start + 3], columns[0], columns[1], columns[2], columns[3], limit)
+        found = int(mask.sum())
+        if found > best[0]:
+            best = found, stack[start:start + 3].copy(), mask.reshape(-1, 1)
+    return best
+
+
+def _samples_needed(probability, outliers):
+    """Samples of five for one without outliers to be among them with that probability."""
+    missed = 1.0 - math.pow(1.0 - outliers, SAMPLE)
+    if missed < np.finfo(float).tiny:
+        return 0
+    needed, missed = math.log(max(1.0 - probability, np.finfo(float).tiny)), math.log(missed)
+    return MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
+
+
+@FAST
+def _agree(e, x, y, u, v, limit):
+    """N times 0 or 1: whether the squared Sampson distance, rounded to float32, is within the limit."""
+    mask = np.empty(len(x), np.uint8)
+    for k in range(len(x)):
+        l0 = e[0, 0] * x[k] + e[0, 1] * y[k] + e[0, 2]
+        l1 = e[1, 0] * x[k] + e[1, 1] * y[k] + e[1, 2]
+        l2 = e[2, 0] * x[k] + e[2, 1] * y[k] + e[2, 2]
+        m0 = e[0, 0] * u[k] + e[1, 0] * v[k] + e[2, 0]
+        m1 = e[0, 1] * u[k] + e[1, 1] * v[k] + e[2, 1]
+        algebraic = u[k] * l0 + v[k] * l1 + l2
+        distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        mask[k] = np.float32(distance) <= limit
+    return mask
+
+
+@FAST
+def _next_better(columns, limit, state, sample, samples, best):
+    """Draw samples until one may have more than `best` inliers, or until there are `samples` of them.
+
+    Returns the generator's state, the number of samples drawn, the five indices, and the bounds between which the
+    number of inliers of the sample's best solution lies, 0 and 0 where there is none that may be better.
+    """
+    count = columns.shape[1]
+    chosen = np.empty(SAMPLE, np.int64)
+    five = np.empty((SAMPLE, 4))
+    while sample < samples:
+        sample += 1
+        taken = 0
+        while taken < SAMPLE:
+            state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
+            index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
+            new = True
+            for k in range(taken):
+                new = new and chosen[k] != index
+            if new:
+                chosen[taken] = index
+                taken += 1
+        for k in range(SAMPLE):
+            for j in range(4):
+                five[k, j] = columns[j, chosen[k]]
+        sure, solutions, margins = solve(five)
+        if not sure:
+            return state, sample, chosen, 0, count
+        low, high = 0, 0
+        for k in range(len(solutions)):
+            fewest, most = _bounds(solutions[k], margins[k], columns, limit, max(best, low))
+            low, high = max(low, fewest), max(high, most)
+        if high > best:
+            return state, sample, chosen, low, high
+    return state, sample, chosen, 0, 0
+
+
+@FAST
+def _bounds(e, margin, columns, limit, best):
+    """Inliers that any matrix within the margin of e has at least and at most; 0 and 0 where not above `best`."""
+    count = columns.shape[1]
+    low, high = 0, 0
+    for start in range(0, count, BLOCK):
+        stop = min(start + BLOCK, count)
+        few, many = _bounds_of_block(e, margin, columns[0, start:stop], columns[1, start:stop], columns[2, start:stop],
+                                     columns[3, start:stop], limit)
+        low += few
+        high += many
+        if high + count - stop <= best:
+            return 0, 0
+    return low, high
+
+
+@FAST
+def _bounds_of_block(e, margin, x, y, u, v, limit):
+    root = np.sqrt(limit)
+    e0, e1, e2, e3, e4, e5, e6, e7, e8 = e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
+    low, high = 0, 0
+    for k in range(len(x)):
+        l0 = e0 * x[k] + e1 * y[k] + e2
+        l1 = e3 * x[k] + e4 * y[k] + e5
+        l2 = e6 * x[k] + e7 * y[k] + e8
+        m0 = e0 * u[k] + e3 * v[k] + e6
+        m1 = e1 * u[k] + e4 * v[k] + e7
+        algebraic = u[k] * l0 + v[k] * l1 + l2
+        excess = algebraic * algebraic - limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        # Both |algebraic| and the root of the other term change by less than `change`.
+        change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))
+        size = abs(algebraic) + root * (abs(l0) + abs(l1) + abs(m0) + abs(m1)) + change
+        doubt = 2 * change * size + 1e-6 * size * size
+        low += 1 if excess < -doubt else 0
+        high += 1 if excess <= doubt else 0
+    return low, high
+
+
+def _signs():
+    """The vectors from which OpenCV's singular value decomposition completes a basis: 4 x 9 random signs."""
+    state, signs = 0x12345678, np.empty((4, 9))
+    for place in np.ndindex(signs.shape):
+        state = (state & 0xFFFFFFFF) * 4164903690 + (state >> 32)
+        signs[place] = 1.0 if state & 256 else -1.0
+    return signs
+
+
+def _products():
+    """Where monomials of x, y, z, 1 go when multiplied: (4, 4) to quadratic ones, (10, 4) to cubic ones.
+
+    The cubic ones are in Nister's order, by which elimination leaves a system of three equations in x, y, 1.
+    """
+    linear = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]
+    quadratic = [(2, 0, 0), (1, 1, 0), (1, 0, 1), (1, 0, 0), (0, 2, 0), (0, 1, 1), (0, 1, 0), (0, 0, 2), (0, 0, 1),
+                 (0, 0, 0)]
+    cubic = [(3, 0, 0), (0, 3, 0), (2, 1, 0), (1, 2, 0), (2, 0, 1), (2, 0, 0), (0, 2, 1), (0, 2, 0), (1, 1, 1),
+             (1, 1, 0), (1, 0, 2), (1, 0, 1), (1, 0, 0), (0, 1, 2), (0, 1, 1), (0, 1, 0), (0, 0, 3), (0, 0, 2),
+             (0, 0, 1), (0, 0, 0)]
+
+    def table(lower, higher):
+        return np.array([[higher.index(tuple(np.add(a, b))) for b in linear] for a in lower])
+
+    return table(linear, quadratic), table(quadratic, cubic)
+
+
+SIGNS = _signs()
+CHANGES = ERROR * np.random.default_rng(0).choice([-1.0, 1.0], (10, 20))
+TO_QUADRATIC, TO_CUBIC = _products()
+
+
+@FAST
+def solve(five):
+    """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the previous one).
+
+    Returns whether these are surely all that OpenCV finds, the matrices (K, 9) of unit norm, and K margins within
+    which (Frobenius norm, up to sign) OpenCV's rounding leaves its own.
+    """
+    nothing, no_margins = np.empty((0, 9)), np.empty(0)
+    sure, basis = _null_space(five)
+    if not sure:
+        return False, nothing, no_margins
+    equations = _constraints(basis)
+    b_moved = _eliminate(equations + CHANGES)
+    b = _eliminate(equations)
+    polynomial, polynomial_moved = _determinant(b), _determinant(b_moved)
+    safety = SAFETY * (1 + 0.03 * np.abs(b).max())  # OpenCV inverts a matrix, at which the rounding grows
+    sure, roots = real_roots(polynomial, safety * (polynomial_moved - polynomial))
+    if not sure:
+        return False, nothing, no_margins
+    found, margins = np.empty((len(roots), 9)), np.empty(len(roots))
+    moved = np.empty(9)
+    for k in range(len(roots)):
+        z = roots[k]
+        _essential(b, basis, z, found[k])
+        for _ in range(2):
+            value, slope = _horner(polynomial_moved, 10, z)
+            z -= value / slope if slope != 0 else np.inf
+        _essential(b_moved, basis, z, moved)
+        plus, minus = 0.0, 0.0
+        for j in range(9):
+            plus += (found[k, j] + moved[j]) ** 2
+            minus += (found[k, j] - moved[j]) ** 2
+        margins[k] = max(LEAST_MARGIN, safety * np.sqrt(min(plus, minus)))
+        if not margins[k] < LARGEST_MARGIN:
+            return False, nothing, no_margins
+    return True, found, margins
+
+
+@FAST
+def _null_space(five):
+    """Whether five correspondences are independent, and the basis (4, 9) of the rest of space that OpenCV takes.
+
+    With another basis the solutions would be the same, but not how much rounding changes them.
+    """
+    rows = np.empty((9, 9))
+    for k in range(9):
+        if k < SAMPLE:
+            x, y, u, v = five[k]
+            rows[k, 0], rows[k, 1], rows[k, 2] = x * u, y * u, u
+            rows[k, 3], rows[k, 4], rows[k, 5] = x * v, y * v, v
+            rows[k, 6], rows[k, 7], rows[k, 8] = x, y, 1.0
+        else:
+            rows[k] = SIGNS[k - SAMPLE]
+        before = np.sqrt((rows[k] * rows[k]).sum())
+        for _ in range(2):
+            for j in range(k):
+                along = 0.0
+                for i in range(9):
+                    along += rows[k, i] * rows[j, i]
+                for i in range(9):
+                    rows[k, i] -= along * rows[j, i]
+        norm = np.sqrt((rows[k] * rows[k]).sum())
+        if not norm > 1e-8 * before:
+            return False, rows[SAMPLE:]
+        rows[k] /= norm
+    return True, rows[SAMPLE:]
+
+
+@FAST
+def _constraints(basis):
+    """Ten cubic equations (10, 20) in x, y, z: E E^T E = trace(E E^T) E / 2 and det E = 0, E = (x, y, z, 1) basis."""
+    squares, minors = np.zeros((3, 3, 10)), np.zeros((3, 10))
+    for i in range(3):
+        for j in range(i + 1):
+            for k in range(3):
+                for p in range(4):
+                    for q in range(4):
+                        squares[i, j, TO_QUADRATIC[p, q]] += basis[p, 3 * i + k] * basis[q, 3 * j + k]
+        for j in range(i):
+            squares[j, i] = squares[i, j]
+        first, second = 3 + (i + 1) % 3, 6 + (i + 2) % 3
+        for p in range(4):
+            for q in range(4):
+                minors[i, TO_QUADRATIC[p, q]] += (basis[p, first] * basis[q, second]
+                                                  - basis[p, 3 + (i + 2) % 3] * basis[q, 6 + (i + 1) % 3])
+    half = 0.5 * (squares[0, 0] + squares[1, 1] + squares[2, 2])
+    for i in range(3):
+        squares[i, i] -= half
+    equations = np.zeros((10, 20))
+    for p in range(10):
+        for q in range(4):
+            place = TO_CUBIC[p, q]
+            for i in range(3):
+                equations[9, place] += minors[i, p] * basis[q, i]
+                for j in range(3):
+                    for k in range(3):
+                        equations[3 * i + j, place] += squares[i, k, p] * basis[q, 3 * k + j]
+    return equations
+
+
+@FAST
+def _eliminate(a):
+    """Nister's B (3, 13): three rows of three polynomials in z, to which (x, y, 1) is normal. Overwrites a (10, 20)."""
+    b = np.zeros((3, 13))
+    for k in range(10):
+        pivot = k
+        for i in range(k + 1, 10):
+            if abs(a[i, k]) > abs(a[pivot, k]):
+                pivot = i
+        if a[pivot, k] == 0:
+            return np.full((3, 13), np.nan)
+        if pivot != k:
+            for j in range(k, 20):
+                a[k, j], a[pivot, j] = a[pivot, j], a[k, j]
+        for i in range(k + 1, 10):
+            factor = a[i, k] / a[k, k]
+            for j in range(k + 1, 20):
+                a[i, j] -= factor * a[k, j]
+    for k in range(9, 3, -1):  # the first four unknowns are not needed
+        for i in range(k + 1, 10):
+            for j in range(10, 20):
+                a[k, j] -= a[k, i] * a[i, j]
+        for j in range(10, 20):
+            a[k, j] /= a[k, k]
+    for i in range(3):
+        for start, stop, place in ((10, 13, 0), (13, 16, 4), (16, 20, 8)):
+            for j in range(start, stop):
+                b[i, place + j - start + 1] += a[4 + 2 * i, j]
+                b[i, place + j - start] -= a[5 + 2 * i, j]
+    return b
+
+
+@FAST
+def _determinant(b):
+    """Coefficients (11, highest power first) of the determinant of B."""
+    polynomial = np.zeros(11)
+    minor = np.empty(8)
+    for i in range(3):
+        first, second = (i + 1) % 3, (i + 2) % 3
+        minor[:7] = 0
+        for p in range(4):
+            for q in range(4):
+                minor[p + q] += b[first, p] * b[second, 4 + q] - b[second, p] * b[first, 4 + q]
+        for p in range(7):
+            for q in range(5):
+                polynomial[p + q] += minor[p] * b[i, 8 + q]
+    return polynomial
+
+
+@FAST
+def _horner(polynomial, degree, z):
+    """A polynomial's value and slope at z."""
+    value, slope = polynomial[0], 0.0
+    for k in range(1, degree + 1):
+        slope = slope * z + value
+        value = value * z + polynomial[k]
+    return value, slope
+
+
+@FAST
+def real_roots(polynomial, error):
+    """Whether these are surely all real roots of a polynomial of degree ten (11, highest power first), and the roots.
+
+    error: a polynomial; where it reaches an extremum, there may be a double root or none.
+    Between two roots of the derivative lies at most one, so the derivatives are solved one after the other.
+    """
+    bound = 0.0
+    for k in range(1, 11):
+        if not abs(polynomial[k]) < 1e15 * abs(polynomial[0]):
+            return False, np.empty(0)
+        bound = max(bound, 2 * (abs(polynomial[k]) / abs(polynomial[0])) ** (1.0 / k))
+    if abs(polynomial[0]) < 1e-12:  # OpenCV drops a leading coefficient of 2e-16
+        return False, np.empty(0)
+    derivative = np.empty(11)
+    edges, roots = np.empty(12), np.empty(11)
+    found = 0
+    for degree in range(1, 11):
+        for k in range(degree + 1):
+            factor = 1.0
+            for power in range(degree - k + 1, 10 - k + 1):
+                factor *= power
+            derivative[k] = polynomial[k] * factor
+        edges[0], edges[found + 1] = -bound, bound
+        for k in range(found):
+            edges[k + 1] = roots[k]
+            if degree == 10:
+                if not abs(_horner(polynomial, 10, roots[k])[0]) > abs(_horner(error, 10, roots[k])[0]):
+                    return False, np.empty(0)
+        intervals, found = found + 1, 0
+        left = _horner(derivative, degree, edges[0])[0]
+        for k in range(intervals):
+            right = _horner(derivative, degree, edges[k + 1])[0]
+            if (left < 0) != (right < 0):
+                roots[found] = _root_between(derivative, degree, edges[k], edges[k + 1], left < 0)
+                found += 1
+            left = right
+    return True, roots[:found].copy()
+
+
+@FAST
+def _root_between(polynomial, degree, left, right, rising):
+    """Newton's iteration, with bisection where it would leave the interval or is slow."""
+    z = 0.5 * (left + right)
+    before = right - left
+    for _ in range(100):
+        value, slope = polynomial[0], 0.0
+        for k in range(1, degree + 1):
+            slope = slope * z + value
+            value = value * z + polynomial[k]
+        if (value < 0) == rising:
+            left = z
+        else:
+            right = z
+        step = value / slope if slope != 0 else np.inf
+        if not (left <= z - step <= right) or abs(step) > 0.5 * before:
+            step = z - 0.5 * (left + right)
+        before = abs(step)
+        z -= step
+        if before <= 1e-14 * abs(z) + 1e-300:
+            break
+    return z
+
+
+@FAST
+def _essential(b, basis, z, matrix):
+    """Write the essential matrix (9, unit norm) that belongs to a root z."""
+    rows = np.empty((3, 3))
+    for i in range(3):
+        rows[i, 0] = ((b[i, 0] * z + b[i, 1]) * z + b[i, 2]) * z + b[i, 3]
+        rows[i, 1] = ((b[i, 4] * z + b[i, 5]) * z + b[i, 6]) * z + b[i, 7]
+        rows[i, 2] = (((b[i, 8] * z + b[i, 9]) * z + b[i, 10]) * z + b[i, 11]) * z + b[i, 12]
+    x, y, w, largest = 0.0, 0.0, 1.0, -1.0
+    for i in range(3):  # the rows span a plane; the best conditioned pair gives its normal
+        p, q = rows[i], rows[(i + 1) % 3]
+        c0, c1, c2 = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+        size = c0 * c0 + c1 * c1 + c2 * c2
+        if size > largest:
+            x, y, w, largest = c0, c1, c2, size
+    total = 0.0
+    for j in range(9):
+        matrix[j] = x * basis[0, j] + y * basis[1, j] + w * (z * basis[2, j] + basis[3, j])
+        total += matrix[j] * matrix[j]
+    total = np.sqrt(total)
+    for j in range(9):
+        matrix[j] /= total
