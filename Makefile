@@ -70,7 +70,7 @@ $(error the settings above are wrong)
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
-SOURCES := $(filter-out thesis_repro/page.py thesis_repro/captions.py,\
+SOURCES := $(filter-out $(addprefix thesis_repro/,page.py html_parts.py captions.py),\
              $(wildcard thesis_repro/*.py thesis_repro/*.json thesis_repro/weights/*))
 DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
         $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*))

@@ -123,7 +123,7 @@ def test_the_executed_notebook_keeps_its_results_and_leads_back(run):
 @pytest.mark.parametrize("kitti, cityscapes, says", [
     (True, True, "All images and numbers here come from the embedded world"),
     (True, False, "The odometry's frames and numbers here come from the embedded world"),
-    (False, True, "drawn from the training data come from the embedded world"),
+    (False, True, "drawn from the training data, comes from the embedded world"),
     (False, False, None),
 ])
 def test_the_embedded_world_is_named_at_the_top_where_it_was_used(run, tmp_path, kitti, cityscapes, says):
@@ -188,11 +188,18 @@ def test_page_and_notebooks_are_made_again_only_where_something_is_newer(run):
 def test_thesis_numbers_stand_beside_those_of_the_run(run):
     (run.settings.build / "model").mkdir()
     (run.settings.build / "model" / "history.csv").write_text(
-        "epoch,loss,f1-score,iou_score,val_loss,val_f1-score,val_iou_score\n1,0.9,0.1,0.1,0.8,0.21,0.2\n2,0.7,0.3,0.2,0.9,0.2,0.1\n")
+        "epoch,loss,f1-score,iou_score,val_loss,val_f1-score,val_iou_score\n"
+        "1,0.9,0.1,0.1,0.8,0.21,0.2\n2,0.7,0.3,0.2,0.9,0.2,0.1\n")
     (run.settings.build / "seconds.csv").write_text(
-        "sequence,variant,dilation_width,seconds\n00,baseline,,4\n01,baseline,,6\n00,masked,1,4\n01,masked,1,4\n00,masked,2,11\n")
+        "sequence,variant,dilation_width,seconds\n"
+        "00,baseline,,4\n01,baseline,,6\n00,masked,1,4\n01,masked,1,4\n00,masked,2,11\n")
+    (run.settings.build / "runs.csv").write_text(
+        "sequence,variant,repetition,mean_keypoints\n"
+        "00,baseline,0,1990\n00,baseline,1,2010\n01,baseline,0,900\n00,masked,0,7\n")
+    (run.settings.figures / "table_4_1.csv").write_text("sequence,mean keypoints\n00,500\n01,300\n")
     text = read(run).text
+    assert "Here: 3.0 to 4.0 times fewer" in text and "gives 2.0 to 4.1 times fewer than 2000" in text
     assert "Thesis, Cityscapes: 24 epochs, the best was 19; train loss 0.32" in text
-    assert "Here: 2 epochs, the best was 1; train loss 0.90, F1 0.10, IoU 0.10; validation loss 0.80, F1 0.21, IoU 0.20." in text
+    assert "Here: 2 epochs, the best was 1; train loss 0.90, F1 0.10, IoU 0.10; validation loss 0.80, F1 0.21" in text
     assert "5 to 10 % of the time saved." in text and "Here: −10 to 20 %, by width." in text
     assert "15,337,571 parameters" in text

@@ -77,7 +77,8 @@ CHAPTERS = {
         "figure_4_08": ("Keypoints that jump", "One object in consecutive frames: the predicted boundary moves, and "
                         "the keypoints along it with it. The thesis sees in this a cause of its errors."),
         "figure_4_09": ("RMSE against dilation width", "Root mean square distance from the true path (Equation 3.5), "
-                        "one line a sequence. Where runs were repeated, bands or bars span the repetitions."),
+                        "one line a sequence; below, one panel a sequence with the bands that the repetitions "
+                        "span with masks and with all keypoints."),
         "figure_4_10": ("MAE against dilation width", "Mean absolute error (Equation 3.6), drawn as Figure 4.9."),
         "table_4_1": ("Best dilation width", "The width with the lowest RMSE on each sequence, and the mean number of "
                       "keypoints that it leaves. The width is chosen on the sequence that it is judged on."),
@@ -86,12 +87,13 @@ CHAPTERS = {
         "figure_4_12": ("Paths with plainly fewer keypoints", "No masks: the detector is limited to the mean number of "
                         "keypoints of Table 4.1."),
         "figure_4_13": ("RMSE of the three variants", "All keypoints, masks of the best width, and plainly fewer "
-                        "keypoints, every sequence."),
+                        "keypoints, every sequence: mean of the repetitions, and the range that they span."),
         "figure_4_14": ("RMSE of each sequence", "The errors of Figure 4.13, one panel a sequence with its own scale."),
         "figure_4_15": ("MAE of the three variants", "As Figure 4.13, for the mean absolute error."),
         "figure_4_16": ("MAE of each sequence", "As Figure 4.14, for the mean absolute error."),
-        "table_4_2": ("Change of RMSE", "Percent change from all keypoints (Equation 4.1; negative is better). The "
-                      "thesis's aggregate is the sum of the sequences' percentages; mean and median stand below it."),
+        "table_4_2": ("Change of RMSE", "Percent change from all keypoints (Equation 4.1; negative is better) with "
+                      "each sequence's best width, beside it what fairer choices of width and the controls give. The "
+                      "thesis's aggregate is the sum of the percentages; mean, its interval and median stand below it."),
         "table_4_3": ("Change of MAE", "As Table 4.2, for the mean absolute error."),
         "figure_4_17": ("Time saved", "Change of the total time of all sequences for each dilation width (Equation "
                         "4.2; negative is time saved). Masks are counted, the network that predicts the label maps is "
@@ -132,6 +134,7 @@ REPORTS = {
     "figure_4_07": ("runs", "fewer keypoints by a factor of {} to {}; its Table 4.1 gives {:.1f} to {:.1f} times "
                     "fewer than 2000.".format(*REPORTED["headline_claims"]["keypoint_reduction_factor"],
                                               min(_FACTORS), max(_FACTORS))),
-    "figure_4_17": ("runs", "{} to {} % of the time saved.".format(*REPORTED["headline_claims"]["time_savings_percent"])),
+    "figure_4_17": ("runs", "{} to {} % of the time saved.".format(
+        *REPORTED["headline_claims"]["time_savings_percent"])),
     "figure_a_01": ("model", f"{REPORTED['figure_a1_model_summary']['total']:,} parameters."),
 }

@@ -4,7 +4,6 @@
 anything it shows is newer. Neither needs a network, a server or scripts to be read.
 """
 
-import csv
 import importlib.metadata
 import json
 import os
@@ -16,9 +15,8 @@ from datetime import datetime, timezone
 from functools import lru_cache
 from html import escape
 from pathlib import Path
-from urllib.parse import quote
 
-from thesis_repro import InputError, captions
+from thesis_repro import InputError, captions, html_parts
 from thesis_repro.files import write_text
 from thesis_repro.settings import ROOT, read_settings
 
@@ -27,7 +25,6 @@ THESIS = [name for artefacts in captions.CHAPTERS.values() for name in artefacts
 CODE = ("thesis_repro", "notebooks", "environment.txt", "pyproject.toml", "Makefile")
 ENDINGS = {"figure": (".svg", ".png"), "table": (".csv", ".md"), "text": (".md",)}  # the first is the one shown
 WIDE = 9  # columns; a table with more is printed on a page laid on its side
-STYLE = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
 
 
 def update(settings):
@@ -43,7 +40,8 @@ def update(settings):
 
 
 def _own_files():
-    return [path for pattern in ("page.*", "captions.py") for path in Path(__file__).parent.glob(pattern)]
+    names = ("page.py", "page.css", "html_parts.py", "captions.py")
+    return [Path(__file__).parent / name for name in names]
 
 
 def _newer(paths, made):
@@ -69,9 +67,10 @@ def write_notebooks(paths, page):
                             exclude_output_prompt=True, exclude_anchor_links=True)
     for path in paths:
         content, resources = exporter.from_filename(str(path))
-        back = f'<p class="small"><a href="{_link(page, path.parent)}">all tables and figures</a></p>'
-        style = STYLE + "\n".join(resources["inlining"]["css"])
-        write_text(path.with_suffix(".html"), _document(path.stem, style, f'{back}\n<main class="notebook">{content}</main>'))
+        back = f'<p class="small"><a href="{html_parts.link(page, path.parent)}">all tables and figures</a></p>'
+        style = html_parts.STYLE + "\n".join(resources["inlining"]["css"])
+        body = f'{back}\n<main class="notebook">{content}</main>'
+        write_text(path.with_suffix(".html"), html_parts.document(path.stem, style, body))
 
 
 # The page
@@ -80,49 +79,51 @@ def write_notebooks(paths, page):
 def build(settings):
     """The page of a run as HTML, from the files in its folders."""
     shown = [name for name in THESIS if _path(settings, _kind(name), name).is_file()]
-    parts = [f"<h1>Tables and figures</h1>\n<p>Run {escape(settings.run)}: {len(shown)} of {len(THESIS)} tables and "
-             "figures of the thesis.</p>", _embedded(settings), _missing(settings), _what_was_run(settings), HOW_TO_READ,
-             _contents(settings)]
+    parts = ["<h1>Tables and figures</h1>",
+             f"<p>Run {escape(settings.run)}: {len(shown)} of {len(THESIS)} tables and figures of the thesis.</p>",
+             _embedded(settings), _missing(settings), _what_was_run(settings), HOW_TO_READ, _contents(settings)]
     here = _here(settings)
     for chapter, artefacts in captions.CHAPTERS.items():
         parts.append(f'<h2 id="{_anchor(chapter)}">{escape(chapter)}</h2>')
         parts += [_artefact(settings, _kind(name), name, f"{_number(name)}. {title}", caption, here.get(name))
                   for name, (title, caption) in artefacts.items()]
     parts.append('<h2 id="added">Beyond the thesis</h2>')
-    parts += [_artefact(settings, kind, name, title, caption) for (kind, name), (title, caption) in captions.ADDED.items()]
+    parts += [_artefact(settings, kind, name, title, caption)
+              for (kind, name), (title, caption) in captions.ADDED.items()]
     parts.append(_notebooks(settings))
-    return _document(f"Tables and figures, {settings.run}", STYLE, "<main>\n" + "\n".join(filter(None, parts)) + "\n</main>")
+    body = "<main>\n" + "\n".join(filter(None, parts)) + "\n</main>"
+    return html_parts.document(f"Tables and figures, {settings.run}", html_parts.STYLE, body)
 
 
 HOW_TO_READ = """<h2 id="how-to-read">How to read it</h2>
 <ul>
 <li>Numbers marked as the thesis's come from the complete KITTI sequences and from Cityscapes. They can be set beside
 those of this run only where it used the same data at the same length.</li>
-<li>The odometry is chaotic: harmless changes, such as the order in which correspondences reach RANSAC, move the error of
-a whole sequence. A difference smaller than the spread of the repetitions means nothing.</li>
+<li>The odometry is chaotic: harmless changes, such as the order in which correspondences reach RANSAC, move the error
+of a whole sequence. A difference smaller than the spread of the repetitions means nothing.</li>
 <li>The thesis chooses each sequence's dilation width by the error on that same sequence. A best of many looks good even
 where masks do nothing; <a href="#table-widths">a fair choice</a> is below.</li>
-<li>RMSE and MAE are distances in metres without alignment, and grow with a sequence's length. Changes are in percent from
-all keypoints, negative where the error is smaller (Equation 4.1).</li>
+<li>RMSE and MAE are distances in metres without alignment, and grow with a sequence's length. Changes are in percent
+from all keypoints, negative where the error is smaller (Equation 4.1).</li>
 <li>Whether it is the segmentation that helps, the <a href="#figure-controls">controls</a> tell;
 <a href="#findings">what the runs show</a> says so in words.</li>
 </ul>"""
 
 
 def _embedded(settings):
-    both = settings.kitti_is_embedded and settings.cityscapes_is_embedded
-    if not (settings.kitti_is_embedded or settings.cityscapes_is_embedded):
-        return ""
     world = "the <strong>embedded world</strong>, small rendered street scenes"
-    if both:
-        text = f"All images and numbers here come from {world}."
+    limit = "show that the way from data to results works, and cannot be set against the thesis's numbers."
+    if settings.kitti_is_embedded and settings.cityscapes_is_embedded:
+        text = f"All images and numbers here come from {world}. They {limit}"
     elif settings.kitti_is_embedded:
-        text = f"The odometry's frames and numbers here come from {world}; the training data are the user's."
+        text = (f"The odometry's frames and numbers here come from {world}. They {limit} The network is trained on the "
+                "user's data.")
+    elif settings.cityscapes_is_embedded:
+        text = (f"Training, and what is drawn from the training data, comes from {world}; those images and numbers "
+                f"{limit} The odometry's frames and numbers are the user's, with label maps by the model in the package.")
     else:
-        text = (f"Training, Table 3.2 aside, and everything drawn from the training data come from {world}; the odometry's "
-                "frames and numbers are from the user's data, with label maps by the model in the package.")
-    return (f'<p class="note">{text} They show that the way from data to results works, and cannot be set against the '
-            "thesis's numbers.</p>")
+        return ""
+    return f'<p class="note">{text}</p>'
 
 
 def _missing(settings):
@@ -138,21 +139,24 @@ def _what_was_run(settings):
     frames = "all frames" if sizes.frames is None else f"at most {sizes.frames} frames"
     images = "all images" if sizes.training_images is None else f"at most {sizes.training_images} images"
     rows = {
-        "odometry data": "embedded world" if settings.kitti_is_embedded else f"KITTI folder “{settings.kitti.name}”",
+        "odometry data": "embedded world" if settings.kitti_is_embedded
+                         else f"KITTI folder “{settings.kitti.name}”",
+        "sequences": ", ".join(f"{row['sequence']} ({row['frames']} frames)"
+                               for row in _rows(settings.figures / "table_4_1.csv") if row.get("frames")),
         "training data": "embedded world" if settings.cityscapes_is_embedded
                          else f"Cityscapes folder “{settings.cityscapes.name}”",
-        "profile": f"{settings.profile}: network {sizes.image_size}x{sizes.image_size} with {sizes.base_filters} filters "
-                   f"in the first block, up to {sizes.epochs} epochs on {images}; {frames} of each sequence, "
+        "profile": f"{settings.profile}: network {sizes.image_size}x{sizes.image_size} with {sizes.base_filters} "
+                   f"filters in the first block, up to {sizes.epochs} epochs on {images}; {frames} of each sequence, "
                    f"{len(sizes.widths)} dilation widths, {sizes.repetitions} repetitions",
-        "seeds": f"{settings.seed} throughout; repetition 0 keeps the order of the correspondences, repetition n shuffles it "
-                 "with seed n",
+        "seeds": f"{settings.seed} throughout; repetition 0 keeps the order of the correspondences, repetition n "
+                 "shuffles it with seed n",
         "results of": _when(settings, executed),
         "code": _commit(),
         "Python": f"{_python(executed)} on {platform.system()} {platform.machine()}, {settings.jobs} processes",
         "packages": _packages(),
     }
-    return ('<h2 id="what-was-run">What was run</h2>\n<dl>\n'
-            + "\n".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in rows.items()) + "\n</dl>")
+    lines = [f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in rows.items() if value]
+    return "\n".join(['<h2 id="what-was-run">What was run</h2>', "<dl>", *lines, "</dl>"])
 
 
 def _when(settings, executed):
@@ -166,14 +170,16 @@ def _when(settings, executed):
         files = [path for ending in (".svg", ".csv") for path in settings.figures.glob(f"*{ending}")]
         if not files:
             return "nothing yet"
-        return f"{datetime.fromtimestamp(max(path.stat().st_mtime for path in files), timezone.utc):%d %B %Y, %H:%M} UTC"
+        newest = max(path.stat().st_mtime for path in files)
+        return f"{datetime.fromtimestamp(newest, timezone.utc):%d %B %Y, %H:%M} UTC"
     first, last = (time.astimezone(timezone.utc) for time in (times[0], times[-1]))
     return f"{first:%d %B %Y, %H:%M} to {last:{'%H:%M' if first.date() == last.date() else '%d %B %Y, %H:%M'}} UTC"
 
 
 def _commit():
     def git(*arguments):
-        return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True).stdout.strip()
+        command = ["git", "-C", str(ROOT), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     if not (ROOT / ".git").exists():  # else a checkout around this folder would answer
         return "no git checkout"
@@ -222,15 +228,15 @@ def _artefact(settings, kind, name, title, caption, here=None):
     if not path.is_file():
         body = f'<p class="missing">Missing. {_reason(name)}</p>'
     elif kind == "figure":
-        size = _svg_size(path)
+        size = html_parts.svg_size(path)
         body = (f'<a class="scroll" href="{path.name}"><img src="{path.name}" alt="{escape(title)}"'
                 + (' width="{}" height="{}"'.format(*size) if size else "") + "></a>")
     elif kind == "table":
-        header, *rows = _lines(path)
-        body = f'<div class="scroll" tabindex="0">{_table(header, rows)}</div>'
+        header, *rows = html_parts.lines(path)
+        body = f'<div class="scroll" tabindex="0">{html_parts.table(header, rows)}</div>'
         style = "table wide" if len(header) > WIDE else kind
     else:
-        body = _markdown(path.read_text(encoding="utf-8"))
+        body = html_parts.markdown(path.read_text(encoding="utf-8"))
     if kind == "text":
         return f'<section id="{_id(kind, name)}">\n<h3>{escape(title)}</h3>\n{body}\n</section>'
     said = f"<p><strong>{escape(title)}.</strong> {escape(caption)}</p>"
@@ -259,27 +265,30 @@ def _here(settings):
                                           (("loss", "loss"), ("f1-score", "F1"), ("iou_score", "IoU")))
                   for split, prefix in (("train", ""), ("validation", "val_"))]
         found["figure_4_01"] = f"{len(history)} epochs, the best was {int(float(best['epoch']))}; {'; '.join(scores)}."
+    baseline = {}
+    for row in _rows(settings.build / "runs.csv"):
+        if row["variant"] == "baseline":
+            baseline.setdefault(row["sequence"], []).append(float(row["mean_keypoints"]))
+    factors = [sum(baseline[row["sequence"]]) / len(baseline[row["sequence"]]) / float(row["mean keypoints"])
+               for row in _rows(settings.figures / "table_4_1.csv")
+               if row["sequence"] in baseline and float(row.get("mean keypoints") or 0)]
+    if factors:
+        found["figure_4_07"] = (f"{min(factors):.1f} to {max(factors):.1f} times fewer than without masks, with the "
+                                "widths of Table 4.1.")
     if seconds := _rows(settings.build / "seconds.csv"):
         totals = {}
         for row in seconds:
-            width = row["dilation_width"] if row["variant"] == "masked" else row["variant"]
-            totals[width] = totals.get(width, 0) + float(row["seconds"])
-        if baseline := totals.pop("baseline", 0):
-            saved = [100 * (1 - total / baseline) for width, total in totals.items() if width[:1].isdigit()]
-            if saved:
-                found["figure_4_17"] = f"{min(saved):.0f} to {max(saved):.0f} %, by width.".replace("-", "−")
+            run = row["variant"], row["dilation_width"]
+            totals[run] = totals.get(run, 0) + float(row["seconds"])
+        unmasked = sum(total for (variant, _), total in totals.items() if variant == "baseline")
+        saved = [100 * (1 - total / unmasked) for (variant, _), total in totals.items() if variant == "masked"]
+        if saved:
+            found["figure_4_17"] = f"{min(saved):.0f} to {max(saved):.0f} %, by width.".replace("-", "−")
     return found
 
 
-def _lines(path):
-    if not path.is_file():
-        return []
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.reader(file))
-
-
 def _rows(path):
-    header, *rows = _lines(path) or [()]
+    header, *rows = html_parts.lines(path) or [()]
     return [dict(zip(header, row, strict=True)) for row in rows]
 
 
@@ -291,31 +300,28 @@ def _reason(name):
 
 
 def _made_by(settings, name):
-    return [f'<a href="{_link(path.with_suffix(".html"), settings.figures)}">notebook {escape(path.stem)}</a>'
+    return [f'<a href="{html_parts.link(path.with_suffix(".html"), settings.figures)}">notebook {escape(path.stem)}</a>'
             for path in _executed(settings) if path.with_suffix(".html").is_file() and _makes(path, name)]
 
 
 def _makes(path, name):
-    return any(f'"{name}"' in "".join(cell["source"]) for cell in _read(path)["cells"] if cell["cell_type"] == "code")
+    return any(re.search(rf'"{name}(\.\w+)?"', "".join(cell["source"]))
+               for cell in _read(path)["cells"] if cell["cell_type"] == "code")
 
 
 def _notebooks(settings):
     paths = [path.with_suffix(".html") for path in _executed(settings) if path.with_suffix(".html").is_file()]
     where = os.path.relpath(settings.build / "notebooks", settings.figures)
-    text = (f"<p>With their results, as <code>make figures</code> leaves them in <code>{escape(where)}</code> from here. "
-            "Where this page was copied without that folder, its links to them lead nowhere.</p>")
-    links = "\n".join(f'<li><a href="{_link(path, settings.figures)}">{escape(path.stem)}</a></li>' for path in paths)
+    text = (f"<p>With their results, as <code>make figures</code> leaves them in <code>{escape(where)}</code> from "
+            "here. Where this page was copied without that folder, its links to them lead nowhere.</p>")
+    links = "\n".join(f'<li><a href="{html_parts.link(path, settings.figures)}">{escape(path.stem)}</a></li>'
+                      for path in paths)
     return ('<h2 id="notebooks">The executed notebooks</h2>\n'
-            + (f"{text}\n<ul>\n{links}\n</ul>" if paths else "<p>None is there; <code>make figures</code> leaves them.</p>"))
+            + (f"{text}\n<ul>\n{links}\n</ul>" if paths
+               else "<p>None is there; <code>make figures</code> leaves them.</p>"))
 
 
 # Pieces
-
-
-def _document(title, style, body):
-    return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n")
 
 
 def _kind(name):
@@ -340,10 +346,6 @@ def _path(settings, kind, name):
     return settings.figures / f"{name}{ENDINGS[kind][0]}"
 
 
-def _link(path, folder):
-    return quote(os.path.relpath(path, folder))
-
-
 def _read(path):
     return _parsed(path, path.stat().st_mtime_ns)
 
@@ -351,63 +353,6 @@ def _read(path):
 @lru_cache(maxsize=None)  # every table and figure asks for the same few notebooks
 def _parsed(path, written):
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def _svg_size(path):
-    """Width and height in pixels as the file says, so that the page keeps its place while it loads; None if it does not."""
-    with open(path, encoding="utf-8") as file:
-        head = file.read(2000)
-    size = re.search(r'<svg[^>]*?width="([\d.]+)pt"[^>]*?height="([\d.]+)pt"', head) or \
-        re.search(r'<svg[^>]*?height="([\d.]+)pt"[^>]*?width="([\d.]+)pt"', head)
-    if not size:
-        return None
-    return tuple(round(float(points) * 4 / 3) for points in size.groups())
-
-
-def _markdown(text):
-    import mistune  # comes with nbconvert
-
-    html = mistune.create_markdown(escape=True, plugins=["table"])(text)
-    return re.sub(r"<(/?)h([1-6])", lambda match: f"<{match[1]}h{min(6, int(match[2]) + 3)}", html)
-
-
-NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")
-RANGE = re.compile(rf"{NUMBER.pattern} to {NUMBER.pattern}")
-
-
-def _table(header, rows):
-    """Lines of a CSV file as an HTML table: numbers to the right, whole ones without the point of missing values."""
-    columns = list(zip(*rows, strict=True)) or [()] * len(header)
-    right = [_is_numeric(name, column) for name, column in zip(header, columns, strict=True)]
-    shown = [[_shown(value, name, column, row) if number else escape(value)
-              for value, name, column, number in zip(row, header, columns, right, strict=True)] for row in rows]
-    marks = [' class="number"' if number else "" for number in right]
-    lines = ["<table>", "<thead><tr>" + "".join(f'<th scope="col"{mark}>{escape(name)}</th>'
-                                                for name, mark in zip(header, marks, strict=True)) + "</tr></thead>", "<tbody>"]
-    lines += ["<tr>" + "".join(f"<td{mark}>{value}</td>" for value, mark in zip(row, marks, strict=True)) + "</tr>"
-              for row in shown]
-    return "\n".join([*lines, "</tbody>", "</table>"])
-
-
-def _is_numeric(name, column):
-    filled = [value for value in column if value]
-    return name != "sequence" and bool(filled) and all(NUMBER.fullmatch(value) or RANGE.fullmatch(value) for value in filled)
-
-
-def _shown(value, name, column, row):
-    numbers = [cell for cell in row if NUMBER.fullmatch(cell)]
-    if NUMBER.fullmatch(value):
-        counts = len(numbers) > 1 and all(_is_whole(cell) for cell in numbers)  # such as a row that counts sequences
-        if counts or all(_is_whole(cell) for cell in column if cell):
-            value = value.split(".")[0]
-        elif "%" in name:
-            digits = max(len(cell.partition(".")[2]) for cell in column)
-            value = f"{float(value):.{digits}f}"
-    return escape(value).replace("-", "−")
-
-
-def _is_whole(value):
-    return bool(NUMBER.fullmatch(value)) and float(value).is_integer()
 
 
 def main():
