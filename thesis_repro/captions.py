@@ -15,8 +15,8 @@ CHAPTERS = {
         "figure_2_01": ("Basic CNN", "The stages of a convolutional network that classifies: convolution, activation, "
                         "pooling, dense layer, softmax. A diagram."),
         "figure_2_02": ("One convolution, in numbers", "A patch of an image, one kernel of the trained U-Net's first "
-                        "layer, the feature map it gives, and what is left of it after the activation. A marked "
-                        "neighbourhood and the kernel give the marked value."),
+                        "layer, the feature map it gives, and what normalisation and activation leave of it. A "
+                        "marked neighbourhood and the kernel give the marked value."),
         "figure_2_03": ("Sigmoid and ReLU", "Both activation functions and their derivatives. The sigmoid's derivative "
                         "vanishes on both sides, which is what slows training; that of ReLU does not."),
         "figure_2_04": ("Max pooling", "A 4x4 array under 2x2 max pooling with stride 2: of every block the largest "
@@ -33,7 +33,8 @@ CHAPTERS = {
         "figure_2_09": ("ORB matches", "Keypoints found by ORB in two frames of one sequence and matched by their "
                         "descriptors; the closest matches are drawn."),
         "figure_2_10": ("Drift", "An estimated path leaves the true one, and the distance between them along the "
-                        "way: each step adds its own error to all later positions."),
+                        "way: each step adds its own error to all later positions. Drift too small to be "
+                        "seen is drawn a second time, enlarged."),
         "figure_2_11": ("Keypoints change with the viewpoint", "The same scene from two places: keypoints that are "
                         "found again, and those that are lost or new."),
         "figure_2_12": ("Keypoints on a frame and on its label map", "Shi-Tomasi on a frame covers every texture; on "
@@ -101,7 +102,7 @@ CHAPTERS = {
     },
     "Appendix": {
         "figure_a_01": ("Model summary", "Every layer of the thesis's network at its full size, 320x320 with 64 "
-                        "filters in the first block, as built here."),
+                        "filters in the first block, as built here, with the number of parameters below."),
     },
 }
 
