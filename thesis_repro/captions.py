@@ -94,7 +94,7 @@ CHAPTERS = {
         "figure_4_16": ("MAE of each sequence", "As Figure 4.14, for the mean absolute error."),
         "table_4_2": ("Change of RMSE", "Percent change from all keypoints (Equation 4.1; negative is better) with "
                       "each sequence's best width, beside it what fairer choices of width and the controls give. The "
-                      "thesis's aggregate is the sum of the percentages; mean, its interval and median stand below it."),
+                      "thesis's aggregate is the sum of the percentages; mean, its interval and median are below it."),
         "table_4_3": ("Change of MAE", "As Table 4.2, for the mean absolute error."),
         "figure_4_17": ("Time saved", "Change of the total time of all sequences for each dilation width (Equation "
                         "4.2; negative is time saved). Masks are counted, the network that predicts the label maps is "
