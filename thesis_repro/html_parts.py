@@ -1,4 +1,4 @@
-"""The parts that pages are put together from: HTML of tables and Markdown, the size of a drawing, links between files."""
+"""The parts that pages are put together from: documents, tables, Markdown, sizes of drawings, links between files."""
 
 import csv
 import os

@@ -120,7 +120,8 @@ def _embedded(settings):
                 "user's data.")
     elif settings.cityscapes_is_embedded:
         text = (f"Training, and what is drawn from the training data, comes from {world}; those images and numbers "
-                f"{limit} The odometry's frames and numbers are the user's, with label maps by the model in the package.")
+                f"{limit} The odometry's frames and numbers are the user's; the label maps come from the model in the "
+                "package.")
     else:
         return ""
     return f'<p class="note">{text}</p>'
