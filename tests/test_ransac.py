@@ -129,11 +129,11 @@ def test_solutions_lie_within_their_margins_of_opencvs():
 def test_real_roots_of_a_known_polynomial():
     roots = np.array([-3.0, -1.0, 0.5, 2.0])
     polynomial = np.poly(np.concatenate([roots, [1j, -1j, 2 + 1j, 2 - 1j, -1 + 3j, -1 - 3j]])).real
-    sure, found = ransac.real_roots(polynomial, 1e-12 * polynomial)
+    sure, found = ransac.real_roots(polynomial, 1e-12 * polynomial, 0 * polynomial)
     assert sure
     np.testing.assert_allclose(found, roots, rtol=1e-9)
     double = np.poly([1.0, 1.0, 3.0, -2.0, 1j, -1j, 2j, -2j, 3j, -3j]).real
-    assert not ransac.real_roots(double, 1e-9 * double)[0]
+    assert not ransac.real_roots(double, 0 * double, np.full(11, 1e-9))[0]
 
 
 @pytest.mark.real

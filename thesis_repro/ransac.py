@@ -21,7 +21,8 @@ FEWEST = 8  # correspondences: below, the few samples there are go to OpenCV
 SEED = 2**64 - 1  # of OpenCV's RANSAC
 BLOCK = 128  # correspondences scored between two looks at whether the best can still be beaten
 ERROR = 1e-12  # by which all equations are changed, at random, to see what rounding does to their solutions
-SAFETY = 10.0  # times that change, and more where elimination is ill-conditioned, is granted to OpenCV's solutions
+ROOT_ERROR = 1e-13  # relative to the polynomial's terms: of finding a root
+SAFETY = 8.0  # times such changes, and more where elimination is ill-conditioned, is granted to OpenCV's solutions
 LEAST_MARGIN, LARGEST_MARGIN = 1e-9, 1e-3  # of a unit-norm essential matrix
 
 FAST = njit(cache=True, nogil=True, error_model="numpy")
@@ -212,7 +213,7 @@ def _products():
 
 
 SIGNS = _signs()
-CHANGES = ERROR * np.random.default_rng(0).choice([-1.0, 1.0], (10, 20))
+CHANGES = ERROR * np.random.default_rng(0).choice([-1.0, 1.0], (2, 10, 20))
 TO_QUADRATIC, TO_CUBIC = _products()
 
 
@@ -228,30 +229,48 @@ def solve(five):
     if not sure:
         return False, nothing, no_margins
     equations = _constraints(basis)
-    b_moved = _eliminate(equations + CHANGES)
+    first, second = _eliminate(equations + CHANGES[0]), _eliminate(equations + CHANGES[1])
     b = _eliminate(equations)
-    polynomial, polynomial_moved = _determinant(b), _determinant(b_moved)
-    safety = SAFETY * (1 + 0.03 * np.abs(b).max())  # OpenCV inverts a matrix, at which the rounding grows
-    sure, roots = real_roots(polynomial, safety * (polynomial_moved - polynomial))
+    polynomial, polynomial_first, polynomial_second = _determinant(b), _determinant(first), _determinant(second)
+    safety = SAFETY * (1 + 0.01 * np.abs(b).max())  # OpenCV inverts a matrix, at which the rounding grows
+    sure, roots = real_roots(polynomial, safety * (polynomial_first - polynomial),
+                             safety * (polynomial_second - polynomial))
     if not sure:
         return False, nothing, no_margins
     found, margins = np.empty((len(roots), 9)), np.empty(len(roots))
-    moved = np.empty(9)
+    absolute, moved = np.abs(polynomial), np.empty(9)
     for k in range(len(roots)):
         z = roots[k]
         _essential(b, basis, z, found[k])
-        for _ in range(2):
-            value, slope = _horner(polynomial_moved, 10, z)
-            z -= value / slope if slope != 0 else np.inf
-        _essential(b_moved, basis, z, moved)
-        plus, minus = 0.0, 0.0
-        for j in range(9):
-            plus += (found[k, j] + moved[j]) ** 2
-            minus += (found[k, j] - moved[j]) ** 2
-        margins[k] = max(LEAST_MARGIN, safety * np.sqrt(min(plus, minus)))
+        _essential(first, basis, _nearby_root(polynomial_first, z), moved)
+        change = _distance(found[k], moved)
+        _essential(second, basis, _nearby_root(polynomial_second, z), moved)
+        change = np.hypot(change, _distance(found[k], moved))  # unlike a maximum, this keeps what is not a number
+        _essential(b, basis, z + ROOT_ERROR * _horner(absolute, 10, abs(z))[0] / _horner(polynomial, 10, z)[1], moved)
+        margins[k] = LEAST_MARGIN + safety * (change + _distance(found[k], moved))
         if not margins[k] < LARGEST_MARGIN:
             return False, nothing, no_margins
     return True, found, margins
+
+
+@FAST
+def _nearby_root(polynomial, z):
+    for _ in range(2):
+        value, slope = _horner(polynomial, 10, z)
+        z -= value / slope
+    return z
+
+
+@FAST
+def _distance(e, other):
+    """Between two essential matrices (9, unit norm), whose signs mean nothing."""
+    plus, minus = 0.0, 0.0
+    for k in range(9):
+        plus += (e[k] + other[k]) ** 2
+        minus += (e[k] - other[k]) ** 2
+    if plus < minus:
+        return np.sqrt(plus)
+    return np.sqrt(minus)
 
 
 @FAST
@@ -376,10 +395,10 @@ def _horner(polynomial, degree, z):
 
 
 @FAST
-def real_roots(polynomial, error):
+def real_roots(polynomial, error, other):
     """Whether these are surely all real roots of a polynomial of degree ten (11, highest power first), and the roots.
 
-    error: a polynomial; where it reaches an extremum, there may be a double root or none.
+    error, other: polynomials; an extremum no larger than both together may be a double root or none at all.
     Between two roots of the derivative lies at most one, so the derivatives are solved one after the other.
     """
     bound = 0.0
@@ -402,7 +421,8 @@ def real_roots(polynomial, error):
         for k in range(found):
             edges[k + 1] = roots[k]
             if degree == 10:
-                if not abs(_horner(polynomial, 10, roots[k])[0]) > abs(_horner(error, 10, roots[k])[0]):
+                doubt = abs(_horner(error, 10, roots[k])[0]) + abs(_horner(other, 10, roots[k])[0])
+                if not abs(_horner(polynomial, 10, roots[k])[0]) > doubt:
                     return False, np.empty(0)
         intervals, found = found + 1, 0
         left = _horner(derivative, degree, edges[0])[0]
