@@ -208,13 +208,14 @@ def _percent_scale(panels, lowest, highest):
     if highest <= 100:
         return
     low, high = (100 + max(lowest, -99)) / 115 - 1, (100 + highest) / 100 * 1.15 - 1
+    step = 2.0 if (1 + high) / (1 + low) < 16 else 4.0  # as many times the error from tick to tick
     for panel in panels:
         panel.set_xscale("function", functions=(lambda x: np.log1p(np.maximum(x, -99.9) / 100),
                                                 lambda x: 100 * np.expm1(x)))
         panel.set_xlim(100 * low, 100 * high)
-        panel.xaxis.set_major_locator(FixedLocator([-98, -90, -75, -50, 0, 100, 300, 900, 3900, 19900]))
+        panel.xaxis.set_major_locator(FixedLocator(100 * (step ** np.arange(-2, 9) - 1)))
         panel.xaxis.set_minor_locator(NullLocator())
-        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+g}" if value else "0"))
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.0f}" if value else "0"))
 
 
 def time_savings(seconds):

@@ -68,10 +68,11 @@ def _chance(summary):
     if len(stability):
         number = results.of_variant(summary, "masked")["dilation_width"].nunique()
         promised = results.widths(summary).loc[stability.index, "best_rmse"]
-        text += (f" A sequence's best width in one repetition is the best in another {stability['same_best'].mean():.0f}"
-                 f" times in 100; lots drawn among {number} widths would agree {100 / number:.0f} times. Chosen in one "
-                 f"repetition and judged in the others, it changes RMSE by {_signed(stability['elsewhere'].mean())} % "
-                 f"on average; chosen and judged by the same runs, as in the thesis, by {_signed(promised.mean())} %.")
+        text += (" A sequence's best width in one repetition is the best in another "
+                 f"{stability['same_best'].mean():.0f} times in 100; lots drawn among {number} widths would agree "
+                 f"{100 / number:.0f} times. Chosen in one repetition and judged in the others, it changes RMSE by "
+                 f"{_signed(stability['elsewhere'].mean())} % on average; chosen and judged by the same runs, as in "
+                 f"the thesis, by {_signed(promised.mean())} %.")
     return text
 
 
@@ -122,19 +123,19 @@ def _in_sequences(summary, others, pose):
     repetitions = masked["repetition"].nunique()
     if repetitions < FEWEST_REPETITIONS:
         return ""
-    found = []
+    found, count = [], 0
     for variant in ("baseline", *others):
-        lower, higher = results.apart(masked, results.of_control(summary, variant, pose))
-        said = [f"{word} in {', '.join(names)}" for word, names in (("better", lower), ("worse", higher)) if names]
+        rows = results.of_control(summary, variant, pose)
+        count += rows["sequence"].isin(masked["sequence"]).groupby(rows["sequence"]).any().sum()
+        said = [f"{word} in {', '.join(names) if len(names) <= 3 else f'{len(names)} sequences'}"
+                for word, names in zip(("better", "worse"), results.apart(masked, rows)) if names]
         if said:
             found.append(f"{NAMES[variant]} ({'; '.join(said)})")
-    count = masked["sequence"].nunique()
-    expected = 2 / comb(2 * repetitions, repetitions) * count * (1 + len(others))
+    expected = 2 / comb(2 * repetitions, repetitions) * count
     if not found:
         return " In no single sequence do all repetitions with masks lie on one side of all those of another variant."
     return (f" In single sequences, every repetition with masks is better or worse than every one with "
-            f"{', '.join(found)}; of {count * (1 + len(others))} such comparisons chance alone would give "
-            f"{expected:.1g}.")
+            f"{', '.join(found)}; of {count} such comparisons chance alone would give {expected:.1g}.")
 
 
 def _conclusion(change, signs):
@@ -148,12 +149,12 @@ def _conclusion(change, signs):
     helps = {-1: "Masks help here", 0: "Masks are not shown to help here", 1: "Masks do harm here"}[verdict(change)]
     beaten = [variant for variant, sign in signs.items() if sign < 0]
     if len(beaten) == len(signs):
-        why = "the segmentation matters: every control that knows no class of the frame does worse"
+        why = "the segmentation matters: every control without it does worse"
     elif beaten:
         rest = [CONTROLS[variant] for variant in signs if variant not in beaten]
-        why = f"the segmentation is not shown to be the reason, since these are not shown to do worse: {', '.join(rest)}"
+        why = f"the segmentation is not shown to matter, as these are not shown to do worse: {', '.join(rest)}"
     else:
-        why = "the segmentation is not shown to matter: no control that knows no class of the frame is shown to do worse"
+        why = "the segmentation is not shown to matter: no control without it is shown to do worse"
     return f" **{helps}, and {why}.**" if verdict(change) or len(beaten) < len(signs) else f" **{helps}, but {why}.**"
 
 
