@@ -43,7 +43,8 @@ def table_of_change(summary, metric, reported_as):
     baseline = results.over_orders(results.of_variant(summary, "baseline"), metric)
     masked = results.over_orders(results.of_best_width(summary), metric).reindex(baseline.index)
     chosen = results.widths(summary).reindex(baseline.index)
-    reported = pd.Series(REPORTED[{"rmse": "table_4_2_rmse_percent_change", "mae": "table_4_3_mae_percent_change"}[metric]])
+    key = {"rmse": "table_4_2_rmse_percent_change", "mae": "table_4_3_mae_percent_change"}[metric]
+    reported = pd.Series(REPORTED[key])
     theirs = f"change (%), {reported_as}"
     changes = pd.DataFrame({
         "change (%)": chosen[f"best_{metric}"],
@@ -72,7 +73,8 @@ def _below(changes):
     few = "" if len(changes) >= results.FEWEST else " (too few sequences)"
     intervals = [results.interval(changes[name]) for name in changes]
     rows = {"sum (the thesis's aggregate)": changes.sum(min_count=1), "mean": changes.mean(),
-            f"{INTERVAL}, from{few}": [low for low, _ in intervals], f"{INTERVAL}, to{few}": [high for _, high in intervals],
+            f"{INTERVAL}, from{few}": [low for low, _ in intervals],
+            f"{INTERVAL}, to{few}": [high for _, high in intervals],
             "median": changes.median(), "sequences improved": (changes < 0).sum().where(changes.notna().any())}
     return pd.DataFrame({row: np.asarray(values, float) for row, values in rows.items()}, index=changes.columns).T
 
