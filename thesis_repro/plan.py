@@ -288,7 +288,7 @@ def text(root, plan, calibration, repetitions, complete):
     wide = max(len(step[0]) for step in steps)
     lines += [f"{'step':{wide}}  {'number':>18}  CPU hours"]
     lines += [f"{name:{wide}}  {f'{number:,} {unit}':>18}  {hours:9.2f}" for name, number, unit, hours in steps]
-    lines += [f"{'label maps by one network only; with the first:':{wide}}  {'':18}  "
+    lines += [f"{'in all, with the model in the package':{wide}}  {'':18}  "
               f"{sum(step[3] for step in steps) - steps[1][3]:9.2f}", ""]
     few, many = plan.label_hours.values()
     lines.append(f"{'cores':>5}  {'odometry, wall hours':>20}  {'label maps, wall hours':>22}  {'memory a worker':>15}  "
@@ -303,7 +303,7 @@ def text(root, plan, calibration, repetitions, complete):
               f"how sure: {spread}; a busy machine, other processors and the clocks of many busy",
               "cores easily change times by a third. Wall hours take cores for as fast as this one alone, and the",
               "network for as divisible as its work. The training of a network of one's own is not included.",
-              f"{repetitions} repetitions; finished runs are kept, and a stopped pass goes on from its last "
+              f"{repetitions} repetition{'s' * (repetitions > 1)}; finished runs are kept, and a stopped pass goes on from its last "
               f"{odometry.CHECKPOINT} frames"]
     return "\n".join(lines)
 
