@@ -1,10 +1,12 @@
 """RANSAC gives the bits of cv2.findEssentialMat."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import odometry, pose, ransac
+from thesis_repro import five_point, odometry, pose, ransac
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS
 
@@ -111,7 +113,7 @@ def test_solutions_lie_within_their_margins_of_opencvs():
     random, compared, outside, unsure = np.random.default_rng(3), 0, 0, 0
     for _ in range(400):
         current, previous = scene(random, 5, outliers=0.0)
-        sure, solutions, margins = ransac.solve(np.hstack([current, previous]))
+        sure, solutions, margins = five_point.solve(np.hstack([current, previous]))
         if not sure:
             unsure += 1
             continue
@@ -129,11 +131,25 @@ def test_solutions_lie_within_their_margins_of_opencvs():
 def test_real_roots_of_a_known_polynomial():
     roots = np.array([-3.0, -1.0, 0.5, 2.0])
     polynomial = np.poly(np.concatenate([roots, [1j, -1j, 2 + 1j, 2 - 1j, -1 + 3j, -1 - 3j]])).real
-    sure, found = ransac.real_roots(polynomial, 1e-12 * polynomial, 0 * polynomial)
+    sure, found = five_point.real_roots(polynomial, 1e-12 * polynomial, 0 * polynomial)
     assert sure
     np.testing.assert_allclose(found, roots, rtol=1e-9)
     double = np.poly([1.0, 1.0, 3.0, -2.0, 1j, -1j, 2j, -2j, 3j, -3j]).real
-    assert not ransac.real_roots(double, 0 * double, np.full(11, 1e-9))[0]
+    assert not five_point.real_roots(double, 0 * double, np.full(11, 1e-9))[0]
+
+
+def test_same_bits_in_threads():
+    scenes = [scene(np.random.default_rng(seed), 300) for seed in range(8)]
+    expected = [opencv(*each, THESIS.threshold)[0] for each in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda each: ransac.find(*each, THESIS.threshold, pose.PROBABILITY)[0], scenes)
+    np.testing.assert_array_equal(list(found), expected)
+
+
+def test_a_threshold_that_nothing_meets():
+    random = np.random.default_rng(4)
+    for count in (8, 12, 60):
+        assert_same_bits(*scene(random, count), 1e-17)
 
 
 @pytest.mark.real
