@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thesis_repro import cityscapes, files, segmentation, training
+from thesis_repro import cityscapes, files, memory, segmentation, training
 from thesis_repro.unet import build_unet
 
 TRAINING_IMAGES, VALIDATION_IMAGES = 2380, 595  # Section 3.5.2, before augmentation doubles them
@@ -28,14 +28,15 @@ def input_memory(size=320, batch_size=16, batches=12):
     return {"images": 2 * (TRAINING_IMAGES + VALIDATION_IMAGES), "size": size, "gigabytes": (peak - before) / GB}
 
 
-def input_speed(size, base_filters, batch_size, images=64, repeats=3):
-    """How many times faster the input makes batches than a training step of the U-Net consumes them."""
+def input_speed(size, base_filters, batch_size, images=32, repeats=2):
+    """How many times faster the input makes batches than the training of the U-Net consumes them."""
+    memory.keep_freed()  # as training does
     batches = training.Batches([_noise(images, size, 0)], batch_size, seed=0)
     model = build_unet((size, size, 1), cityscapes.N_CLASSES, base_filters)
     training.compile_model(model)
-    x, y = next(iter(batches.dataset()))
-    model.train_on_batch(x, y)  # compiles
-    consumed = min(_seconds(lambda: model.train_on_batch(x, y)) for _ in range(repeats)) / batch_size
+    ready = batches.dataset().cache()
+    model.fit(ready, shuffle=False, verbose=0)  # compiles, and makes the batches
+    consumed = min(_seconds(lambda: model.fit(ready, shuffle=False, verbose=0)) for _ in range(repeats)) / images
     made = min(_seconds(lambda: [None for _ in batches.dataset()]) for _ in range(repeats)) / images
     return {"size": size, "base_filters": base_filters, "batch_size": batch_size,
             "made_images_per_s": 1 / made, "consumed_images_per_s": 1 / consumed, "times_faster": consumed / made}
@@ -83,17 +84,21 @@ def _seconds(work):
 
 
 def main():
-    print("input at 4760 + 1190 images:", _round(input_memory()))
-    for size, base_filters, batch_size in ((64, 4, 4), (160, 16, 8), (320, 16, 16)):
-        print("input against training:", _round(input_speed(size, base_filters, batch_size)))
-    print("prediction, shipped model:", _round(prediction_speed()))
-    for size, base_filters in ((64, 4), (160, 16), (320, 64)):
+    found = input_memory()
+    print(f"input side at {found['images']} images of {found['size']}x{found['size']}: {found['gigabytes']:.2f} GB")
+    for size, base_filters, batch_size in ((64, 4, 4), (160, 8, 4), (320, 16, 16)):
+        found = input_speed(size, base_filters, batch_size)
+        print(f"input at {size}x{size}: {found['made_images_per_s']:.0f} images/s, training with {base_filters} filters "
+              f"consumes {found['consumed_images_per_s']:.1f}: {found['times_faster']:.1f} times as fast")
+    model = segmentation.load_shipped()
+    networks = [("the model in the package", model, 48, 12)]
+    for size, base_filters, frames, one_by_one in ((64, 4, 48, 12), (160, 8, 48, 12), (320, 64, 16, 4)):
         model = build_unet((size, size, 1), cityscapes.N_CLASSES, base_filters)
-        print("prediction:", _round(prediction_speed(model, one_by_one=6)))
-
-
-def _round(numbers):
-    return {name: round(value, 3) if isinstance(value, float) else value for name, value in numbers.items()}
+        networks.append((f"{base_filters} filters at {size}x{size}", model, frames, one_by_one))
+    for name, model, frames, one_by_one in networks:
+        found = prediction_speed(model, frames, one_by_one)
+        print(f"prediction, {name}: {found['sequence_frames_per_s']:.1f} frames/s, model.predict one by one "
+              f"{found['one_by_one_frames_per_s']:.1f}: {found['times_faster']:.2f} times as fast")
 
 
 if __name__ == "__main__":
