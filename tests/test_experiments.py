@@ -1,3 +1,6 @@
+import re
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -100,3 +103,12 @@ def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finishe
     assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
     again = experiments.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
     pd.testing.assert_frame_equal(timed, again)
+
+
+def test_runs_are_stale_when_any_module_that_they_depend_on_changes():
+    neutral = {"cityscapes", "cluster", "files", "metrics", "stages"}  # read, write and judge what is there
+    for module in experiments.CODE:
+        source = (Path(experiments.__file__).parent / f"{module}.py").read_text()
+        used = [name.strip() for line in re.findall(r"^from thesis_repro import (.*)", source, re.M)
+                for name in line.split(",")] + re.findall(r"^from thesis_repro\.(\w+) import", source, re.M)
+        assert set(used) - neutral - {"InputError"} <= set(experiments.CODE), module

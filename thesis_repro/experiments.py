@@ -22,7 +22,8 @@ from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, forget_edges
 
-CODE = ("controls", "experiments", "keypoints", "kitti", "masks", "odometry", "pose")  # a finished run depends on them
+# what a finished run depends on
+CODE = ("controls", "experiments", "five_point", "keypoints", "kitti", "masks", "odometry", "pose", "ransac")
 CONTROL_WIDTH = 10  # pixels: the width of A.8 and Figure 3.6, chosen before any run
 PIECES = 4  # passes for each of several workers, at the least
 POSES = ("all", "refined")  # the thesis's estimator, and the one with the far smaller spread
@@ -279,6 +280,8 @@ def _run_pass(jobs, kitti, labels, folder, frames, settings, record, threads):
         _check_machine(folder / name, record)
         sequence = Sequence(kitti, name).subset(frames)
         variants, failures = _variants(_waiting(jobs, pass_file, folder), sequence, labels, settings)
+        if not variants:  # or Dask does again what it lost the answer of
+            return failures
         write_text(pass_file, json.dumps([job.name for job in jobs]))
         results = odometry.run_many(sequence, {job.name: variant for job, variant in variants.items()},
                                     checkpoint=_state(pass_file), workers=threads)
