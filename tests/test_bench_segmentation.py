@@ -24,7 +24,8 @@ def test_prediction_is_set_against_the_thesis_s():
 
 def test_the_input_side_holds_bytes_not_floats():
     # in a process of its own, for memory that earlier tests freed would be taken again
-    program = "from thesis_repro import bench_segmentation as bench; print(bench.input_memory(64, batches=2)['gigabytes'])"
+    program = ("from thesis_repro import bench_segmentation as bench\n"
+               "print(bench.input_memory(64, batches=2)['gigabytes'])")
     gigabytes = float(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
                                      check=True).stdout.split()[-1])
     # two bytes a pixel, an image and its label map, and some batches

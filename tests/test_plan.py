@@ -9,8 +9,8 @@ import pytest
 from thesis_repro import InputError, experiments, kitti, plan, stages
 from thesis_repro.__main__ import main
 
-EXCERPT = plan.Excerpt("00 from frame 2", jobs=(168, 30), series=(1.68 + 0.05, 0.3 + 0.05), shared=0.05, row_bytes=500.0,
-                       worker_bytes=200_000_000)
+EXCERPT = plan.Excerpt("00 from frame 2", jobs=(168, 30), series=(1.68 + 0.05, 0.3 + 0.05), shared=0.05,
+                       row_bytes=500.0, worker_bytes=200_000_000)
 CALIBRATION = plan.Calibration((EXCERPT,), timing=0.5, networks=dict.fromkeys(plan.MODELS, 1.0),
                                network_bytes=2_000_000_000, label_bytes=6000.0, seconds=30.0, repetitions=2)
 

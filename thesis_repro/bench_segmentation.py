@@ -88,8 +88,8 @@ def main():
     print(f"input side at {found['images']} images of {found['size']}x{found['size']}: {found['gigabytes']:.2f} GB")
     for size, base_filters, batch_size in ((64, 4, 4), (160, 8, 4), (320, 16, 16)):
         found = input_speed(size, base_filters, batch_size)
-        print(f"input at {size}x{size}: {found['made_images_per_s']:.0f} images/s, training with {base_filters} filters "
-              f"consumes {found['consumed_images_per_s']:.1f}: {found['times_faster']:.1f} times as fast")
+        print(f"input at {size}x{size}: {found['made_images_per_s']:.0f} images/s, training with {base_filters} "
+              f"filters consumes {found['consumed_images_per_s']:.1f}: {found['times_faster']:.1f} times as fast")
     model = segmentation.load_shipped()
     networks = [("the model in the package", model, 48, 12)]
     for size, base_filters, frames, one_by_one in ((64, 4, 48, 12), (160, 8, 48, 12), (320, 64, 16, 4)):

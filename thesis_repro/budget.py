@@ -1,4 +1,4 @@
-"""What a frame costs from its file to its pose, the network included (Section 5.2 asks for it; Figure 4.17 leaves it out).
+"""What a frame costs from its file to its pose, the network included, as Section 5.2 asks.
 
 Everything is done as a live system would: one frame after the other, the network on one image at a time, all cores.
 """
@@ -42,8 +42,8 @@ def measure(sequence, model, *, frames=20, width=WIDTH, settings=odometry.THESIS
                 seconds = run.step(frame, metres[index], mask if name == masked else None).seconds
                 before = {"read": read, **({"segmentation": network, "mask": masking} if name == masked else {})}
                 if index >= WARM_UP:
-                    rows.append({"variant": name, **before, "detection": seconds["detect"], "tracking": seconds["track"],
-                                 "pose": seconds["essential"] + seconds["pose"]})
+                    rows.append({"variant": name, **before, "detection": seconds["detect"],
+                                 "tracking": seconds["track"], "pose": seconds["essential"] + seconds["pose"]})
     medians = 1000 * pd.DataFrame(rows).groupby("variant", sort=False)[list(STAGES)].median()
     return medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds").dropna().reset_index()
 

@@ -277,7 +277,7 @@ def text(root, plan, calibration, repetitions, complete):
         lines.append(f"(the complete benchmark has {len(kitti.FRAME_COUNTS)} sequences, {everything:,} frames; "
                      "--complete plans for it)")
     places = "; ".join(one.where for one in calibration.excerpts)
-    lines += [f"calibrated in {calibration.seconds:.0f} s on {FRAMES} frames each of sequences {places}",
+    lines += [f"calibrated in {calibration.seconds:.0f} s on {FRAMES} frames of sequence {places}",
               f"this machine: {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}", ""]
     first, second = plan.jobs
     steps = [("label maps, " + name, total, "label maps", hours) for name, hours in plan.label_hours.items()]
@@ -291,8 +291,8 @@ def text(root, plan, calibration, repetitions, complete):
     lines += [f"{'in all, with the model in the package':{wide}}  {'':18}  "
               f"{sum(step[3] for step in steps) - steps[1][3]:9.2f}", ""]
     few, many = plan.label_hours.values()
-    lines.append(f"{'cores':>5}  {'odometry, wall hours':>20}  {'label maps, wall hours':>22}  {'memory a worker':>15}  "
-                 f"{'memory in all':>13}")
+    lines.append(f"{'cores':>5}  {'odometry, wall hours':>20}  {'label maps, wall hours':>22}  "
+                 f"{'memory a worker':>15}  {'memory in all':>13}")
     for cores, hours in plan.wall_hours.items():
         lines.append(f"{cores:5}  {hours:20.2f}  {f'{few / cores:.2f} or {many / cores:.2f}':>22}  "
                      f"{_size(plan.worker_bytes[cores]):>15}  {_size(plan.memory_bytes[cores]):>13}")
@@ -300,11 +300,12 @@ def text(root, plan, calibration, repetitions, complete):
               if len(calibration.excerpts) > 1 else "only one excerpt could be calibrated in the time")
     lines += ["", f"disk: label maps {_size(plan.label_bytes)}, results {_size(plan.result_bytes)}; masks are not kept",
               f"predicting takes {_size(calibration.network_bytes)} of memory once, whatever the number of cores",
-              f"how sure: {spread}; a busy machine, other processors and the clocks of many busy",
-              "cores easily change times by a third. Wall hours take cores for as fast as this one alone, and the",
-              "network for as divisible as its work. The training of a network of one's own is not included.",
-              f"{repetitions} repetition{'s' * (repetitions > 1)}; finished runs are kept, and a stopped pass goes on from its last "
-              f"{odometry.CHECKPOINT} frames"]
+              f"how sure: {spread};",
+              "a busy machine, other processors and the clocks of many busy cores easily change times by a third.",
+              "Wall hours take cores for as fast as this one alone, and the network for as divisible as its work.",
+              "The training of a network of one's own is not included.",
+              f"{repetitions} repetition{'s' * (repetitions > 1)}; finished runs are kept, and a stopped pass "
+              f"goes on from its last checkpoint, one every {odometry.CHECKPOINT} frames"]
     return "\n".join(lines)
 
 
