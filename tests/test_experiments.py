@@ -1,4 +1,5 @@
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -62,8 +63,8 @@ def test_a_failing_run_is_reported_and_stops_no_other(small_world, small_labels,
 
 
 @pytest.mark.parametrize("error", [OSError("pulled the plug"), KeyboardInterrupt()])
-def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small_labels, finished, tmp_path, monkeypatch,
-                                                              error):
+def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small_labels, finished, tmp_path,
+                                                              monkeypatch, error):
     folder, jobs, _ = finished
     jobs = [job for job in jobs if job.variant != "reduced"]
     monkeypatch.setattr(odometry, "CHECKPOINT", 5)
@@ -94,6 +95,17 @@ def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small
         one, two = (pd.read_csv(root / job.sequence / f"{job.name}.csv") for root in (folder, tmp_path))
         exact = [column for column in one if not column.endswith("seconds")]
         pd.testing.assert_frame_equal(one[exact], two[exact], check_exact=True)
+
+
+def test_a_broken_label_map_costs_only_the_runs_that_need_it(small_world, small_labels, tmp_path, capsys):
+    shutil.copytree(small_labels, tmp_path / "labels")
+    broken = tmp_path / "labels" / "00" / "000003.png"
+    broken.write_bytes(broken.read_bytes()[:-20])
+    jobs = experiments.first_jobs(["00"], WIDTHS) + [Job("00", "true-labels", 10), Job("00", "mirrored", 10)]
+    summary = experiments.run(jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5)
+    assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
+    assert ("sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: "
+            f"{broken}: the image is truncated") in capsys.readouterr().out
 
 
 def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finished, monkeypatch):

@@ -273,7 +273,7 @@ def _check_label_map(path):
 
 
 def _run_pass(jobs, kitti, labels, folder, frames, settings, record, threads):
-    """Run jobs of one sequence in one pass, here or on a machine of a cluster; returns {job: reason} of those failed."""
+    """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason} of those that failed."""
     cv2.setNumThreads(1)  # the processes already use every core
     name, pass_file, failures = jobs[0].sequence, _pass_file(jobs, folder), {}
     try:
