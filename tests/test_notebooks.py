@@ -10,6 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
 TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
+OWN_TABLES, OWN_FIGURES = ["budget", "controls", "widths"], ["budget", "controls"]
 FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" for n in range(1, 7)),
            *(f"figure_4_{n:02d}" for n in range(1, 18)), "figure_a_01"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
@@ -35,10 +36,15 @@ def test_all_notebooks_run_and_leave_every_artefact(tmp_path):
     executed = tmp_path / "build" / "embedded-smoke" / "notebooks"
     assert sorted(path.name for path in executed.glob("*.ipynb")) == NOTEBOOKS
     figures = tmp_path / "figures" / "embedded-smoke"
-    assert names(figures, ".svg") == names(figures, ".png") == sorted(FIGURES)
-    assert names(figures, ".csv") == names(figures, ".md") == TABLES
-    assert all("embedded world" in (figures / f"{name}.md").read_text() for name in TABLES[2:])
-    assert all("embedded world" in (figures / f"{name}.svg").read_text() for name in set(FIGURES) - WITHOUT_DATA)
+    assert names(figures, ".svg") == names(figures, ".png") == sorted(FIGURES + OWN_FIGURES)
+    assert names(figures, ".csv") == sorted(TABLES + OWN_TABLES)
+    assert names(figures, ".md") == sorted(TABLES + OWN_TABLES + ["findings"])
+    texts = [f"{name}.md" for name in (*TABLES[2:], *OWN_TABLES, "findings")]
+    texts += [f"{name}.svg" for name in {*FIGURES, *OWN_FIGURES} - WITHOUT_DATA]
+    assert [name for name in texts if "embedded world" not in (figures / name).read_text()] == []
+    page = (figures / "index.html").read_text()
+    assert "41 of 41" in page and "embedded world" in page
+    assert len(list(executed.glob("*.html"))) == len(NOTEBOOKS)
     again = make_figures(tmp_path)
     assert again.returncode == 0 and "load_images" not in again.stdout, again.stdout
 

@@ -17,7 +17,8 @@ WIDTH = 10  # pixels by which boundaries are dilated: that of A.8 and Figure 3.6
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
 WARM_UP = 3  # frames that load compiled code and fill caches, not counted
 KITTI_MS = 100.0  # a frame at KITTI's ten a second
-CODE = ("bench", "budget", "cityscapes", "files", "keypoints", "masks", "odometry", "pose", "segmentation")
+CODE = ("bench", "budget", "cityscapes", "files", "five_point", "keypoints", "masks", "odometry", "pose", "ransac",
+        "segmentation")
 
 
 def measure(sequence, model, *, frames=20, width=WIDTH, settings=odometry.THESIS):
