@@ -94,7 +94,8 @@ CHAPTERS = {
         "figure_4_16": ("MAE of each sequence", "As Figure 4.14, for the mean absolute error."),
         "table_4_2": ("Change of RMSE", "Percent change from all keypoints (Equation 4.1; negative is better) with "
                       "each sequence's best width, beside it what fairer choices of width and the controls give. The "
-                      "thesis's aggregate is the sum of the percentages; mean, its interval and median are below it."),
+                      "thesis's aggregate is the sum of the percentages; mean, its interval and median are below it. "
+                      "Intervals of chosen widths are too narrow: the choices share most of their data."),
         "table_4_3": ("Change of MAE", "As Table 4.2, for the mean absolute error."),
         "figure_4_17": ("Time saved", "Change of the total time of all sequences for each dilation width (Equation "
                         "4.2; negative is time saved). Masks are counted, the network that predicts the label maps is "
@@ -111,7 +112,8 @@ ADDED = {
     ("text", "findings"): ("What the runs show", ""),
     ("table", "widths"): ("A fair choice of width", "The thesis's best width of each sequence beside one width for all "
                           "and the width that the other sequences choose, as changes in percent from all keypoints; "
-                          "and how far the best width is chance."),
+                          "and how far the best width is chance. The intervals of chosen widths are too narrow: the "
+                          "choices share most of their data."),
     ("figure", "controls"): ("Controls", "Masks from the segmentation against masks and limits that know nothing of "
                              "it, under the thesis's estimator and under the refined one. If a control does as well, "
                              "it is not the segmentation that helps."),
