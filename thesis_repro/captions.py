@@ -116,8 +116,8 @@ ADDED = {
                           "choices share most of their data."),
     ("figure", "controls"): ("Controls", "Masks from the segmentation against masks and limits that know nothing of "
                              "it, under the thesis's estimator and under the refined one. If a control does as well, "
-                             "it is not the segmentation that helps. The axes follow the logarithm of the ratio of the "
-                             "errors: four times larger is as far from 0 as four times smaller."),
+                             "it is not the segmentation that helps. Where changes are large, the axis follows the "
+                             "logarithm of the ratio of the errors: four times is as far from 0 as a quarter."),
     ("table", "controls"): ("Controls, in numbers", "Mean changes in percent from all keypoints under the same "
                             "estimator, and what masks do better (negative) or worse than each control."),
     ("figure", "budget"): ("Time of a frame, whole", "What one frame costs from reading it to its pose, the network "
