@@ -4,7 +4,8 @@ import pandas as pd
 import pytest
 
 from thesis_repro import experiments, figures_results, findings, results, tables_results
-from thesis_repro.figures import REPORTED, markdown
+from thesis_repro.captions import REPORTED
+from thesis_repro.figures import markdown
 
 ELEVEN = [f"{number:02d}" for number in range(11)]
 OTHERS = [variant for variant in results.CONTROLS if variant != "masked"]

@@ -11,12 +11,11 @@ import pandas as pd
 
 from thesis_repro import InputError, masks, odometry, segmentation, stages, training
 from thesis_repro.bench import opencv_threads
+from thesis_repro.experiments import CONTROL_WIDTH as WIDTH
 from thesis_repro.files import progress, write_text
 
-WIDTH = 10  # pixels by which boundaries are dilated: that of A.8 and Figure 3.6
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
 WARM_UP = 3  # frames that load compiled code and fill caches, not counted
-KITTI_MS = 100.0  # a frame at KITTI's ten a second
 CODE = ("bench", "budget", "cityscapes", "files", "five_point", "keypoints", "masks", "odometry", "pose", "ransac",
         "segmentation")
 

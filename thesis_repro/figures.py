@@ -4,7 +4,6 @@ The functions that draw are in figures_background (chapter 2), figures_methods (
 masks) and figures_results (the odometry of chapter 4). Each takes arrays or a table and returns a matplotlib figure.
 """
 
-import json
 from pathlib import Path
 
 import matplotlib
@@ -42,8 +41,6 @@ TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # what each colour s
 _LINES = [(color, style) for style in ("-", "--", ":") for color in (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK)]
 
 DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"  # the note where no data is shown
-
-REPORTED = json.loads((Path(__file__).parent / "reported.json").read_text(encoding="utf-8"))
 
 
 def line_style(index):

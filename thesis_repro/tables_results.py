@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro import results
+from thesis_repro.captions import REPORTED
 from thesis_repro.experiments import CONTROL_WIDTH, best_widths
-from thesis_repro.figures import REPORTED
 
 SHORT = {"masked": f"width {CONTROL_WIDTH}", "exact-boundaries": "exact", "true-labels": "true",
          "other-frame": "other frame", "mirrored": "mirrored", "random-lines": "random lines",

@@ -1,7 +1,5 @@
 """Pictures of the odometry at work: keypoints kept and discarded, tracks, the mask's outline, the path so far."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 
