@@ -70,13 +70,12 @@ $(error the settings above are wrong)
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
-SOURCES := $(filter-out $(addprefix thesis_repro/,page.py html_parts.py captions.py),\
-             $(wildcard thesis_repro/*.py thesis_repro/*.json thesis_repro/weights/*))
+SOURCES := $(filter-out %/page.py %/html_parts.py %/page.css,$(shell find thesis_repro -type f -not -name '*.pyc'))
 DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
         $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*))
 
 figures: $(EXECUTED)
-	@$(BIN)/python -m thesis_repro.page
+	@$(BIN)/python -m thesis_repro.report.page
 	@$(BIN)/python -m thesis_repro.settings figures
 
 $(RUN)/checked: .venv/ready $(DATA)
@@ -114,12 +113,12 @@ lab: setup
 
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
-	@$(BIN)/python -m thesis_repro.bench --kitti "$(or $(KITTI),build/world-demo/kitti)" --output build/bench.json
-	@$(BIN)/python -m thesis_repro.bench_segmentation
+	@$(BIN)/python -m thesis_repro.bench.odometry --kitti "$(or $(KITTI),build/world-demo/kitti)" --output build/bench.json
+	@$(BIN)/python -m thesis_repro.bench.segmentation
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.shipped "$(CAMVID)" build/shipped
+	@$(BIN)/python -m thesis_repro.segmentation.shipped "$(CAMVID)" build/shipped
 
 clean:
 	rm -rf .venv build figures/*/ *.egg-info .pytest_cache

@@ -42,11 +42,11 @@ def reference():
 @pytest.fixture(scope="session")
 def small_world(tmp_path_factory):
     """A small embedded world: two sequences of 12 frames and a few street images."""
-    from thesis_repro import world
+    from thesis_repro.world import dataset
     from thesis_repro.settings import PROFILES
 
     folder = tmp_path_factory.mktemp("world")
-    world.write(folder / "world", **PROFILES["smoke"].world, seed=0)
+    dataset.write(folder / "world", **PROFILES["smoke"].world, seed=0)
     return folder / "world"
 
 

@@ -1,4 +1,9 @@
-from thesis_repro import stages
+import ast
+
+import numpy as np
+import pytest
+
+from thesis_repro import InputError, stages
 
 
 def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
@@ -10,13 +15,86 @@ def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
     assert not (folder / "result").exists() and stages.made_from(folder) != before
 
 
-def test_code_ignores_comments_and_docstrings(tmp_path, monkeypatch):
-    monkeypatch.setattr(stages, "_PACKAGE", tmp_path)
-    versions = []
-    for text in ('def f():\n    return 1\n', '# why\ndef f():\n    """What."""\n    return 1\n', 'def f():\n    return 2\n'):
-        (tmp_path / "module.py").write_text(text)
-        versions.append(stages.code("module"))
-    assert versions[0] == versions[1] != versions[2]
+def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
+    (tmp_path / "letter.txt").write_text("mine")
+    with pytest.raises(InputError, match="did not make; choose an empty or new folder"):
+        stages.stage(tmp_path, data="one")
+    with pytest.raises(InputError, match="letter.txt: is a file"):
+        stages.stage(tmp_path / "letter.txt", data="one")
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_results_of_other_settings_are_refused_where_they_must_not_be_deleted(tmp_path):
+    (stages.stage(tmp_path / "a", size=3) / "result").write_text("kept")
+    with pytest.raises(InputError, match="a: holds results of other settings .size 3, not 4."):
+        stages.stage(tmp_path / "a", replace=False, size=4)
+    assert (tmp_path / "a" / "result").exists()
+
+
+def test_a_damaged_record_is_one_clear_line(tmp_path):
+    (tmp_path / stages.RECORD).write_text("[1, 2")
+    with pytest.raises(InputError, match="made-from.json: is damaged"):
+        stages.stage(tmp_path, data="one")
+
+
+def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):
+    file = tmp_path / "state.npz"
+    assert stages.resume(file) is None
+    stages.store(file, {"epoch": 3}, {"0": np.eye(2), "job": np.arange(3)})
+    job, arrays = stages.resume(file)
+    assert job == {"epoch": 3} and np.array_equal(arrays["0"], np.eye(2)) and np.array_equal(arrays["job"], [0, 1, 2])
+    assert stages.resume(file, arrays=False) == ({"epoch": 3}, {})
+    np.savez(file, job="{}", **{"array 0": np.array([object()])})  # a pickle
+    with pytest.raises(InputError, match="state.npz: is damaged; delete it"):
+        stages.resume(file)
+    stages.store(file, {}, {"0": np.zeros(1000)})
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(InputError, match="state.npz: is damaged; delete it"):
+        stages.resume(file)
+
+
+def write_package(root, **modules):
+    for name, text in modules.items():
+        path = root / "package" / f"{name.replace('__', '/')}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+def test_code_ignores_comments_and_docstrings_and_follows_imports(tmp_path, monkeypatch):
+    monkeypatch.setattr(stages, "_PACKAGE", tmp_path / "package")
+    plain = {"room__table": "from package.room import chair\n", "room__chair": "from package import house\n",
+             "house": "def f():\n    return 1\n", "garden": "x = 1\n"}
+
+    def version(place="room", **changed):
+        write_package(tmp_path, **{**plain, **changed})
+        stages.code.cache_clear()
+        return stages.code(place)
+
+    first = version()
+    assert version(house='# why\ndef f():\n    """What."""\n    return 1\n') == first
+    assert version(house="def f():\n    return 2\n") != first
+    assert version(room__chair="from package import house\nx = 2\n") != first
+    assert version(garden="x = 2\n") == first
+    assert version("room/table", house="def f():\n    return 2\n") != version("room/table")
+    with pytest.raises(ValueError, match="attic: no folder or module"):
+        version("attic")
+    stages.code.cache_clear()
+
+
+def test_what_a_run_depends_on_is_found():
+    def modules(*places):
+        found, waiting = set(), [path for place in places for path in stages._modules(place)]
+        while waiting:
+            path = waiting.pop()
+            if path not in found:
+                found.add(path)
+                waiting += stages._imported(ast.parse(path.read_text()))
+        return {str(path.relative_to(stages._PACKAGE).with_suffix("")) for path in found}
+
+    found = modules("odometry", "study/jobs")
+    assert {"kitti", "masks", "odometry/five_point", "study/controls", "cityscapes"} <= found
+    assert not {name for name in found if name.startswith(("report", "segmentation", "world"))}
+    assert not {"study/results", "study/runner"} & found
 
 
 def test_listing_notices_other_files(tmp_path):

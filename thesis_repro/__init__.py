@@ -1,5 +1,26 @@
-"""A reproduction of a thesis on keypoint masks from semantic segmentation for monocular visual odometry."""
+"""A reproduction of a thesis on keypoint masks from semantic segmentation for monocular visual odometry.
+
+What is most needed is here by name: Sequence, keypoint_mask, Odometry, OdometrySettings, THESIS, run, build_unet and
+InputError. Each is loaded when it is asked for, so that TensorFlow is, only for build_unet.
+"""
+
+from importlib import import_module
+
+_HOMES = {"Sequence": "kitti", "keypoint_mask": "masks", "Odometry": "odometry", "OdometrySettings": "odometry",
+          "THESIS": "odometry", "run": "odometry", "build_unet": "segmentation.unet"}
+
+__all__ = ["InputError", *_HOMES]
 
 
 class InputError(ValueError):
     """Bad input: one line that says what, which file or setting, and what to do about it."""
+
+
+def __getattr__(name):
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__():
+    return [*globals(), *_HOMES]

@@ -38,7 +38,7 @@ def check_data(options):
 
 def predict(options):
     """write label maps (8-bit ids, 320x320 PNG, named like the frames) for a folder of images or a sequence"""
-    from thesis_repro import backbones, segmentation, training
+    from thesis_repro.segmentation import backbones, prediction, training
     from thesis_repro.files import listed
 
     images = options.images / "image_0" if (options.images / "image_0").is_dir() else options.images
@@ -51,15 +51,17 @@ def predict(options):
     if options.output.resolve() == images.resolve():
         raise InputError(f"{options.output}: is the folder of the images; label maps have the same names, "
                          "so name another folder")
-    models = [training.load_model(path) for path in options.model] or [segmentation.load_shipped()]
+    models = [training.load_model(path) for path in options.model] or [prediction.load_shipped()]
     model = models[0] if len(models) == 1 else backbones.ensemble(models)
-    segmentation.write_label_maps(model, paths, options.output)
+    prediction.write_label_maps(model, paths, options.output)
     print(f"{options.output}: {len(paths)} label maps")
 
 
 def odometry(options):
     """run the visual odometry over one sequence and print its errors, keypoints and time"""
-    from thesis_repro import metrics, odometry, video
+    from thesis_repro import odometry
+    from thesis_repro.odometry import metrics
+    from thesis_repro.report import video
     from thesis_repro.files import write_text
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder
@@ -107,7 +109,7 @@ def odometry(options):
 
 def plan(options):
     """say how long all runs over a KITTI folder would take here, and their memory and disk, from a short calibration"""
-    from thesis_repro import plan
+    from thesis_repro.study import plan
 
     if options.repetitions < 1 or min(options.cores) < 1:
         raise InputError("--repetitions and --cores: need whole numbers of 1 or more")
@@ -158,7 +160,7 @@ def build_parser():
     sub.add_argument("--permute", type=int, metavar="SEED", help="shuffle the correspondences before RANSAC")
     sub.add_argument("--mask-mode", metavar="detect|filter",
                      help="give the mask to the detector (default), or drop what it found outside")
-    sub.add_argument("--estimator", metavar="ransac|usac|usac-accurate|usac-magsac", help="of the essential matrix")
+    sub.add_argument("--estimator", metavar="ransac|usac|usac-magsac", help="of the essential matrix")
     sub.add_argument("--detector", metavar="shi-tomasi|orb", help="of keypoints; they are tracked all the same")
     sub.add_argument("--min-distance", type=float, metavar="PIXELS", help="between keypoints (3)")
     sub.add_argument("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")

@@ -1,30 +1,60 @@
-"""Results on disk that know what they were made from, so that a rerun goes on and never reuses what is stale."""
+"""Results on disk that know what they were made from, and going on after a stop: one mechanism for everything.
+
+A *stage* is a folder with a record of what its results were made from (`stage`). A *state* is one file with what a long
+job needs to go on, written whole or not at all (`store`, `resume`). Digests say in a few letters what an input was.
+"""
 
 import ast
 import hashlib
 import json
 import shutil
+import zipfile
+from functools import lru_cache
 from pathlib import Path
 
-from thesis_repro.files import write_text
+import numpy as np
+
+from thesis_repro import InputError
+from thesis_repro.files import atomic, write_text
 
 _PACKAGE = Path(__file__).parent
 RECORD = "made-from.json"
 
 
-def stage(folder, **inputs):
+def stage(folder, *, replace=True, **inputs):
     """The folder of one stage, holding only results that were made from `inputs` (JSON values).
 
-    What an earlier run with the same inputs finished is kept; results of other inputs are deleted.
+    What an earlier run with the same inputs finished is kept; results of other inputs are deleted, or with `replace`
+    False refused. Raises InputError for those, and for a file or a folder that this project did not make.
     """
     folder = Path(folder)
-    wanted = json.dumps(inputs, indent=1, sort_keys=True, default=str)
-    record = folder / RECORD
-    if not record.is_file() or record.read_text(encoding="utf-8") != wanted:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        write_text(record, wanted)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; name a folder for the results")
+    wanted = json.loads(json.dumps(inputs, default=str))
+    found = record(folder)
+    if found is None and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
+    if found is not None and found != wanted:
+        if not replace:
+            key = next(key for key in {**wanted, **found} if wanted.get(key) != found.get(key))
+            raise InputError(f"{folder}: holds results of other settings ({key} {found.get(key)!r}, not "
+                             f"{wanted.get(key)!r}); remove the folder or choose another")
+        shutil.rmtree(folder)
+    if found != wanted:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / RECORD, json.dumps(wanted, indent=1, sort_keys=True))
     return folder
+
+
+def record(folder):
+    """What the results in a stage's folder were made from: a dict, or None where the folder is no stage."""
+    path = Path(folder) / RECORD
+    if not path.is_file():
+        return None
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError):
+        raise InputError(f"{path}: is damaged; remove the folder to make its results anew") from None
 
 
 def made_from(folder):
@@ -32,16 +62,72 @@ def made_from(folder):
     return content(Path(folder) / RECORD)
 
 
-def code(*modules):
-    """A digest of what modules of this package do: their syntax trees, without comments and docstrings."""
+# The state of a long job
+
+
+def store(path, job, arrays):
+    """Keep what a long job needs to go on: `job`, what it is and how far (JSON values), and arrays by name."""
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, job=json.dumps(job), **{f"array {name}": array for name, array in arrays.items()})
+
+
+def resume(path, arrays=True):
+    """What `store` kept, (job, arrays); None where there is nothing. Raises InputError for a damaged file.
+
+    arrays: False leaves them unread, to look at the job alone.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            names = [name for name in kept.files if name != "job"] if arrays else []
+            return json.loads(str(kept["job"])), {name.removeprefix("array "): kept[name] for name in names}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        raise InputError(f"{path}: is damaged; delete it to start from the beginning") from None
+
+
+# Digests
+
+
+@lru_cache
+def code(*places):
+    """A digest of what folders ("odometry") or modules ("study/controls") of this package do.
+
+    Everything of the package that they import counts with them. Comments and docstrings do not.
+    """
+    waiting = [path for place in places for path in _modules(place)]
+    trees = {}
+    while waiting:
+        path = waiting.pop()
+        if path not in trees:
+            trees[path] = ast.parse(path.read_text(encoding="utf-8"))
+            waiting += _imported(trees[path])
     digest = hashlib.sha256()
-    for module in modules:
-        tree = ast.parse((_PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
+    for path in sorted(trees):
+        for node in ast.walk(trees[path]):
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
                 node.body = node.body[1:]
-        digest.update(ast.dump(tree).encode())
+        digest.update(f"{path.relative_to(_PACKAGE)}{ast.dump(trees[path])}".encode())
     return digest.hexdigest()[:12]
+
+
+def _modules(place):
+    folder, module = _PACKAGE / place, _PACKAGE / f"{place}.py"
+    found = sorted(folder.glob("*.py")) if folder.is_dir() else [module] * module.is_file()
+    if not found:
+        raise ValueError(f"{place}: no folder or module of the package")
+    return found
+
+
+def _imported(tree):
+    """The package's modules that a module imports."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == _PACKAGE.name:
+            place = "/".join(node.module.split(".")[1:])
+            for name in (place, *(f"{place}/{alias.name}".lstrip("/") for alias in node.names)):
+                yield from (path for path in (_PACKAGE / f"{name}.py", _PACKAGE / name / "__init__.py")
+                            if path.is_file())
 
 
 def listing(paths):

@@ -1,0 +1,33 @@
+"""The bench of the segmentation: its ratios are those of the speeds it prints."""
+
+import subprocess
+import sys
+
+import pytest
+
+from thesis_repro import cityscapes
+from thesis_repro.bench import segmentation as bench_segmentation
+from thesis_repro.segmentation.unet import build_unet
+
+
+def test_the_input_is_set_against_the_training():
+    found = bench_segmentation.input_speed(32, 2, 4, images=8, repeats=1)
+    assert found["times_faster"] == pytest.approx(found["made_images_per_s"] / found["consumed_images_per_s"])
+    assert found["made_images_per_s"] > 0 < found["consumed_images_per_s"]
+
+
+def test_prediction_is_set_against_the_thesis_s():
+    model = build_unet((32, 32, 1), cityscapes.N_CLASSES, 2)
+    found = bench_segmentation.prediction_speed(model, frames=8, one_by_one=3, batch_size=4, frame_size=(40, 80))
+    assert found["times_faster"] == pytest.approx(found["sequence_frames_per_s"] / found["one_by_one_frames_per_s"])
+    assert found["times_faster"] > 1 and found["parameters"] == model.count_params()
+
+
+def test_the_input_side_holds_bytes_not_floats():
+    # in a process of its own, for memory that earlier tests freed would be taken again
+    program = ("from thesis_repro.bench import segmentation as bench\n"
+               "print(bench.input_memory(64, batches=2)['gigabytes'])")
+    gigabytes = float(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
+                                     check=True).stdout.split()[-1])
+    # two bytes a pixel, an image and its label map, and some batches
+    assert 0.9 * 2 * 5950 * 64**2 / 1e9 < gigabytes < 4 * 2 * 5950 * 64**2 / 1e9

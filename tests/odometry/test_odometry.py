@@ -1,0 +1,526 @@
+"""The odometry against PySLAM's own runs, its rules for bad frames, and its named choices."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from street import Street, Stripes
+
+from thesis_repro import InputError, odometry
+from thesis_repro.odometry import keypoints, metrics, pose, refine
+from thesis_repro.files import read_gray
+from thesis_repro.kitti import Sequence, write_kitti_poses
+from thesis_repro.odometry import PYSLAM_2024, THESIS, Odometry
+
+SMALL = replace(THESIS, max_keypoints=500)  # quicker
+COUNTS = {"points": "n_kps_to_lk", "detected": "n_detected", "tracked": "n_tracked", "inliers": "n_inliers_E",
+          "pose_inliers": "n_inliers_recoverPose"}
+
+
+class Masks:
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __getitem__(self, index):
+        return read_gray(self.folder / f"{index:06d}.png")
+
+
+# Real frames against PySLAM
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("run, sequence, frames, rmse, mae", [
+    ("00", "00", 200, 1.700609, 0.705170), ("00_masked", "00", 200, 1.811076, 0.794264),
+    ("06", "06", 51, 0.357133, 0.146225)])
+def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, run, sequence, frames, rmse, mae):
+    expected = pd.read_csv(reference / f"{run}.csv")
+    kitti = Sequence(kitti_real, sequence)
+    masks = Masks(reference / "masks_00") if "masked" in run else None
+    result = odometry.run(kitti, THESIS, masks)
+    assert len(result.frames) == len(expected) == frames
+    for ours, theirs in COUNTS.items():
+        np.testing.assert_array_equal(result.frames[ours].to_numpy(float, na_value=np.nan), expected[theirs])
+    rotation = [f"r{i}{j}" for i in range(3) for j in range(3)]
+    np.testing.assert_allclose(result.frames[["x", "y", "z", *rotation]],
+                               expected[["x", "y", "z", *rotation]], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.frames["scale"][1:], expected["gt_scale"][1:], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(result.frames["updated"][1:], expected["pose_updated"][1:] == 1)
+    assert metrics.rmse(result.poses, kitti.poses) == pytest.approx(rmse, abs=5e-7)
+    assert metrics.mae(result.poses, kitti.poses) == pytest.approx(mae, abs=5e-7)
+    assert result.flagged.empty
+
+
+@pytest.mark.real
+def test_agrees_with_the_later_pyslam(kitti_real):
+    kitti = Sequence(kitti_real, "06")
+    result = odometry.run(kitti, PYSLAM_2024)
+    assert metrics.rmse(result.poses, kitti.poses, PYSLAM_2024.alignment) == pytest.approx(0.267954, abs=5e-7)
+
+
+@pytest.mark.real
+def test_an_excerpt_starts_where_the_truth_does(kitti_real, tmp_path):
+    whole = Sequence(kitti_real, "05")
+    images = tmp_path / "sequences" / "05" / "image_0"
+    images.mkdir(parents=True)
+    for path in whole.frame_paths[100:160]:
+        (images / path.name).symlink_to(path)
+    shutil.copy(whole.folder / "calib.txt", images.parent)
+    np.savetxt(images.parent / "times.txt", whole.times[100:160])
+    write_kitti_poses(tmp_path / "poses" / "05.txt", whole.poses[100:160])
+    kitti = Sequence(tmp_path, "05")
+    result = odometry.run(kitti)
+    np.testing.assert_array_equal(result.poses[0], kitti.poses[0])
+    assert metrics.rmse(result.poses, kitti.poses) == pytest.approx(0.1935, abs=5e-5)
+
+
+# Everywhere: a street of noise
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return Street()
+
+
+def pyslam_with_bare_calls(sequence, masks=None):
+    """The thesis's algorithm in its OpenCV calls: a row of counts a frame, and the poses."""
+    rotation, position, points, previous = np.eye(3), np.zeros((3, 1)), None, None
+    inverse = np.linalg.inv(sequence.intrinsics)
+    inverse[:2, 2] = -sequence.intrinsics[:2, 2] / np.diag(sequence.intrinsics)[:2]
+    counts, poses = [], []
+    for index in range(len(sequence)):
+        frame, row = sequence.frame(index), {}
+        if previous is not None:
+            tracked, status, _ = cv2.calcOpticalFlowPyrLK(previous, frame, points, None, winSize=(21, 21), maxLevel=3,
+                                                          criteria=(3, 30, 0.01))
+            old, new = points[status == 1], tracked[status == 1]
+            old_n, new_n = ((inverse @ np.c_[some.astype(float), np.ones(len(some))].T).T[:, :2] for some in (old, new))
+            matrix, inliers = cv2.findEssentialMat(new_n, old_n, focal=1, pp=(0, 0), method=cv2.RANSAC, prob=0.999,
+                                                   threshold=0.0003)
+            votes, turn, shift, _ = cv2.recoverPose(matrix, new_n, old_n, focal=1, pp=(0, 0))
+            scale = np.linalg.norm(sequence.poses[index, :3, 3] - sequence.poses[index - 1, :3, 3])
+            if scale > 0.1:
+                position = position + scale * rotation @ shift
+                rotation = rotation @ turn
+            row = {"points": len(points), "tracked": len(new), "inliers": inliers.sum(), "pose_inliers": votes}
+        if previous is None or len(new) < 2000:
+            points = cv2.goodFeaturesToTrack(frame, 2000, 0.01, 3, blockSize=5,
+                                             mask=None if masks is None else masks[index])
+        else:
+            points = new.reshape(-1, 1, 2)
+        previous = frame
+        counts.append(row)
+        poses.append(np.vstack([np.hstack([rotation, position]), [0, 0, 0, 1]]))
+    return pd.DataFrame(counts), np.array(poses)
+
+
+@pytest.mark.parametrize("masks", [None, Stripes(40)])
+def test_agrees_with_the_bare_opencv_calls(drive, masks):
+    counts, poses = pyslam_with_bare_calls(drive, masks)
+    result = odometry.run(drive, masks=masks)
+    for column in counts:
+        np.testing.assert_array_equal(result.frames[column].to_numpy(float, na_value=np.nan), counts[column])
+    np.testing.assert_allclose(result.poses, poses, rtol=0, atol=1e-12)
+    assert metrics.rmse(result.poses, drive.poses) < 0.05
+
+
+def test_gives_the_stored_numbers(drive):
+    # Recorded with OpenCV 4.14.0; another version of OpenCV may move the last digits of a position, never a count.
+    expected = pd.read_csv(Path(__file__).with_name("street.csv"))
+    frames = odometry.run(drive, masks=Stripes(40)).frames
+    for column in ("detected", "tracked", "inliers", "pose_inliers"):
+        np.testing.assert_array_equal(frames[column].to_numpy(float, na_value=np.nan), expected[column])
+    np.testing.assert_allclose(frames[["x", "y", "z"]], expected[["x", "y", "z"]], rtol=0, atol=1e-7)
+
+
+def test_a_threaded_opencv_changes_no_bit(drive):
+    threads = cv2.getNumThreads()
+    try:
+        results = []
+        for count in (1, 4):
+            cv2.setNumThreads(count)
+            results.append(odometry.run(Changed(drive, frames=4)).poses)
+    finally:
+        cv2.setNumThreads(threads)
+    np.testing.assert_array_equal(*results)
+
+
+# The pose vote
+
+
+@pytest.mark.parametrize("kind", ["plain", "swapped", "few", "noisy", "still", "nonsense"])
+def test_vote_is_opencvs_to_the_last_bit(drive, kind):
+    random = np.random.RandomState(1)
+    for index in range(3):
+        points = keypoints.detect(drive.frame(index), THESIS)
+        tracked, found = keypoints.track(drive.frame(index), drive.frame(index + 1), points)
+        previous, current = (pose.normalise(some[found], drive.intrinsics) for some in (points, tracked))
+        if kind == "swapped":
+            previous, current = current, previous
+        elif kind == "few":
+            previous, current = previous[:30], current[:30]
+        elif kind == "noisy":
+            current = current + random.normal(0, 3e-3, current.shape)
+        elif kind == "still":
+            current = previous + random.normal(0, 1e-5, current.shape)
+        elif kind == "nonsense":
+            previous = random.permutation(previous)
+        matrix, _, problem = pose.essential_matrix(current, previous, THESIS.threshold)
+        assert problem == ""
+        votes, rotation, translation, _ = cv2.recoverPose(matrix, current, previous, focal=1, pp=(0, 0))
+        ours = pose.recover_pose(matrix, current, previous)
+        assert ours[0] == votes
+        np.testing.assert_array_equal(ours[1], rotation)
+        np.testing.assert_array_equal(ours[2], translation.ravel())
+
+
+# Bad frames: the run goes on, by a rule, and says so
+
+
+class Changed:
+    """A sequence with some of its frames replaced."""
+
+    def __init__(self, sequence, replaced=None, poses=None, frames=None):
+        self.name, self.intrinsics = sequence.name, sequence.intrinsics
+        self.poses = (sequence.poses if poses is None else poses)[:frames]
+        self.images = list(sequence.images)[:frames]
+        for index, image in (replaced or {}).items():
+            self.images[index] = image
+
+    def __len__(self):
+        return len(self.images)
+
+    def frame(self, index):
+        return self.images[index]
+
+
+def flags(result):
+    return {index: flag for index, flag in enumerate(result.frames["flag"]) if flag}
+
+
+@pytest.mark.parametrize("level", [0, 255])
+@pytest.mark.parametrize("noise", [0, 2])
+def test_black_or_blown_out_frames_are_bridged(drive, level, noise):
+    random = np.random.RandomState(0)
+    blank = np.clip(level + random.normal(0, noise, drive.frame(0).shape), 0, 255).astype(np.uint8)
+    result = odometry.run(Changed(drive, {4: blank}))
+    assert flags(result) == {4: "flat frame"}
+    np.testing.assert_array_equal(result.poses[4], result.poses[3])
+    # frame 5 is measured from frame 3, so nothing of the way is lost
+    assert result.frames["scale"][5] == pytest.approx(2 * result.frames["scale"][3])
+    assert np.linalg.norm(result.poses[-1][:3, 3] - drive.poses[-1][:3, 3]) < 0.1
+
+
+def test_a_sequence_may_begin_black(drive):
+    black = np.zeros_like(drive.frame(0))
+    result = odometry.run(Changed(drive, {0: black, 1: black}))
+    assert flags(result) == {0: "flat frame", 1: "flat frame", 2: "no points"}
+    assert not result.frames["updated"][:3].any() and result.frames["updated"][3:].all()
+
+
+def test_an_empty_mask_lets_the_tracked_points_go_on(drive):
+    masks = {index: np.zeros(drive.frame(0).shape, np.uint8) if index == 4 else np.full(drive.frame(0).shape, 255,
+                                                                                       np.uint8) for index in range(10)}
+    result = odometry.run(drive, masks=masks)
+    assert flags(result) == {4: "no keypoints"}
+    assert result.frames["detected"][4] == 0
+    assert result.frames["points"][5] == result.frames["tracked"][4]
+    assert result.frames["updated"][1:].all()
+
+
+@pytest.mark.parametrize("mode", ["detect", "filter"])
+def test_nothing_but_empty_masks_stands_still_and_says_so(drive, mode):
+    masks = [np.zeros(drive.frame(0).shape, np.uint8)] * len(drive)
+    result = odometry.run(drive, replace(THESIS, mask_mode=mode), masks)
+    assert flags(result) == {0: "no keypoints", **{index: "no points; no keypoints" for index in range(1, 10)}}
+    np.testing.assert_array_equal(result.poses, np.tile(np.eye(4), (10, 1, 1)))
+    assert result.flagged.to_dict() == {"no keypoints": 10, "no points": 9}
+
+
+@pytest.mark.parametrize("count, reason", [(4, "fewer than five correspondences"), (5, "several essential matrices")])
+def test_too_few_correspondences_keep_the_pose(drive, count, reason):
+    result = odometry.run(drive, replace(THESIS, max_keypoints=count, min_distance=40))
+    full = result.frames[result.frames["tracked"] == count]
+    assert len(full) and (full["flag"].isin([reason, "no agreement"])).all() and (full["flag"] == reason).any()
+    assert not result.frames["updated"].any()
+
+
+def test_no_essential_matrix_keeps_the_pose(drive, monkeypatch):
+    odometry.odometry.warm_up()
+    real = pose.ransac.find
+    calls = []
+
+    def failing(*arguments):
+        calls.append(1)
+        if len(calls) == 3:
+            return None, None
+        if len(calls) == 5:
+            raise cv2.error("degenerate")
+        return real(*arguments)
+
+    monkeypatch.setattr(pose.ransac, "find", failing)
+    result = odometry.run(drive)
+    assert flags(result) == {3: "no essential matrix", 5: "no essential matrix"}
+    np.testing.assert_array_equal(result.poses[3], result.poses[2])
+    assert result.frames["updated"][[2, 4, 6]].all()
+
+
+def test_a_standing_camera_keeps_the_pose(drive):
+    poses = np.insert(drive.poses, 5, drive.poses[4], axis=0)
+    still = Changed(drive, poses=poses)
+    still.images.insert(5, drive.frame(4).copy())
+    result = odometry.run(still)
+    assert flags(result)[5] in ("stationary", "no essential matrix")
+    np.testing.assert_array_equal(result.poses[5], result.poses[4])
+    assert result.frames["updated"][6:].all()
+
+
+def test_a_scene_cut_keeps_the_pose(drive):
+    after = Street(4, start=500.0)
+    cut = Changed(drive, {6 + index: cv2.flip(after.frame(index), 0) for index in range(4)})
+    result = odometry.run(cut)
+    assert flags(result) == {6: "no agreement"}
+    np.testing.assert_array_equal(result.poses[6], result.poses[5])
+    assert result.frames["updated"][7:].all()
+
+
+# Named choices
+
+
+def test_masks_in_the_detector_refill_the_quota_and_filters_do_not(drive):
+    masks = Stripes(40)
+    limited = replace(THESIS, max_keypoints=500)
+    inside = odometry.run(drive, limited, masks).frames["detected"]
+    filtered = odometry.run(drive, replace(limited, mask_mode="filter"), masks).frames["detected"]
+    assert inside.eq(500).all() and filtered.lt(400).all() and filtered.gt(100).all()
+
+
+def test_permutations_vary_the_path_and_repeat_by_seed(drive):
+    first, again, other, plain = (odometry.run(Changed(drive, frames=4), replace(SMALL, permute=seed)).poses for seed in (0, 0, 1, None))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-6 and np.abs(first - plain).max() > 1e-6
+
+
+def test_permuted_inliers_belong_to_their_correspondences(drive):
+    follower = Odometry(drive.intrinsics, replace(THESIS, permute=3))
+    follower.step(drive.frame(0))
+    step = follower.step(drive.frame(1), 0.4)
+    t = step.motion.translation
+    matrix = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ step.motion.rotation
+    current, previous = (np.c_[pose.normalise(some, drive.intrinsics), np.ones(len(some))]
+                         for some in (step.current, step.previous))
+    lines, others = current @ matrix.T, previous @ matrix
+    distances = np.abs((previous * lines).sum(axis=1)) / np.sqrt(
+        (lines[:, :2] ** 2).sum(axis=1) + (others[:, :2] ** 2).sum(axis=1))
+    np.testing.assert_array_equal(step.inliers, distances < THESIS.threshold)
+
+
+def test_refinement_is_closer_to_the_truth_and_varies_less(drive):
+    few = Changed(drive, frames=6)
+    errors = {choice: [metrics.rmse(odometry.run(few, replace(THESIS, pose=choice, permute=seed)).poses, few.poses)
+                       for seed in range(3)] for choice in ("inliers", "refined")}
+    assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
+    assert np.std(errors["refined"]) < 0.5 * np.std(errors["inliers"])
+
+
+def test_refinement_keeps_the_sign_of_the_translation():
+    random = np.random.RandomState(0)
+    world = random.uniform([-5, -2, 4], [5, 2, 30], (200, 3))
+    turn, shift = cv2.Rodrigues(np.array([0.01, 0.02, -0.01]))[0], np.array([0.0, 0.0, 1.0])
+    moved = world @ turn.T + shift  # current camera coordinates to previous ones
+    current, previous = world[:, :2] / world[:, 2:], moved[:, :2] / moved[:, 2:]
+    start = cv2.Rodrigues(np.array([0.013, 0.018, -0.008]))[0]
+    for sign in (1, -1):
+        direction = sign * np.array([0.05, -0.03, 1.0]) / np.linalg.norm([0.05, -0.03, 1.0])
+        rotation, translation = refine.refine(start, direction, current, previous, np.arange(200) < 150,
+                                           THESIS.threshold)
+        np.testing.assert_allclose(rotation, turn, atol=1e-8)
+        np.testing.assert_allclose(translation, sign * shift, atol=1e-7)
+
+
+def test_inliers_alone_decide_the_sign():
+    # 60 good points and 140 that fit the motion's rotation but lie behind: they outvote the good ones unless masked.
+    random = np.random.RandomState(0)
+    world = random.uniform([-5, -2, 4], [5, 2, 30], (200, 3))
+    current = world[:, :2] / world[:, 2:]
+    ahead, back = world + [0, 0, 1.0], world - [0, 0, 1.0]
+    previous = np.where(np.arange(200)[:, None] < 60, ahead[:, :2] / ahead[:, 2:], back[:, :2] / back[:, 2:])
+    matrix = np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]])
+    assert pose.recover_pose(matrix, current, previous)[2][2] == pytest.approx(-1)
+    assert pose.recover_pose(matrix, current[:60], previous[:60])[2][2] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("estimator", ["usac", "usac-magsac"])
+def test_other_estimators_find_the_way(drive, estimator):
+    few = Changed(drive, frames=5)
+    result = odometry.run(few, replace(THESIS, estimator=estimator))
+    assert metrics.rmse(result.poses, few.poses) < 0.05
+    assert np.abs(result.poses - odometry.run(few).poses).max() > 1e-9
+
+
+def test_orb_keypoints_find_the_way(drive):
+    result = odometry.run(drive, replace(THESIS, detector="orb"))
+    assert metrics.rmse(result.poses, drive.poses) < 0.1
+    assert result.frames["detected"].gt(500).all()
+
+
+def test_minimum_distance_thins_the_keypoints_out(drive):
+    points = keypoints.detect(drive.frame(0), replace(THESIS, min_distance=10))
+    distances = np.linalg.norm(points[:, None] - points[None], axis=-1) + 1e9 * np.eye(len(points))
+    assert 100 < len(points) < 500 and distances.min() >= 10
+
+
+def test_the_later_pyslam_turns_first_and_gates_on_the_shift_of_points(drive):
+    few = Changed(drive, frames=4)
+    assert odometry.run(few, PYSLAM_2024).frames["updated"][1:].all()
+    gated = odometry.run(few, replace(PYSLAM_2024, shift_gate=50.0)).frames
+    assert (gated["flag"][1:] == "stationary").all()
+    start = Changed(drive, frames=2)
+    late, early = odometry.run(start, replace(THESIS, rotate_first=True)), odometry.run(start)
+    expected = early.poses[0][:3, 3] + early.frames["scale"][1] * (
+        late.poses[1][:3, :3] @ (early.poses[1][:3, 3] / early.frames["scale"][1]))
+    np.testing.assert_allclose(late.poses[1][:3, 3], expected, atol=1e-12)
+
+
+# Many runs in one pass
+
+
+def variants():
+    runs = {f"stripes-{width}": (SMALL, Stripes(width)) for width in (7, 20)}
+    runs["all"] = (THESIS, None)
+    runs["reduced"] = (replace(THESIS, max_keypoints=300), None)
+    runs["kept"] = (replace(SMALL, redetect_below=450), None)  # tracks fractional positions on
+    runs["filter"] = (replace(SMALL, mask_mode="filter", min_distance=4.5), Stripes(40))
+    runs["orb"] = (replace(SMALL, detector="orb"), Stripes(40))
+    runs["empty"] = (THESIS, [np.zeros((160, 480), np.uint8)] * 10)
+    return runs
+
+
+def assert_same(one, other):
+    np.testing.assert_array_equal(one.poses, other.poses)
+    columns = [name for name in one.frames if not name.endswith("_seconds")]
+    pd.testing.assert_frame_equal(one.frames[columns], other.frames[columns])
+
+
+def test_many_runs_in_one_pass_give_the_bits_of_separate_runs(drive):
+    bad = Changed(drive, {4: np.zeros_like(drive.frame(0))}, frames=7)
+    together = odometry.run_many(bad, variants())
+    threaded = odometry.run_many(bad, variants(), workers=3)
+    for name, (settings, masks) in variants().items():
+        assert_same(together[name], odometry.run(bad, settings, masks))
+        assert_same(together[name], threaded[name])
+    assert (together["kept"].frames["detected"].isna()).any()
+    assert together["all"].frames["track_seconds"].isna().all()
+
+
+def test_runs_that_differ_after_the_tracking_share_masks_keypoints_and_essential_matrices(drive, monkeypatch):
+    class Counted(Stripes):
+        asked = 0
+
+        def __getitem__(self, index):
+            Counted.asked += 1
+            return super().__getitem__(index)
+
+    stripes = Counted(20)
+    runs = {(order, way): (replace(THESIS, permute=order, pose=way), stripes)
+            for order in (None, 1, 2) for way in ("all", "refined")}
+    estimated = []
+    monkeypatch.setattr(pose, "essential_matrix",
+                        lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1])
+    together = odometry.run_many(drive, runs, workers=2)
+    assert Counted.asked == len(drive) and len(estimated) == 3 * (len(drive) - 1)
+    for name, (settings, masks) in runs.items():
+        assert_same(together[name], odometry.run(drive, settings, masks))
+    assert len({together[name].poses.tobytes() for name in runs}) == len(runs)  # they do differ
+
+
+@pytest.mark.parametrize("mask", [None, "stripes", "nothing", "specks"])
+def test_shared_detection_is_opencvs_to_the_last_bit(drive, mask):
+    frame = drive.frame(3)
+    masks = {"stripes": Stripes(20)[0], "nothing": np.zeros_like(frame),
+             "specks": (np.random.RandomState(0).rand(*frame.shape) < 0.02).astype(np.uint8)}
+    shared = keypoints.SharedKeypoints()
+    for image in (frame, frame // 64 * 64, np.full_like(frame, 7)):  # the second has many corners of equal strength
+        for distance in (1, 2.4, 3, 7):
+            for limit in (10, 2000, 0):
+                settings = replace(THESIS, min_distance=distance, max_keypoints=limit)
+                np.testing.assert_array_equal(shared.detect(image, settings, masks.get(mask)),
+                                              keypoints.detect(image, settings, masks.get(mask)))
+
+
+def test_a_killed_pass_goes_on_with_the_same_bits(drive, tmp_path, monkeypatch):
+    monkeypatch.setattr(odometry.passes, "CHECKPOINT", 4)
+    file = tmp_path / "state"
+
+    class Killed(Changed):
+        def frame(self, index):
+            if index == 6:
+                raise KeyboardInterrupt
+            return super().frame(index)
+
+    runs = {name: run for name, run in variants().items() if name in ("all", "stripes-20", "kept")}
+    with pytest.raises(KeyboardInterrupt):
+        odometry.run_many(Killed(drive), runs, checkpoint=file)
+    assert file.is_file()
+
+    class Remembering(Changed):
+        asked = []
+
+        def frame(self, index):
+            self.asked.append(index)
+            return super().frame(index)
+
+    resumed = odometry.run_many(Remembering(drive), runs, description="street", checkpoint=file)
+    assert Remembering.asked == [4, 5, 6, 7, 8, 9]
+    for name, (settings, masks) in runs.items():
+        assert_same(resumed[name], odometry.run(drive, settings, masks))
+    # another kind of run (its settings differ), or a damaged file, starts from the beginning
+    Remembering.asked.clear()
+    odometry.run_many(Remembering(drive), {"all": (THESIS, None)}, checkpoint=file)
+    assert Remembering.asked == list(range(10))
+    file.write_bytes(b"damaged")
+    Remembering.asked.clear()
+    odometry.run_many(Remembering(drive), {"all": (THESIS, None)}, checkpoint=file)
+    assert Remembering.asked == list(range(10))
+
+
+def test_what_fails_in_a_thread_stops_the_pass(drive, monkeypatch):
+    def broken(*arguments):
+        raise ValueError("broken")
+
+    monkeypatch.setattr(pose, "recover_pose", broken)
+    with pytest.raises(ValueError, match="broken"):
+        odometry.run_many(drive, {"all": (THESIS, None), "reduced": (replace(THESIS, max_keypoints=50), None)},
+                          workers=2)
+
+
+# Bad input
+
+
+@pytest.mark.parametrize("setting, value, message", [
+    ("pose", "best", "odometry setting pose: 'best' is unknown; choose one of all, inliers, refined"),
+    ("estimator", "lmeds", "estimator: 'lmeds'"), ("max_keypoints", -1, "max_keypoints: -1"),
+    ("threshold", 0.0, "threshold: 0.0")])
+def test_unknown_settings_are_named(setting, value, message):
+    with pytest.raises(InputError, match=message):
+        replace(THESIS, **{setting: value})
+
+
+def test_bad_frames_and_masks_are_named(drive):
+    follower = Odometry(drive.intrinsics)
+    follower.step(drive.frame(0))
+    with pytest.raises(InputError, match="frame 1: the mask is uint8 of shape .10, 10."):
+        follower.step(drive.frame(1), 0.4, np.zeros((10, 10), np.uint8))
+    with pytest.raises(InputError, match="frame 1: the mask is bool"):
+        follower.step(drive.frame(1), 0.4, np.zeros(drive.frame(0).shape, bool))
+    with pytest.raises(InputError, match="frame 1: shape .80, 480."):
+        follower.step(drive.frame(1)[:80], 0.4)
+    with pytest.raises(InputError, match="frame 1: float64"):
+        follower.step(drive.frame(1) / 255, 0.4)
+    with pytest.raises(InputError, match="frame 1: the scale nan"):
+        follower.step(drive.frame(1), float("nan"))
+    assert follower.step(drive.frame(1), 0.4).updated  # nothing of that changed its state

@@ -1,0 +1,174 @@
+"""RANSAC gives the bits of cv2.findEssentialMat."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro import odometry
+from thesis_repro.odometry import five_point, pose, ransac
+from thesis_repro.kitti import Sequence
+from thesis_repro.odometry import THESIS
+
+
+def opencv(current, previous, threshold):
+    return cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=pose.PROBABILITY,
+                                threshold=threshold)
+
+
+def scene(random, count, outliers=0.3, noise=2e-4, motion=1.0, depth=(4, 40), turn=0.02):
+    """Correspondences of a camera that moves forward by `motion`; the first of them, a share `outliers`, are wrong."""
+    points = random.uniform([-10, -3, depth[0]], [10, 3, depth[1]], (count, 3))
+    rotation = cv2.Rodrigues(random.normal(0, turn, 3))[0]
+    moved = points @ rotation.T - motion * (np.array([0, 0, 1]) + random.normal(0, 0.05, 3))
+    previous, current = (some[:, :2] / some[:, 2:] for some in (points, moved))
+    current = current + random.normal(0, noise, current.shape)
+    wrong = int(outliers * count)
+    current[:wrong] = random.permutation(current[:wrong])
+    return current, previous
+
+
+def assert_same_bits(current, previous, threshold=THESIS.threshold):
+    expected, expected_mask = opencv(current, previous, threshold)
+    matrix, mask = ransac.find(current, previous, threshold, pose.PROBABILITY)
+    if expected is None:
+        assert matrix is None
+        return False
+    np.testing.assert_array_equal(matrix, expected)
+    np.testing.assert_array_equal(mask, expected_mask)
+    assert mask.dtype == expected_mask.dtype
+    return True
+
+
+@pytest.mark.parametrize("count", [5, 6, 7, 8, 9, 20, 100, 700, 2000])
+@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
+def test_same_bits_as_opencv(count, outliers):
+    random = np.random.default_rng((count, int(10 * outliers)))
+    found = [assert_same_bits(*scene(random, count, outliers, noise)) for noise in (0.0, 1e-6, 1e-4, 1e-3)]
+    assert any(found)
+
+
+KINDS = {
+    "sideways, flat": lambda random: scene(random, 300, depth=(20, 20)),
+    "hardly moving": lambda random: scene(random, 300, motion=1e-3),
+    "turning only": lambda random: scene(random, 300, motion=0.0, turn=0.1),
+    "turning only, exact": lambda random: scene(random, 300, outliers=0.0, noise=0.0, motion=0.0, turn=0.1),
+    "standing": lambda random: scene(random, 300, outliers=0.0, noise=1e-6, motion=0.0, turn=0.0),
+    "standing exactly": lambda random: scene(random, 300, outliers=0.0, noise=0.0, motion=0.0, turn=0.0),
+    "nonsense": lambda random: (random.uniform(-1, 1, (100, 2)), random.uniform(-1, 1, (100, 2))),
+    "all equal": lambda random: (np.full((50, 2), 0.25), np.full((50, 2), 0.25)),
+    "on a line": lambda random: (np.repeat(random.uniform(-1, 1, (60, 1)), 2, axis=1),) * 2,
+    "in pairs": lambda random: tuple(np.repeat(side, 2, axis=0) for side in scene(random, 100)),
+    "three places": lambda random: tuple(np.repeat(side, 20, axis=0) for side in scene(random, 3)),
+    "on a grid": lambda random: tuple(np.round(side, 1) for side in scene(random, 200)),
+    "not a number": lambda random: tuple(np.where(np.arange(100)[:, None] == 7, np.nan, side)
+                                         for side in scene(random, 100)),
+    "far": lambda random: tuple(side * 1e6 for side in scene(random, 100)),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_degenerate_correspondences_give_opencvs_bits(kind):
+    for seed in range(3):
+        assert_same_bits(*KINDS[kind](np.random.default_rng(seed)))
+
+
+def test_other_thresholds_and_probabilities():
+    random = np.random.default_rng(0)
+    for threshold in (1e-6, 1e-4, 4e-4, 1e-2):
+        assert_same_bits(*scene(random, 400), threshold)
+    current, previous = scene(random, 400)
+    for probability in (0.5, 0.99, 0.999999):
+        expected, _ = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC,
+                                           prob=probability, threshold=3e-4)
+        np.testing.assert_array_equal(ransac.find(current, previous, 3e-4, probability)[0], expected)
+
+
+def test_few_samples_are_solved_by_opencv(monkeypatch):
+    """What makes it fast: OpenCV is asked about a few samples of five, and never about everything."""
+    real, asked = cv2.findEssentialMat, []
+
+    def counting(current, *arguments, **options):
+        asked.append(len(current))
+        return real(current, *arguments, **options)
+
+    current, previous = scene(np.random.default_rng(1), 1000, outliers=0.5)
+    expected, _ = opencv(current, previous, THESIS.threshold)
+    monkeypatch.setattr(cv2, "findEssentialMat", counting)
+    matrix, _ = ransac.find(current, previous, THESIS.threshold, pose.PROBABILITY)
+    np.testing.assert_array_equal(matrix, expected)
+    assert 0 < len(asked) < 60 and set(asked) == {5}  # of some 200 samples
+
+
+def test_a_wrong_forecast_leaves_everything_to_opencv(monkeypatch):
+    current, previous = scene(np.random.default_rng(2), 500)
+    expected, expected_mask = opencv(current, previous, THESIS.threshold)
+    monkeypatch.setattr(ransac, "_solved", lambda *arguments: (1, None, None))
+    matrix, mask = ransac.find(current, previous, THESIS.threshold, pose.PROBABILITY)
+    np.testing.assert_array_equal(matrix, expected)
+    np.testing.assert_array_equal(mask, expected_mask)
+
+
+def test_solutions_lie_within_their_margins_of_opencvs():
+    random, compared, outside, unsure = np.random.default_rng(3), 0, 0, 0
+    for _ in range(400):
+        current, previous = scene(random, 5, outliers=0.0)
+        sure, solutions, margins = five_point.solve(np.hstack([current, previous]))
+        if not sure:
+            unsure += 1
+            continue
+        stack, _ = opencv(current, previous, 1e-3)
+        theirs = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
+        assert len(theirs) == len(solutions)
+        for matrix in theirs:
+            distances = np.minimum(np.linalg.norm(solutions - matrix, axis=1),
+                                   np.linalg.norm(solutions + matrix, axis=1))
+            compared += 1
+            outside += distances.min() > margins[distances.argmin()]
+    assert compared > 1000 and outside <= 1 and unsure < 60
+
+
+def test_real_roots_of_a_known_polynomial():
+    roots = np.array([-3.0, -1.0, 0.5, 2.0])
+    polynomial = np.poly(np.concatenate([roots, [1j, -1j, 2 + 1j, 2 - 1j, -1 + 3j, -1 - 3j]])).real
+    sure, found = five_point.real_roots(polynomial, 1e-12 * polynomial, 0 * polynomial)
+    assert sure
+    np.testing.assert_allclose(found, roots, rtol=1e-9)
+    double = np.poly([1.0, 1.0, 3.0, -2.0, 1j, -1j, 2j, -2j, 3j, -3j]).real
+    assert not five_point.real_roots(double, 0 * double, np.full(11, 1e-9))[0]
+
+
+def test_same_bits_in_threads():
+    scenes = [scene(np.random.default_rng(seed), 300) for seed in range(8)]
+    expected = [opencv(*each, THESIS.threshold)[0] for each in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda each: ransac.find(*each, THESIS.threshold, pose.PROBABILITY)[0], scenes)
+    np.testing.assert_array_equal(list(found), expected)
+
+
+def test_a_threshold_that_nothing_meets():
+    random = np.random.default_rng(4)
+    for count in (8, 12, 60):
+        assert_same_bits(*scene(random, count), 1e-17)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["00", "05", "06"])
+def test_same_bits_on_real_frames(kitti_real, name, monkeypatch):
+    odometry.odometry.warm_up()
+    seen, real = [], ransac.find
+
+    def keeping(current, previous, *arguments):
+        seen.append((current, previous))
+        return real(current, previous, *arguments)
+
+    monkeypatch.setattr(ransac, "find", keeping)
+    odometry.run(Sequence(kitti_real, name).subset(12))
+    monkeypatch.undo()
+    assert len(seen) == 11
+    random = np.random.default_rng(0)
+    for current, previous in seen:
+        order = random.permutation(len(current))
+        assert assert_same_bits(current, previous)
+        assert assert_same_bits(current[order[:200]], previous[order[:200]])

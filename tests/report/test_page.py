@@ -1,0 +1,205 @@
+"""The page of a run, on a figures folder written by hand."""
+
+import json
+import os
+import re
+from html.parser import HTMLParser
+from types import SimpleNamespace
+from urllib.parse import unquote
+
+import nbformat
+import pytest
+
+from thesis_repro.report import captions, page
+from thesis_repro.settings import ROOT, read_settings
+
+SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><path d="M0 0"/></svg>'
+CSV = 'sequence,RMSE (m),change (%),"change (%), thesis"\n00,0.5,-3.25,1.0\n01,12.0,4.5,\nsequences improved,,1.0,0.0\n'
+VOID = {"img", "meta"}
+
+
+class Reader(HTMLParser):
+    """The elements of a page in order as (tag, attributes); fails where tags are not closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.open, self.text = [], [], ""
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+    def of(self, tag, attribute):
+        return [attributes[attribute] for name, attributes in self.elements if name == tag and attribute in attributes]
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run in a folder with a space in its name: every artefact, and one executed notebook."""
+    settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "my build"),
+                              "THESIS_REPRO_FIGURES": str(tmp_path / "figures")})
+    settings.figures.mkdir()
+    for kind, name in [*((name.split("_")[0], name) for name in page.THESIS), *captions.ADDED]:
+        for ending in page.ENDINGS[kind]:
+            text = {".svg": SVG, ".csv": CSV, ".md": "**What** <b>it</b> shows"}.get(ending, "")
+            (settings.figures / f"{name}{ending}").write_text(text)
+    executed = settings.build / "notebooks" / "08_results.ipynb"
+    executed.parent.mkdir(parents=True)
+    cell = nbformat.v4.new_code_cell('keep(figure, "figure_4_06")', execution_count=1,
+                                     outputs=[nbformat.v4.new_output("stream", text="a number: 42")])
+    cell["metadata"]["execution"] = {"iopub.execute_input": "2024-02-29T12:34:56.789Z"}
+    nbformat.write(nbformat.v4.new_notebook(
+        cells=[nbformat.v4.new_markdown_cell("# Results"), cell],
+        metadata={"language_info": {"name": "python", "version": "3.11.99"}}), executed)
+    return SimpleNamespace(settings=settings, page=settings.figures / "index.html", executed=executed)
+
+
+def read(run):
+    page.update(run.settings)
+    return Reader(run.page.read_text())
+
+
+def test_all_41_in_the_order_of_the_thesis_then_the_projects_own(run):
+    shown = read(run)
+    names = [name for name in shown.of("img", "src")]
+    figures = [name for name in page.THESIS if name.startswith("figure")]
+    assert (len(figures), len(page.THESIS) - len(figures)) == (36, 5)
+    assert names == [f"{name}.svg" for name in (*figures, "controls", "budget")]
+    ids = [attributes["id"] for tag, attributes in shown.elements if tag in ("figure", "section")]
+    assert ids == [*page.THESIS, "findings", "table-widths", "figure-controls", "table-controls", "figure-budget",
+                   "table-budget"]
+    assert page.THESIS.index("table_4_1") == page.THESIS.index("figure_4_10") + 1
+    assert "41 of 41" in shown.text and "Figure 4.7." in shown.text and "Figure A.1." in shown.text
+    assert "Missing" not in shown.text and all(shown.of("img", "alt"))
+
+
+def test_missing_ones_are_named_with_the_notebook_that_makes_them(run):
+    (run.settings.figures / "figure_4_06.svg").unlink()
+    (run.settings.figures / "table_3_2.csv").unlink()
+    (run.settings.figures / "findings.md").unlink()
+    shown = read(run)
+    assert "39 of 41" in shown.text and "Missing: Table 3.2, Figure 4.6, What the runs show." in shown.text
+    assert "figure_4_06.svg" not in shown.of("img", "src")
+    assert "Missing. Notebook 08_results makes it" in shown.text
+
+
+def test_every_link_of_the_page_leads_somewhere(run):
+    shown = read(run)
+    ids = {attributes["id"] for _, attributes in shown.elements if "id" in attributes}
+    links = shown.of("a", "href") + shown.of("img", "src")
+    assert any("08_results.html" in link for link in links)
+    for link in links:
+        assert link[1:] in ids if link.startswith("#") else (run.settings.figures / unquote(link)).is_file(), link
+
+
+def test_nothing_is_loaded_from_elsewhere_and_no_folder_of_the_machine_is_named(run):
+    read(run)
+    for path in (run.page, run.executed.with_suffix(".html")):
+        text = path.read_text()
+        shown = Reader(text)
+        assert "script" not in {tag for tag, _ in shown.elements}
+        assert not re.search(r"https?:|url\(|@import|file:", text)
+        assert str(ROOT) not in text and str(run.settings.figures.parent) not in text
+
+
+def test_the_executed_notebook_keeps_its_results_and_leads_back(run):
+    read(run)
+    html = run.executed.with_suffix(".html")
+    shown = Reader(html.read_text())
+    assert "a number: 42" in shown.text and "Results" in shown.text
+    assert (html.parent / shown.of("a", "href")[0]).resolve() == run.page
+
+
+@pytest.mark.parametrize("kitti, cityscapes, says", [
+    (True, True, "All images and numbers here come from the embedded world"),
+    (True, False, "The odometry's frames and numbers here come from the embedded world"),
+    (False, True, "drawn from the training data, comes from the embedded world"),
+    (False, False, None),
+])
+def test_the_embedded_world_is_named_at_the_top_where_it_was_used(run, tmp_path, kitti, cityscapes, says):
+    environment = {f"THESIS_REPRO_{name}": str(tmp_path) for name, own in (("KITTI", not kitti),
+                                                                         ("CITYSCAPES", not cityscapes)) if own}
+    settings = read_settings(environment | {"THESIS_REPRO_BUILD": str(tmp_path / "b"),
+                                            "THESIS_REPRO_FIGURES": str(tmp_path / "f")})
+    settings.figures.mkdir(parents=True)
+    (settings.figures / "figure_4_07.svg").write_text(SVG)
+    page.update(settings)
+    shown = Reader((settings.figures / "index.html").read_text())
+    notes = [attributes for _, attributes in shown.elements if attributes.get("class") == "note"]
+    assert len(notes) == (says is not None)
+    if says:
+        assert shown.text.index(says) < shown.text.index("What was run")
+    assert shown.text.count("Not comparable with the embedded world") == 2 * kitti + cityscapes  # 4.7, 4.17; 4.1
+    assert "Thesis, complete KITTI sequences" in shown.text
+
+
+def test_what_was_run_is_told_from_the_run_itself(run):
+    text = read(run).text
+    assert "29 February 2024, 12:34 to 12:34 UTC" in text and "3.11.99" in text
+    assert "tensorflow 2." in text and "not installed" not in text
+
+
+def test_tables_are_tables_with_numbers_to_the_right(run):
+    text = read(run) and run.page.read_text()
+    table = re.search(r'<figure id="table_4_2".*?</figure>', text, re.DOTALL)[0]
+    cells = [re.findall(r"<td.*?</td>", row) for row in table.split("<tr>")[2:]]
+    number = '<td class="number">{}</td>'.format
+    assert cells == [
+        ["<td>00</td>", number("0.5"), number("−3.25"), number("1")],
+        ["<td>01</td>", number("12.0"), number("4.50"), number("")],
+        ["<td>sequences improved</td>", number(""), number("1"), number("0")],
+    ]
+    assert "change (%), thesis" in table
+
+
+def test_text_of_the_findings_cannot_become_markup(run):
+    text = read(run) and run.page.read_text()
+    assert "<strong>What</strong> &lt;b&gt;it&lt;/b&gt; shows" in text
+
+
+def test_page_and_notebooks_are_made_again_only_where_something_is_newer(run):
+    html = run.executed.with_suffix(".html")
+    assert page.update(run.settings)
+    first = html.stat().st_mtime_ns
+    assert not page.update(run.settings) and html.stat().st_mtime_ns == first
+    (run.settings.figures / "figure_4_06.svg").unlink()
+    assert page.update(run.settings) and "40 of 41" in run.page.read_text()
+    assert html.stat().st_mtime_ns == first
+    figure = run.settings.figures / "table_4_1.csv"
+    figure.write_text("sequence,frames\n00,77\n")
+    os.utime(figure, ns=(run.page.stat().st_mtime_ns + 1,) * 2)
+    assert page.update(run.settings) and ">77<" in run.page.read_text()
+    notebook = json.loads(run.executed.read_text())
+    notebook["cells"][1]["outputs"][0]["text"] = "a number: 43"
+    run.executed.write_text(json.dumps(notebook))
+    assert page.update(run.settings) and "a number: 43" in html.read_text()
+
+
+def test_thesis_numbers_stand_beside_those_of_the_run(run):
+    (run.settings.build / "model").mkdir()
+    (run.settings.build / "model" / "history.csv").write_text(
+        "epoch,loss,f1-score,iou_score,val_loss,val_f1-score,val_iou_score\n"
+        "1,0.9,0.1,0.1,0.8,0.21,0.2\n2,0.7,0.3,0.2,0.9,0.2,0.1\n")
+    (run.settings.build / "seconds.csv").write_text(
+        "sequence,variant,dilation_width,seconds\n"
+        "00,baseline,,4\n01,baseline,,6\n00,masked,1,4\n01,masked,1,4\n00,masked,2,11\n")
+    (run.settings.build / "runs.csv").write_text(
+        "sequence,variant,repetition,mean_keypoints\n"
+        "00,baseline,0,1990\n00,baseline,1,2010\n01,baseline,0,900\n00,masked,0,7\n")
+    (run.settings.figures / "table_4_1.csv").write_text("sequence,mean keypoints\n00,500\n01,300\n")
+    text = read(run).text
+    assert "Here: 3.0 to 4.0 times fewer" in text and "gives 2.0 to 4.1 times fewer than 2000" in text
+    assert "Thesis, Cityscapes: 24 epochs, the best was 19; train loss 0.32" in text
+    assert "Here: 2 epochs, the best was 1; train loss 0.90, F1 0.10, IoU 0.10; validation loss 0.80, F1 0.21" in text
+    assert "5 to 10 % of the time saved." in text and "Here: −10 to 20 %, by width." in text
+    assert "15,337,571 parameters" in text

@@ -1,0 +1,73 @@
+"""The video and the still sheet of the odometry."""
+
+import cv2
+import numpy as np
+import pytest
+from street import Street, Stripes
+
+from thesis_repro import InputError
+from thesis_repro.report import video
+from thesis_repro.odometry import Odometry
+
+
+class TimedStreet(Street):
+    times = 0.1 * np.arange(4)
+
+    def __init__(self):
+        super().__init__(4)
+
+
+def painted(image, color):
+    return (image == np.array(color)).all(axis=2)
+
+
+def test_a_frame_shows_what_the_mask_keeps_and_discards():
+    drive, mask = TimedStreet(), Stripes(60)[0]
+    odometry = Odometry(drive.intrinsics)
+    odometry.step(drive.frame(0), mask=mask)
+    step = odometry.step(drive.frame(1), 0.4, mask)
+    image = video.draw_frame(drive.frame(1), step, mask=mask)
+    inside = cv2.erode(mask, np.ones((7, 7))) > 0  # dots reach over the edge
+    outside = cv2.dilate(mask, np.ones((7, 7))) == 0
+    assert painted(image, video.KEPT)[inside].sum() > 500 and not painted(image, video.KEPT)[outside].any()
+    assert painted(image, video.DISCARDED)[outside].sum() > 500 and not painted(image, video.DISCARDED)[inside].any()
+    assert painted(image, video.OUTLINE).any() and painted(image, video.INLIER).any()
+
+
+def test_the_map_shows_both_paths():
+    true = np.tile(np.eye(4), (10, 1, 1))
+    true[:, 2, 3] = np.arange(10)
+    estimated = true[:6].copy()
+    estimated[:, 0, 3] = 0.5 * np.arange(6)
+    image = video.draw_map((200, 300), true, estimated)
+    columns_true = np.flatnonzero(painted(image[40:], video.TRUE).any(axis=0))
+    columns_estimated = np.flatnonzero(painted(image[40:], video.ESTIMATED).any(axis=0))
+    assert columns_estimated.max() > columns_true.max() + 20  # the estimate goes off to the right
+
+
+def test_the_video_has_every_frame_and_grows(tmp_path):
+    drive = TimedStreet()
+    video.write_video(tmp_path / "drive.mp4", drive, masks=Stripes(60))
+    capture = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
+    frames = []
+    while (read := capture.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 4 and capture.get(cv2.CAP_PROP_FPS) == pytest.approx(10, rel=0.01)
+    assert frames[0].shape == (280, 480, 3)
+    assert np.abs(frames[0].astype(int) - frames[3]).mean() > 5
+    assert [file.name for file in tmp_path.iterdir()] == ["drive.mp4"]
+
+
+def test_a_video_that_fails_leaves_nothing(tmp_path):
+    drive = TimedStreet()
+    drive.images[2] = drive.images[2][:50]
+    with pytest.raises(InputError, match="frame 2: shape"):
+        video.write_video(tmp_path / "drive.mp4", drive)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="must end in .mp4"):
+        video.write_video(tmp_path / "drive.avi", drive)
+
+
+def test_the_sheet_shows_frames_side_by_side(tmp_path):
+    video.write_sheet(tmp_path / "sheet.png", TimedStreet(), count=3)
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape == (560, 960, 3)

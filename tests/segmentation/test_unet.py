@@ -1,0 +1,47 @@
+import json
+from importlib import resources
+
+import pytest
+
+from thesis_repro import InputError
+from thesis_repro.segmentation.unet import build_unet, summary_rows
+
+FIGURE = json.loads(resources.files("thesis_repro.report").joinpath("reported.json").read_text())["figure_a1_model_summary"]
+
+
+def test_every_row_of_figure_a1():
+    model = build_unet((320, 320, 1), 35)
+
+    assert summary_rows(model) == FIGURE["rows"]
+    assert len(FIGURE["rows"]) == 41
+    assert model.name == "U-Net"
+    assert model.count_params() == FIGURE["total"] == 15_337_571
+    assert sum(w.numpy().size for w in model.trainable_weights) == FIGURE["trainable"]
+    assert sum(w.numpy().size for w in model.non_trainable_weights) == FIGURE["non_trainable"]
+
+
+def test_corrected_blocks_have_both_convolutions_in_a_row():
+    rows = {row["layer"].split()[0]: row for row in summary_rows(build_unet((32, 32, 1), 35, 4, corrected_blocks=True))}
+
+    assert len(rows) == 41 + 3 * 9
+    assert rows["conv2d"]["connected_to"] == "input_2[0][0]"
+    assert rows["conv2d_1"]["connected_to"] == "activation[0][0]"
+    assert rows["conv2d_17"]["connected_to"] == "activation_16[0][0]"
+
+
+def test_the_first_convolution_of_a_block_is_dead_in_the_thesis():
+    rows = {row["layer"].split()[0]: row for row in summary_rows(build_unet((32, 32, 1), 35, 4))}
+
+    assert "conv2d" not in rows and rows["conv2d_1"]["connected_to"] == "input_2[0][0]"
+
+
+def test_base_filters_scale_every_block():
+    outputs = {row["layer"].split()[0]: row["output_shape"] for row in summary_rows(build_unet((64, 64, 3), 5, 8))}
+
+    assert outputs["conv2d_9"] == "(None, 4, 4, 128)"
+    assert outputs["conv2d_18"] == "(None, 64, 64, 5)"
+
+
+def test_a_size_that_cannot_be_halved_four_times():
+    with pytest.raises(InputError, match="100x100.*multiples of 16"):
+        build_unet((100, 100, 1), 35)

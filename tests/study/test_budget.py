@@ -1,0 +1,90 @@
+"""The budget of a frame: the stages are those of the chain that the label maps, masks and runs on disk go through."""
+
+import time
+
+import cv2
+import keras
+import numpy as np
+import pytest
+
+from thesis_repro import InputError, cityscapes, masks, odometry, stages
+from thesis_repro.segmentation import prediction, training
+from thesis_repro.study import budget
+from thesis_repro.kitti import Sequence
+from thesis_repro.segmentation.unet import build_unet
+
+
+@pytest.fixture(scope="module")
+def model():
+    keras.utils.set_random_seed(0)
+    return build_unet((64, 64, 1), cityscapes.N_CLASSES, 4)
+
+
+@pytest.fixture
+def sequence(small_world):
+    return Sequence(small_world / "kitti", "00")
+
+
+def test_every_stage_of_both_variants_takes_time(sequence, model):
+    table = budget.measure(sequence, model, frames=4)
+    assert list(table.columns) == ["variant", "stage", "milliseconds"] and (table["milliseconds"] > 0).all()
+    by_variant = table.groupby("variant")["stage"].agg(list)
+    assert by_variant["masked, width 10"] == list(budget.STAGES)
+    assert by_variant["all keypoints"] == [stage for stage in budget.STAGES if stage not in ("segmentation", "mask")]
+
+
+def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
+    fast = budget.measure(sequence, model, frames=4).set_index(["variant", "stage"])["milliseconds"]
+    keypoint_mask = masks.keypoint_mask
+    monkeypatch.setattr(masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0])
+    slow = budget.measure(sequence, model, frames=4).set_index(["variant", "stage"])["milliseconds"]
+    assert slow["masked, width 10", "mask"] > 500 > fast["masked, width 10", "mask"]
+    assert slow.drop(("masked, width 10", "mask")).max() < 500
+
+
+def test_its_masks_are_those_from_written_label_maps(sequence, model, tmp_path):
+    prediction.write_label_maps(model, sequence.frame_paths[:1], tmp_path)
+    frame = sequence.frame(0)
+    mask = budget._mask(budget._segment(model, frame), frame.shape)
+    assert np.array_equal(mask, masks.LabelMasks(tmp_path, sequence.subset(1), 10)[0])
+
+
+def test_its_steps_are_those_of_a_run(sequence, model, monkeypatch):
+    seen = []
+    step = odometry.Odometry.step
+    monkeypatch.setattr(odometry.Odometry, "step", lambda *given: seen.append(step(*given)) or seen[-1])
+    budget.measure_overlapped(sequence, model, frames=4)
+    short = sequence.subset(7)
+    made = [masks.keypoint_mask(cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST), short.size, 10)
+            for label_map in prediction.predict(model, np.stack(
+                [cityscapes.read_image(path, 64, 64) for path in short.frame_paths]))]
+    assert 0 < min(map(masks.coverage, made)) and max(map(masks.coverage, made)) < 1
+    for steps, expected in ((seen[:7], odometry.run(short)), (seen[7:], odometry.run(short, masks=made))):
+        assert np.array_equal([one.pose for one in steps], expected.poses)
+        assert [one.detected for one in steps] == expected.frames["detected"].tolist()
+
+
+def test_overlapping_hides_the_shorter_side(sequence, model, monkeypatch):
+    segment = budget._segment
+    monkeypatch.setattr(budget, "_segment", lambda *given: (time.sleep(0.5), segment(*given))[1])
+    step = odometry.Odometry.step
+    monkeypatch.setattr(odometry.Odometry, "step", lambda *given: (time.sleep(0.5), step(*given))[1])
+    table = budget.measure_overlapped(sequence, model, frames=4).set_index("variant")["milliseconds"]
+    assert (table >= 499).all() and (table < 990).all()
+
+
+def test_it_is_measured_once_for_a_model(sequence, model, tmp_path, monkeypatch):
+    training_file = tmp_path / "model.keras"
+    model.save(training_file)
+    first = budget.kept(tmp_path / "budget", sequence, training_file, frames=3)
+    monkeypatch.setattr(training, "load_model", lambda path: pytest.fail("measured again"))
+    second = budget.kept(tmp_path / "budget", sequence, training_file, frames=3)
+    assert all(one.equals(other) for one, other in zip(first, second))
+    monkeypatch.setattr(stages, "content", lambda path: "another model")
+    with pytest.raises(pytest.fail.Exception, match="measured again"):
+        budget.kept(tmp_path / "budget", sequence, training_file, frames=3)
+
+
+def test_too_few_frames_are_one_clear_line(sequence, model):
+    with pytest.raises(InputError, match="sequence 00: 3 frames; the budget needs 5 or more"):
+        budget.measure(sequence.subset(3), model)

@@ -1,0 +1,137 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro import InputError, masks, odometry
+from thesis_repro.odometry import keypoints
+from thesis_repro.study import controls, results, runner
+from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, mask_control_jobs, reduced_jobs
+from thesis_repro.kitti import Sequence
+
+WIDTH = 10
+
+
+@pytest.fixture(scope="module")
+def sequence(small_world):
+    return Sequence(small_world / "kitti", "00")
+
+
+@pytest.fixture(scope="module")
+def made(sequence, small_labels):
+    """Every control's masks and the thesis's own."""
+    return {variant: controls.masks(variant, small_labels / "00", sequence, WIDTH) for variant in controls.MASKS} | {
+        "masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
+
+
+def test_every_control_gives_masks_that_the_odometry_takes_and_always_the_same(sequence, made):
+    for variant, source in made.items():
+        assert len(source) == len(sequence)
+        mask = source[3]
+        assert mask.shape == sequence.size and mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}, variant
+        assert mask.flags.c_contiguous
+        source[7]
+        assert np.array_equal(source[3], mask), variant
+        if variant != "masked":
+            assert not np.array_equal(mask, made["masked"][3]), variant
+
+
+def test_masks_of_another_frame_come_from_half_a_sequence_away(made):
+    for index, other in ((0, 6), (5, 11), (6, 0), (11, 5)):
+        assert np.array_equal(made["other-frame"][index], made["masked"][other])
+
+
+def test_mirrored_masks_are_mirrored(made):
+    assert np.array_equal(made["mirrored"][4], cv2.flip(made["masked"][4], 1))
+
+
+def test_random_lines_and_image_edges_cover_what_the_mask_covers(made):
+    for index in range(12):
+        wanted = masks.coverage(made["masked"][index])
+        assert 0.05 < wanted < 0.95
+        assert masks.coverage(made["random-lines"][index]) == pytest.approx(wanted, abs=0.01)
+        assert masks.coverage(made["image-edges"][index]) == pytest.approx(wanted, abs=0.01)
+    assert not np.array_equal(made["random-lines"][0], made["random-lines"][1])
+
+
+def test_random_lines_are_segments_dilated_like_the_boundaries(made):
+    # a square of ones leaves no pixel alone: opening with it changes nothing but at the border
+    mask = made["random-lines"][2]
+    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((WIDTH - 1, WIDTH - 1), np.uint8))
+    assert np.array_equal(opened[WIDTH:-WIDTH, WIDTH:-WIDTH], mask[WIDTH:-WIDTH, WIDTH:-WIDTH])
+
+
+def test_image_edges_lie_along_the_strongest_edges_of_the_frame(sequence, made):
+    dx, dy = cv2.spatialGradient(sequence.frame(3))
+    strength = np.abs(dx.astype(int)) + np.abs(dy)
+    strongest = strength >= np.quantile(strength, 0.995)
+    for variant, least in (("image-edges", 0.9), ("random-lines", 0)):
+        share = (made[variant][3][strongest] > 0).mean()
+        assert share > least
+    assert share < 0.6  # of random lines
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_masks_that_are_empty_or_full_have_controls_of_their_kind(sequence, made, monkeypatch, value):
+    monkeypatch.setattr(masks.LabelMasks, "__getitem__", lambda self, index: np.full(self.size, value, np.uint8))
+    covered = {variant: masks.coverage(made[variant][0]) for variant in ("random-lines", "image-edges")}
+    if value == 0:
+        assert set(covered.values()) == {0.0}
+    else:
+        assert covered["random-lines"] > 0.99 and covered["image-edges"] > 0.5
+
+
+def test_true_labels_are_those_of_the_world(sequence, small_world, made):
+    label_map = cv2.imread(str(small_world / "kitti/sequences/00/labels_0/000005.png"), cv2.IMREAD_GRAYSCALE)
+    assert label_map.shape == sequence.size
+    assert np.array_equal(made["true-labels"][5], masks.keypoint_mask(label_map, sequence.size, WIDTH))
+    exact = masks.keypoint_mask(label_map, sequence.size, WIDTH, "exact")
+    near = masks.keypoint_mask(cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST), sequence.size, WIDTH,
+                               "exact")
+    assert np.array_equal(made["exact-boundaries"][5], near) and not np.array_equal(near, exact)
+
+
+def test_a_sequence_without_label_maps_has_no_controls(sequence, tmp_path):
+    with pytest.raises(InputError, match="no such folder; it must hold one label map"):
+        controls.masks("mirrored", tmp_path / "none", sequence, WIDTH)
+
+
+def test_keypoints_spread_out_are_as_many_as_asked_for(sequence):
+    every = [len(keypoints.detect(frame, odometry.THESIS)) for frame in sequence.frames()]
+    wanted = np.mean(every) / 2
+    distance = controls.min_distance(sequence, wanted)
+    assert distance > odometry.THESIS.min_distance and distance == round(distance, 1)
+    spread = replace(odometry.THESIS, min_distance=distance)
+    found = np.mean([len(keypoints.detect(frame, spread)) for frame in sequence.frames()])
+    assert found == pytest.approx(wanted, rel=0.03)
+    assert controls.min_distance(sequence, max(every)) == odometry.THESIS.min_distance
+
+
+def test_jobs_of_the_controls_have_both_estimators_and_every_repetition(small_world, small_labels, tmp_path):
+    kitti = small_world / "kitti"
+    jobs = [*first_jobs(["00"], (5, WIDTH), 2), *mask_control_jobs(kitti, ["00"], 2)]
+    summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
+    jobs += reduced_jobs(results.best_widths(summary), 2) + keypoint_control_jobs(
+        results.keypoints_left(summary), kitti, frames=5, repetitions=2)
+    assert len({job.name for job in jobs}) == len(jobs)
+    summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
+    assert list(summary["run"]) == [job.name for job in jobs]
+    compared = summary[~((summary["variant"] == "masked") & (summary["dilation_width"] != WIDTH))]
+    runs = compared[compared["variant"] != "reduced"].groupby("variant").size()
+    assert set(runs.index) == {"baseline", "masked", "fewer", "spread", *controls.MASKS} and set(runs) == {4}
+    number = summary.set_index("run")["mean_keypoints"]
+    assert number[_named(number, "fewer")] == pytest.approx(number["masked-10-0"], abs=1)
+    assert number[_named(number, "spread")] == pytest.approx(number["masked-10-0"], rel=0.05)
+    assert number["masked-10-0"] == number["masked-10-refined-1"] != number["mirrored-10-0"]
+    error = summary.set_index("run")["rmse"]
+    assert len(set(error[["baseline-0", "baseline-1", "baseline-refined-0", "baseline-refined-1"]])) == 4
+
+
+def _named(series, variant):
+    return next(name for name in series.index if name.startswith(variant))
+
+
+def test_without_true_label_maps_that_control_is_left_out(tiny_kitti):
+    variants = {job.variant for job in mask_control_jobs(tiny_kitti, ["00"])}
+    assert variants == {"baseline", "masked", *controls.MASKS} - {"true-labels"}

@@ -1,0 +1,156 @@
+"""The runs on a real Dask cluster: a scheduler and two workers, each a process of its own on this machine."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from thesis_repro import InputError
+from thesis_repro.study import cluster, runner
+from thesis_repro.study.jobs import first_jobs
+
+ROOT = Path(__file__).resolve().parents[2]
+FRAMES, CHECKPOINT = 12, 4
+# loaded by the workers: slow enough to be killed in the middle, and telling which frames they read
+PRELOAD = """
+import os, time
+from thesis_repro.odometry import passes
+from thesis_repro.kitti import Sequence
+
+def slow(self, index, original=Sequence.frame):
+    with open({log!r}, "a") as file:
+        file.write(f"{{os.getpid()}} {{self.name}} {{index}}\\n")
+    time.sleep(0.1)
+    return original(self, index)
+
+if passes.CHECKPOINT != {checkpoint}:  # Dask loads this more than once
+    passes.CHECKPOINT = {checkpoint}
+    Sequence.frame = slow
+"""
+
+
+def start(folder, *arguments):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    with open(folder / "dask.log", "a") as log:
+        return subprocess.Popen([sys.executable, "-m", "dask", *map(str, arguments)], cwd=folder, stdout=log,
+                                stderr=log, env=environment)
+
+
+@pytest.fixture
+def scheduler(tmp_path):
+    """Address of a scheduler without workers."""
+    file = tmp_path / "scheduler.json"
+    process = start(tmp_path, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+                    "--dashboard-address", "127.0.0.1:0", "--scheduler-file", file)
+    try:
+        wait_for(lambda: file.is_file() and file.read_text().strip().endswith("}"), "the scheduler to start")
+        yield pd.read_json(file, typ="series")["address"]
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def workers(scheduler, tmp_path):
+    """Two worker processes, by process number, and the file that they log the frames they read to."""
+    log = tmp_path / "frames.log"
+    log.touch()
+    (tmp_path / "slow.py").write_text(PRELOAD.format(checkpoint=CHECKPOINT, log=str(log)))
+    processes = [start(tmp_path, "worker", scheduler, "--no-nanny", "--nthreads", 1, "--no-dashboard", "--host",
+                       "127.0.0.1", "--preload", tmp_path / "slow.py", "--local-directory", tmp_path / "scratch")
+                 for _ in range(2)]
+    from dask.distributed import Client
+
+    try:
+        with Client(scheduler, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=30)
+        yield {process.pid: process for process in processes}, log
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def wait_for(condition, what, seconds=30):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"waited {seconds} s for {what}"
+        time.sleep(0.02)
+
+
+def reads(log):
+    return [(int(process), (name, int(index))) for process, name, index in map(str.split, log.open())]
+
+
+def test_a_killed_worker_loses_nothing(small_world, small_labels, workers, scheduler, tmp_path):
+    jobs = first_jobs(["00", "01"], (5, 15), repetitions=2)
+    kitti, (processes, log) = small_world / "kitti", workers
+    here = runner.run(jobs, kitti, small_labels, tmp_path / "here")
+    there, killed, finished = tmp_path / "there", [], {}
+
+    def kill():
+        """A worker in the middle of a pass that has a checkpoint, when others have finished some."""
+        def victims():
+            last = dict(reads(log))  # the frame that each worker read last
+            return [process for process, (_, index) in last.items() if index >= CHECKPOINT + 1 and index < FRAMES - 3]
+
+        wait_for(lambda: list(there.rglob("*.csv")) and victims(), "a worker in the middle of a pass")
+        killed.extend(victims()[:1])
+        os.kill(killed[0], signal.SIGKILL)
+        processes[killed[0]].wait()
+        finished.update({path: path.stat().st_mtime_ns for path in there.rglob("*.csv")})
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    result = runner.run(jobs, kitti, small_labels, there, scheduler=scheduler)
+    killer.join()
+
+    pd.testing.assert_frame_equal(result, here, check_exact=True)
+    for job in jobs:
+        one, two = (pd.read_csv(tmp_path / where / job.sequence / f"{job.name}.csv") for where in ("here", "there"))
+        exact = [column for column in one if not column.endswith("_seconds")]
+        pd.testing.assert_frame_equal(one[exact], two[exact], check_exact=True)
+    # nothing finished was done again, and what was half done went on from its checkpoint
+    assert 0 < len(finished) < len(jobs)
+    assert finished == {path: path.stat().st_mtime_ns for path in finished}
+    assert not list(there.rglob("pass-*"))
+    name, stopped = [frame for process, frame in reads(log) if process == killed[0]][-1]
+    times, passes = Counter(frame for _, frame in reads(log)), 3
+    again = {frame for frame, count in times.items() if count > passes}
+    assert again and again <= {(name, index) for index in range(CHECKPOINT, stopped + 1)}
+    assert set(times.values()) == {passes, passes + 1} and len(times) == 2 * FRAMES
+
+
+def test_a_scheduler_without_workers_says_so(scheduler):
+    with pytest.raises(InputError, match="has no workers; start some with 'dask worker"):
+        with cluster.open_pool(1, scheduler):
+            pass
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"])
+def test_a_scheduler_that_does_not_answer_is_one_clear_line(address, monkeypatch):
+    monkeypatch.setattr(cluster, "TIMEOUT", 1)
+    with pytest.raises(InputError, match=f"DASK_SCHEDULER={address}: no scheduler answers there") as error:
+        with cluster.open_pool(1, address):
+            pass
+    assert "\n" not in str(error.value)
+
+
+def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, small_labels, tmp_path, monkeypatch):
+    jobs, kitti = first_jobs(["00"], ()), small_world / "kitti"
+    runner.run(jobs, kitti, small_labels, tmp_path)
+    record = runner.stages.made_from(tmp_path / "00")
+    call = kitti, small_labels
+    elsewhere = runner._run_pass(jobs, *call, tmp_path / "elsewhere", None, runner.odometry.THESIS, record, 1)
+    assert "same folders under the same paths" in elsewhere[jobs[0]]
+    (tmp_path / "00" / "baseline-0.csv").unlink()
+    monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
+    older = runner._run_pass(jobs, *call, tmp_path, None, runner.odometry.THESIS, record, 1)
+    assert "another version of thesis_repro or of OpenCV" in older[jobs[0]]

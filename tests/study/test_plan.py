@@ -1,0 +1,116 @@
+"""The plan: counted from the job lists that are run, and near what a run then really takes."""
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro import InputError, kitti, stages
+from thesis_repro.study import plan, runner
+from thesis_repro.study.jobs import first_jobs, mask_control_jobs
+from thesis_repro.__main__ import main
+
+EXCERPT = plan.Excerpt("00 from frame 2", jobs=(168, 30), series=(1.68 + 0.05, 0.3 + 0.05), shared=0.05,
+                       row_bytes=500.0, worker_bytes=200_000_000)
+CALIBRATION = plan.Calibration((EXCERPT,), timing=0.5, networks=dict.fromkeys(plan.MODELS, 1.0),
+                               network_bytes=2_000_000_000, label_bytes=6000.0, seconds=30.0, repetitions=2)
+
+
+def test_the_complete_benchmark_is_added_up(tmp_path):
+    made = plan.make(tmp_path, kitti.FRAME_COUNTS, CALIBRATION, 2, (1, 4, 64))
+    # 34 thesis runs without the 2 reduced, refined baseline and masks, 5 mask controls under both estimators
+    assert made.jobs == (11 * (32 + 4 + 20), 11 * (2 + 4 + 4))
+    assert made.label_hours == dict.fromkeys(plan.MODELS, pytest.approx(23201 / 3600))
+    # one pass a sequence: what all share, and a hundredth of a second a job
+    assert made.odometry_hours == pytest.approx((23201 * (0.05 + 0.56) / 3600, 23201 * (0.05 + 0.1) / 3600))
+    assert made.timing_hours == pytest.approx(11 * 200 * 0.5 / 3600)
+    assert made.label_bytes == 23201 * 6000 and made.result_bytes == pytest.approx(23201 * 66 * 500)
+    hours = made.wall_hours
+    assert hours[1] == pytest.approx(sum(made.odometry_hours) + made.timing_hours)
+    assert hours[1] / 4 < hours[4] < hours[1] / 3 and hours[64] < hours[4]
+    # no faster than the longest sequence with what no cut can take from it
+    assert hours[64] * 3600 > 2 * 4661 * 0.05
+    assert made.memory_bytes[64] > made.memory_bytes[4] > made.worker_bytes[4] > 200_000_000
+
+
+def test_workers_take_what_comes_next():
+    assert plan._schedule([4, 3, 3, 2], 2) == 6
+    assert plan._schedule([4, 3, 3, 2], 1) == 12
+    assert plan._schedule([4, 3], 8) == 4
+
+
+def test_the_excerpts_are_spread_over_all_frames(small_world):
+    places = [(sequence.name, start) for sequence, start in plan._places(small_world / "kitti")]
+    assert places == [("00", 4), ("01", 0), ("01", 6)]  # frames 4, 12 and 20 of 24; the last as far as it goes
+
+
+def test_an_excerpt_is_the_frames_it_names(small_world, tmp_path):
+    sequence = kitti.Sequence(small_world / "kitti", "01")
+    plan._copy(sequence, 3, tmp_path / "kitti")
+    excerpt = kitti.Sequence(tmp_path / "kitti", plan.NAME)
+    assert len(excerpt) == plan.FRAMES and np.array_equal(excerpt.frame(1), sequence.frame(4))
+    assert np.array_equal(excerpt.poses, sequence.poses[3:3 + plan.FRAMES])
+    assert np.array_equal(excerpt.intrinsics, sequence.intrinsics)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """The thesis's plan with one width and no network of 64 filters, so that it takes seconds."""
+    monkeypatch.setattr(plan, "EXCERPTS", 1)
+    monkeypatch.setattr(plan, "NETWORK_IMAGES", 1)
+    monkeypatch.setattr(plan, "_thesis_model", plan._shipped_model)
+
+
+def test_the_command_prints_a_table(small_world, quick, capsys):
+    assert main(["plan", "--kitti", str(small_world / "kitti"), "--repetitions", "1", "--cores", "2", "6"]) == 0
+    text = capsys.readouterr().out
+    assert "2 sequences, 24 frames" in text and "--complete plans for it" in text
+    # 16 runs, 2 refined ones and 12 controls, the true label maps among them, for each of two sequences
+    assert f"{2 * (16 + 2 + 12)} runs" in text and f"{2 * 5} runs" in text
+    table = text[text.index("cores  odometry"):text.index("\n\ndisk")].splitlines()[1:]
+    assert [int(line.split()[0]) for line in table] == [1, 2, 6]
+
+
+def test_the_calibration_is_near_what_a_run_takes(small_world, tmp_path):
+    """Loosely, since machines are busy: the excerpt is from the same world as the runs that it stands for."""
+    sequence = kitti.Sequence(small_world / "kitti", "00")
+    plan._copy(sequence, 0, tmp_path / "excerpt" / "kitti")
+    labels = stages.stage(tmp_path / "excerpt" / "labels" / plan.NAME)
+    more = stages.stage(tmp_path / "labels" / "00")
+    for path in sequence.frame_paths:
+        label_map = cv2.imread(str(sequence.folder / "labels_0" / path.name), 0)
+        cv2.imwrite(str(labels / path.name), label_map)
+        cv2.imwrite(str(more / path.name), label_map)
+    with plan.ProcessPoolExecutor(1, plan.get_context("spawn")) as pool:
+        excerpt = pool.submit(plan._measure, tmp_path / "excerpt", "00", 1).result()
+    jobs = first_jobs(["00"], plan.PROFILE.widths) + mask_control_jobs(sequence.root, ["00"])
+    started = time.process_time()
+    runner.run(jobs, sequence.root, tmp_path / "labels", tmp_path / "results")
+    seconds = time.process_time() - started
+    assert excerpt.jobs[0] == len(jobs)
+    assert 1 / 3 < excerpt.series[0] * (len(sequence) - 1) / seconds < 3
+    assert 0 < excerpt.shared < excerpt.series[0] and 200 < excerpt.row_bytes < 2000
+
+
+@pytest.mark.parametrize("options, says", [
+    (["--kitti", "nowhere"], "nowhere: holds no folder 'sequences'"),
+    (["--kitti", ".", "--repetitions", "0"], "--repetitions and --cores: need whole numbers"),
+])
+def test_bad_input_is_one_clear_line(options, says, capsys):
+    assert main(["plan", *options]) == 1
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("error: ") and says in error and "\n" not in error
+
+
+def test_a_damaged_frame_is_named_where_the_user_has_it(tiny_kitti, monkeypatch):
+    monkeypatch.setattr(plan, "FRAMES", 3)
+    path = tiny_kitti / "sequences/00/image_0/000002.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InputError, match="kitti/sequences/00/image_0/000002.png: the image is truncated"):
+        plan.calibrate(tiny_kitti)
+
+
+def test_too_short_a_sequence_is_one_clear_line(tiny_kitti):
+    with pytest.raises(InputError, match="too short to plan from; one of 6 frames"):
+        plan.calibrate(tiny_kitti)

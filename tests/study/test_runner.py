@@ -1,0 +1,117 @@
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from thesis_repro import InputError, odometry
+from thesis_repro.odometry import metrics
+from thesis_repro.study import budget, results, runner
+from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
+from thesis_repro.kitti import Sequence
+from thesis_repro.masks import LabelMasks
+
+WIDTHS = (5, 10, 15)
+
+
+@pytest.fixture(scope="module")
+def finished(small_world, small_labels, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("odometry")
+    jobs = first_jobs(["00", "01"], WIDTHS)
+    summary = runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
+    jobs += reduced_jobs(results.best_widths(summary))
+    return folder, jobs, runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
+
+
+def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finished):
+    folder, _, summary = finished
+    assert len(summary) == 10
+    sequence = Sequence(small_world / "kitti", "01")
+    alone = odometry.run(sequence, masks=LabelMasks(small_labels / "01", sequence, 15))
+    row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
+    assert row["rmse"] == metrics.rmse(alone.poses, sequence.poses)
+    assert np.array_equal(runner.paths(summary, folder)["01", "masked-15-0"], alone.poses[:, :3, 3])
+
+
+def test_reduced_runs_have_the_keypoints_of_the_best_width(finished):
+    _, _, summary = finished
+    best = results.best_widths(summary)
+    for name in ("00", "01"):
+        of_name = summary[(summary["sequence"] == name) & (summary["variant"] == "masked")]
+        assert best.loc[name, "rmse"] == of_name["rmse"].min()
+        reduced = summary[(summary["sequence"] == name) & (summary["variant"] == "reduced")]
+        assert reduced["max_keypoints"].item() == round(best.loc[name, "mean_keypoints"])
+
+
+def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, small_labels, finished, monkeypatch):
+    folder, jobs, summary = finished
+    times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
+    lost = folder / "00" / "masked-05-0.csv"
+    lost.unlink()
+    again = runner.run(jobs, small_world / "kitti", small_labels, folder)
+    assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost}
+    pd.testing.assert_frame_equal(again, summary)
+
+
+def test_a_failing_run_is_reported_and_stops_no_other(small_world, small_labels, tmp_path, capsys):
+    jobs = [Job("00", "baseline"), Job("00", "masked", dilation_width=0)]
+    summary = runner.run(jobs, small_world / "kitti", small_labels, tmp_path)
+    assert list(summary["run"]) == ["baseline-0"]
+    assert "sequence 00, masked-00-0: failed: dilation width 0" in capsys.readouterr().out
+    with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
+        runner.run(jobs[1:], small_world / "kitti", small_labels, tmp_path)
+
+
+@pytest.mark.parametrize("error", [OSError("pulled the plug"), KeyboardInterrupt()])
+def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small_labels, finished, tmp_path,
+                                                              monkeypatch, error):
+    folder, jobs, _ = finished
+    jobs = [job for job in jobs if job.variant != "reduced"]
+    monkeypatch.setattr(odometry.passes, "CHECKPOINT", 5)
+    read, plugged = [], []
+
+    def frame(self, index, original=Sequence.frame):
+        read.append((self.name, index))
+        if self.name == "01" and index == 8 and not plugged:
+            plugged.append(True)
+            raise error
+        return original(self, index)
+
+    monkeypatch.setattr(Sequence, "frame", frame)
+    if isinstance(error, KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(jobs, small_world / "kitti", small_labels, tmp_path)
+    else:
+        assert set(runner.run(jobs, small_world / "kitti", small_labels, tmp_path)["sequence"]) == {"00"}
+    assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".npz"}
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
+    read.clear()
+    # by however many processes: what has a checkpoint goes on as it was
+    runner.run(jobs + [Job("01", "masked", 7)], small_world / "kitti", small_labels, tmp_path)
+    assert [index for name, index in read if name == "01"] == [*range(5, 12), *range(12)]
+    assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
+    assert not list(tmp_path.rglob("pass-*"))
+    for job in jobs:
+        one, two = (pd.read_csv(root / job.sequence / f"{job.name}.csv") for root in (folder, tmp_path))
+        exact = [column for column in one if not column.endswith("seconds")]
+        pd.testing.assert_frame_equal(one[exact], two[exact], check_exact=True)
+
+
+def test_a_broken_label_map_costs_only_the_runs_that_need_it(small_world, small_labels, tmp_path, capsys):
+    shutil.copytree(small_labels, tmp_path / "labels")
+    broken = tmp_path / "labels" / "00" / "000003.png"
+    broken.write_bytes(broken.read_bytes()[:-20])
+    jobs = first_jobs(["00"], WIDTHS) + [Job("00", "true-labels", 10), Job("00", "mirrored", 10)]
+    summary = runner.run(jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5)
+    assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
+    assert ("sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: "
+            f"{broken}: the image is truncated") in capsys.readouterr().out
+
+
+def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finished, monkeypatch):
+    folder, jobs, _ = finished
+    first = [job for job in jobs if job.variant != "reduced"]
+    timed = budget.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
+    assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
+    again = budget.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
+    pd.testing.assert_frame_equal(timed, again)

@@ -1,0 +1,72 @@
+"""The house: which folder may import which, and that no import leads in a circle."""
+
+import ast
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parent.parent / "thesis_repro"
+# what each folder, or module at the top, must not know of
+NOT_KNOWN = {
+    "odometry": {"segmentation", "world", "study", "report", "bench"},
+    "masks": {"odometry", "segmentation", "world", "study", "report", "bench"},
+    "segmentation": {"study", "report", "bench"},
+    "world": {"study", "report", "bench"},
+    "study": {"report", "bench"},
+    "report": {"bench"},
+}
+
+
+FOLDERS = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.rglob("*.py")}
+
+
+def imports(path, folder=None):
+    """The package's modules that a module in a folder imports, as dotted names without the package's own."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    inner = {name.removeprefix("thesis_repro.") for name in found if name.startswith("thesis_repro.")}
+    # from outside, a folder's name stands for what its __init__ gathers; inside, for the way to a neighbour
+    return inner & MODULES | {f"{name}.__init__" for name in inner & FOLDERS if name != folder}
+
+
+def test_the_top_is_small():
+    assert len(list(PACKAGE.glob("*.py"))) <= 11
+
+
+def test_no_folder_knows_what_it_must_not():
+    wrong = []
+    for path in PACKAGE.rglob("*.py"):
+        here = path.relative_to(PACKAGE).with_suffix("").parts[0]
+        wrong += [f"{path.relative_to(PACKAGE)} imports {name}" for name in imports(path, here)
+                  if name.split(".")[0] in NOT_KNOWN.get(here, ())]
+    assert wrong == []
+
+
+def test_no_import_leads_in_a_circle():
+    graph = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        graph[".".join(parts)] = imports(path, parts[0] if len(parts) > 1 else None)
+    done, under_way = set(), []
+
+    def visit(name):
+        assert name not in under_way, " -> ".join([*under_way, name])
+        if name in done:
+            return
+        under_way.append(name)
+        for other in sorted(graph[name]):
+            visit(other)
+        done.add(under_way.pop())
+
+    for name in sorted(graph):
+        visit(name)
+
+
+def test_the_check_of_the_imports_can_fail(tmp_path):
+    module = tmp_path / "module.py"
+    module.write_text("from thesis_repro.study import runner\nimport numpy\nfrom thesis_repro.report.style import BLUE\n")
+    assert imports(module) == {"study.__init__", "study.runner", "report.style"}
+    assert imports(module, "study") == {"study.runner", "report.style"}

@@ -1,0 +1,1 @@
+"""What the odometry and the segmentation cost on this machine; for development."""

@@ -1,0 +1,296 @@
+"""The camera's path, frame by frame: what it is asked to do, what a frame brings, and how the pose moves on."""
+
+import time
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+
+from thesis_repro import InputError
+from thesis_repro.odometry import keypoints, pose
+from thesis_repro.odometry.pose import Motion
+from thesis_repro.odometry.refine import refine
+
+SECONDS = ("detect", "track", "essential", "pose")
+ROTATION = [f"r{i}{j}" for i in range(3) for j in range(3)]
+FLAT = 4.0  # gray levels: a standard deviation below it is no picture of a street (real frames: above 50)
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """What the odometry does; the defaults are the thesis's.
+
+    detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
+    max_keypoints: limit of the detector, 0 for none. min_distance: between keypoints, pixels (Shi-Tomasi only).
+    mask_mode: "detect" gives the mask to the detector, which fills its quota inside; "filter" drops what lies outside.
+    redetect_below: detect again on a frame to which fewer points were tracked; all points are replaced then.
+    estimator: "ransac", or OpenCV's "usac", "usac-magsac".
+    threshold: of the estimator, in normalised coordinates.
+    permute: seed that shuffles the correspondences before the estimator, whose own seed is fixed; None: not shuffled.
+    pose: which points vote on the sign of the motion: "all" (PySLAM, audit row 13), "inliers"; or "refined": voted by
+    the inliers, then fitted to them.
+    scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
+    points, pixels.
+    rotate_first: turn the pose before moving it.
+    alignment: how the two paths are laid over each other for RMSE and MAE, see metrics.rmse.
+    """
+
+    detector: str = "shi-tomasi"
+    max_keypoints: int = 2000
+    min_distance: float = 3
+    mask_mode: str = "detect"
+    redetect_below: int = 2000
+    estimator: str = "ransac"
+    threshold: float = 0.0003
+    permute: int | None = None
+    pose: str = "all"
+    scale_gate: float = 0.1
+    shift_gate: float = 0.0
+    rotate_first: bool = False
+    alignment: str = "position"
+
+    def __post_init__(self):
+        for name, known in (("detector", ("shi-tomasi", "orb")), ("mask_mode", ("detect", "filter")),
+                            ("estimator", tuple(pose.ESTIMATORS)), ("pose", ("all", "inliers", "refined")),
+                            ("alignment", ("position", "pose"))):
+            if getattr(self, name) not in known:
+                raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
+                                 f"choose one of {', '.join(known)}")
+        for name, least in (("max_keypoints", 0), ("min_distance", 0), ("redetect_below", 0), ("permute", 0),
+                            ("scale_gate", 0), ("shift_gate", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(f"odometry setting {name}: {value} is below {least}; give {least} or more")
+        if not self.threshold > 0:
+            raise InputError(f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003")
+
+
+THESIS = OdometrySettings()
+PYSLAM_2024 = OdometrySettings(threshold=0.0004, rotate_first=True, shift_gate=1.5, scale_gate=0.015,
+                               alignment="pose")
+PRESETS = {"2021": THESIS, "2024": PYSLAM_2024}
+
+
+@dataclass
+class Step:
+    """What one frame brought. Arrays of one length N: `previous`, `current` (N, 2) pixels, and `inliers` (N)."""
+
+    frame: int
+    scale: float = 0.0  # metres moved since the frame that the points come from
+    points: int | None = None  # given to the tracker
+    detected: int | None = None  # None: not detected on this frame
+    previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
+    current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
+    keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)  # that the next frame starts from
+    motion: Motion = Motion()
+    pose: np.ndarray | None = None  # 4x4 camera to world, metres
+    updated: bool = False
+    flags: list = field(default_factory=list)
+    seconds: dict = field(default_factory=lambda: dict.fromkeys(SECONDS, 0.0))
+
+    @property
+    def inliers(self):
+        return np.zeros(len(self.current), bool) if self.motion.inliers is None else self.motion.inliers
+
+    def copy(self):
+        """The same observation, for another estimate."""
+        return replace(self, flags=list(self.flags), seconds=dict(self.seconds))
+
+    def row(self):
+        """One row of Result.frames."""
+        tracked = None if self.points is None else len(self.current)
+        return {"frame": self.frame, "points": self.points, "detected": self.detected, "tracked": tracked,
+               "inliers": None if tracked is None else int(self.inliers.sum()),
+               "pose_inliers": None if tracked is None else self.motion.pose_inliers,
+               "scale": self.scale, "updated": self.updated, "flag": "; ".join(self.flags),
+               **dict(zip("xyz", self.pose[:3, 3].tolist())),
+               **dict(zip(ROTATION, self.pose[:3, :3].ravel().tolist())),
+               **{f"{name}_seconds": value for name, value in self.seconds.items()}}
+
+
+COLUMNS = tuple(Step(0, pose=np.eye(4)).row())
+
+
+class Odometry:
+    """The camera's path, frame by frame.
+
+    `step(frame, scale, mask)` takes the next gray frame (height, width), the metres moved since the frame before, and
+    an optional mask of the same size (0: no keypoints there), and returns a Step. It is the three methods below, one
+    after the other; only `motion` is expensive, and it depends on nothing but its own step.
+    """
+
+    def __init__(self, intrinsics, settings=THESIS, start=None, features=keypoints.Keypoints()):
+        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. features: a shared keypoints source."""
+        self.intrinsics = np.asarray(intrinsics, np.float64)
+        self.settings = settings
+        self.pose = np.eye(4) if start is None else np.array(start, np.float64)
+        self.features = features
+        self.count = 0
+        self.previous = None  # the frame that self.points belong to
+        self.points = keypoints.NO_POINTS
+        self._gap = 0.0  # metres from there to the last frame seen
+        warm_up()
+
+    def step(self, frame, scale=0.0, mask=None):
+        step = self.observe(frame, scale, mask)
+        self.estimate(step)
+        return self.compose(step)
+
+    def observe(self, frame, scale=0.0, mask=None):
+        """Track the points to this frame and detect new ones; returns a Step without a motion."""
+        step = Step(frame=self.count, scale=float(scale))
+        self._check(frame, scale, mask)
+        self.count += 1
+        if self.previous is not None:
+            step.scale += self._gap
+        if frame[::8, ::8].std() < FLAT:
+            step.flags.append("flat frame")
+            self._gap = step.scale
+            return step
+        started, self._gap = time.perf_counter(), 0.0
+        tracked = keypoints.NO_POINTS
+        if len(self.points):
+            step.points = len(self.points)
+            tracked, found = self.features.track(self.previous, frame, self.points)
+            step.previous, step.current = self.points[found], tracked[found]
+            tracked = step.current
+        elif self.previous is not None or step.frame > 0:
+            step.points = 0
+            step.flags.append("no points")
+        step.seconds["track"] = time.perf_counter() - started
+        if len(tracked) < self.settings.redetect_below or not len(tracked):
+            started = time.perf_counter()
+            detected = self.features.detect(frame, self.settings, mask)
+            step.seconds["detect"] = time.perf_counter() - started
+            step.detected = len(detected)
+            if len(detected):
+                tracked = detected
+            else:
+                step.flags.append("no keypoints")
+        self.previous, self.points = frame, tracked
+        step.keypoints = tracked
+        return step
+
+    def estimate(self, step, essential=None):
+        """The motion from the step's correspondences; returns the essential matrix with what it was made from.
+
+        essential: what another Odometry with the same settings but for `pose` returned for the same correspondences.
+        Safe in threads: reads nothing that later steps change.
+        """
+        if not step.points:
+            return None
+        chosen = self.settings
+        found = essential or _essential(step, chosen, self.intrinsics)
+        step.seconds["essential"] = found.seconds
+        if found.matrix is None:
+            step.motion = Motion(problem=found.problem)
+            return found
+        started = time.perf_counter()
+        current, previous, inliers = found.current, found.previous, found.inliers
+        if chosen.pose == "all":
+            votes, rotation, translation = pose.recover_pose(found.matrix, current, previous)
+        else:
+            votes, rotation, translation = pose.recover_pose(found.matrix, current[inliers], previous[inliers])
+        if chosen.pose == "refined":
+            rotation, translation = refine(rotation, translation, current, previous, inliers, chosen.threshold)
+        step.motion = Motion(rotation, translation, found.in_order(), votes)
+        step.seconds["pose"] = time.perf_counter() - started
+        return found
+
+    def compose(self, step):
+        """Move the pose by the step's motion, where it has one that can be believed."""
+        motion, chosen = step.motion, self.settings
+        if step.points:
+            if motion.rotation is None:
+                step.flags.append(motion.problem)
+            elif _by_chance(motion.inliers):
+                step.flags.append("no agreement")
+            elif (step.scale <= chosen.scale_gate
+                  or chosen.shift_gate and _mean_shift(step) < chosen.shift_gate):
+                step.flags.append("stationary")
+            else:
+                self.pose = self._moved(motion, step.scale)
+                step.updated = True
+        step.pose = self.pose
+        return step
+
+    def state(self):
+        """What `restore` needs to go on from here, and nothing that belongs to the settings."""
+        return {"pose": self.pose, "count": self.count, "previous": self.previous, "points": self.points,
+                "gap": self._gap}
+
+    def restore(self, state):
+        self.pose, self.count, self.previous = state["pose"], state["count"], state["previous"]
+        self.points, self._gap = state["points"], state["gap"]
+
+    def _moved(self, motion, scale):
+        moved, rotation = np.eye(4), self.pose[:3, :3]
+        moved[:3, :3] = rotation @ motion.rotation
+        heading = moved[:3, :3] if self.settings.rotate_first else rotation
+        moved[:3, 3] = self.pose[:3, 3] + scale * (heading @ motion.translation)
+        return moved
+
+    def _check(self, frame, scale, mask):
+        if frame.dtype != np.uint8 or frame.ndim != 2:
+            raise InputError(f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
+                             "the odometry needs 8-bit gray, (height, width)")
+        if not np.isfinite(scale) or scale < 0:
+            raise InputError(f"frame {self.count}: the scale {scale} is no distance in metres")
+        if mask is not None and (mask.shape != frame.shape or mask.dtype != np.uint8):
+            raise InputError(f"frame {self.count}: the mask is {mask.dtype} of shape {mask.shape}, the frame uint8 of "
+                             f"shape {frame.shape}; masks must be 8-bit and as large as their frames")
+        if self.previous is not None and frame.shape != self.previous.shape:
+            raise InputError(f"frame {self.count}: shape {frame.shape}, the frames before {self.previous.shape}; "
+                             "all frames must have one size")
+
+
+@dataclass(frozen=True)
+class _Essential:
+    """An essential matrix and the normalised correspondences (N, 2) that it was estimated from."""
+
+    current: np.ndarray
+    previous: np.ndarray
+    order: np.ndarray | None  # in which they were fed
+    matrix: np.ndarray | None
+    inliers: np.ndarray  # (N,) booleans, as fed
+    problem: str
+    seconds: float
+
+    def in_order(self):
+        """The inliers in the order of the step's points."""
+        if self.order is None:
+            return self.inliers
+        inliers = np.empty_like(self.inliers)
+        inliers[self.order] = self.inliers
+        return inliers
+
+
+def _essential(step, settings, intrinsics):
+    started = time.perf_counter()
+    current = pose.normalise(step.current, intrinsics)
+    previous = pose.normalise(step.previous, intrinsics)
+    order = None
+    if settings.permute is not None:
+        order = np.random.default_rng((settings.permute, step.frame)).permutation(len(current))
+        current, previous = current[order], previous[order]
+    found = pose.essential_matrix(current, previous, settings.threshold, settings.estimator)
+    return _Essential(current, previous, order, *found, time.perf_counter() - started)
+
+
+def _by_chance(inliers):
+    # Between frames with nothing in common the estimator finds 7 inliers among 20 points, 9 among 100, 12 among 300,
+    # and 1.5 to 2.7 % of 1600 (with PySLAM's threshold); between real neighbours, 45 to 85 % of them.
+    return inliers.sum() <= 8 + 0.03 * len(inliers)
+
+
+def _mean_shift(step):
+    return np.linalg.norm(step.current - step.previous, axis=1).mean()
+
+
+@lru_cache
+def warm_up():
+    """Load the compiled functions (compile them the first time ever), so that no frame's time holds that."""
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
+    pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
+    pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
+    refine(np.eye(3), np.array([0.0, 0.0, 1.0]), points, points, np.ones(8, bool), 1.0)

@@ -1,0 +1,250 @@
+"""Passes of the odometry over a sequence: one run, or many for little more than the cost of their estimators."""
+
+import hashlib
+import time
+from collections.abc import Iterable, Mapping, Sequence as List
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from thesis_repro import InputError, stages
+from thesis_repro.files import progress
+from thesis_repro.kitti import Sequence
+from thesis_repro.odometry import keypoints
+from thesis_repro.odometry.odometry import COLUMNS, ROTATION, THESIS, Odometry, OdometrySettings, Step
+
+CHECKPOINT = 300  # frames
+# What the observed points depend on, and what the essential matrix depends on besides: runs that agree share the work
+OBSERVED = ("detector", "max_keypoints", "min_distance", "mask_mode", "redetect_below")
+ESTIMATED = ("estimator", "threshold", "permute")
+NUMBERS = [*(column for column in COLUMNS if column != "flag"), "mask_seconds"]
+
+
+class Masks(Protocol):
+    """Anything that gives a (height, width) uint8 mask for a frame number; 0: no keypoints there."""
+
+    def __getitem__(self, index: int, /) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Result:
+    """poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; blank where not applicable."""
+
+    poses: np.ndarray
+    frames: pd.DataFrame
+    settings: OdometrySettings = THESIS
+
+    @property
+    def flagged(self) -> pd.Series:
+        """Frames by flag: a Series of counts, empty where nothing was remarkable."""
+        return self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
+
+
+def start_pose(sequence: Sequence) -> np.ndarray:
+    """Where the estimate starts: the identity, as in PySLAM, or the first true pose where that is another one.
+
+    The first pose of every complete KITTI sequence is the identity up to 1e-10, an excerpt's is not.
+    """
+    first = sequence.poses[0]
+    return np.eye(4) if np.abs(first - np.eye(4)).max() < 1e-6 else first
+
+
+def scales(sequence: Sequence) -> np.ndarray:
+    """Metres between the true positions of a frame and the one before; 0 for the first. (n,)"""
+    return np.concatenate([[0.0], [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]])
+
+
+def run(sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None,
+        description: str | None = None) -> Result:
+    """The odometry over a kitti.Sequence; returns a Result.
+
+    masks: anything that gives an (height, width) uint8 mask for a frame number (0: no keypoints there).
+    description: of a progress bar; None for no bar.
+    Raises InputError where a frame cannot be read or a mask has another size.
+    """
+    return _run(sequence, {"": (settings, masks)}, keypoints.Keypoints(), description, None, 1)[""]
+
+
+def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
+             description: str | None = None, checkpoint: Path | None = None, workers: int = 1) -> dict[str, Result]:
+    """Many runs over one sequence, {name: (settings, masks)}, as {name: Result}: the bits of separate runs.
+
+    Frames are decoded, corner strengths computed and points tracked once for all runs, so the times of detection and
+    tracking belong to no run and are blank. Runs with the same masks (one object) and settings that differ only after
+    the tracking also share their masks and keypoints, and those that differ only in `pose` their essential matrices.
+    workers: threads for the estimators, which are most of what remains.
+    checkpoint: a file to keep the state in, every CHECKPOINT frames; a killed run that is started again with the same
+    file, sequence and settings goes on from there. Whoever names the file deletes it once the results are stored,
+    and gives other masks another file.
+    """
+    results = _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
+    for result in results.values():
+        result.frames[["detect_seconds", "track_seconds"]] = np.nan
+    return results
+
+
+@dataclass
+class _Run:
+    """One run of a pass, and what came of it so far: a row of numbers a frame, for a long sequence has a million."""
+
+    odometry: Odometry
+    masks: Masks | None
+    numbers: np.ndarray
+    flags: dict[int, str] = field(default_factory=dict)
+
+
+@dataclass
+class _Estimate:
+    """Runs of one essential matrix at one frame: each with its own copy of the step, and the thread that works on it."""
+
+    runs: List[_Run]
+    steps: List[Step]
+    mask_seconds: float
+    future: Future | None = None
+
+    def work(self) -> None:
+        essential = None
+        for one, step in zip(self.runs, self.steps, strict=True):
+            essential = one.odometry.estimate(step, essential)
+
+    def finish(self) -> None:
+        if self.future is not None:
+            self.future.result()  # raises what the thread raised
+        for one, step in zip(self.runs, self.steps, strict=True):
+            row = one.odometry.compose(step).row()
+            flag = row.pop("flag")
+            one.numbers[step.frame] = [np.nan if value is None else value
+                                       for value in (*row.values(), self.mask_seconds)]
+            if flag:
+                one.flags[step.frame] = flag
+
+
+def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]], features: Any,
+         description: str | None, checkpoint: Path | None, workers: int) -> dict[str, Result]:
+    members = {name: _Run(Odometry(sequence.intrinsics, settings, start_pose(sequence), features), masks,
+                          np.full((len(sequence), len(NUMBERS)), np.nan))
+               for name, (settings, masks) in runs.items()}
+    groups = _groups(members.values())
+    leaders = [alike[0][0] for alike in groups]  # the first of those with the same keypoints finds them for all
+    metres = scales(sequence)
+    job = _job(sequence, members)
+    done = _resume(checkpoint, job, members, leaders)
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: list[_Estimate] = []
+        for index in _with_bar(range(done, len(sequence)), description, len(sequence)):
+            frame = sequence.frame(index)
+            features.expect(frame, [leader.odometry for leader in leaders])
+            observed = []
+            for leader, group in zip(leaders, groups, strict=True):
+                started = time.perf_counter()
+                mask = None if leader.masks is None else leader.masks[index]
+                mask_seconds = time.perf_counter() - started
+                step = leader.odometry.observe(frame, metres[index], mask)
+                for alike in group:
+                    estimate = _Estimate(alike, [step.copy() for _ in alike], mask_seconds)
+                    if workers > 1:
+                        estimate.future = pool.submit(estimate.work)
+                    else:
+                        estimate.work()
+                    observed.append(estimate)
+            # What is tracked next does not depend on the pose, so the estimators may be one frame behind.
+            _finish(waiting)
+            waiting = observed
+            if checkpoint and (index + 1) % CHECKPOINT == 0:
+                _finish(waiting)
+                waiting = []
+                _store(checkpoint, job, index + 1, members, leaders)
+        _finish(waiting)
+    return {name: _result(one) for name, one in members.items()}
+
+
+def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
+    """A list for each set of keypoints, in it a list of runs for each essential matrix."""
+    groups: dict[tuple, dict[tuple, list[_Run]]] = {}
+    for one in members:
+        settings = one.odometry.settings
+        seen = (id(one.masks), *(getattr(settings, key) for key in OBSERVED))
+        estimated = tuple(getattr(settings, key) for key in ESTIMATED)
+        groups.setdefault(seen, {}).setdefault(estimated, []).append(one)
+    return [list(group.values()) for group in groups.values()]
+
+
+def _with_bar(indices: range, description: str | None, total: int) -> Iterable[int]:
+    return indices if description is None else progress(indices, description, total=total, initial=indices.start)
+
+
+def _finish(estimates: Iterable[_Estimate]) -> None:
+    for estimate in estimates:
+        estimate.finish()
+
+
+# Going on after a stop
+
+
+def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
+    """Everything that has to be the same for a checkpoint to go on from."""
+    numbers = hashlib.sha256(sequence.intrinsics.tobytes() + sequence.poses.tobytes()).hexdigest()
+    return {"sequence": sequence.name, "frames": len(sequence), "numbers": numbers, "opencv": cv2.__version__,
+            "columns": NUMBERS, "runs": {name: asdict(one.odometry.settings) for name, one in members.items()}}
+
+
+def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: List[_Run]) -> None:
+    arrays = {"numbers": np.array([one.numbers[:done] for one in members.values()]),
+              "poses": np.array([one.odometry.pose for one in members.values()])}
+    frames: list[np.ndarray] = []  # nearly always one, the last; more where some runs passed over it
+    where = []
+    for index, leader in enumerate(leaders):
+        state = leader.odometry.state()
+        previous = state["previous"]
+        if previous is not None and not any(previous is frame for frame in frames):
+            frames.append(previous)
+        number = next((number for number, frame in enumerate(frames) if frame is previous), None)
+        where.append({"count": state["count"], "gap": state["gap"], "frame": number})
+        arrays[f"points {index}"] = state["points"]
+    arrays |= {f"frame {number}": frame for number, frame in enumerate(frames)}
+    stages.store(checkpoint, {"job": job, "done": done, "leaders": where,
+                              "flags": {name: one.flags for name, one in members.items()}}, arrays)
+
+
+def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: List[_Run]) -> int:
+    """Number of frames done according to the checkpoint, 0 where there is none of this job."""
+    try:
+        kept = stages.resume(checkpoint) if checkpoint else None
+    except InputError:  # nothing that is needed: start from the beginning
+        kept = None
+    if kept is None or kept[0].get("job") != job:
+        return 0
+    state, arrays = kept
+    done = int(state["done"])
+    for name, one, numbers, pose in zip(members, members.values(), arrays["numbers"], arrays["poses"], strict=True):
+        one.numbers[:done] = numbers
+        one.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
+        one.odometry.pose = pose
+    frames = {None: None} | {number: arrays[f"frame {number}"] for number in range(len(arrays))
+                             if f"frame {number}" in arrays}
+    for index, (leader, where) in enumerate(zip(leaders, state["leaders"], strict=True)):
+        leader.odometry.restore({"pose": leader.odometry.pose, "count": where["count"], "gap": where["gap"],
+                                 "previous": frames[where["frame"]], "points": arrays[f"points {index}"]})
+    return done
+
+
+def _result(one: _Run) -> Result:
+    frames = pd.DataFrame(one.numbers, columns=NUMBERS)
+    flags = [one.flags.get(index, "") for index in range(len(frames))]
+    frames.insert(list(COLUMNS).index("flag"), "flag", flags)
+    counts = ["points", "detected", "tracked", "inliers", "pose_inliers"]
+    frames = frames.astype({"frame": int, "updated": bool, **dict.fromkeys(counts, "Int64")})
+    return Result(poses_of(frames), frames, one.odometry.settings)
+
+
+def poses_of(frames: pd.DataFrame) -> np.ndarray:
+    """The poses (n, 4, 4) in a table of one row a frame."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3] = frames[ROTATION].to_numpy().reshape(-1, 3, 3)
+    poses[:, :3, 3] = frames[["x", "y", "z"]]
+    return poses

@@ -1,0 +1,170 @@
+"""Relative motion of a calibrated camera from point correspondences (Section 2.2): essential matrix and vote.
+
+Directions as in PySLAM: points of the current frame come first, so the rotation and the unit translation take
+current camera coordinates to previous ones, and composing them onto a camera-to-world pose needs no inverse.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+
+from thesis_repro.odometry import ransac
+
+PROBABILITY = 0.999  # of RANSAC
+MAX_DEPTH = 50.0  # in units of the translation: recoverPose lets no point beyond it vote
+MIN_CORRESPONDENCES = 5
+
+ESTIMATORS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What two frames say about the camera's motion; `rotation` is None where they say nothing (see `problem`)."""
+
+    rotation: np.ndarray | None = None  # 3x3
+    translation: np.ndarray | None = None  # 3, unit length
+    inliers: np.ndarray | None = None  # N booleans: correspondences that agree with the essential matrix
+    pose_inliers: int = 0  # correspondences that lie in front of both cameras and not too far away
+    problem: str = ""
+
+
+def normalise(points, intrinsics):
+    """Pixels (N, 2) to normalised image coordinates (N, 2) in double precision.
+
+    u * (1 / fx) + (-cx / fx), which is the inverse camera matrix times (u, v, 1) to the last bit. RANSAC amplifies the
+    last bit, so (u - cx) / fx would lead to another trajectory.
+    """
+    focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
+    return points * (1 / focal) + (-intrinsics[:2, 2] / focal)
+
+
+def essential_matrix(current, previous, threshold, estimator="ransac"):
+    """The essential matrix of normalised correspondences (N, 2): (matrix, inliers, problem).
+
+    `matrix` is None, and `problem` says why, where there is none or more than one: OpenCV stacks all solutions of
+    exactly five correspondences, returns nothing for four, and raises for none.
+    """
+    none = np.zeros(len(current), bool)
+    if len(current) < MIN_CORRESPONDENCES:
+        return None, none, "fewer than five correspondences"
+    try:
+        if estimator == "ransac":
+            matrix, inliers = ransac.find(current, previous, threshold, PROBABILITY)
+        else:
+            matrix, inliers = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0),
+                                                   method=ESTIMATORS[estimator], prob=PROBABILITY, threshold=threshold)
+    except cv2.error:  # the USAC estimators raise on degenerate points
+        matrix = None
+    if matrix is None or not np.isfinite(matrix).all():
+        return None, none, "no essential matrix"
+    if matrix.shape != (3, 3):
+        return None, none, "several essential matrices"
+    return matrix, inliers.ravel() > 0, ""
+
+
+def recover_pose(matrix, current, previous):
+    """cv2.recoverPose(matrix, current, previous) without its inlier mask, to the last bit: (votes, R, t).
+
+    An essential matrix allows four motions; the one that puts most points in front of both cameras, and nearer than
+    MAX_DEPTH, wins. OpenCV triangulates every point four times with a singular value decomposition. Only the side of
+    a few limits counts, so a few steps of inverse iteration decide nearly all points, one of them for both signs of
+    the translation; the few points too close to a limit are triangulated by OpenCV itself.
+    """
+    first, second, translation = cv2.decomposeEssentialMat(matrix)
+    direction = translation.ravel()
+    votes = np.zeros(4, np.int64)
+    for index, rotation in enumerate((first, second)):
+        forward, backward, doubtful = _count_in_front(current, previous, rotation, direction)
+        for sign, count, slot in ((1.0, forward, index), (-1.0, backward, index + 2)):
+            if len(doubtful):
+                count += _triangulate_and_count(current[doubtful], previous[doubtful], rotation, sign * translation)
+            votes[slot] = count
+    candidates = ((first, direction), (second, direction), (first, -direction), (second, -direction))
+    best = int(np.argmax(votes))  # the first of equals, as in OpenCV
+    return int(votes[best]), *candidates[best]
+
+
+def _triangulate_and_count(current, previous, rotation, translation):
+    projection = np.hstack([rotation, translation])
+    points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T.copy(), previous.T.copy())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        good = points[2] * points[3] > 0
+        points = points / points[3]
+        depth = projection[2] @ points
+        return int((good & (points[2] < MAX_DEPTH) & (depth > 0) & (depth < MAX_DEPTH)).sum())
+
+
+@njit(cache=True, nogil=True)
+def _count_in_front(current, previous, rotation, t):
+    """Votes for (rotation, t), for (rotation, -t), and the indices of points too close to a limit to be sure."""
+    margin = 1e-7
+    forward = 0
+    backward = 0
+    doubtful = np.empty(len(current), np.int64)
+    doubts = 0
+    a = np.zeros((4, 4))
+    b = np.empty((4, 4))
+    for index in range(len(current)):
+        # Rows x * P[2] - P[0], y * P[2] - P[1] of both cameras; the point is their singular vector of least value.
+        u, v = previous[index, 0], previous[index, 1]
+        a[0, 0] = -1.0
+        a[0, 2] = current[index, 0]
+        a[1, 1] = -1.0
+        a[1, 2] = current[index, 1]
+        for k in range(3):
+            a[2, k] = u * rotation[2, k] - rotation[0, k]
+            a[3, k] = v * rotation[2, k] - rotation[1, k]
+        a[2, 3] = u * t[2] - t[0]
+        a[3, 3] = v * t[2] - t[1]
+        for i in range(4):
+            for j in range(i + 1):
+                b[i, j] = a[0, i] * a[0, j] + a[1, i] * a[1, j] + a[2, i] * a[2, j] + a[3, i] * a[3, j]
+        sure, x, y, z, w = _least_eigenvector(b)
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + t[2] * w
+        if w < 0:
+            z, w, depth = -z, -w, -depth
+        if (not sure or w < margin or abs(z) < margin or abs(depth) < margin
+                or abs(abs(z) - MAX_DEPTH * w) < MAX_DEPTH * margin
+                or abs(abs(depth) - MAX_DEPTH * w) < MAX_DEPTH * margin):
+            doubtful[doubts] = index
+            doubts += 1
+        elif 0 < z < MAX_DEPTH * w and 0 < depth < MAX_DEPTH * w:
+            forward += 1
+        elif 0 < -z < MAX_DEPTH * w and 0 < -depth < MAX_DEPTH * w:
+            backward += 1  # the other sign of t turns the sign of w and of both depths
+    return forward, backward, doubtful[:doubts]
+
+
+@njit(cache=True, nogil=True)
+def _least_eigenvector(b):
+    """Unit eigenvector of the least eigenvalue of b (lower triangle; overwritten) and whether it is sure."""
+    for j in range(4):  # Cholesky
+        for k in range(j):
+            b[j, j] -= b[j, k] * b[j, k]
+        if b[j, j] < 1e-15:
+            return False, 0.0, 0.0, 0.0, 1.0
+        b[j, j] = np.sqrt(b[j, j])
+        for i in range(j + 1, 4):
+            for k in range(j):
+                b[i, j] -= b[i, k] * b[j, k]
+            b[i, j] /= b[j, j]
+    x0, x1, x2, x3 = 0.5, 0.5, 0.5, 0.5
+    change = 1.0
+    for _ in range(30):
+        y0 = x0 / b[0, 0]
+        y1 = (x1 - b[1, 0] * y0) / b[1, 1]
+        y2 = (x2 - b[2, 0] * y0 - b[2, 1] * y1) / b[2, 2]
+        y3 = (x3 - b[3, 0] * y0 - b[3, 1] * y1 - b[3, 2] * y2) / b[3, 3]
+        y3 = y3 / b[3, 3]
+        y2 = (y2 - b[3, 2] * y3) / b[2, 2]
+        y1 = (y1 - b[2, 1] * y2 - b[3, 1] * y3) / b[1, 1]
+        y0 = (y0 - b[1, 0] * y1 - b[2, 0] * y2 - b[3, 0] * y3) / b[0, 0]
+        norm = 1 / np.sqrt(y0 * y0 + y1 * y1 + y2 * y2 + y3 * y3)
+        y0, y1, y2, y3 = y0 * norm, y1 * norm, y2 * norm, y3 * norm
+        change = abs(y0 - x0) + abs(y1 - x1) + abs(y2 - x2) + abs(y3 - x3)
+        x0, x1, x2, x3 = y0, y1, y2, y3
+        if change < 1e-11:
+            return True, x0, x1, x2, x3
+    return False, x0, x1, x2, x3

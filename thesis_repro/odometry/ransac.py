@@ -1,0 +1,180 @@
+"""cv2.findEssentialMat with RANSAC to the last bit, several times faster.
+
+Nearly all of OpenCV's time goes into the five-point solver (Nister 2004: An efficient solution to the five-point
+relative pose problem), most of it into finding all ten complex roots of a polynomial by Durand and Kerner's iteration,
+which runs to its last round although the roots settled long before. Of all these solutions RANSAC keeps one. So
+five_point.solve, not the same to the last bit but with a margin for the difference, says of each sample of five how
+many correspondences agree with its best solution; OpenCV itself solves those samples for which the margin leaves open
+whether they are better than the best so far, and the winner. Should the winner's inliers not be as many as foretold,
+OpenCV does everything. Samples are drawn with OpenCV's generator of random numbers. The margin is an estimate with
+room to spare, not a proof; the tests compare.
+"""
+
+import math
+
+import cv2
+import numpy as np
+
+from thesis_repro.odometry.five_point import FAST, SAMPLE, solve
+
+MAX_SAMPLES = 1000
+FEWEST = 8  # correspondences: below, the few samples there are go to OpenCV
+SEED = 2**64 - 1  # of OpenCV's RANSAC
+BLOCK = 128  # correspondences scored between two looks at whether the best can still be beaten
+
+
+def find(current, previous, threshold, probability):
+    """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability, threshold): (E, mask).
+
+    Correspondences are (N, 2) float64 in normalised coordinates. E is 3x3, or OpenCV's stack of solutions for N = 5,
+    or None; mask is (N, 1) uint8 as OpenCV returns it.
+    """
+    count = len(current)
+    current, previous = np.ascontiguousarray(current, float), np.ascontiguousarray(previous, float)
+    if count < FEWEST or not (np.isfinite(current).all() and np.isfinite(previous).all()):
+        return _opencv(current, previous, threshold, probability)
+    columns = np.ascontiguousarray(np.hstack([current, previous]).T)
+    limit = np.float32(threshold * threshold)
+
+    def solve_now(winner):
+        return _solved(columns, winner, threshold, probability, limit)
+
+    # The best so far has between `low` and `high` inliers; which of them matters only when another comes near it, or
+    # when it decides whether the search ends.
+    state, sample, low, high, winner, solution = SEED, 0, SAMPLE - 1, SAMPLE - 1, None, None
+    while True:
+        enough = MAX_SAMPLES if winner is None else _samples_needed(probability, (count - high) / count)
+        state, sample, chosen, fewest, most = _next_better(columns, float(limit), np.uint64(state), sample, enough, low)
+        if most > low and fewest > high:
+            low, high, winner, solution = fewest, most, chosen, None
+            continue
+        if winner is not None and solution is None:
+            solution = solve_now(winner)
+            if not low <= solution[0] <= high:
+                return _opencv(current, previous, threshold, probability)
+            low = high = solution[0]
+        elif most == 0:
+            break
+        if most > low:
+            new = solve_now(chosen)
+            if new[0] > low:
+                low, high, winner, solution = new[0], new[0], chosen, new
+    return _opencv(current, previous, threshold, probability) if solution is None else solution[1:]
+
+
+def _opencv(current, previous, threshold, probability):
+    return cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=probability,
+                                threshold=threshold)
+
+
+def _solved(columns, chosen, threshold, probability, limit):
+    """OpenCV's first best solution for five correspondences: its inliers among all, the matrix, the mask."""
+    five = np.ascontiguousarray(columns[:, chosen].T)
+    stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
+    best = 0, None, None
+    for start in range(0, 0 if stack is None else len(stack), 3):
+        mask = _agree(stack[start:start + 3], columns[0], columns[1], columns[2], columns[3], limit)
+        found = int(mask.sum())
+        if found > best[0]:
+            best = found, stack[start:start + 3].copy(), mask.reshape(-1, 1)
+    return best
+
+
+def _samples_needed(probability, outliers):
+    """Samples of five for one without outliers to be among them with that probability."""
+    missed = 1.0 - math.pow(1.0 - outliers, SAMPLE)
+    if missed < np.finfo(float).tiny:
+        return 0
+    needed, missed = math.log(max(1.0 - probability, np.finfo(float).tiny)), math.log(missed)
+    return MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
+
+
+@FAST
+def _agree(e, x, y, u, v, limit):
+    """N times 0 or 1: whether the squared Sampson distance, rounded to float32, is within the limit."""
+    mask = np.empty(len(x), np.uint8)
+    for k in range(len(x)):
+        l0 = e[0, 0] * x[k] + e[0, 1] * y[k] + e[0, 2]
+        l1 = e[1, 0] * x[k] + e[1, 1] * y[k] + e[1, 2]
+        l2 = e[2, 0] * x[k] + e[2, 1] * y[k] + e[2, 2]
+        m0 = e[0, 0] * u[k] + e[1, 0] * v[k] + e[2, 0]
+        m1 = e[0, 1] * u[k] + e[1, 1] * v[k] + e[2, 1]
+        algebraic = u[k] * l0 + v[k] * l1 + l2
+        distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        mask[k] = np.float32(distance) <= limit
+    return mask
+
+
+@FAST
+def _next_better(columns, limit, state, sample, samples, best):
+    """Draw samples until one may have more than `best` inliers, or until there are `samples` of them.
+
+    Returns the generator's state, the number of samples drawn, the five indices, and the bounds between which the
+    number of inliers of the sample's best solution lies, 0 and 0 where there is none that may be better.
+    """
+    count = columns.shape[1]
+    chosen = np.empty(SAMPLE, np.int64)
+    five = np.empty((SAMPLE, 4))
+    while sample < samples:
+        sample += 1
+        taken = 0
+        while taken < SAMPLE:
+            state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
+            index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
+            new = True
+            for k in range(taken):
+                new = new and chosen[k] != index
+            if new:
+                chosen[taken] = index
+                taken += 1
+        for k in range(SAMPLE):
+            for j in range(4):
+                five[k, j] = columns[j, chosen[k]]
+        sure, solutions, margins = solve(five)
+        if not sure:
+            return state, sample, chosen, 0, count
+        low, high = 0, 0
+        for k in range(len(solutions)):
+            fewest, most = _bounds(solutions[k], margins[k], columns, limit, max(best, low))
+            low, high = max(low, fewest), max(high, most)
+        if high > best:
+            return state, sample, chosen, low, high
+    return state, sample, chosen, 0, 0
+
+
+@FAST
+def _bounds(e, margin, columns, limit, best):
+    """Inliers that any matrix within the margin of e has at least and at most; 0 and 0 where not above `best`."""
+    count = columns.shape[1]
+    low, high = 0, 0
+    for start in range(0, count, BLOCK):
+        stop = min(start + BLOCK, count)
+        few, many = _bounds_of_block(e, margin, columns[0, start:stop], columns[1, start:stop], columns[2, start:stop],
+                                     columns[3, start:stop], limit)
+        low += few
+        high += many
+        if high + count - stop <= best:
+            return 0, 0
+    return low, high
+
+
+@FAST
+def _bounds_of_block(e, margin, x, y, u, v, limit):
+    root = np.sqrt(limit)
+    e0, e1, e2, e3, e4, e5, e6, e7, e8 = e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
+    low, high = 0, 0
+    for k in range(len(x)):
+        l0 = e0 * x[k] + e1 * y[k] + e2
+        l1 = e3 * x[k] + e4 * y[k] + e5
+        l2 = e6 * x[k] + e7 * y[k] + e8
+        m0 = e0 * u[k] + e3 * v[k] + e6
+        m1 = e1 * u[k] + e4 * v[k] + e7
+        algebraic = u[k] * l0 + v[k] * l1 + l2
+        excess = algebraic * algebraic - limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        # Both |algebraic| and the root of the other term change by less than `change`.
+        change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))
+        size = abs(algebraic) + root * (abs(l0) + abs(l1) + abs(m0) + abs(m1)) + change
+        doubt = 2 * change * size + 1e-6 * size * size
+        low += 1 if excess < -doubt else 0
+        high += 1 if excess <= doubt else 0
+    return low, high

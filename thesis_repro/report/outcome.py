@@ -1,0 +1,275 @@
+"""Figures 4.6, 4.7, 4.9 to 4.17, and those of the controls and the budget.
+
+`summary` is the table that `runner.run` returns; what is computed from it is in results.py. Lines and bars stand
+at the mean over repetitions; bands and error bars go from the lowest to the highest of them.
+"""
+
+import numpy as np
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+from thesis_repro.study import results
+from thesis_repro.report.style import (BASELINE, BLUE, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, RED, REDUCED, SKY, TRUTH,
+                                  line_style, new_figure)
+from thesis_repro.odometry.metrics import percent_change
+
+VARIANTS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
+            "reduced": ("plainly reduced", REDUCED, "..")}
+FRAME_MS = 100  # KITTI's cameras take ten frames a second
+STAGES = {"read": (SKY, ""), "segmentation": (RED, ""), "mask": (ORANGE, "//"), "detection": (BLUE, ""),
+          "tracking": (GREEN, ".."), "pose": (PINK, "")}
+
+
+def figure_paths(truths, rows, paths, variant, title):
+    """Figures 4.6, 4.11, 4.12: estimated against true path of each sequence, seen from above.
+
+    truths: {sequence: true positions (n, 3)}. rows: the runs to draw, of one variant; repetition 0 is drawn bold, the
+    others faint. paths: {(sequence, run): estimated positions (n, 3)}.
+    """
+    groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
+    figure, panels, columns = _panels(len(groups), PAGE_WIDTH / min(4, len(groups)))
+    color = VARIANTS[variant][1]
+    errors = results.over_orders(rows, "rmse")
+    for panel, (name, runs) in zip(panels, groups.items()):
+        panel.plot(truths[name][:, 0], truths[name][:, 2], color=TRUTH, linewidth=2.2, alpha=0.45, label="true path")
+        for order, run in enumerate(runs["run"]):
+            positions = paths[name, run]
+            faint = {"linewidth": 0.6, "alpha": 0.45, "label": "other orders of the correspondences"}
+            bold = {"linewidth": 1.2, "label": "estimated path", "zorder": 3}
+            panel.plot(positions[:, 0], positions[:, 2], color=color, **(faint if order else bold))
+        row = errors.loc[name]
+        span = f" ({row['lowest']:.2g} to {row['highest']:.2g})" if len(runs) > 1 else ""
+        panel.set_title(f"{name}: {row['mean']:.2g} m{span}", fontsize=7.5)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.tick_params(labelsize=7)
+        panel.xaxis.set_major_locator(MaxNLocator(4))
+    for panel in panels[-columns:]:
+        panel.set_xlabel("x (m)")
+    for panel in panels[::columns]:
+        panel.set_ylabel("z (m)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    named = dict(zip(labels, handles))
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=3)
+    figure.suptitle(f"{title}; RMSE: mean (lowest to highest of the repetitions)", fontsize=9)
+    return figure
+
+
+def _panels(count, height):
+    """(figure, axes in use, columns) of a grid with one panel a sequence, each `height` inches high."""
+    columns = min(4, count)
+    rows = -(-count // columns)
+    figure, axes = new_figure(rows, columns, height=height * rows + 0.5, squeeze=False)
+    for panel in axes.flat[count:]:
+        panel.set_axis_off()
+    return figure, list(axes.flat[:count]), columns
+
+
+def figure_4_07(summary):
+    """Fraction of keypoints kept, relative to the baseline's mean number, against dilation width."""
+    masked = results.of_variant(summary, "masked")
+    kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack()
+    kept = kept.div(results.over_orders(results.of_variant(summary, "baseline"), "mean_keypoints")["mean"], axis=0)
+    figure, axes = new_figure(height=4.0)
+    _lines(axes, kept)
+    axes.set(xlabel="dilation width (pixels)", ylabel="fraction of keypoints kept", ylim=(0, None),
+             title="Keypoints kept by masks of increasing dilation width")
+    axes.axhline(1, color="#999999", linewidth=0.8, linestyle=":")
+    return figure
+
+
+def _lines(axes, table):
+    """One line a row of a table with one column a dilation width."""
+    for index, (name, row) in enumerate(table.iterrows()):
+        axes.plot(row.index, row, marker="o", markersize=2.5, label=name, **line_style(index))
+    axes.set_xticks(table.columns.astype(int))
+    axes.legend(title="sequence", loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def figure_against_width(summary, metric):
+    """Figures 4.9, 4.10: the metric against dilation width, one line a sequence, and one panel a sequence below with
+    the band of its repetitions and that of all keypoints."""
+    masked = results.of_variant(summary, "masked")
+    baseline = results.over_orders(results.of_variant(summary, "baseline"), metric)
+    names = sorted(masked["sequence"].unique())
+    columns = min(4, len(names))
+    rows = -(-len(names) // columns)
+    label = f"{metric.upper()} (m)"
+    figure, _ = new_figure(height=3.8 + 1.35 * rows)
+    figure.clear()
+    above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
+    axes = above.subplots()
+    _lines(axes, masked.groupby(["sequence", "dilation_width"])[metric].mean().unstack())
+    axes.set(xlabel="dilation width (pixels)", ylabel=label, ylim=(0, None),
+             title=f"{metric.upper()} against dilation width, means over repetitions")
+    panels = below.subplots(rows, columns, squeeze=False, sharex=True)
+    for panel, name in zip(panels.flat, names):
+        errors = results.over_orders(masked[masked["sequence"] == name], metric, by="dilation_width")
+        panel.fill_between(errors.index, errors["lowest"], errors["highest"], color=MASKED, alpha=0.25, linewidth=0)
+        panel.plot(errors.index, errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1, label="masked")
+        if name in baseline.index:
+            row = baseline.loc[name]
+            panel.axhspan(row["lowest"], row["highest"], color=BASELINE, alpha=0.2, linewidth=0)
+            panel.axhline(row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints")
+        panel.set_title(name, fontsize=8, pad=3)
+        panel.set_ylim(0, None)
+        panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        panel.tick_params(labelsize=7)
+    for panel in panels.flat[len(names):]:
+        panel.set_axis_off()
+    for panel in panels.flat[max(0, len(names) - columns):len(names)]:
+        panel.tick_params(labelbottom=True)
+        panel.set_xlabel("width (pixels)", fontsize=8)
+    for panel in panels[:, 0]:
+        panel.set_ylabel(label, fontsize=8)
+    below.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _compared(summary, metric):
+    """Mean, lowest and highest of the three variants of the thesis, {variant: table with one row a sequence}."""
+    rows = {"baseline": results.of_variant(summary, "baseline"), "masked": results.of_best_width(summary),
+            "reduced": results.of_variant(summary, "reduced")}
+    names = sorted(rows["baseline"]["sequence"].unique())
+    return names, {variant: results.over_orders(runs, metric).reindex(names) for variant, runs in rows.items()}
+
+
+def _bar(axes, position, table, width, variant):
+    text, color, hatch = VARIANTS[variant]
+    axes.set_axisbelow(True)
+    axes.bar(position, table["mean"], width, label=text, color=color, hatch=hatch, edgecolor="white", linewidth=0)
+    errors = np.array([table["mean"] - table["lowest"], table["highest"] - table["mean"]])
+    axes.errorbar(position, table["mean"], yerr=errors.reshape(2, -1), fmt="none", ecolor="black", elinewidth=0.9,
+                  capsize=2)
+
+
+def figure_comparison(summary, metric):
+    """Figures 4.13, 4.15: the metric of baseline, best mask and plainly reduced, all sequences."""
+    names, tables = _compared(summary, metric)
+    figure, axes = new_figure(height=3.2)
+    positions = np.arange(len(names))
+    for offset, (variant, table) in enumerate(tables.items()):
+        _bar(axes, positions + (offset - 1) * 0.27, table, 0.25, variant)
+    axes.set_xticks(positions, names)
+    axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
+    axes.grid(axis="x", visible=False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return figure
+
+
+def figure_breakdown(summary, metric):
+    """Figures 4.14, 4.16: the same, one panel a sequence with its own scale."""
+    names, tables = _compared(summary, metric)
+    figure, panels, columns = _panels(len(names), 1.7)
+    for panel, name in zip(panels, names):
+        for offset, (variant, table) in enumerate(tables.items()):
+            _bar(panel, offset, table.loc[name], 0.8, variant)
+        panel.set_title(name)
+        panel.set_xticks([])
+        panel.grid(axis="x", visible=False)
+    for panel in panels[::columns]:
+        panel.set_ylabel(f"{metric.upper()} (m)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def figure_controls(summary):
+    """Mean change of RMSE and MAE with masks of one width and with each control; one column of panels an estimator."""
+    table = results.controls(summary)
+    table = table[table["variant"] != "baseline"]
+    variants = [variant for variant in results.CONTROLS if variant in set(table["variant"])]
+    figure, axes = new_figure(2, 2, height=1.6 + 0.5 * len(variants), sharex="col", sharey=True)
+    for column, (pose, text) in enumerate(results.POSES.items()):
+        extreme = [0.0]
+        for panel, metric in zip(axes[:, column], ("rmse", "mae")):
+            changes = results.control_changes(summary, metric, pose)
+            panel.axvline(0, color="black", linewidth=0.8)
+            for row in table[table["pose"] == pose].to_dict("records"):
+                y, masked = variants.index(row["variant"]), row["variant"] == "masked"
+                color = MASKED if masked else BASELINE
+                values = changes[row["variant"]].dropna()
+                panel.plot(values, np.full(len(values), y - 0.24), "o", color="#555555", alpha=0.45, markersize=3.5,
+                           markeredgewidth=0)
+                panel.plot([row[f"{metric}_low"], row[f"{metric}_high"]], [y + 0.1] * 2, color=color, linewidth=2.4)
+                panel.plot(row[metric], y + 0.1, "D" if masked else "o", color=color, markersize=5.5,
+                           markeredgecolor="white")
+                extreme += list(values)
+            panel.set_title(f"{metric.upper()}, {text}")
+            panel.grid(axis="y", visible=False)
+        axes[1, column].set_xlabel("change from all keypoints (%)")
+        _percent_scale(axes[:, column], min(extreme), max(extreme))
+    axes[0, 0].set_yticks(range(len(variants)), [results.CONTROLS[variant] for variant in variants])
+    axes[0, 0].set_ylim(len(variants) - 0.5, -0.6)
+    figure.suptitle("Grey: sequences. Marker and bar: their mean and its "
+                    f"{results.LEVEL} % interval. Left of 0 is better than all keypoints.", fontsize=8)
+    return figure
+
+
+def _percent_scale(panels, lowest, highest):
+    """A scale of percent changes on which half and double are equally far from 0, where changes are that large."""
+    if highest <= 100:
+        return
+    low, high = (100 + max(lowest, -99)) / 115 - 1, (100 + highest) / 100 * 1.15 - 1
+    step = 2.0 if (1 + high) / (1 + low) < 16 else 4.0  # as many times the error from tick to tick
+    for panel in panels:
+        panel.set_xscale("function", functions=(lambda x: np.log1p(np.maximum(x, -99.9) / 100),
+                                                lambda x: 100 * np.expm1(x)))
+        panel.set_xlim(100 * low, 100 * high)
+        panel.xaxis.set_major_locator(FixedLocator(100 * (step ** np.arange(-2, 9) - 1)))
+        panel.xaxis.set_minor_locator(NullLocator())
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.0f}" if value else "0"))
+
+
+def time_savings(seconds):
+    """Equation 4.2 for each dilation width, from the table of `budget.time_runs`: percent by which the total
+    time of all sequences changes.
+
+    Negative where time is saved, as the thesis defines it. Mask making is included, prediction is not.
+    """
+    baseline = seconds[seconds["variant"] == "baseline"]["seconds"].sum()
+    masked = seconds[seconds["variant"] == "masked"].groupby("dilation_width")["seconds"].sum()
+    return percent_change(masked, baseline)
+
+
+def figure_4_17(seconds):
+    """Percent time savings of each dilation width (Equation 4.2)."""
+    savings = time_savings(seconds)
+    figure, axes = new_figure(height=3.0)
+    axes.bar(savings.index.astype(int), savings, color=MASKED)
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_xticks(savings.index.astype(int))
+    axes.set(xlabel="dilation width (pixels)", ylabel="change of total time (%)",
+             title="Time against all keypoints (negative: time saved)")
+    axes.grid(axis="x", visible=False)
+    return figure
+
+
+def figure_budget(measured, overlapped):
+    """Milliseconds a frame of every stage, from reading the frame to its pose, against KITTI's ten frames a second.
+
+    measured: variant, stage and milliseconds (`budget.measure`). overlapped: variant and milliseconds between frames
+    where the next frame is read and segmented beside the odometry of this one (`budget.measure_overlapped`).
+    """
+    variants = list(measured["variant"].unique())
+    figure, axes = new_figure(height=1.4 + 0.5 * len(variants))
+    axes.set_axisbelow(True)
+    left = dict.fromkeys(variants, 0.0)
+    for stage, (color, hatch) in STAGES.items():
+        rows = measured[measured["stage"] == stage].set_index("variant")["milliseconds"].reindex(variants).fillna(0)
+        axes.barh(variants, rows, 0.6, left=list(left.values()), label=stage, color=color, hatch=hatch,
+                  edgecolor="white", linewidth=0.5)
+        for variant in variants:
+            left[variant] += rows[variant]
+    between = overlapped.set_index("variant")["milliseconds"].reindex(variants)
+    axes.plot(between, range(len(variants)), "D", color="black", markeredgecolor="white", markersize=6,
+              linestyle="none", label="between frames, overlapped")
+    for place, variant in enumerate(variants):
+        end = np.nanmax([left[variant], between[variant] + 1])
+        axes.text(end, place, f"  {left[variant]:.0f} ms", va="center", ha="left", fontsize=8)
+    axes.axvline(FRAME_MS, color="black", linewidth=1, linestyle="--")
+    axes.text(FRAME_MS, -0.4, "10 frames a second ", ha="right", va="bottom", fontsize=8)
+    axes.set(xlim=(0, max(FRAME_MS, *left.values(), between.max()) * 1.12), xlabel="time a frame (ms)",
+             ylim=(len(variants) - 0.6, -0.65))
+    axes.grid(axis="y", visible=False)
+    handles = dict(zip(*reversed(axes.get_legend_handles_labels())))
+    labels = [*STAGES, "between frames, overlapped"]
+    figure.legend([handles[label] for label in labels], labels, loc="outside lower center", ncols=4)
+    return figure

@@ -1,0 +1,140 @@
+"""Tables 4.1 to 4.3 and those of the choice of width, the controls and the budget, for reading: few digits, units.
+
+`summary` is the table that `runner.run` returns; what is computed from it is in results.py.
+"""
+
+import numpy as np
+import pandas as pd
+
+from thesis_repro.study import results
+from thesis_repro.report.captions import REPORTED
+from thesis_repro.study.jobs import CONTROL_WIDTH
+from thesis_repro.study.results import best_widths
+
+SHORT = {"masked": f"width {CONTROL_WIDTH}", "exact-boundaries": "exact", "true-labels": "true",
+         "other-frame": "other frame", "mirrored": "mirrored", "random-lines": "random lines",
+         "image-edges": "image edges", "fewer": "fewer", "spread": "spread out"}  # the controls as columns
+INTERVAL = f"mean, {results.LEVEL} % interval"
+
+
+def table_4_1(summary, reported_as):
+    """Best dilation width and mean number of keypoints of each sequence, the thesis's numbers beside them."""
+    best = best_widths(summary)
+    reported = {row["sequence"]: row for row in REPORTED["table_4_1"]}
+    return pd.DataFrame({
+        "sequence": best.index,
+        "frames": best["frames"].to_numpy(),
+        "dilation width (pixels)": best["dilation_width"].astype(int).to_numpy(),
+        "mean keypoints": best["mean_keypoints"].round().astype(int).to_numpy(),
+        f"width, {reported_as}": [_reported(reported, name, "dilation_width") for name in best.index],
+        f"mean keypoints, {reported_as}": [_reported(reported, name, "mean_keypoints") for name in best.index],
+    })
+
+
+def _reported(reported, name, key):
+    return pd.NA if name not in reported else reported[name][key]
+
+
+def table_of_change(summary, metric, reported_as):
+    """Tables 4.2 and 4.3: percent change (Equation 4.1) of the metric from all keypoints to the best mask.
+
+    Beside the thesis's choice of width: one width for all, the width chosen on the other sequences, and the controls.
+    The thesis's "aggregate" is the sum of the sequences' percentages; mean, its interval and median stand beside it.
+    """
+    baseline = results.over_orders(results.of_variant(summary, "baseline"), metric)
+    masked = results.over_orders(results.of_best_width(summary), metric).reindex(baseline.index)
+    chosen = results.widths(summary).reindex(baseline.index)
+    key = {"rmse": "table_4_2_rmse_percent_change", "mae": "table_4_3_mae_percent_change"}[metric]
+    reported = pd.Series(REPORTED[key])
+    theirs = f"change (%), {reported_as}"
+    changes = pd.DataFrame({
+        "change (%)": chosen[f"best_{metric}"],
+        theirs: reported.reindex(baseline.index),
+        "one width for all (%)": chosen[f"fixed_{metric}"],
+        "left-out width (%)": chosen[f"left_out_{metric}"],
+        **{f"{SHORT[variant]} (%)": change
+           for variant, change in results.control_changes(summary, metric).items()},
+    })
+    label = metric.upper()
+    errors = pd.DataFrame({
+        f"{label}, all keypoints (m)": baseline["mean"].map(_significant),
+        "all keypoints, range": _ranges(baseline),
+        f"{label}, best mask (m)": masked["mean"].map(_significant),
+        "best mask, range": _ranges(masked),
+    }, index=baseline.index)
+    below = _below(changes.assign(**{theirs: np.nan}))
+    below[theirs] = _below(reported.to_frame()).to_numpy()[:, 0]  # of all that the thesis reports
+    table = pd.concat([errors.join(changes), below])[[*errors.columns, *changes.columns]]
+    digits = {name: 2 if name in ("change (%)", theirs) else 1 for name in changes}  # the thesis prints two
+    return table.round(digits).rename_axis("sequence").reset_index()
+
+
+def _below(changes):
+    """What stands below columns of percent changes, one row a sequence."""
+    few = "" if len(changes) >= results.FEWEST else " (too few sequences)"
+    intervals = [results.interval(changes[name]) for name in changes]
+    rows = {"sum (the thesis's aggregate)": changes.sum(min_count=1), "mean": changes.mean(),
+            f"{INTERVAL}, from{few}": [low for low, _ in intervals],
+            f"{INTERVAL}, to{few}": [high for _, high in intervals],
+            "median": changes.median(), "sequences improved": (changes < 0).sum().where(changes.notna().any())}
+    return pd.DataFrame({row: np.asarray(values, float) for row, values in rows.items()}, index=changes.columns).T
+
+
+def _significant(value):
+    return value if not np.isfinite(value) else float(f"{value:.3g}")
+
+
+def _ranges(table):
+    return [pd.NA if np.isnan(row.lowest) else f"{row.lowest:.3g} to {row.highest:.3g}" for row in table.itertuples()]
+
+
+def table_widths(summary):
+    """What the best, the left-out and the fixed width give, and how far the best is chance (`results.widths`)."""
+    table = results.widths(summary)
+    count = results.of_variant(summary, "masked")["dilation_width"].nunique()
+    names = {}
+    for choice, name in (("best", f"best of {count}"), ("left_out", "left-out"), ("fixed", "one for all")):
+        names |= {choice: f"{name}: width", f"{choice}_rmse": f"{name}: RMSE (%)", f"{choice}_mae": f"{name}: MAE (%)"}
+    names |= {"elsewhere": "best of one repetition, in the others: RMSE (%)",
+              "same_best": "best of one repetition is best in another (%)"}
+    table = table[list(names)].rename(columns=names)
+    changes = table.drop(columns=[names[choice] for choice in ("best", "left_out", "fixed")])
+    below = _below(changes).drop("sum (the thesis's aggregate)")
+    below.loc[below.index != "mean", names["same_best"]] = np.nan  # not a change
+    return pd.concat([table.astype(float), below])[list(table)].round(1).rename_axis("sequence").reset_index()
+
+
+def table_controls(summary):
+    """Masks of one width and every control under both estimators: mean changes from all keypoints, with intervals."""
+    table = results.controls(summary)
+    names = {"baseline": "all keypoints", **results.CONTROLS}
+    shown = pd.DataFrame({"estimator": table["pose"].map(results.POSES), "keypoints": table["variant"].map(names),
+                          "mean number": table["keypoints"].round().astype(int), "sequences": table["sequences"]})
+    for metric in ("rmse", "mae"):
+        label = metric.upper()
+        shown[f"{label} (%)"] = table[metric].round(1)
+        shown[f"{label}, {results.LEVEL} % interval"] = _between(table, f"{metric}_low", f"{metric}_high")
+        shown[f"{label}, repetitions"] = _between(table, f"{metric}_lowest", f"{metric}_highest")
+        shown[f"{label} improved"] = table[f"{metric}_improved"].astype("Int64")
+    shown["mask minus this, RMSE (points)"] = table["rmse_minus"].round(1)
+    shown["points, interval"] = _between(table, "rmse_minus_low", "rmse_minus_high")
+    return shown
+
+
+def _between(table, low, high):
+    return [pd.NA if np.isnan(one) else f"{one:+.1f} to {other:+.1f}" for one, other in zip(table[low], table[high])]
+
+
+def table_budget(measured, overlapped):
+    """Milliseconds a frame of each stage, one column a variant, and the frames a second that they allow.
+
+    measured: variant, stage and milliseconds (`budget.measure`). overlapped: variant and milliseconds between frames
+    where the next frame is read and segmented beside the odometry of this one (`budget.measure_overlapped`).
+    """
+    table = measured.pivot(index="stage", columns="variant", values="milliseconds")
+    table = table.loc[measured["stage"].unique(), measured["variant"].unique()]
+    total, between = table.sum(), overlapped.set_index("variant")["milliseconds"].reindex(table.columns)
+    below = pd.DataFrame({"all stages (ms)": total, "frames a second": 1000 / total,
+                          "between frames, overlapped (ms)": between, "frames a second, overlapped": 1000 / between}).T
+    table = pd.concat([table.round(2).rename(lambda stage: f"{stage} (ms)"), below.round(1)])
+    return table.rename_axis("stage", axis=0).rename_axis(None, axis=1).reset_index()

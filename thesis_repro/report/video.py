@@ -1,0 +1,160 @@
+"""Pictures of the odometry at work: keypoints kept and discarded, tracks, the mask's outline, the path so far."""
+
+import cv2
+import numpy as np
+
+from thesis_repro import InputError
+from thesis_repro.odometry import keypoints
+from thesis_repro.files import atomic, progress, write_png
+from thesis_repro.odometry import THESIS, Odometry, scales, start_pose
+
+# blue, green, red, as OpenCV draws; blue and orange can be told apart by most people
+KEPT, DISCARDED, OUTLINE = (255, 140, 30), (60, 60, 230), (0, 220, 255)
+INLIER, OUTLIER = (120, 220, 0), (0, 140, 255)
+TRUE, ESTIMATED, TEXT, PAPER = (90, 90, 90), (200, 80, 0), (40, 40, 40), (255, 255, 255)
+MAP_SHARE = 0.75  # height of the map below the frame, in heights of the frame
+
+
+def draw_frame(frame, step, settings=THESIS, mask=None):
+    """One frame (height, width) with what the step did on it: (height, width, 3) blue, green, red.
+
+    Points the detector takes, points the mask discards (found by detecting once more without it), the mask's outline,
+    and the way each tracked point came: inliers of the essential matrix and outliers.
+    """
+    image = cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR)
+    if mask is not None:
+        contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
+        cv2.drawContours(image, contours, -1, OUTLINE, 1)
+        everywhere = keypoints.detect(frame, settings)
+        columns, rows = np.rint(everywhere).astype(int).T
+        _dots(image, everywhere[mask[rows, columns] == 0], DISCARDED)
+    for chosen, color in ((~step.inliers, OUTLIER), (step.inliers, INLIER)):
+        lines = np.stack([step.previous[chosen], step.current[chosen]], axis=1)
+        cv2.polylines(image, list(np.rint(lines).astype(np.int32)), False, color, 1, cv2.LINE_AA)
+    if step.detected:
+        _dots(image, step.keypoints, KEPT)
+    return image
+
+
+def _dots(image, points, color):
+    for x, y in np.rint(points).astype(int).tolist():
+        cv2.circle(image, (x, y), 2, color, -1, cv2.LINE_AA)
+
+
+def draw_map(size, true, estimated, limits=None):
+    """The path from above, x to the right and z upwards: an image of size (height, width).
+
+    true, estimated: (n, 4, 4) poses, metres; the true path is drawn whole, the estimated one as far as it goes.
+    limits: ((x, z) least, (x, z) greatest) of what has to be seen; by default what the two paths cover.
+    """
+    height, width = size
+    image = np.full((height, width, 3), PAPER, np.uint8)
+    low, high = _limits(true, estimated) if limits is None else limits
+    margin = 14
+    metre = min((width - 2 * margin) / (high[0] - low[0]), (height - 2 * margin) / (high[1] - low[1]))
+    centre = (low + high) / 2
+
+    def pixels(poses):
+        xz = (poses[:, [0, 2], 3] - centre) * metre
+        return np.rint(np.stack([width / 2 + xz[:, 0], height / 2 - xz[:, 1]], axis=1)).astype(np.int32)
+
+    cv2.polylines(image, [pixels(true)], False, TRUE, 2, cv2.LINE_AA)
+    cv2.polylines(image, [pixels(estimated)], False, ESTIMATED, 2, cv2.LINE_AA)
+    cv2.circle(image, pixels(estimated)[-1].tolist(), 4, ESTIMATED, -1, cv2.LINE_AA)
+    bar = 10.0 ** np.floor(np.log10((width - 2 * margin) / metre / 2))
+    left = (margin, height - margin)
+    cv2.line(image, left, (round(margin + bar * metre), height - margin), TEXT, 2)
+    _write(image, f"{bar:g} m", (left[0], left[1] - 6), TEXT)
+    _write(image, "ground truth", (margin, 18), TRUE)
+    _write(image, "estimate", (margin, 36), ESTIMATED)
+    return image
+
+
+def _limits(*paths):
+    points = np.concatenate([path[:, [0, 2], 3] for path in paths])
+    low, high = points.min(axis=0), points.max(axis=0)
+    spread = np.maximum(high - low, max(1.0, 0.2 * (high - low).max()))  # a straight path is not a hairline
+    middle = (low + high) / 2
+    return middle - spread / 2, middle + spread / 2
+
+
+def _write(image, text, where, color):
+    cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, 1, cv2.LINE_AA)
+
+
+def pictures(sequence, settings=THESIS, masks=None, description=None):
+    """Run the odometry over a kitti.Sequence and yield one picture a frame, (h, w, 3) blue, green, red.
+
+    Above the frame, below it what happened in numbers and the path beside the true one, growing.
+    """
+    odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence))
+    # The true path starts at frame 1 for the errors; here both start where the odometry does.
+    true = sequence.poses.copy()
+    true[:, :3, 3] += odometry.pose[:3, 3] - true[0, :3, 3]
+    limits, metres, poses = _limits(true), scales(sequence), []
+    indices = range(len(sequence))
+    for index in indices if description is None else progress(indices, description):
+        frame, mask = sequence.frame(index), None if masks is None else masks[index]
+        step = odometry.step(frame, metres[index], mask)
+        poses.append(step.pose)
+        limits = tuple(pick(old, new) for pick, old, new in zip((np.minimum, np.maximum), limits,
+                                                                _limits(true, np.array(poses))))
+        upper = draw_frame(frame, step, settings, mask)
+        height, width = frame.shape
+        lower = draw_map((int(MAP_SHARE * height), width), true, np.array(poses), limits)
+        _describe(lower, step, true, mask is not None)
+        picture = np.vstack([upper, lower])
+        yield picture[:picture.shape[0] // 2 * 2, :picture.shape[1] // 2 * 2]  # video wants even sizes
+
+
+def _describe(image, step, true, masked):
+    row = step.row()
+    off = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
+    lines = [(f"frame {step.frame}", TEXT), (f"{off:.2f} m from the truth", TEXT)]
+    if step.detected is not None:
+        lines.append((f"{step.detected} keypoints" + " inside the mask" * masked, KEPT))
+    if masked:
+        lines.append(("keypoints the mask discards", DISCARDED))
+    if row["tracked"] is not None:
+        lines += [(f"{row['inliers']} tracks agree", (60, 150, 0)),
+                  (f"{row['tracked'] - row['inliers']} do not", OUTLIER)]
+    if row["flag"]:
+        lines.append((row["flag"], DISCARDED))
+    left = image.shape[1] - 275
+    for number, (text, color) in enumerate(lines):
+        _write(image, text, (left, 20 + 20 * number), color)
+
+
+def write_video(path, sequence, settings=THESIS, masks=None, description=None):
+    """Write `pictures` as a video at the sequence's own pace (its times, seconds); the file's name ends in .mp4.
+
+    Raises InputError for another ending.
+    """
+    if not str(path).endswith(".mp4"):
+        raise InputError(f"{path}: a video's name must end in .mp4")
+    pace = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 10.0
+    with atomic(path) as temporary:
+        writer = None
+        try:
+            for picture in pictures(sequence, settings, masks, description):
+                if writer is None:
+                    size = picture.shape[1], picture.shape[0]
+                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"mp4v"), float(pace), size)
+                    if not writer.isOpened():
+                        raise OSError(f"{path}: this OpenCV cannot write video")
+                writer.write(picture)
+        finally:
+            if writer is not None:
+                writer.release()
+
+
+def write_sheet(path, sequence, settings=THESIS, masks=None, count=4, description=None):
+    """Write a still of the video's `count` evenly spaced frames, one below the other in two columns."""
+    wanted = set(np.linspace(1 if len(sequence) > 1 else 0, len(sequence) - 1, count).round().astype(int).tolist())
+    chosen = [picture for index, picture in enumerate(pictures(sequence, settings, masks, description))
+              if index in wanted]
+    if len(chosen) % 2 and len(chosen) > 1:
+        chosen.append(np.full_like(chosen[0], PAPER))
+    columns = min(2, len(chosen))
+    rows = [np.hstack(chosen[start:start + columns]) for start in range(0, len(chosen), columns)]
+    write_png(path, np.vstack(rows))

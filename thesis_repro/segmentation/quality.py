@@ -1,0 +1,86 @@
+"""How good a model is on a set of images: by the library's scores, and by the Cityscapes benchmark's."""
+
+import os
+from dataclasses import dataclass
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
+import tensorflow as tf  # noqa: E402 - reads its variables on import
+
+from thesis_repro import InputError, files  # noqa: E402
+from thesis_repro.cityscapes import LABELS, N_CLASSES  # noqa: E402
+from thesis_repro.segmentation import memory, training  # noqa: E402
+
+# The ids that the Cityscapes benchmark evaluates; pixels of all others are left out of its confusion matrix.
+EVALUATED = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How good a model is on a set, by the library's measure and by that of the Cityscapes benchmark."""
+
+    iou_score: float  # segmentation-models: mean over 35 classes, absent ones scoring 1, then over batches as in Keras
+    f1_score: float
+    mean_iou: float  # Cityscapes: one confusion matrix over the set, mean over the classes present
+    accuracy: float  # share of evaluated pixels that are right
+    classes: pd.DataFrame  # a row for each class present: id, pixels, iou, precision, recall
+    confusion: np.ndarray  # (35, 35) pixels: true class, predicted class
+
+
+def quality(model, images, labels, batch_size=16):
+    """Measure a model on images (n, size, size, channels) and true label maps (n, size, size), both uint8.
+
+    The library's scores depend on the batch size, the others do not (Sections 3.3 and 4.1).
+    Raises InputError for an empty set or one of another shape than the model's.
+    """
+    if len(images) == 0:
+        raise InputError("quality: an empty set; it needs at least one image with its label map")
+    if images.shape[1:] != model.input_shape[1:] or images.shape[:3] != labels.shape:
+        raise InputError(f"quality: images {images.shape} and label maps {labels.shape}; the model takes "
+                         f"{model.input_shape[1:]} and one label map for each image")
+    memory.require(model, min(batch_size, len(images)))
+    scores = training.metrics()
+
+    @tf.function(reduce_retracing=True)
+    def run(some_images, some_labels):
+        probabilities = model(tf.cast(some_images, tf.float32), training=False)
+        true = tf.one_hot(some_labels, N_CLASSES)
+        predicted = tf.argmax(probabilities, axis=-1, output_type=tf.int32)
+        return [score(true, probabilities) for score in scores], predicted
+
+    batch_scores, confusion = [], np.zeros((N_CLASSES, N_CLASSES), np.int64)
+    for start in files.progress(range(0, len(images), batch_size), "measuring", unit="batch"):
+        true = labels[start:start + batch_size]
+        values, predicted = run(images[start:start + batch_size], true)
+        batch_scores.append([float(value) for value in values])
+        confusion += confusion_matrix(true, predicted.numpy())
+    mean_iou, accuracy, classes = cityscapes_scores(confusion)
+    return Quality(*np.mean(batch_scores, axis=0), mean_iou, accuracy, classes, confusion)
+
+
+def confusion_matrix(true, predicted):
+    """Pixels by true class (rows) and predicted class (columns); pixels without a true class are not counted."""
+    known = true < N_CLASSES
+    pairs = true[known].astype(np.int64) * N_CLASSES + predicted[known]
+    return np.bincount(pairs, minlength=N_CLASSES**2).reshape(N_CLASSES, N_CLASSES)
+
+
+def cityscapes_scores(confusion):
+    """Mean IoU, pixel accuracy and per-class table as the Cityscapes benchmark defines them.
+
+    Pixels whose true class it does not evaluate are left out. The mean is over the evaluated classes that are present
+    in the true label maps; a prediction of any other class counts against the class it should have been.
+    """
+    evaluated = np.zeros_like(confusion)
+    evaluated[EVALUATED, :] = confusion[EVALUATED, :]
+    right, true, predicted = np.diag(evaluated), evaluated.sum(1), evaluated.sum(0)
+    present = np.flatnonzero(true)
+    if not len(present):
+        raise InputError("quality: no pixel of a class that Cityscapes evaluates; are the label maps Cityscapes ids?")
+    table = pd.DataFrame({
+        "id": present, "pixels": true[present], "iou": right[present] / (true + predicted - right)[present],
+        "precision": right[present] / np.maximum(predicted[present], 1), "recall": right[present] / true[present],
+    }, index=pd.Index([LABELS[number].name for number in present], name="class"))
+    return float(table["iou"].mean()), float(right.sum() / true.sum()), table

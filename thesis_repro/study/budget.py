@@ -1,0 +1,191 @@
+"""What things cost: every dilation width as the thesis times it (Figure 4.17), and a frame from its file to its pose with
+the network included, as Section 5.2 asks.
+
+The second is done as a live system would: one frame after the other, the network on one image at a time, all cores.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import joblib
+import numpy as np
+import pandas as pd
+
+from thesis_repro import InputError, masks, odometry, stages
+from thesis_repro.files import progress, write_text
+from thesis_repro.kitti import Sequence
+from thesis_repro.study.jobs import CONTROL_WIDTH, Job
+from thesis_repro.study.runner import variants
+
+STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
+PLAIN, MASKED = "all keypoints", f"masked, width {CONTROL_WIDTH}"
+WARM_UP = 3  # frames that load compiled code and fill caches, not counted
+
+
+@contextmanager
+def opencv_threads(count: int) -> Iterator[None]:
+    """So many threads inside OpenCV's functions for a while; -1 for one a core."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(count)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+# Every width, without the network
+
+
+def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, frames: int,
+              processes: int = 1) -> pd.DataFrame:
+    """What each job costs as a run of its own: a table of sequence, run, variant, dilation_width and seconds.
+
+    Only the first `frames` frames are timed; the first two steps are left out, since they load compiled code. The jobs
+    of a sequence take turns at every frame, so that what else the machine does falls on all of them alike.
+    To be called after `runner.run`, whose folder it shares.
+    """
+    jobs = list(jobs)
+    files = {name: folder / name / f"seconds-{frames}.csv" for name in sorted({job.sequence for job in jobs})}
+    waiting = {name: [job for job in jobs if job.sequence == name] for name in files}
+    waiting = {name: of_name for name, of_name in waiting.items() if not files[name].is_file()
+               or not {job.name for job in of_name} <= set(pd.read_csv(files[name])["run"])}
+    work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")(
+        joblib.delayed(_time_jobs)(of_name, Sequence(kitti, name).subset(frames), labels, files[name])
+        for name, of_name in waiting.items())
+    for _ in progress(work, "timing", total=len(waiting), unit="sequence"):
+        pass
+    return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in files.values()], ignore_index=True)
+
+
+def _time_jobs(jobs: list[Job], sequence: Sequence, labels: Path, path: Path) -> None:
+    scales = odometry.scales(sequence)
+    runs, _ = variants(jobs, sequence, labels, odometry.THESIS)
+    followers = {job: odometry.Odometry(sequence.intrinsics, chosen) for job, (chosen, _) in runs.items()}
+    seconds = dict.fromkeys(runs, 0.0)
+    with opencv_threads(1):  # one thread makes times comparable
+        for index in range(len(sequence)):
+            frame = sequence.frame(index)
+            for job, (_, some_masks) in runs.items():
+                masks.forget_edges()  # each run of its own would have to make them
+                mask, masking = (None, 0.0) if some_masks is None else _timed(some_masks.__getitem__, index)
+                step = followers[job].step(frame, scales[index], mask)
+                if index > 1:
+                    # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
+                    seconds[job] += masking + sum(step.seconds.values())
+    table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "variant": job.variant,
+                           "dilation_width": job.dilation_width, "seconds": value} for job, value in seconds.items()],
+                         columns=["sequence", "run", "variant", "dilation_width", "seconds"])
+    write_text(path, table.to_csv(index=False))
+
+
+# A whole frame, with the network
+
+
+def measure(sequence: Sequence, model: Any, *, frames: int = 20) -> pd.DataFrame:
+    """Milliseconds a frame of every stage: a table of variant, stage and milliseconds, medians over `frames` frames.
+
+    Variants: "all keypoints", without network and mask, and "masked, width 10". Stages: read (decode the PNG),
+    segmentation (stretch to the model's input, network, class of every pixel), mask (label map to 320x320, edges,
+    dilation), detection, tracking, pose (essential matrix, then rotation and translation).
+    model: a Keras model of `segmentation`. The variants take turns at every frame.
+    Raises InputError for a sequence with too few frames.
+    """
+    sequence, metres = _start(sequence, frames)
+    runs = {name: odometry.Odometry(sequence.intrinsics) for name in (PLAIN, MASKED)}
+    rows = []
+    with opencv_threads(-1):
+        for index in progress(range(len(sequence)), "budget"):
+            frame, read = _timed(sequence.frame, index)
+            label_map, network = _timed(_segment, model, frame)
+            mask, masking = _timed(_mask, label_map, frame.shape)
+            for name, run in runs.items():
+                seconds = run.step(frame, metres[index], mask if name == MASKED else None).seconds
+                before = {"read": read, **({"segmentation": network, "mask": masking} if name == MASKED else {})}
+                if index >= WARM_UP:
+                    rows.append({"variant": name, **before, "detection": seconds["detect"],
+                                 "tracking": seconds["track"], "pose": seconds["essential"] + seconds["pose"]})
+    medians = 1000 * pd.DataFrame(rows).groupby("variant", sort=False)[list(STAGES)].median()
+    return medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds").dropna().reset_index()
+
+
+def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20) -> pd.DataFrame:
+    """Milliseconds between frames where reading, network and mask of the next frame go on beside the odometry of this.
+
+    A table of variant and milliseconds (medians). A frame's own way takes as long as before or longer; more frames a
+    second come through. Variants and arguments as in `measure`.
+    """
+    sequence, metres = _start(sequence, frames)
+    rows = []
+    with opencv_threads(-1), ThreadPoolExecutor(1) as pool:
+        for name in (PLAIN, MASKED):
+
+            def front(index: int, name: str = name) -> tuple[np.ndarray, np.ndarray | None]:
+                frame = sequence.frame(index)
+                return frame, _mask(_segment(model, frame), frame.shape) if name == MASKED else None
+
+            run, times = odometry.Odometry(sequence.intrinsics), []
+            waiting = pool.submit(front, 0)
+            for index in range(len(sequence)):
+                frame, mask = waiting.result()
+                if index + 1 < len(sequence):
+                    waiting = pool.submit(front, index + 1)
+                run.step(frame, metres[index], mask)
+                times.append(time.perf_counter())
+            rows.append({"variant": name, "milliseconds": 1000 * pd.Series(times).diff()[WARM_UP:].median()})
+    return pd.DataFrame(rows)
+
+
+def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """(`measure`, `measure_overlapped`) of the first frames with the model in a file, measured once and kept in folder.
+
+    Measured anew when the frames, the model or the code become others.
+    """
+    short = sequence.subset(frames + WARM_UP)
+    folder = stages.stage(folder, code=stages.code("odometry", "segmentation/prediction"), model=stages.content(model_file), opencv=cv2.__version__,
+                          frames=stages.listing(short.frame_paths))
+    files = {folder / "budget.csv": measure, folder / "overlapped.csv": measure_overlapped}
+    missing = {path: function for path, function in files.items() if not path.is_file()}
+    if missing:
+        from thesis_repro.segmentation import training  # here and below: TensorFlow takes seconds to load
+
+        model = training.load_model(model_file)
+    for path, function in missing.items():
+        write_text(path, function(short, model, frames=frames).to_csv(index=False))
+    measured, overlapped = (pd.read_csv(path) for path in files)
+    return measured, overlapped
+
+
+def _start(sequence: Sequence, frames: int) -> tuple[Sequence, np.ndarray]:
+    sequence = sequence.subset(frames + WARM_UP)
+    if len(sequence) < WARM_UP + 2:
+        raise InputError(f"sequence {sequence.name}: {len(sequence)} frames; the budget needs {WARM_UP + 2} or more")
+    return sequence, odometry.scales(sequence)
+
+
+def _timed(work: Callable, *arguments: Any) -> tuple[Any, float]:
+    started = time.perf_counter()
+    result = work(*arguments)
+    return result, time.perf_counter() - started
+
+
+def _segment(model: Any, frame: np.ndarray) -> np.ndarray:
+    from thesis_repro.segmentation import prediction
+
+    _, height, width, channels = model.input_shape
+    if channels == 3:
+        frame = cv2.cvtColor(frame, cv2.COLOR_GRAY2RGB)
+    image = cv2.resize(frame, (width, height)).reshape(height, width, channels)
+    return prediction.predict(model, image[None])[0]
+
+
+def _mask(label_map: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    from thesis_repro.segmentation import prediction
+
+    # the same as from a written label map, whose size is the thesis's whatever the model's is
+    label_map = cv2.resize(label_map, (prediction.SIZE,) * 2, interpolation=cv2.INTER_NEAREST)
+    return masks.keypoint_mask(label_map, size, CONTROL_WIDTH)

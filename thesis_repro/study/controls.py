@@ -1,0 +1,146 @@
+"""The controls: masks and settings that leave as many keypoints as the segmentation, but for another reason.
+
+If the odometry gains as much from them, it is not the segmentation that helps. Masks are indexed by frame number, like
+those of `masks`.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from thesis_repro import odometry
+from thesis_repro.odometry.keypoints import SharedKeypoints
+from thesis_repro.masks import LabelMasks, dilate
+
+LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
+CLOSE = 0.002  # of the frame: a difference of coverage that is none
+SAMPLE = 12  # frames on which a distance between keypoints is chosen
+STEP = 0.1  # pixels between the distances that are tried
+
+
+def true_labels(kitti, name):
+    """Where a sequence's true label maps are, if it has any (the embedded world's have)."""
+    return Path(kitti) / "sequences" / name / "labels_0"
+
+
+def masks(variant, labels, sequence, dilation_width):
+    """The masks of one of MASKS for a sequence whose predicted label maps are in the folder `labels`."""
+    return MASKS[variant](labels, sequence, dilation_width)
+
+
+class OtherFrame:
+    """The mask of the frame half a sequence away: as many boundaries, of the same kind, in the wrong place."""
+
+    def __init__(self, labels, sequence, dilation_width):
+        self.masks = LabelMasks(labels, sequence, dilation_width)
+        self.paths = self.masks.paths
+
+    def __len__(self):
+        return len(self.masks)
+
+    def __getitem__(self, index):
+        count = len(self)
+        return self.masks[(index + count // 2) % count]
+
+
+class Mirrored(OtherFrame):
+    """The frame's own mask, left and right exchanged: the layout of a street, but not of this one."""
+
+    def __getitem__(self, index):
+        return np.ascontiguousarray(self.masks[index][:, ::-1])
+
+
+class RandomLines(OtherFrame):
+    """Random segments, dilated as the boundaries are, as many as cover what the frame's mask covers."""
+
+    def __init__(self, labels, sequence, dilation_width, seed=0):
+        super().__init__(labels, sequence, dilation_width)
+        self.seed = seed
+
+    def __getitem__(self, index):
+        mask = self.masks[index]
+        wanted = np.count_nonzero(mask)
+        for number in (2**8, 2**11, 2**14):
+            first = self._first_segments(index, number, mask.shape)
+            covered = np.cumsum(np.bincount(first.ravel(), minlength=number + 1))[:number]
+            if covered[-1] >= wanted:
+                break
+        count = np.abs(np.concatenate([[0], covered]) - wanted).argmin()
+        return np.where(first < count, np.uint8(255), np.uint8(0))
+
+    def _first_segments(self, index, number, shape):
+        """The number of the first of the dilated segments that covers a pixel, `number` where none does."""
+        random = np.random.default_rng((self.seed, index))
+        height, width = shape
+        start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
+        length = length * height / 2
+        start = np.column_stack([start_x * width, start_y * height])
+        end = start + np.column_stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]) * length[:, None]
+        image = np.full(shape, number, np.uint16)
+        for segment in range(number - 1, -1, -1):
+            cv2.line(image, start[segment].astype(int).tolist(), end[segment].astype(int).tolist(), segment)
+        return cv2.erode(image, np.ones((self.masks.dilation_width,) * 2, np.uint8))  # the least number near a pixel
+
+
+class ImageEdges(OtherFrame):
+    """The strongest Canny edges of the frame itself, dilated, that cover what its mask covers: no network at all."""
+
+    def __init__(self, labels, sequence, dilation_width):
+        super().__init__(labels, sequence, dilation_width)
+        self.sequence = sequence
+
+    def __getitem__(self, index):
+        frame, wanted = self.sequence.frame(index), np.count_nonzero(self.masks[index])
+        across, down = cv2.spatialGradient(frame)
+        low, high = 1, LARGEST_GRADIENT  # thresholds that cover too much, and not enough
+        covered_low, covered_high = frame.size, 0
+        best, miss = np.zeros_like(frame), wanted
+        while high - low > 1 and miss > CLOSE * frame.size:
+            # interpolated, but never so near an end that the other one could stay for ever
+            share = np.clip((covered_low - wanted) / (covered_low - covered_high), 0.1, 0.9)
+            threshold = int(np.clip(low * (high / low) ** share, low + 1, high - 1))
+            mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), self.masks.dilation_width)
+            covered = cv2.countNonZero(mask)
+            if abs(covered - wanted) < miss:
+                best, miss = mask, abs(covered - wanted)
+            if covered > wanted:
+                low, covered_low = threshold, covered
+            else:
+                high, covered_high = threshold, covered
+        return best
+
+
+def _exact_boundaries(labels, sequence, dilation_width):
+    return LabelMasks(labels, sequence, dilation_width, boundaries="exact")
+
+
+def _true_labels(labels, sequence, dilation_width):
+    return LabelMasks(true_labels(sequence.root, sequence.name), sequence, dilation_width)
+
+
+MASKS = {"other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges,
+         "exact-boundaries": _exact_boundaries, "true-labels": _true_labels}
+
+
+def min_distance(sequence, number, settings=odometry.THESIS):
+    """The distance between keypoints, pixels, at which the detector finds `number` of them on average.
+
+    Looked for on SAMPLE frames of the sequence, never below the distance in `settings`.
+    """
+    chosen = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
+    frames = [(sequence.frame(index), SharedKeypoints()) for index in chosen]
+
+    def found(steps):
+        at = replace(settings, min_distance=round(settings.min_distance + steps * STEP, 6))
+        return np.mean([len(keypoints.detect(frame, at)) for frame, keypoints in frames])
+
+    low, high = 0, round(min(sequence.size) / STEP)
+    counts = {low: found(low)}
+    while high - low > 1:
+        middle = (low + high) // 2
+        counts[middle] = found(middle)
+        low, high = (middle, high) if counts[middle] > number else (low, middle)
+    best = min(counts, key=lambda steps: abs(counts[steps] - number))
+    return round(settings.min_distance + best * STEP, 6)

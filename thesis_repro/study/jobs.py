@@ -1,0 +1,144 @@
+"""The odometry runs behind chapter 4, as a plain list: every sequence with all keypoints, with masks of each width, and
+plainly reduced; and the controls, which ask whether it is the segmentation that helps.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pandas as pd
+
+from thesis_repro.kitti import Sequence
+from thesis_repro.masks import LabelMasks
+from thesis_repro.odometry.odometry import OdometrySettings
+from thesis_repro.odometry.passes import Masks
+from thesis_repro.study import controls
+
+CONTROL_WIDTH = 10  # pixels: the width of Section 3.6 and Figure 3.6, chosen before any run
+POSES = ("all", "refined")  # the thesis's estimator, and the one with the far smaller spread
+PIECES = 4  # passes for each of several workers, at the least
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of the odometry over one sequence. What is None or left out is as in the thesis.
+
+    variant: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
+    dilation_width: pixels, of masks. max_keypoints, min_distance: of the detector.
+    pose: "all" or "refined", see OdometrySettings.
+    repetition: 0 takes the correspondences in the order in which they come, which is the thesis's single run; any
+    other number is the seed that shuffles them.
+    """
+
+    sequence: str
+    variant: str
+    dilation_width: int | None = None
+    max_keypoints: int | None = None
+    min_distance: float | None = None
+    pose: str = "all"
+    repetition: int = 0
+
+    @property
+    def name(self) -> str:
+        """Unique in its sequence, and the stem of its file: masked-05-0, mirrored-10-refined-1, spread-7.5-0."""
+        width = None if self.dilation_width is None else f"{self.dilation_width:02d}"
+        distance = None if self.min_distance is None else f"{self.min_distance:g}"
+        pose = None if self.pose == "all" else self.pose
+        parts = (self.variant, width, self.max_keypoints, distance, pose, self.repetition)
+        return "-".join(str(part) for part in parts if part is not None)
+
+    def settings(self, settings: OdometrySettings) -> OdometrySettings:
+        """What the odometry does in this job, where `settings` are those of all."""
+        changes = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
+                   "permute": self.repetition or None, "pose": self.pose}
+        return replace(settings, **{name: value for name, value in changes.items() if value is not None})
+
+    def masks(self, sequence: Sequence, labels: Path) -> Masks | None:
+        """Its masks, where the folder `labels` holds a folder of label maps a sequence; None for all keypoints."""
+        if self.variant == "masked":
+            return LabelMasks(labels / self.sequence, sequence, self.dilation_width)
+        if self.variant in controls.MASKS:
+            return controls.masks(self.variant, labels / self.sequence, sequence, self.dilation_width)
+        return None
+
+
+def first_jobs(names: Iterable[str], widths: Iterable[int], repetitions: int = 1) -> list[Job]:
+    """The thesis's runs that depend on no other: baseline and masks of every width, for each sequence."""
+    variants = [("baseline", None), *(("masked", width) for width in widths)]
+    return [Job(name, variant, width, repetition=repetition) for name in names for variant, width in variants
+            for repetition in range(repetitions)]
+
+
+def mask_control_jobs(kitti: Path, names: Iterable[str], repetitions: int = 1) -> list[Job]:
+    """The controls that depend on no other run, under both estimators; baseline and masks under the refined one.
+
+    The true label maps take part where a sequence has them, in a folder labels_0 beside its frames.
+    """
+    jobs = []
+    for name in names:
+        jobs += [Job(name, variant, width, pose="refined", repetition=repetition)
+                 for variant, width in (("baseline", None), ("masked", CONTROL_WIDTH))
+                 for repetition in range(repetitions)]
+        jobs += [Job(name, variant, CONTROL_WIDTH, pose=pose, repetition=repetition)
+                 for variant in controls.MASKS
+                 if variant != "true-labels" or controls.true_labels(kitti, name).is_dir()
+                 for pose in POSES for repetition in range(repetitions)]
+    return jobs
+
+
+def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
+    """The detector limited to each sequence's mean number of keypoints at its best width (Figure 4.12).
+
+    best: the table of `results.best_widths`.
+    """
+    return [Job(name, "reduced", max_keypoints=_whole(number), repetition=repetition)
+            for name, number in best["mean_keypoints"].items() for repetition in range(repetitions)]
+
+
+def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: int | None = None,
+                          repetitions: int = 1) -> list[Job]:
+    """As many keypoints as masks leave, {sequence: number}, without a mask: the strongest, or spread out.
+
+    "fewer" limits their number; "spread" keeps them farther apart.
+    """
+    jobs = []
+    for name, number in keypoints.items():
+        distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
+        jobs += [Job(name, variant, pose=pose, repetition=repetition, **setting)
+                 for variant, setting in (("fewer", {"max_keypoints": _whole(number)}),
+                                          ("spread", {"min_distance": distance}))
+                 for pose in POSES for repetition in range(repetitions)]
+    return jobs
+
+
+def _whole(number: float) -> int:
+    return max(1, round(number))  # 0 would lift the detector's limit
+
+
+def in_passes(jobs: Iterable[Job], frames: Mapping[str, int], workers: int) -> list[list[Job]]:
+    """Jobs cut into lists for one pass over a sequence each, the longest first; frames: of each sequence.
+
+    A pass is at most 1 / PIECES of a worker's share, so that no worker is alone at the end; jobs with the same
+    keypoints stay together, since they share most. A worker on its own takes each sequence whole.
+    """
+    groups: dict[str, dict[Job, list[Job]]] = {name: {} for name in frames}
+    for job in jobs:
+        groups[job.sequence].setdefault(replace(job, pose="", repetition=0), []).append(job)
+    everything = sum(len(groups[name]) * frames[name] for name in frames)
+    passes = []
+    for name, of_name in groups.items():
+        share = len(of_name) * frames[name] / max(everything, 1)
+        pieces = min(len(of_name), math.ceil(share * (PIECES * workers if workers > 1 else 1)))
+        passes += [[job for group in some for job in group] for some in _cut(list(of_name.values()), pieces)]
+    return longest_first(passes, frames)
+
+
+def longest_first(passes: list[list[Job]], frames: Mapping[str, int]) -> list[list[Job]]:
+    """The passes in the order in which they are to be started."""
+    return sorted(passes, key=lambda jobs: -len(jobs) * frames[jobs[0].sequence])
+
+
+def _cut(some: list, pieces: int) -> Iterator[list]:
+    for index in range(pieces):
+        yield some[index * len(some) // pieces:(index + 1) * len(some) // pieces]

@@ -1,0 +1,225 @@
+"""What the odometry runs of chapter 4 amount to: tables in, tables out.
+
+`summary` is the table that `runner.run` returns: one row a run, with sequence, variant, dilation_width, pose,
+repetition, rmse and mae in metres, mean_keypoints. A change is always Equation 4.1, in percent, of means over the
+repetitions, from all keypoints under the same pose; negative is better.
+"""
+
+import numpy as np
+import pandas as pd
+
+from thesis_repro.odometry.metrics import percent_change
+from thesis_repro.study.jobs import CONTROL_WIDTH
+
+POSES = {"all": "thesis's estimator", "refined": "refined estimator"}
+CONTROLS = {  # what the runs at one width are called, in the order in which they are shown
+    "masked": "segmentation mask",
+    "exact-boundaries": "exact class boundaries",
+    "true-labels": "true label maps",
+    "other-frame": "mask of another frame",
+    "mirrored": "mirrored mask",
+    "random-lines": "random lines",
+    "image-edges": "edges of the image",
+    "fewer": "fewer keypoints",
+    "spread": "keypoints spread out",
+}
+FEWEST = 3  # sequences for an interval
+LEVEL = 95  # percent
+DRAWS = 10_000
+
+
+def of_variant(summary, variant, pose="all", width=None):
+    """The rows of one variant under one pose, of one dilation width where it is given."""
+    rows = summary[(summary["variant"] == variant) & (summary["pose"] == pose)]
+    return rows if width is None else rows[rows["dilation_width"] == width]
+
+
+def of_best_width(summary):
+    """The thesis's masked runs: the rows of each sequence's best width (`best_widths`)."""
+    rows = of_variant(summary, "masked")
+    best = best_widths(summary)["dilation_width"]
+    return rows[rows["dilation_width"] == rows["sequence"].map(best)]
+
+
+def over_orders(rows, column, by="sequence"):
+    """Mean, lowest and highest of a column over the repetitions: a table with one row for each value of `by`."""
+    return rows.groupby(by)[column].agg(["mean", "min", "max"]).set_axis(["mean", "lowest", "highest"], axis=1)
+
+
+def interval(changes, draws=DRAWS, seed=0):
+    """Bootstrap interval (low, high) of the mean of one value a sequence, whole sequences being drawn anew.
+
+    The values are changes or differences within a sequence, so the comparison is paired. NaN values are left out.
+    (NaN, NaN) for fewer than three sequences, where drawing anew says nothing.
+    """
+    values = np.asarray(changes, float)
+    values = values[~np.isnan(values)]
+    if len(values) < FEWEST:
+        return np.nan, np.nan
+    drawn = np.random.default_rng(seed).integers(0, len(values), (draws, len(values)))
+    low, high = np.percentile(values[drawn].mean(axis=1), [(100 - LEVEL) / 2, (100 + LEVEL) / 2])
+    return float(low), float(high)
+
+
+# The choice of width
+
+
+def best_widths(summary):
+    """The width with the lowest RMSE of each sequence, as the thesis chooses it (Section 4.2), and its means.
+
+    One row a sequence: dilation_width, frames, rmse, mae, mean_keypoints, means over the repetitions.
+    The width is chosen by its error on the very sequence it is then judged on: a best of 15, not a test.
+    """
+    masked = of_variant(summary, "masked")
+    means = masked.groupby(["sequence", "dilation_width"])[["frames", "rmse", "mae", "mean_keypoints"]].mean()
+    best = means.loc[means.groupby("sequence")["rmse"].idxmin()].reset_index("dilation_width")
+    return best.astype({"dilation_width": int, "frames": int}).sort_index()
+
+
+def width_changes(summary, metric):
+    """Change of the metric (%) with masks: one row a sequence, one column a dilation width."""
+    masked = of_variant(summary, "masked").groupby(["sequence", "dilation_width"])[metric].mean().unstack()
+    return percent_change(masked.T, _baseline(summary, metric)).T.reindex(masked.index)
+
+
+def _baseline(summary, metric, pose="all"):
+    return of_variant(summary, "baseline", pose).groupby("sequence")[metric].mean()
+
+
+def chosen_widths(summary):
+    """The dilation width of each sequence, chosen in three ways, always by RMSE as the thesis does.
+
+    best: the lowest error on the sequence itself (Section 4.2). fixed: the lowest mean change over all sequences.
+    left_out: the lowest mean change over the other sequences, so that no sequence judges a width that it chose;
+    missing where there is no other. The choices hang together, so that `interval` of what they give is too narrow:
+    where masks do nothing, it excludes zero in one of three studies of eleven sequences and fifteen widths.
+    """
+    changes = width_changes(summary, "rmse")
+    return pd.DataFrame({
+        "best": best_widths(summary)["dilation_width"].reindex(changes.index),
+        "left_out": [_lowest(changes.drop(index=name)) for name in changes.index],
+        "fixed": _lowest(changes),
+    }, index=changes.index).astype("Int64")
+
+
+def _lowest(changes):
+    """The width with the lowest mean change; only widths that every sequence has are compared."""
+    changes = changes.dropna(how="all").dropna(axis=1)
+    return changes.mean().idxmin() if changes.size else pd.NA
+
+
+def widths(summary):
+    """What each choice of width gives: one row a sequence.
+
+    Columns best, left_out, fixed (widths); the changes of both metrics at each, such as left_out_rmse; and how far
+    the best width is chance (`stability`): same_best, elsewhere.
+    """
+    chosen = chosen_widths(summary)
+    table = chosen.copy()
+    for metric in ("rmse", "mae"):
+        changes = width_changes(summary, metric)
+        for choice in chosen:
+            table[f"{choice}_{metric}"] = [np.nan if pd.isna(width) else changes.loc[name, width]
+                                           for name, width in chosen[choice].items()]
+    return table.join(stability(summary))
+
+
+def stability(summary):
+    """Whether the width that is best in one repetition is so in another: one row a sequence.
+
+    same_best: percent of the pairs of repetitions that agree on the best width.
+    elsewhere: the change of RMSE (%) in the other repetitions with the width that is best in one, on average.
+    NaN with one repetition.
+    """
+    baseline, rows = _baseline(summary, "rmse"), {}
+    for name, runs in of_variant(summary, "masked").groupby("sequence"):
+        errors = runs.pivot(index="repetition", columns="dilation_width", values="rmse").dropna(axis=1)
+        count = len(errors)
+        if count < 2 or errors.empty:
+            rows[name] = (np.nan, np.nan)
+            continue
+        best = errors.to_numpy().argmin(axis=1)
+        agreeing = (best[:, None] == best).sum() - count
+        others = ((errors.sum() - errors) / (count - 1)).to_numpy()
+        rows[name] = (agreeing / (count * (count - 1)) * 100,
+                      percent_change(others[np.arange(count), best].mean(), baseline.get(name, np.nan)))
+    return pd.DataFrame.from_dict(rows, orient="index", columns=["same_best", "elsewhere"])
+
+
+# The controls
+
+
+def keypoints_left(summary):
+    """The mean number of keypoints that masks of CONTROL_WIDTH leave, by sequence."""
+    rows = summary[(summary["variant"] == "masked") & (summary["dilation_width"] == CONTROL_WIDTH)]
+    return rows.groupby("sequence")["mean_keypoints"].mean()
+
+
+def of_control(summary, variant, pose="all"):
+    """The rows of one variant of the comparison: masked runs of the controls' width, all rows of any other."""
+    return of_variant(summary, variant, pose, CONTROL_WIDTH if variant == "masked" else None)
+
+
+def control_changes(summary, metric, pose="all"):
+    """Change of the metric (%) with masks of the controls' width and with each control that was run.
+
+    One row a sequence, one column a variant in the order of CONTROLS.
+    """
+    baseline = _baseline(summary, metric, pose)
+    columns = {}
+    for variant in CONTROLS:
+        rows = of_control(summary, variant, pose)
+        if len(rows):
+            columns[variant] = percent_change(rows.groupby("sequence")[metric].mean(), baseline)
+    return pd.DataFrame(columns, index=baseline.index, dtype=float).dropna(axis=1, how="all")
+
+
+def controls(summary):
+    """One row for each pose and variant, all keypoints first: means over sequences of the changes (%).
+
+    Columns pose, variant, sequences, keypoints; rmse, rmse_low, rmse_high (mean and interval); rmse_improved (number
+    of sequences); rmse_lowest, rmse_highest (of the repetitions, each a mean over sequences); rmse_minus,
+    rmse_minus_low, rmse_minus_high (the change with masks minus that of the variant, in percentage points, and its
+    interval); the same for mae.
+    """
+    rows = []
+    for pose in POSES:
+        changes = {metric: control_changes(summary, metric, pose) for metric in ("rmse", "mae")}
+        for variant in ("baseline", *changes["rmse"]):
+            runs = of_control(summary, variant, pose)
+            if not len(runs):
+                continue
+            row = {"pose": pose, "variant": variant, "sequences": runs["sequence"].nunique(),
+                   "keypoints": runs.groupby("sequence")["mean_keypoints"].mean().mean()}
+            for metric, table in changes.items():
+                row |= _row(runs, metric, table, variant, _baseline(summary, metric, pose))
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _row(runs, metric, changes, variant, baseline):
+    repeated = runs.assign(change=percent_change(runs[metric], runs["sequence"].map(baseline)))
+    repeated = repeated.groupby("repetition")["change"].mean()
+    row = {f"{metric}_lowest": repeated.min(), f"{metric}_highest": repeated.max()}
+    own = changes[variant] if variant in changes else pd.Series(0.0, changes.index)
+    row[metric] = own.mean()
+    if variant != "baseline":
+        row[f"{metric}_low"], row[f"{metric}_high"] = interval(own)
+        row[f"{metric}_improved"] = int((own < 0).sum())
+    if variant != "masked" and "masked" in changes:
+        minus = changes["masked"] - own
+        row[f"{metric}_minus"] = minus.mean()
+        row[f"{metric}_minus_low"], row[f"{metric}_minus_high"] = interval(minus)
+    return row
+
+
+def apart(one, other, metric="rmse"):
+    """Sequences in which every repetition of one variant has a lower error than every one of the other.
+
+    one, other: rows of two variants. Returns (names where one is lower, names where it is higher).
+    """
+    one, other = over_orders(one, metric), over_orders(other, metric)
+    names = one.index.intersection(other.index)
+    lower = one.loc[names, "highest"] < other.loc[names, "lowest"]
+    higher = one.loc[names, "lowest"] > other.loc[names, "highest"]
+    return list(names[lower]), list(names[higher])

@@ -1,0 +1,208 @@
+"""What stands and drives in the streets of the embedded world: buildings, vehicles, signs and lamps as faces."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesis_repro.world import render
+from thesis_repro.cityscapes import ID
+from thesis_repro.world.sprites import PROFILES, WIDTHS
+from thesis_repro.world.surfaces import FACADE_TILE, FACADES, SHOP_TILE, TILE
+
+
+class Faces:
+    """Rows of the face matrix in the making. Rectangles are seen from outside: s to the right, t up."""
+
+    def __init__(self, names):
+        self.names, self.rows = names, []
+
+    def add(self, corner, edge_s, edge_t, texture, label, repeats=(1.0, 1.0), uv=None, gain=1.0, triangle=0, ground=0,
+            casts=1, lit=1):
+        uv = uv or (0.0, repeats[0], 0.0, 1.0, 0.0, -repeats[1])
+        self.rows.append((*corner, *edge_s, *edge_t, *uv, self.names[texture], ID[label], gain, triangle, ground,
+                          casts, lit))
+
+    def box(self, x, y, z, texture, label, metres=1.0, gain=1.0, casts=1, top=None, front=None):
+        """An upright box between (low, high) of each axis; y low is the top. `metres` covers one repeat."""
+        (x0, x1), (top_y, bottom), (z0, z1) = x, y, z
+        w, h, l = x1 - x0, bottom - top_y, z1 - z0
+        up = (0, -h, 0)
+        settings = {"gain": gain, "casts": casts}
+        across, along = (w / metres, h / metres), (l / metres, h / metres)
+        if front:
+            self.add((x0, bottom, z0), (w, 0, 0), up, front, label, (1, 1), **settings)
+        else:
+            self.add((x0, bottom, z0), (w, 0, 0), up, texture, label, across, **settings)
+        self.add((x1, bottom, z1), (-w, 0, 0), up, texture, label, across, **settings)
+        self.add((x1, bottom, z0), (0, 0, l), up, texture, label, along, **settings)
+        self.add((x0, bottom, z1), (0, 0, -l), up, texture, label, along, **settings)
+        self.add((x0, top_y, z0), (w, 0, 0), (0, 0, l), top or texture, label, (w / metres, l / metres), **settings)
+
+    def matrix(self):
+        return np.array(self.rows, np.float64).reshape(-1, render.COLUMNS)
+
+
+def place(faces, x, z, yaw, y=0.0):
+    """Turn local faces by yaw (right positive) and move them to (x, y, z)."""
+    placed = faces.copy()
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    for start in (render.CORNER, render.EDGE_S, render.EDGE_T):
+        local_x, local_z = faces[:, start], faces[:, start + 2]
+        placed[:, start] = cosine * local_x + sine * local_z
+        placed[:, start + 2] = cosine * local_z - sine * local_x
+    placed[:, render.CORNER] += x
+    placed[:, render.CORNER + 1] += y
+    placed[:, render.CORNER + 2] += z
+    return placed
+
+
+_BODY = {"sedan": "FFPGPGPRR", "hatch": "FFPGPGRR", "estate": "FFPGPGRR", "van": "FFPGPGR", "truck": "FPGPPPPP",
+         "bus": "FPGPPPR"}
+_LABEL_OF = {"truck": "truck", "bus": "bus"}
+
+
+def vehicle(names, kind, paint):
+    """A vehicle that stands on the ground and looks along z, its middle at the origin.
+
+    The side view is cut out of two panels a side, the upper one leaning in; the skin between them follows its profile.
+    """
+    faces = Faces(names)
+    label = _LABEL_OF.get(kind, "car")
+    profile = np.array(PROFILES[kind])
+    length, top, half = profile[:, 0].max(), profile[:, 1].max() + 0.04, WIDTHS[kind] / 2
+    belt, lean = (0.96, 0.28) if label == "car" and kind != "van" else (1.2, 0.06)
+
+    def half_at(y):
+        return half - lean * max(0.0, y - belt)
+
+    side, split, z0 = f"{kind}{paint}", belt / top, -length / 2
+    inward = lean * (top - belt)
+    for sign in (1, -1):
+        z, s = (z0, length) if sign > 0 else (-z0, -length)
+        u = (0.0, 1.0) if sign > 0 else (1.0, -1.0)
+        faces.add((sign * half, 0, z), (0, 0, s), (0, -belt, 0), side, label, uv=(*u, 0, 1, 0, -split))
+        faces.add((sign * half, -belt, z), (0, 0, s), (-sign * inward, belt - top, 0), side, label,
+                  uv=(*u, 0, 1 - split, 0, split - 1))
+    body = _BODY[kind]
+    for index, material in enumerate(body):
+        (za, ya), (zb, yb) = profile[index], profile[index + 1]  # from front to rear over the roof
+        texture = {"F": f"front{paint}", "R": f"rear{paint}", "G": "glass", "P": f"paint{paint}"}[material]
+        v_top, v_bottom = 0.0, 1.0
+        if material in "FR" and body.count(material) == 2:  # one picture over two parts
+            upper = (material == "F") == (index > 0 and body[index - 1] == material)
+            v_top, v_bottom = (0.0, 0.5) if upper else (0.5, 1.0)
+        wa, wb = half_at(ya), half_at(yb)
+        va, vb = (v_bottom, v_top) if ya < yb else (v_top, v_bottom)
+        first = np.array((-wb, -yb, zb + z0))
+        faces.add(first, (2 * wb, 0, 0), np.array((-wa, -ya, za + z0)) - first, texture, label, triangle=1,
+                  uv=(0, 1, 0, vb, 0, va - vb))
+        second = np.array((wa, -ya, za + z0))
+        faces.add(second, (-2 * wa, 0, 0), np.array((wb, -yb, zb + z0)) - second, texture, label, triangle=1,
+                  uv=(1, -1, 0, va, 0, vb - va))
+    faces.add((-half, -0.32, z0), (2 * half, 0, 0), (0, 0, length), "bin", label, lit=0, gain=0.3)  # underside
+    return faces.matrix()
+
+
+def cut_out(names, texture, label, width, height, crossed=False, gain=1.0, base=0.0):
+    """An upright picture in front view, or two that cross."""
+    faces = Faces(names)
+    faces.add((-width / 2, -base, 0), (width, 0, 0), (0, -height, 0), texture, label, lit=0, gain=gain)
+    if crossed:
+        faces.add((0, -base, -width / 2), (0, 0, width), (0, -height, 0), texture, label, lit=0, gain=gain)
+    return faces.matrix()
+
+
+def cyclist(names):
+    faces = Faces(names)
+    faces.add((0, 0, -0.9), (0, 0, 1.8), (0, -1.05, 0), "bicycle", "bicycle", lit=0)
+    faces.add((0.02, -0.42, -0.62), (0, 0, 1.25), (0, -1.3, 0), "rider", "rider", lit=0)
+    return faces.matrix()
+
+
+def lamp(names, height, arm):
+    faces = Faces(names)
+    faces.box((-0.07, 0.07), (-height, 0), (-0.07, 0.07), "metal", "pole", 2.0)
+    faces.box((0, arm), (-height, -height + 0.09), (-0.05, 0.05), "metal", "pole", 2.0)
+    faces.box((arm, arm + 0.7), (-height - 0.05, -height + 0.12), (-0.14, 0.14), "metal", "pole", 2.0, gain=1.3)
+    return faces.matrix()
+
+
+def sign(names, kind, size, height, half_pole=0.035):
+    faces = Faces(names)
+    faces.box((-half_pole, half_pole), (-height - size / 2, 0), (0.01, 0.01 + 2 * half_pole), "metal", "pole", 2.0)
+    faces.add((-size / 2, -height, 0), (size, 0, 0), (0, -size, 0), f"sign{kind}", "traffic sign", lit=0, gain=1.05)
+    faces.add((size / 2, -height, 0.005), (-size, 0, 0), (0, -size, 0), f"back{kind}", "traffic sign", lit=0)
+    return faces.matrix()
+
+
+def traffic_light(names):
+    faces = Faces(names)
+    faces.box((-0.06, 0.06), (-2.4, 0), (0.02, 0.14), "metal", "pole", 2.0)
+    faces.box((-0.19, 0.19), (-3.3, -2.35), (-0.1, 0.15), "bin", "traffic light", 0.5, front="light")
+    return faces.matrix()
+
+
+def building(names, rng, width, depth, floors, pitched):
+    """A house whose front stands at z = 0 and looks at -z; the walls take whole bays of a facade."""
+    faces = Faces(names)
+    kind = int(rng.integers(0, FACADES))
+    ground, height = 3.5, 3.5 + 3.0 * floors
+    gain = rng.uniform(0.85, 1.12)
+    start, shop = rng.integers(0, 4) / 4.0, rng.integers(0, 4) / 4.0
+    for corner, edge, length in (((-width / 2, 0), (1, 0), width), ((width / 2, depth), (-1, 0), width),
+                                 ((width / 2, 0), (0, 1), depth), ((-width / 2, depth), (0, -1), depth)):
+        edge_s = (edge[0] * length, 0, edge[1] * length)
+        bays = max(1, round(length / (FACADE_TILE[0] / 4))) / 4
+        faces.add((corner[0], 0, corner[1]), edge_s, (0, -ground, 0), f"shop{kind}", "building",
+                  uv=(shop, bays, 0, 1, 0, -ground / SHOP_TILE[1]), gain=gain)
+        faces.add((corner[0], -ground, corner[1]), edge_s, (0, ground - height, 0), f"facade{kind}", "building",
+                  uv=(start, bays, 0, 1, 0, -floors / 2), gain=gain)
+    if pitched:
+        rise, over = depth * rng.uniform(0.3, 0.5), 0.4
+        lift = over * rise / (depth / 2)
+        ridge = (0, -rise - lift, depth / 2 + over)
+        across = width + 2 * over
+        tiles = (across / TILE["roof"][0], np.hypot(rise, depth / 2) / TILE["roof"][1])
+        faces.add((-width / 2 - over, -height + lift, -over), (across, 0, 0), ridge, "roof", "building", tiles)
+        faces.add((width / 2 + over, -height + lift, depth + over), (-across, 0, 0), (0, ridge[1], -ridge[2]), "roof",
+                  "building", tiles)
+        for x, z0, z1 in ((width / 2, 0, depth), (-width / 2, depth, 0)):
+            faces.add((x, -height, z0), (0, 0, z1 - z0), (0, -rise, (z1 - z0) / 2), f"facade{kind}", "building",
+                      uv=(0, 0.3, 0.15, 0.1, 0, -0.08), triangle=1, gain=gain)
+        chimney = rng.uniform(-0.3, 0.3) * width
+        faces.box((chimney - 0.35, chimney + 0.35), (-height - rise - 0.9, -height - rise * 0.6),
+                  (depth / 2 + 0.3, depth / 2 + 1.0), "stone", "building", 3.0, gain=0.8)
+    else:
+        faces.box((-width / 2 - 0.15, width / 2 + 0.15), (-height - 0.5, -height), (-0.15, depth + 0.15), "concrete",
+                  "building", 8.0, gain=gain * 0.8)
+    return faces.matrix()
+
+@dataclass
+class Footprint:
+    """The ground plan of a building: middle of its front, yaw, half its width and its depth."""
+
+    x: float
+    z: float
+    yaw: float
+    half: float
+    depth: float
+
+    def near(self, x, z):
+        return (x - self.x) ** 2 + (z - self.z) ** 2 < (self.half + self.depth + 1.0) ** 2
+
+    def points(self):
+        across, along = np.meshgrid(np.linspace(-self.half, self.half, 7), np.linspace(0.0, self.depth, 5))
+        across, along = across.ravel(), along.ravel()
+        return (self.x + np.cos(self.yaw) * across + np.sin(self.yaw) * along,
+                self.z - np.sin(self.yaw) * across + np.cos(self.yaw) * along)
+
+    def covers(self, x, z, margin=-0.3):
+        dx, dz = x - self.x, z - self.z
+        across = np.cos(self.yaw) * dx - np.sin(self.yaw) * dz
+        along = np.sin(self.yaw) * dx + np.cos(self.yaw) * dz
+        return bool(np.any((np.abs(across) < self.half + margin) & (along > -margin) & (along < self.depth + margin)))
+
+    def overlaps(self, other):
+        if np.hypot(self.x - other.x, self.z - other.z) > 45:
+            return False
+        return self.covers(*other.points()) or other.covers(*self.points())
