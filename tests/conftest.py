@@ -42,8 +42,8 @@ def reference():
 @pytest.fixture(scope="session")
 def small_world(tmp_path_factory):
     """A small embedded world: two sequences of 12 frames and a few street images."""
-    from thesis_repro.world import dataset
     from thesis_repro.settings import PROFILES
+    from thesis_repro.world import dataset
 
     folder = tmp_path_factory.mktemp("world")
     dataset.write(folder / "world", **PROFILES["smoke"].world, seed=0)

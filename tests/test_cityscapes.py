@@ -16,7 +16,8 @@ def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
     flat = cityscapes.pairs(tiny_cityscapes, "train")
     official = tmp_path / "official"
     for pair in flat:
-        for source, folder, end in ((pair.image, "leftImg8bit", "leftImg8bit"), (pair.label, "gtFine", "gtFine_labelIds")):
+        for source, folder, end in ((pair.image, "leftImg8bit", "leftImg8bit"),
+                                    (pair.label, "gtFine", "gtFine_labelIds")):
             target = official / folder / "train" / "town" / f"{pair.name}_{end}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(source.read_bytes())

@@ -25,7 +25,8 @@ def test_odometry_writes_one_row_and_one_pose_a_frame(small_world, tmp_path, cap
                     "--frames-csv", tmp_path / "frames.csv") == 0
     summary = json.loads(capsys.readouterr().out)
     frames = pd.read_csv(tmp_path / "frames.csv")
-    columns = ["frame", "detected", "tracked", "inliers", "scale", "x", "y", "z", *(f"r{i}{j}" for i in range(3) for j in range(3))]
+    columns = ["frame", "detected", "tracked", "inliers", "scale", "x", "y", "z",
+               *(f"r{i}{j}" for i in range(3) for j in range(3))]
     assert set(columns) <= set(frames.columns) and len(frames) == summary["frames"] == 12
     poses = read_poses(tmp_path / "poses.txt")
     assert np.array_equal(poses[:, :3, 3], frames[["x", "y", "z"]])

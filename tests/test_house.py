@@ -67,6 +67,7 @@ def test_no_import_leads_in_a_circle():
 
 def test_the_check_of_the_imports_can_fail(tmp_path):
     module = tmp_path / "module.py"
-    module.write_text("from thesis_repro.study import runner\nimport numpy\nfrom thesis_repro.report.style import BLUE\n")
+    module.write_text("from thesis_repro.study import runner\nimport numpy\n"
+                      "from thesis_repro.report.style import BLUE\n")
     assert imports(module) == {"study.__init__", "study.runner", "report.style"}
     assert imports(module, "study") == {"study.runner", "report.style"}

@@ -38,8 +38,8 @@ def check_data(options):
 
 def predict(options):
     """write label maps (8-bit ids, 320x320 PNG, named like the frames) for a folder of images or a sequence"""
-    from thesis_repro.segmentation import backbones, prediction, training
     from thesis_repro.files import listed
+    from thesis_repro.segmentation import backbones, prediction, training
 
     images = options.images / "image_0" if (options.images / "image_0").is_dir() else options.images
     if not images.is_dir():
@@ -60,11 +60,11 @@ def predict(options):
 def odometry(options):
     """run the visual odometry over one sequence and print its errors, keypoints and time"""
     from thesis_repro import odometry
-    from thesis_repro.odometry import metrics
-    from thesis_repro.report import video
     from thesis_repro.files import write_text
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder
+    from thesis_repro.odometry import metrics
+    from thesis_repro.report import video
 
     if options.labels and options.dilation is None:
         raise InputError("--labels: needs --dilation W, the width in pixels by which the boundaries are dilated")

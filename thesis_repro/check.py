@@ -61,8 +61,8 @@ def check_cityscapes(root):
         except InputError as error:
             problems.append(str(error))
             continue
-        ids = set()
-        problems += _failures(lambda pair: ids.update(_check_pair(pair)), found, f"split {split}")
+        ids: set[int] = set()
+        problems += _failures(lambda pair, ids=ids: ids.update(_check_pair(pair)), found, f"split {split}")
         names = ", ".join(f"{label.name} {label.id}" for label in cityscapes.LABELS if label.id in ids)
         facts.append(f"split {split}: {len(found)} images with label maps; labels: {names}")
     return facts, problems

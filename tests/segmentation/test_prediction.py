@@ -1,4 +1,3 @@
-import os
 import signal
 import subprocess
 import sys
@@ -12,8 +11,8 @@ import pytest
 
 from thesis_repro import InputError, cityscapes, files
 from thesis_repro.segmentation import backbones, memory, prediction, quality, training
-from thesis_repro.study.flicker import flicker
 from thesis_repro.segmentation.unet import build_unet
+from thesis_repro.study.flicker import flicker
 
 SIZE = 64
 random = np.random.default_rng(0)
@@ -91,7 +90,8 @@ def test_written_label_maps_are_the_predictions_at_320(model, frames, tmp_path):
 
 def test_a_killed_prediction_goes_on_and_ends_with_the_same_bytes(model, frames, tmp_path):
     model.save(tmp_path / "model.keras")
-    code = ("import time, sys; from thesis_repro import files; from thesis_repro.segmentation import prediction, training; "
+    code = ("import time, sys; from thesis_repro import files; from thesis_repro.segmentation import prediction, "
+            "training; "
             "write = files.write_png; files.write_png = lambda *a: (time.sleep(0.2), write(*a)); "
             "prediction.write_label_maps(training.load_model(sys.argv[1]), sys.argv[3:], sys.argv[2], batch_size=2)")
     output = tmp_path / "killed"

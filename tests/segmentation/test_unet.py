@@ -6,7 +6,8 @@ import pytest
 from thesis_repro import InputError
 from thesis_repro.segmentation.unet import build_unet, summary_rows
 
-FIGURE = json.loads(resources.files("thesis_repro.report").joinpath("reported.json").read_text())["figure_a1_model_summary"]
+REPORTED = resources.files("thesis_repro.report").joinpath("reported.json")
+FIGURE = json.loads(REPORTED.read_text())["figure_a1_model_summary"]
 
 
 def test_every_row_of_figure_a1():

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from thesis_repro import InputError, cityscapes, masks, odometry, stages
-from thesis_repro.segmentation import prediction, training
-from thesis_repro.study import budget
 from thesis_repro.kitti import Sequence
+from thesis_repro.segmentation import prediction, training
 from thesis_repro.segmentation.unet import build_unet
+from thesis_repro.study import budget
 
 
 @pytest.fixture(scope="module")

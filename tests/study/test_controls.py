@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from thesis_repro import InputError, masks, odometry
+from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
 from thesis_repro.study import controls, results, runner
 from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, mask_control_jobs, reduced_jobs
-from thesis_repro.kitti import Sequence
 
 WIDTH = 10
 

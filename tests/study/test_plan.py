@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from thesis_repro import InputError, kitti, stages
+from thesis_repro.__main__ import main
 from thesis_repro.study import plan, runner
 from thesis_repro.study.jobs import first_jobs, mask_control_jobs
-from thesis_repro.__main__ import main
 
 EXCERPT = plan.Excerpt("00 from frame 2", jobs=(168, 30), series=(1.68 + 0.05, 0.3 + 0.05), shared=0.05,
                        row_bytes=500.0, worker_bytes=200_000_000)

@@ -4,10 +4,10 @@ import pandas as pd
 import pytest
 
 from thesis_repro.report import findings, outcome, tables
-from thesis_repro.study import results
-from thesis_repro.study.jobs import Job
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.report.style import markdown
+from thesis_repro.study import results
+from thesis_repro.study.jobs import Job
 
 ELEVEN = [f"{number:02d}" for number in range(11)]
 OTHERS = [variant for variant in results.CONTROLS if variant != "masked"]

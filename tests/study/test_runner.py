@@ -5,11 +5,11 @@ import pandas as pd
 import pytest
 
 from thesis_repro import InputError, odometry
+from thesis_repro.kitti import Sequence
+from thesis_repro.masks import LabelMasks
 from thesis_repro.odometry import metrics
 from thesis_repro.study import budget, results, runner
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
-from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks
 
 WIDTHS = (5, 10, 15)
 

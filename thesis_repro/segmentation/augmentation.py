@@ -5,10 +5,10 @@ import warnings
 
 os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # its look-up for a newer release needs a network
 
-import albumentations as A  # noqa: E402 - reads the variable on import
-import numpy as np  # noqa: E402
+import albumentations as A
+import numpy as np
 
-from thesis_repro.files import progress  # noqa: E402
+from thesis_repro.files import progress
 
 NOTHING = 255  # a label that one-hot encoding turns into zeros everywhere, as the appendix's border fill is
 

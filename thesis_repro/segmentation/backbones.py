@@ -5,10 +5,10 @@ import os
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
 
-import keras  # noqa: E402 - TensorFlow and segmentation-models read their variables on import
-import segmentation_models as sm  # noqa: E402
+import keras
+import segmentation_models as sm
 
-from thesis_repro import InputError  # noqa: E402
+from thesis_repro import InputError
 
 
 def backbone_unet(name):

@@ -9,14 +9,14 @@ from pathlib import Path
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-import cv2  # noqa: E402
-import keras  # noqa: E402 - TensorFlow reads its variables on import
-import numpy as np  # noqa: E402
-import tensorflow as tf  # noqa: E402
+import cv2
+import keras
+import numpy as np
+import tensorflow as tf
 
-from thesis_repro import InputError, files, stages  # noqa: E402
-from thesis_repro.segmentation import memory, training  # noqa: E402
-from thesis_repro.cityscapes import read_image  # noqa: E402
+from thesis_repro import InputError, files, stages
+from thesis_repro.cityscapes import read_image
+from thesis_repro.segmentation import memory, training
 
 SIZE = 320  # pixels, both ways, of written label maps
 SHIPPED = Path(__file__).parent / "weights" / "camvid.keras"

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
-import tensorflow as tf  # noqa: E402 - reads its variables on import
+import numpy as np
+import pandas as pd
+import tensorflow as tf
 
-from thesis_repro import InputError, files  # noqa: E402
-from thesis_repro.cityscapes import LABELS, N_CLASSES  # noqa: E402
-from thesis_repro.segmentation import memory, training  # noqa: E402
+from thesis_repro import InputError, files
+from thesis_repro.cityscapes import LABELS, N_CLASSES
+from thesis_repro.segmentation import memory, training
 
 # The ids that the Cityscapes benchmark evaluates; pixels of all others are left out of its confusion matrix.
 EVALUATED = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)

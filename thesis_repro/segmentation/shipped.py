@@ -14,14 +14,14 @@ from pathlib import Path
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
 
-import keras  # noqa: E402 - TensorFlow reads its variables on import
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
-import tensorflow as tf  # noqa: E402
+import keras
+import numpy as np
+import pandas as pd
+import tensorflow as tf
 
-from thesis_repro import InputError, cityscapes, files  # noqa: E402
-from thesis_repro.segmentation import augmentation, memory, prediction, quality, training  # noqa: E402
-from thesis_repro.segmentation.unet import build_unet  # noqa: E402
+from thesis_repro import InputError, cityscapes, files
+from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
+from thesis_repro.segmentation.unet import build_unet
 
 SIZE = prediction.SIZE
 FOLDER = prediction.SHIPPED.parent

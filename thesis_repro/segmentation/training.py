@@ -9,16 +9,16 @@ from pathlib import Path
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
 
-import keras  # noqa: E402 - TensorFlow and segmentation-models read their variables on import
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
-import segmentation_models as sm  # noqa: E402
-import tensorflow as tf  # noqa: E402
+import keras
+import numpy as np
+import pandas as pd
+import segmentation_models as sm
+import tensorflow as tf
 
-from thesis_repro import InputError, files  # noqa: E402
-from thesis_repro.segmentation import augmentation, memory  # noqa: E402
-from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES  # noqa: E402
-from thesis_repro.segmentation.unet import build_unet  # noqa: E402
+from thesis_repro import InputError, files
+from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
+from thesis_repro.segmentation import augmentation, memory
+from thesis_repro.segmentation.unet import build_unet
 
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
 

@@ -4,9 +4,9 @@ import os
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
-from keras import Model, layers  # noqa: E402 - TensorFlow reads its variables on import
+from keras import Model, layers
 
-from thesis_repro import InputError  # noqa: E402
+from thesis_repro import InputError
 
 DEPTH = 4  # encoder blocks; each halves the image
 

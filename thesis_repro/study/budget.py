@@ -1,5 +1,5 @@
-"""What things cost: every dilation width as the thesis times it (Figure 4.17), and a frame from its file to its pose with
-the network included, as Section 5.2 asks.
+"""What things cost: every dilation width as the thesis times it (Figure 4.17), and a frame from its file to its pose
+with the network included, as Section 5.2 asks.
 
 The second is done as a live system would: one frame after the other, the network on one image at a time, all cores.
 """
@@ -146,7 +146,8 @@ def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20
     Measured anew when the frames, the model or the code become others.
     """
     short = sequence.subset(frames + WARM_UP)
-    folder = stages.stage(folder, code=stages.code("odometry", "segmentation/prediction"), model=stages.content(model_file), opencv=cv2.__version__,
+    folder = stages.stage(folder, code=stages.code("odometry", "segmentation/prediction"),
+                          model=stages.content(model_file), opencv=cv2.__version__,
                           frames=stages.listing(short.frame_paths))
     files = {folder / "budget.csv": measure, folder / "overlapped.csv": measure_overlapped}
     missing = {path: function for path, function in files.items() if not path.is_file()}

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from thesis_repro import odometry
-from thesis_repro.odometry.keypoints import SharedKeypoints
 from thesis_repro.masks import LabelMasks, dilate
+from thesis_repro.odometry.keypoints import SharedKeypoints
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
 CLOSE = 0.002  # of the frame: a difference of coverage that is none

@@ -7,9 +7,8 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro import InputError, files, masks
-from thesis_repro.odometry import keypoints
 from thesis_repro.cityscapes import ID
-from thesis_repro.odometry import THESIS
+from thesis_repro.odometry import THESIS, keypoints
 
 CONSISTENT = 1.0  # pixels; forward and backward flow must cancel to this, or the pixel is left out
 

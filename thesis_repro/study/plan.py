@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from thesis_repro import InputError, kitti, odometry, stages
-from thesis_repro.odometry import passes
-from thesis_repro.study import budget, controls, jobs, results, runner
 from thesis_repro.files import progress, write_text
+from thesis_repro.odometry import passes
 from thesis_repro.settings import PROFILES
+from thesis_repro.study import budget, controls, jobs, results, runner
 
 CORES = (1, 4, 8, 16, 64)
 EXCERPTS, FRAMES, FIRST = 3, 6, 2  # at most; frames of each, of which the first ones stand for what each run costs once

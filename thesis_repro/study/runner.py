@@ -6,7 +6,7 @@ Each finished run is one CSV file, so that a stopped or failed series goes on wh
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -149,7 +149,7 @@ def variants(jobs: Iterable[Job], sequence: Sequence, labels: Path, settings: Od
     return found, failures
 
 
-@lru_cache(maxsize=None)
+@cache
 def _check_label_map(path: Path) -> None:
     read_label_map(path)
 
