@@ -15,6 +15,10 @@ __all__ = ["InputError", *_HOMES]
 class InputError(ValueError):
     """Bad input: one line that says what, which file or setting, and what to do about it."""
 
+    def _render_traceback_(self):
+        """What IPython shows of it: the line alone."""
+        return [f"InputError: {self}"]
+
 
 def __getattr__(name):
     if name not in _HOMES:

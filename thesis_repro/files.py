@@ -93,6 +93,20 @@ def write_png(path, image):
             raise OSError(f"{path}: cannot be written")
 
 
+def write_array(path, array):
+    """Write a numpy array as .npy."""
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, array)
+
+
+def needed(path, notebook):
+    """`path`, which an earlier notebook writes. Raises InputError, naming the notebook, where it does not exist."""
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: not there yet; run notebook {notebook} first")
+    return path
+
+
 def progress(iterable=None, description="", total=None, unit="frame", initial=0):
     """A progress bar on standard error, or on the file that THESIS_REPRO_PROGRESS names.
 

@@ -8,6 +8,7 @@ import keras
 import numpy as np
 import pandas as pd
 import pytest
+import segmentation_models as sm
 
 from thesis_repro import InputError
 from thesis_repro.segmentation import augmentation, training
@@ -15,7 +16,6 @@ from thesis_repro.segmentation.unet import build_unet
 
 ROOT = Path(__file__).parents[2]
 SIZE = 32
-SMALL = dict(base_filters=2, batch_size=4, epochs=3, learning_rate=0.01)
 
 
 def street(count, seed):
@@ -29,14 +29,43 @@ def street(count, seed):
 SETS = (*street(9, 0), *street(3, 1))
 
 
-def weights_of(path):
-    return [variable.numpy() for variable in training.load_model(path).variables]
+def prepared(sets=SETS, filters=2, rate=0.01, loss=None, strategy=None):
+    """A compiled model and its batches, as notebook 4 prepares them."""
+    keras.utils.set_random_seed(0)
+    with (strategy or training.strategy()).scope():
+        model = build_unet((SIZE, SIZE, 1), 35, filters)
+        model.compile(keras.optimizers.Adam(rate), loss or training.total_loss(), metrics=training.metrics())
+        model.optimizer.build(model.trainable_variables)
+    augmented = augmentation.augment_set(*sets[:2], augmentation.training_augmenter(SIZE), 0)
+    blurred = augmentation.augment_set(*sets[2:], augmentation.validation_augmenter(SIZE), 1)
+    return model, training.Batches([sets[:2], augmented], 4, seed=0), training.Batches([sets[2:], blurred], 4)
+
+
+def train(folder, epochs=3, patience=5, callbacks=(), **options):
+    """The fit of notebook 4."""
+    model, batches, validation = prepared(**options)
+    stop = keras.callbacks.EarlyStopping(patience=patience)
+    best = keras.callbacks.ModelCheckpoint(folder / training.MODEL, save_best_only=True)
+    going_on = training.GoingOn(folder, model, batches, [stop, best])
+    model.fit(batches.dataset(), validation_data=validation.dataset(), epochs=epochs, shuffle=False, verbose=0,
+              initial_epoch=going_on.first_epoch(epochs), callbacks=[stop, best, *callbacks, going_on])
+    return going_on
+
+
+def weights_of(folder):
+    return [variable.numpy() for variable in training.load_model(folder / training.MODEL).variables]
+
+
+def assert_same_training(one, other):
+    assert (one / "history.csv").read_text() == (other / "history.csv").read_text()
+    for a, b in zip(weights_of(one), weights_of(other), strict=True):
+        assert np.array_equal(a, b)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
-    training.train(*SETS, folder, **SMALL)
+    train(folder)
     return folder
 
 
@@ -47,10 +76,10 @@ def test_history_and_best_model(trained):
     assert {"loss", "iou_score", "f1-score", "val_loss", "val_iou_score", "val_f1-score"} < set(history.columns)
     assert history["loss"].iloc[-1] < history["loss"].iloc[0]
     # the model in the folder is the one with the lowest validation loss
-    augmented = augmentation.augment_set(SETS[2], SETS[3], augmentation.validation_augmenter(SIZE), 1)
+    _, _, validation = prepared()
     model = training.load_model(trained / "model.keras")
-    loss = model.evaluate(training.Batches([SETS[2:], augmented], 4).dataset(), verbose=0, return_dict=True)["loss"]
-    assert loss == pytest.approx(history["val_loss"].min(), abs=1e-5)
+    model.compile("adam", training.total_loss())
+    assert model.evaluate(validation.dataset(), verbose=0) == pytest.approx(history["val_loss"].min(), abs=1e-5)
 
 
 def test_loss_is_the_sum_of_the_librarys_two():
@@ -81,21 +110,14 @@ def test_each_epoch_shows_each_image_once_in_an_order_of_its_own():
     assert np.array_equal(seen[1], again)
 
 
-def test_the_network_gets_raw_grey_levels():
-    (images, labels), *_ = training.Batches([SETS[:2]], 4).dataset()
+def test_the_network_gets_raw_grey_levels_and_one_hot_masks():
+    labels = SETS[1].copy()
+    labels[0, 0] = augmentation.NOTHING
+    (images, masks), *_ = training.Batches([(SETS[0], labels)], 4).dataset()
 
     assert np.array_equal(images.numpy(), SETS[0][:4].astype(np.float32))
-    assert np.array_equal(labels.numpy(), SETS[1][:4])
-
-
-def test_label_maps_are_scored_as_their_one_hot_masks():
-    labels = SETS[1][:4].copy()
-    labels[0, 0] = augmentation.NOTHING
-    predicted = np.random.default_rng(0).dirichlet(np.ones(35), labels.shape).astype(np.float32)
-    for function in (training.total_loss(), *training.metrics()):
-        scores = [float(training.OnLabelMaps(function)(true, predicted))
-                  for true in (labels, augmentation.one_hot(labels, 35))]
-        assert scores[0] == scores[1] == pytest.approx(float(function(augmentation.one_hot(labels, 35), predicted)))
+    assert np.array_equal(masks.numpy(), augmentation.one_hot(labels[:4], 35))
+    assert not masks.numpy()[0, 0].any()
 
 
 def test_fresh_augmentation_differs_from_epoch_to_epoch():
@@ -112,18 +134,16 @@ def test_fresh_augmentation_differs_from_epoch_to_epoch():
 def test_same_seed_same_model_and_callbacks_see_every_epoch(trained, tmp_path):
     seen = []
     callback = keras.callbacks.LambdaCallback(on_epoch_end=lambda epoch, logs: seen.append(logs["val_loss"]))
-    training.train(*SETS, tmp_path, **SMALL, callbacks=[callback])
+    going_on = train(tmp_path, callbacks=[callback])
 
-    assert seen == pytest.approx(pd.read_csv(tmp_path / "history.csv")["val_loss"].tolist())
-    for a, b in zip(weights_of(tmp_path / "model.keras"), weights_of(trained / "model.keras"), strict=True):
-        assert np.array_equal(a, b)
+    assert seen == pytest.approx(going_on.history["val_loss"].tolist())
+    assert_same_training(tmp_path, trained)
 
 
 def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path):
-    code = ("import sys; sys.path.insert(0, 'tests'); import test_training as t; "
-            f"t.training.train(*t.SETS, {str(tmp_path)!r}, **t.SMALL)")
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL,
-                               cwd=ROOT)
+    code = (f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+            f"t.train(t.Path({str(tmp_path)!r}))")
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, cwd=ROOT)
     deadline = time.monotonic() + 120
     while not (tmp_path / "state.npz").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -131,19 +151,16 @@ def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path):
     assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"
     assert len(pd.read_csv(tmp_path / "history.csv")) < 3
 
-    training.train(*SETS, tmp_path, **SMALL)
-
-    assert (tmp_path / "history.csv").read_text() == (trained / "history.csv").read_text()
-    for a, b in zip(weights_of(tmp_path / "model.keras"), weights_of(trained / "model.keras"), strict=True):
-        assert np.array_equal(a, b)
+    assert train(tmp_path).history["epoch"].tolist() == [1, 2, 3]
+    assert_same_training(tmp_path, trained)
 
 
 def test_several_devices_share_each_batch(tmp_path):
     code = ("import sys; import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
             "tf.config.set_logical_device_configuration(cpu, [tf.config.LogicalDeviceConfiguration()] * 2); "
-            "sys.path.insert(0, 'tests'); import test_training as t; "
-            "t.training._strategy = lambda: tf.distribute.MirroredStrategy(['CPU:0', 'CPU:1']); "
-            f"[t.training.train(*t.SETS, {str(tmp_path)!r}, **t.SMALL | dict(epochs=n)) for n in (1, 2)]")
+            f"sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+            f"[t.train(t.Path({str(tmp_path)!r}), n, strategy=tf.distribute.MirroredStrategy(['CPU:0', 'CPU:1'])) "
+            "for n in (1, 2)]")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300)
 
     assert done.returncode == 0, done.stderr[-2000:]
@@ -151,55 +168,68 @@ def test_several_devices_share_each_batch(tmp_path):
     assert history["epoch"].tolist() == [1, 2] and history["loss"].iloc[1] < history["loss"].iloc[0]
 
 
-def test_a_finished_training_is_loaded(trained):
-    before = (trained / "model.keras").stat().st_mtime_ns
-    training.train(*SETS, trained, **SMALL)
+def test_a_finished_training_is_left_alone(trained):
+    before = {path: path.stat().st_mtime_ns for path in trained.iterdir()}
+    assert train(trained).first_epoch(3) == 3
+    assert before == {path: path.stat().st_mtime_ns for path in before}
 
-    assert (trained / "model.keras").stat().st_mtime_ns == before
 
-
-def test_early_stopping_keeps_the_best(tmp_path):
+def test_early_stopping_keeps_the_best_and_stays_stopped(tmp_path):
     # a validation set that contradicts the training set gets worse as training goes on
-    wrong = np.where(SETS[3] == 7, 11, 7).astype(np.uint8)
-    training.train(*SETS[:3], wrong, tmp_path, **SMALL | dict(epochs=40, patience=2, learning_rate=0.03))
-    losses = pd.read_csv(tmp_path / "history.csv")["val_loss"]
+    sets = (*SETS[:3], np.where(SETS[3] == 7, 11, 7).astype(np.uint8))
+    going_on = train(tmp_path, 40, 2, sets=sets, rate=0.03)
+    losses = going_on.history["val_loss"]
 
     assert len(losses) < 40
     assert losses.idxmin() == len(losses) - 3
+    assert len(train(tmp_path, 40, 2, sets=sets, rate=0.03).history) == len(losses)
+    assert len(train(tmp_path, 40, 3, sets=sets, rate=0.03).history) > len(losses)  # with more patience it goes on
 
 
-def test_other_settings_or_data_in_the_same_folder(trained):
-    with pytest.raises(InputError, match="base_filters=2, not 4"):
-        training.train(*SETS, trained, **SMALL | dict(base_filters=4))
-    with pytest.raises(InputError, match="data_checksum"):
-        training.train(SETS[0] // 2, *SETS[1:], trained, **SMALL)
+def test_what_a_training_depends_on_is_noticed():
+    def inputs(**changed):
+        options = {name: changed.pop(name) for name in ("sets", "filters", "rate", "loss") if name in changed}
+        model, batches, validation = prepared(**options)
+        vars(batches).update(changed)
+        return training.made_from(model, batches, validation)
+
+    plain = inputs()
+    assert inputs() == plain
+    brighter = (SETS[0] // 2, *SETS[1:])
+    for changed in ({"filters": 4}, {"rate": 0.02}, {"loss": sm.losses.DiceLoss()}, {"sets": brighter}, {"seed": 1},
+                    {"batch_size": 5}, {"augmenter": augmentation.training_augmenter(SIZE)}):
+        assert inputs(**changed) != plain, changed
 
 
-def test_a_damaged_state(trained, tmp_path):
+def test_the_state_of_another_network_or_a_damaged_one(trained, tmp_path):
+    model, batches, _ = prepared(filters=4)
+    with pytest.raises(InputError, match="the training of another network"):
+        training.GoingOn(trained, model, batches)
     (tmp_path / "state.npz").write_bytes((trained / "state.npz").read_bytes()[:1000])
-    with pytest.raises(InputError, match="damaged"):
-        training.train(*SETS, tmp_path, **SMALL)
+    with pytest.raises(InputError, match="state.npz: is damaged"):
+        training.GoingOn(tmp_path, model, batches)
 
 
-@pytest.mark.parametrize(("sets", "message"), [
-    ((SETS[0][:0], SETS[1][:0], *SETS[2:]), "training set: empty"),
-    ((*SETS[:2], SETS[2][:0], SETS[3][:0]), "validation set: empty"),
-    ((SETS[0], np.full_like(SETS[1], 35), *SETS[2:]), "label id 35"),
-    ((SETS[0], SETS[1][:, :16], *SETS[2:]), "do not match"),
-    ((*SETS[:2], SETS[2][:, :16, :16], SETS[3][:, :16, :16]), "one size"),
+@pytest.mark.parametrize(("images", "labels", "message"), [
+    (SETS[0][:0], SETS[1][:0], "an empty set"),
+    (SETS[0], np.full_like(SETS[1], 35), "label id 35"),
+    (SETS[0], SETS[1][:, :16], "do not match"),
 ])
-def test_bad_sets(sets, message, tmp_path):
+def test_bad_sets(images, labels, message):
     with pytest.raises(InputError, match=message):
-        training.train(*sets, tmp_path, **SMALL)
+        training.Batches([(images, labels)], 4)
 
 
 def test_the_appendixs_hdf5_loads(trained, tmp_path):
     model = training.load_model(trained / "model.keras")
+    loss, scores = training.total_loss(), training.metrics()
+    model.compile("adam", loss, metrics=scores)
     model.save(tmp_path / "model.hdf5")
     x, y = SETS[2].astype(np.float32), augmentation.one_hot(SETS[3], 35)
 
     # as in the appendix, loss and metrics included, and as everywhere else
-    with_loss = keras.models.load_model(tmp_path / "model.hdf5", custom_objects=training.custom_objects())
+    with_loss = keras.models.load_model(tmp_path / "model.hdf5", custom_objects={
+        loss.name: loss, **{score.name: score for score in scores}})
     assert with_loss.evaluate(x, y, verbose=0) == pytest.approx(model.evaluate(x, y, verbose=0))
     assert np.array_equal(training.load_model(tmp_path / "model.hdf5")(x), model(x))
 

@@ -34,7 +34,7 @@ def input_speed(size, base_filters, batch_size, images=32, repeats=2):
     memory.keep_freed()  # as training does
     batches = training.Batches([_noise(images, size, 0)], batch_size, seed=0)
     model = build_unet((size, size, 1), cityscapes.N_CLASSES, base_filters)
-    training.compile_model(model)
+    model.compile("adam", training.total_loss(), metrics=training.metrics())
     ready = batches.dataset().cache()
     model.fit(ready, shuffle=False, verbose=0)  # compiles, and makes the batches
     consumed = min(_seconds(lambda: model.fit(ready, shuffle=False, verbose=0)) for _ in range(repeats)) / images

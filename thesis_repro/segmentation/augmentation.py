@@ -53,13 +53,18 @@ def _shift_and_scale(fill_mask):
 
 
 class Augmenter:
-    """A transform list that gives the same result for the same seed, whatever was augmented before.
+    """Transforms that give the same result for the same seed, whatever was augmented before.
 
     Holds the library's random state: one Augmenter a thread.
     """
 
     def __init__(self, transforms):
-        self._compose = A.Compose(transforms)
+        """transforms: a list of them, or an `albumentations.Compose`."""
+        self._compose = transforms if isinstance(transforms, A.Compose) else A.Compose(transforms)
+
+    def to_dict(self):
+        """The transforms and their settings as Albumentations writes them (JSON values)."""
+        return A.to_dict(self._compose)
 
     def __call__(self, image, label, seed):
         """Augment one image (height, width[, channels]) uint8 and its label map (height, width) uint8."""

@@ -14,7 +14,7 @@ from thesis_repro import InputError
 def backbone_unet(name):
     """A function of (input_shape, n_classes) that builds a U-Net around a backbone of segmentation-models.
 
-    For `training.train(..., build=backbone_unet("resnet18"))`. Weights are random: the published ones would need a
+    Weights are random: the published ones would need a
     download and colour. Grey levels 0 to 255 are scaled to 0 to 1, as these networks were made for.
 
     Raises InputError for an unknown name, and where height or width is not a multiple of 32.

@@ -10,7 +10,6 @@ from pathlib import Path
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 import cv2
-import keras
 import numpy as np
 import tensorflow as tf
 
@@ -119,67 +118,21 @@ def _call_size(batch_size):
 
 @lru_cache(maxsize=4)
 def _compiled(model):
-    """A function from uint8 images to uint8 label maps. `model.predict` costs two to five times as much: it sets up
-    anew for each call, hands over 35 probabilities a pixel, and normalises where a convolution could."""
+    """A function from uint8 images to uint8 label maps, with the bits of `model.predict` and argmax.
+
+    `model.predict` costs two to four times as much for small networks: it sets up anew for each call and hands over
+    35 probabilities a pixel.
+    """
     memory.keep_freed()
-    network = folded(model)
     signature = tf.TensorSpec((None, *model.input_shape[1:]), tf.uint8)
 
     @tf.function(input_signature=[signature])
     def call(images):
-        scores = network(tf.cast(images, tf.float32), training=False)
-        return tf.cast(tf.argmax(scores, axis=-1, output_type=tf.int32), tf.uint8)
+        probabilities = model(tf.cast(images, tf.float32), training=False)
+        return tf.cast(tf.argmax(probabilities, axis=-1, output_type=tf.int32), tf.uint8)
 
     def run(images):
         step = _call_size(len(images))
         return np.concatenate([call(images[start:start + step]).numpy() for start in range(0, len(images), step)])
 
     return run
-
-
-def folded(model, final=True):
-    """The same network for prediction only: batch normalisation folded into the convolutions, no final softmax.
-
-    Its scores order the classes of a pixel as the model's probabilities do. With `final` false, for a network inside
-    another, the softmax stays.
-    """
-    model = keras.Model(model.input, model.output)  # without loss and metrics, which Keras would try to clone
-    norms = {}  # a convolution's name: the batch normalisation that alone reads it
-    for layer in model.layers:
-        if type(layer) is keras.layers.BatchNormalization:
-            source = layer._inbound_nodes[0].input_tensors[0]._keras_history.operation
-            if (type(source) is keras.layers.Conv2D and len(source._outbound_nodes) == 1
-                    and source.activation is keras.activations.linear):
-                norms[source.name] = layer
-    folded_away = {norm.name for norm in norms.values()}
-    twins = {}
-
-    def clone(layer):
-        if isinstance(layer, keras.Model):
-            return folded(layer, final=False)
-        config = layer.get_config()
-        if layer.name in norms:
-            config["use_bias"] = True
-        if final and layer is model.layers[-1] and config.get("activation") == "softmax":
-            config["activation"] = "linear"
-        twins[layer.name] = type(layer).from_config(config)
-        return twins[layer.name]
-
-    def call(layer, *args, **kwargs):
-        return args[0] if layer.name in folded_away else layer(*args, **kwargs)
-
-    network = keras.models.clone_model(model, clone_function=clone, call_function=call)
-    for name, twin in twins.items():
-        weights = model.get_layer(name).get_weights()
-        if weights and name not in folded_away:
-            twin.set_weights(_fold(weights, norms[name]) if name in norms else weights)
-    return network
-
-
-def _fold(weights, norm):
-    kernel, bias = weights[0], weights[1] if len(weights) > 1 else 0.0
-    factor = 1 / np.sqrt(norm.moving_variance.numpy() + norm.epsilon)
-    if norm.scale:
-        factor = factor * norm.gamma.numpy()
-    shift = norm.beta.numpy() if norm.center else 0.0
-    return [kernel * factor, (bias - norm.moving_mean.numpy()) * factor + shift]
