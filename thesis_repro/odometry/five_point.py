@@ -1,12 +1,20 @@
 """Essential matrices through five correspondences, and how far OpenCV's rounding may move them (see ransac).
 
-Nister (2004), An efficient solution to the five-point relative pose problem: the matrices are combinations of four
-that five correspondences allow; ten cubic equations make them essential; elimination leaves a polynomial of degree
-ten. Only its real roots are of use, so it is solved for them alone.
+After Nister (2004), An efficient solution to the five-point relative pose problem, PAMI 26(6), in his steps:
+
+1. the epipolar constraints of five correspondences leave E = x X + y Y + z Z + W (`_null_space`);
+2. the trace constraint and the determinant constraint make E essential: ten cubics in x, y, z (`_constraints`);
+3. elimination leaves three equations B(z) (x, y, 1)^T = 0 (`_eliminate`);
+4. det B(z) = 0, a polynomial of degree ten (`_determinant`);
+5. its roots (`real_roots`): a complex one is no motion, so it is solved for the real ones alone;
+6. x, y and with them E for each root (`_essential`).
+
+His last step, rotation and translation from E and the vote, is pose.recover_pose.
 """
 
 import numpy as np
-from numba import njit
+
+from thesis_repro.compiled import fast
 
 SAMPLE = 5
 ERROR = 1e-12  # by which all equations are changed, at random, to see what rounding does to their solutions
@@ -14,10 +22,8 @@ ROOT_ERROR = 1e-13  # relative to the polynomial's terms: of finding a root
 SAFETY = 8.0  # times such changes, and more where elimination is ill-conditioned, is granted to OpenCV's solutions
 LEAST_MARGIN, LARGEST_MARGIN = 1e-9, 1e-3  # of a unit-norm essential matrix
 
-FAST = njit(cache=True, nogil=True, error_model="numpy")  # as in OpenCV, x / 0 is infinite
 
-
-def _signs():
+def _signs() -> np.ndarray:
     """The vectors from which OpenCV's singular value decomposition completes a basis: 4 x 9 random signs."""
     state, signs = 0x12345678, np.empty((4, 9))
     for place in np.ndindex(signs.shape):
@@ -26,10 +32,11 @@ def _signs():
     return signs
 
 
-def _products():
+def _products() -> tuple[np.ndarray, np.ndarray]:
     """Where monomials of x, y, z, 1 go when multiplied: (4, 4) to quadratic ones, (10, 4) to cubic ones.
 
-    The cubic ones are in Nister's order, by which elimination leaves a system of three equations in x, y, 1.
+    The cubic ones are in Nister's order, by which elimination leaves a system of three equations in x, y, 1: those of
+    degree two and more in x and y first, then x, y and 1, each with its powers of z.
     """
     linear = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]
     quadratic = [(2, 0, 0), (1, 1, 0), (1, 0, 1), (1, 0, 0), (0, 2, 0), (0, 1, 1), (0, 1, 0), (0, 0, 2), (0, 0, 1),
@@ -49,26 +56,29 @@ CHANGES = ERROR * np.random.default_rng(0).choice([-1.0, 1.0], (2, 10, 20))
 TO_QUADRATIC, TO_CUBIC = _products()
 
 
-@FAST
-def solve(five):
+@fast
+def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the previous one).
 
     Returns whether these are surely all that OpenCV finds, the matrices (K, 9) of unit norm, and K margins within
     which (Frobenius norm, up to sign) OpenCV's rounding leaves its own.
     """
     nothing, no_margins = np.empty((0, 9)), np.empty(0)
-    sure, basis = _null_space(five)
+    sure, basis = _null_space(five)  # step 1
     if not sure:
         return False, nothing, no_margins
-    equations = _constraints(basis)
+    equations = _constraints(basis)  # step 2
+    # Steps 3 and 4, and once more with the equations changed a little in two ways: what changes is what rounding may.
     first, second = _eliminate(equations + CHANGES[0]), _eliminate(equations + CHANGES[1])
     b = _eliminate(equations)
     polynomial, polynomial_first, polynomial_second = _determinant(b), _determinant(first), _determinant(second)
     safety = SAFETY * (1 + 0.01 * np.abs(b).max())  # OpenCV inverts a matrix, at which the rounding grows
+    # Step 5
     sure, roots = real_roots(polynomial, safety * (polynomial_first - polynomial),
                              safety * (polynomial_second - polynomial))
     if not sure:
         return False, nothing, no_margins
+    # Step 6
     found, margins = np.empty((len(roots), 9)), np.empty(len(roots))
     absolute, moved = np.abs(polynomial), np.empty(9)
     for k in range(len(roots)):
@@ -85,7 +95,7 @@ def solve(five):
     return True, found, margins
 
 
-@FAST
+@fast
 def _nearby_root(polynomial, z):
     for _ in range(2):
         value, slope = _horner(polynomial, 10, z)
@@ -93,7 +103,7 @@ def _nearby_root(polynomial, z):
     return z
 
 
-@FAST
+@fast
 def _distance(e, other):
     """Between two essential matrices (9, unit norm), whose signs mean nothing."""
     plus, minus = 0.0, 0.0
@@ -105,11 +115,13 @@ def _distance(e, other):
     return np.sqrt(minus)
 
 
-@FAST
+@fast
 def _null_space(five):
-    """Whether five correspondences are independent, and the basis (4, 9) of the rest of space that OpenCV takes.
+    """Step 1: whether the epipolar constraints of five correspondences, (u, v, 1) E (x, y, 1)^T = 0, are independent,
+    and the basis X, Y, Z, W (4, 9) that OpenCV takes of the matrices that meet them, each row by row.
 
-    With another basis the solutions would be the same, but not how much rounding changes them.
+    Where Nister has a QR factorisation this is Gram and Schmidt's, twice over for the rounding. With another basis the
+    solutions would be the same, but not how much rounding changes them.
     """
     rows = np.empty((9, 9))
     for k in range(9):
@@ -135,26 +147,29 @@ def _null_space(five):
     return True, rows[SAMPLE:]
 
 
-@FAST
+@fast
 def _constraints(basis):
-    """Ten cubic equations (10, 20) in x, y, z: E E^T E = trace(E E^T) E / 2 and det E = 0, E = (x, y, z, 1) basis."""
+    """Step 2: ten cubic equations (10, 20) in x, y, z for E = x X + y Y + z Z + W.
+
+    Rows 0 to 8, the trace constraint: E E^T E - trace(E E^T) E / 2 = 0. Row 9, the determinant constraint: det E = 0.
+    """
     squares, minors = np.zeros((3, 3, 10)), np.zeros((3, 10))
     for i in range(3):
         for j in range(i + 1):
             for k in range(3):
                 for p in range(4):
                     for q in range(4):
-                        squares[i, j, TO_QUADRATIC[p, q]] += basis[p, 3 * i + k] * basis[q, 3 * j + k]
+                        squares[i, j, TO_QUADRATIC[p, q]] += basis[p, 3 * i + k] * basis[q, 3 * j + k]  # E E^T
         for j in range(i):
             squares[j, i] = squares[i, j]
-        first, second = 3 + (i + 1) % 3, 6 + (i + 2) % 3
+        first, second = 3 + (i + 1) % 3, 6 + (i + 2) % 3  # for the minors of E's first row, of the determinant
         for p in range(4):
             for q in range(4):
                 minors[i, TO_QUADRATIC[p, q]] += (basis[p, first] * basis[q, second]
                                                   - basis[p, 3 + (i + 2) % 3] * basis[q, 6 + (i + 1) % 3])
     half = 0.5 * (squares[0, 0] + squares[1, 1] + squares[2, 2])
     for i in range(3):
-        squares[i, i] -= half
+        squares[i, i] -= half  # E E^T - trace(E E^T) / 2, which times E is the trace constraint
     equations = np.zeros((10, 20))
     for p in range(10):
         for q in range(4):
@@ -167,9 +182,14 @@ def _constraints(basis):
     return equations
 
 
-@FAST
+@fast
 def _eliminate(a):
-    """Nister's B (3, 13): three rows of three polynomials in z, to which (x, y, 1) is normal. Overwrites a (10, 20)."""
+    """Step 3: Nister's B(z) (3, 13): three rows of three polynomials in z, to which (x, y, 1) is normal.
+
+    Gauss and Jordan's elimination with partial pivoting of the ten equations a (10, 20), which it overwrites. A row
+    of B is one row less z times the next, in which nothing but x, y and 1 is left; a polynomial has its highest power
+    first, of degree 3, 3 and 4.
+    """
     b = np.zeros((3, 13))
     for k in range(10):
         pivot = k
@@ -192,6 +212,7 @@ def _eliminate(a):
         for j in range(10, 20):
             a[k, j] /= a[k, k]
     for i in range(3):
+        # the columns of x z^2 to x, y z^2 to y, z^3 to 1
         for start, stop, place in ((10, 13, 0), (13, 16, 4), (16, 20, 8)):
             for j in range(start, stop):
                 b[i, place + j - start + 1] += a[4 + 2 * i, j]
@@ -199,9 +220,9 @@ def _eliminate(a):
     return b
 
 
-@FAST
+@fast
 def _determinant(b):
-    """Coefficients (11, highest power first) of the determinant of B."""
+    """Step 4: coefficients (11, highest power first) of det B(z), expanded along its last column."""
     polynomial = np.zeros(11)
     minor = np.empty(8)
     for i in range(3):
@@ -216,7 +237,7 @@ def _determinant(b):
     return polynomial
 
 
-@FAST
+@fast
 def _horner(polynomial, degree, z):
     """A polynomial's value and slope at z."""
     value, slope = polynomial[0], 0.0
@@ -226,9 +247,10 @@ def _horner(polynomial, degree, z):
     return value, slope
 
 
-@FAST
-def real_roots(polynomial, error, other):
-    """Whether these are surely all real roots of a polynomial of degree ten (11, highest power first), and the roots.
+@fast
+def real_roots(polynomial: np.ndarray, error: np.ndarray, other: np.ndarray) -> tuple[bool, np.ndarray]:
+    """Step 5: the real roots of a polynomial of degree ten (11, highest power first), and first whether they are
+    surely all.
 
     error, other: polynomials; an extremum no larger than both together may be a double root or none at all.
     Between two roots of the derivative lies at most one, so the derivatives are solved one after the other.
@@ -267,7 +289,7 @@ def real_roots(polynomial, error, other):
     return True, roots[:found].copy()
 
 
-@FAST
+@fast
 def _root_between(polynomial, degree, left, right, rising):
     """Newton's iteration, with bisection where it would leave the interval or is slow."""
     z = 0.5 * (left + right)
@@ -291,9 +313,9 @@ def _root_between(polynomial, degree, left, right, rising):
     return z
 
 
-@FAST
+@fast
 def _essential(b, basis, z, matrix):
-    """Write the essential matrix (9, unit norm) that belongs to a root z."""
+    """Step 6: write the essential matrix (9, unit norm) that belongs to a root z: (x, y, 1) is normal to B(z)."""
     rows = np.empty((3, 3))
     for i in range(3):
         rows[i, 0] = ((b[i, 0] * z + b[i, 1]) * z + b[i, 2]) * z + b[i, 3]

@@ -15,7 +15,9 @@ import math
 import cv2
 import numpy as np
 
-from thesis_repro.odometry.five_point import FAST, SAMPLE, solve
+from thesis_repro.compiled import fast
+from thesis_repro.odometry import epipolar
+from thesis_repro.odometry.five_point import SAMPLE, solve
 
 MAX_SAMPLES = 1000
 FEWEST = 8  # correspondences: below, the few samples there are go to OpenCV
@@ -23,11 +25,12 @@ SEED = 2**64 - 1  # of OpenCV's RANSAC
 BLOCK = 128  # correspondences scored between two looks at whether the best can still be beaten
 
 
-def find(current, previous, threshold, probability):
+def find(current: np.ndarray, previous: np.ndarray, threshold: float,
+         probability: float) -> tuple[np.ndarray | None, np.ndarray | None]:
     """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability, threshold): (E, mask).
 
     Correspondences are (N, 2) float64 in normalised coordinates. E is 3x3, or OpenCV's stack of solutions for N = 5,
-    or None; mask is (N, 1) uint8 as OpenCV returns it.
+    or None; mask is (N, 1) uint8 as OpenCV returns it, or None.
     """
     count = len(current)
     current, previous = np.ascontiguousarray(current, float), np.ascontiguousarray(previous, float)
@@ -89,23 +92,19 @@ def _samples_needed(probability, outliers):
     return MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
 
 
-@FAST
+@fast
 def _agree(e, x, y, u, v, limit):
     """N times 0 or 1: whether the squared Sampson distance, rounded to float32, is within the limit."""
     mask = np.empty(len(x), np.uint8)
+    matrix = epipolar.entries(e)
     for k in range(len(x)):
-        l0 = e[0, 0] * x[k] + e[0, 1] * y[k] + e[0, 2]
-        l1 = e[1, 0] * x[k] + e[1, 1] * y[k] + e[1, 2]
-        l2 = e[2, 0] * x[k] + e[2, 1] * y[k] + e[2, 2]
-        m0 = e[0, 0] * u[k] + e[1, 0] * v[k] + e[2, 0]
-        m1 = e[0, 1] * u[k] + e[1, 1] * v[k] + e[2, 1]
-        algebraic = u[k] * l0 + v[k] * l1 + l2
+        algebraic, l0, l1, m0, m1 = epipolar.lines(matrix, x[k], y[k], u[k], v[k])
         distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
         mask[k] = np.float32(distance) <= limit
     return mask
 
 
-@FAST
+@fast
 def _next_better(columns, limit, state, sample, samples, best):
     """Draw samples until one may have more than `best` inliers, or until there are `samples` of them.
 
@@ -142,7 +141,7 @@ def _next_better(columns, limit, state, sample, samples, best):
     return state, sample, chosen, 0, 0
 
 
-@FAST
+@fast
 def _bounds(e, margin, columns, limit, best):
     """Inliers that any matrix within the margin of e has at least and at most; 0 and 0 where not above `best`."""
     count = columns.shape[1]
@@ -158,18 +157,13 @@ def _bounds(e, margin, columns, limit, best):
     return low, high
 
 
-@FAST
+@fast
 def _bounds_of_block(e, margin, x, y, u, v, limit):
     root = np.sqrt(limit)
-    e0, e1, e2, e3, e4, e5, e6, e7, e8 = e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
+    matrix = e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
     low, high = 0, 0
     for k in range(len(x)):
-        l0 = e0 * x[k] + e1 * y[k] + e2
-        l1 = e3 * x[k] + e4 * y[k] + e5
-        l2 = e6 * x[k] + e7 * y[k] + e8
-        m0 = e0 * u[k] + e3 * v[k] + e6
-        m1 = e1 * u[k] + e4 * v[k] + e7
-        algebraic = u[k] * l0 + v[k] * l1 + l2
+        algebraic, l0, l1, m0, m1 = epipolar.lines(matrix, x[k], y[k], u[k], v[k])
         excess = algebraic * algebraic - limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
         # Both |algebraic| and the root of the other term change by less than `change`.
         change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))

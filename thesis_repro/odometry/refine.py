@@ -1,15 +1,21 @@
-"""A motion fitted to all correspondences that agree with it, where RANSAC's goes through five of them."""
+"""A motion fitted to all correspondences that agree with it, where RANSAC's goes through five of them.
+
+The essential matrix is E = [t]x R (Equation 2.5, without its factor). The residual of a correspondence (x, y), (u, v)
+is its signed Sampson distance: to first order, how far it is from meeting (u, v, 1) E (x, y, 1)^T = 0.
+"""
 
 import numpy as np
-from numba import njit
 
+from thesis_repro.compiled import fast
+from thesis_repro.odometry import epipolar
 from thesis_repro.odometry.pose import MIN_CORRESPONDENCES
 
 REFINE_STEPS = 10
 REFINE_ROUNDS = 3
 
 
-def refine(rotation, translation, current, previous, inliers, threshold):
+def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
+           inliers: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
     """The motion (rotation 3x3, unit translation) fitted to all its inliers among correspondences (N, 2).
 
     Levenberg-Marquardt over the rotation and the two angles of the translation's direction, on Sampson distances with
@@ -27,26 +33,22 @@ def refine(rotation, translation, current, previous, inliers, threshold):
     return turned, direction if direction @ translation >= 0 else -direction
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _near(r, t, current, previous, limit):
     """N booleans: the correspondences whose Sampson distance from the motion is below the limit."""
-    e = np.dot(_skew(t), r)
+    essential = epipolar.entries(np.dot(_skew(t), r))
     near = np.empty(len(current), np.bool_)
     for index in range(len(current)):
         x, y = current[index, 0], current[index, 1]
         u, v = previous[index, 0], previous[index, 1]
-        l0 = e[0, 0] * x + e[0, 1] * y + e[0, 2]
-        l1 = e[1, 0] * x + e[1, 1] * y + e[1, 2]
-        l2 = e[2, 0] * x + e[2, 1] * y + e[2, 2]
-        m0 = e[0, 0] * u + e[1, 0] * v + e[2, 0]
-        m1 = e[0, 1] * u + e[1, 1] * v + e[2, 1]
-        algebraic = u * l0 + v * l1 + l2
+        algebraic, l0, l1, m0, m1 = epipolar.lines(essential, x, y, u, v)
         near[index] = algebraic * algebraic < limit * limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
     return near
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _refine(rotation, translation, current, previous, scale):
+    """Levenberg and Marquardt's iteration: steps of (H + damping diag H) change = -gradient, while the cost falls."""
     damping = 1e-4
     r, t = rotation.copy(), translation.copy()
     cost, hessian, gradient = _normal_equations(r, t, current, previous, scale)
@@ -70,7 +72,7 @@ def _refine(rotation, translation, current, previous, scale):
     return r, t
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _tangents(t):
     """Two unit vectors that are perpendicular to the unit vector t and to each other."""
     axis = np.zeros(3)
@@ -80,13 +82,15 @@ def _tangents(t):
     return first, np.cross(t, first)
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _skew(v):
+    """The matrix [v]x of the cross product with v (Equation 2.5)."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _moved(r, t, change):
+    """The motion after a change of five parameters: exp([turn]x) R (Rodrigues' formula), t moved along its tangents."""
     turn = change[:3].copy()
     angle = np.sqrt((turn * turn).sum())
     cross = _skew(turn)
@@ -100,12 +104,15 @@ def _moved(r, t, change):
     return np.dot(rodrigues, r), t_new / np.sqrt((t_new * t_new).sum())
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _normal_equations(r, t, current, previous, scale):
-    """Cauchy cost of the Sampson distances, and its Gauss-Newton matrix and gradient in the five parameters."""
-    e = np.dot(_skew(t), r)
+    """Cauchy cost of the Sampson distances, and its Gauss-Newton matrix (5, 5) and gradient (5) in the parameters.
+
+    With residual s and weight w = 1 / (1 + (s / scale)^2): sum of log(1 + (s / scale)^2), of w J^T J, and of w s J.
+    """
+    essential = epipolar.entries(np.dot(_skew(t), r))
     first, second = _tangents(t)
-    derivatives = np.empty((5, 3, 3))
+    derivatives = np.empty((5, 3, 3))  # of E: [t]x [unit]x R by the rotation's three, [tangent]x R by t's two
     for k in range(3):
         unit = np.zeros(3)
         unit[k] = 1.0
@@ -117,26 +124,17 @@ def _normal_equations(r, t, current, previous, scale):
     for index in range(len(current)):
         x, y = current[index, 0], current[index, 1]
         u, v = previous[index, 0], previous[index, 1]
-        # The epipolar lines: l = E (x, y, 1) in the previous frame, m = E^T (u, v, 1) in the current one.
-        l0 = e[0, 0] * x + e[0, 1] * y + e[0, 2]
-        l1 = e[1, 0] * x + e[1, 1] * y + e[1, 2]
-        l2 = e[2, 0] * x + e[2, 1] * y + e[2, 2]
-        m0 = e[0, 0] * u + e[1, 0] * v + e[2, 0]
-        m1 = e[0, 1] * u + e[1, 1] * v + e[2, 1]
+        algebraic, l0, l1, m0, m1 = epipolar.lines(essential, x, y, u, v)
         square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
         if square < 1e-18:
             continue
         inverse = 1 / np.sqrt(square)
-        residual = (u * l0 + v * l1 + l2) * inverse
+        residual = algebraic * inverse  # the Sampson distance, with its sign
         for k in range(5):
-            d = derivatives[k]
-            d0 = d[0, 0] * x + d[0, 1] * y + d[0, 2]
-            d1 = d[1, 0] * x + d[1, 1] * y + d[1, 2]
-            d2 = d[2, 0] * x + d[2, 1] * y + d[2, 2]
-            c0 = d[0, 0] * u + d[1, 0] * v + d[2, 0]
-            c1 = d[0, 1] * u + d[1, 1] * v + d[2, 1]
+            change, d0, d1, c0, c1 = epipolar.lines(epipolar.entries(derivatives[k]), x, y, u, v)
+            # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2 + m1^2
             slope = l0 * d0 + l1 * d1 + m0 * c0 + m1 * c1
-            jacobian[k] = ((u * d0 + v * d1 + d2) - residual * inverse * slope) * inverse
+            jacobian[k] = (change - residual * inverse * slope) * inverse
         ratio = residual / scale
         weight = 1 / (1 + ratio * ratio)
         cost += np.log(1 + ratio * ratio)
