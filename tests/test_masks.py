@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -35,7 +37,7 @@ def test_dilation_gives_a_square_of_that_width(width):
 def test_wider_masks_hold_narrower_ones():
     label_map = np.random.default_rng(0).choice([7, 23, 26], (20, 20)).astype(np.uint8).repeat(16, 0).repeat(16, 1)
     kept = [masks.keypoint_mask(label_map, (94, 310), width) for width in (1, 3, 5, 7)]
-    assert all((wide >= narrow).all() for narrow, wide in zip(kept, kept[1:]))
+    assert all((wide >= narrow).all() for narrow, wide in pairwise(kept))
     assert 0 < masks.coverage(kept[0]) < masks.coverage(kept[-1]) <= 1
 
 

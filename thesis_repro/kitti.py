@@ -1,5 +1,6 @@
 """KITTI odometry: one sequence's frames, camera, times and true poses, and trajectory files."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,14 +31,14 @@ CAMERAS = {"00": _CAMERA_00, "01": _CAMERA_00, "02": _CAMERA_00, "03": _CAMERA_0
            **{f"{n:02d}": _CAMERA_04 for n in range(4, 11)}}
 
 # Frames of the complete sequences (those with ground truth).
-FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201)))
+FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201), strict=True))
 
 
 # The benchmark keeps the true poses of these to itself, and without them there is no scale.
 WITHOUT_TRUTH = frozenset(f"{number}" for number in range(11, 22))
 
 
-def sequences(root):
+def sequences(root: str | Path) -> list[str]:
     """Names of the sequences under root/sequences that hold image_0, sorted, less those without published poses.
 
     Raises InputError when there are none.
@@ -61,7 +62,7 @@ class Sequence:
     Raises InputError, naming the file, for whatever is missing or malformed.
     """
 
-    def __init__(self, root, name):
+    def __init__(self, root: str | Path, name: str) -> None:
         self.root = Path(root)
         self.name = str(name)
         self.folder = self.root / "sequences" / self.name
@@ -82,18 +83,18 @@ class Sequence:
             raise InputError(f"{path}: {count} lines for {len(self)} frames in {self.frame_paths[0].parent}; "
                              "one line a frame is needed")
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.frame_paths)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"Sequence({str(self.root)!r}, {self.name!r}): {len(self)} frames"
 
     @cached_property
-    def size(self):
+    def size(self) -> tuple[int, int]:
         """(height, width) of the first frame; every frame must have it."""
         return read_gray(self.frame_paths[0]).shape
 
-    def frame(self, index):
+    def frame(self, index: int) -> np.ndarray:
         """Frame `index` as 8-bit gray, (height, width). Raises InputError when unreadable or of another size."""
         image = read_gray(self.frame_paths[index])
         if image.shape != self.size:
@@ -101,13 +102,13 @@ class Sequence:
                              f"sequence has {_size(self.size)}; all frames must have one size")
         return image
 
-    def frames(self):
+    def frames(self) -> Iterator[np.ndarray]:
         """Yield the frames in order."""
         for index in range(len(self)):
             yield self.frame(index)
 
-    def subset(self, count):
-        """The same sequence cut to its first `count` frames (all of them where it has fewer)."""
+    def subset(self, count: int | None) -> "Sequence":
+        """The same sequence cut to its first `count` frames (all of them where it has fewer, or for None)."""
         short = object.__new__(Sequence)
         short.__dict__.update(root=self.root, name=self.name, folder=self.folder, intrinsics=self.intrinsics,
                               frame_paths=self.frame_paths[:count], times=self.times[:count],
@@ -162,7 +163,7 @@ def _read_intrinsics(path):
     raise InputError(f"{path}: has no line 'P0:' with the projection matrix of image_0")
 
 
-def read_poses(path):
+def read_poses(path: str | Path) -> np.ndarray:
     """Camera-to-world poses, (n, 4, 4), metres: one line of 12 numbers, the first three rows, a frame."""
     rows = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -170,13 +171,13 @@ def read_poses(path):
     return poses
 
 
-def write_kitti_poses(path, poses):
+def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
     """Write (n, 4, 4) poses as KITTI does: 12 numbers a line, row by row, all digits kept."""
     lines = (" ".join(repr(float(value)) for value in pose[:3].ravel()) for pose in poses)
     write_text(path, "".join(f"{line}\n" for line in lines))
 
 
-def write_tum(path, poses, times):
+def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
     """Write (n, 4, 4) poses with their times (n,), seconds, in TUM form: time, position, quaternion (x, y, z, w)."""
     lines = []
     for time, pose in zip(times, poses, strict=True):

@@ -12,12 +12,13 @@ import numpy as np
 from thesis_repro import InputError
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import listed, read_gray
+from thesis_repro.kitti import Sequence
 
 CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
 BOUNDARIES = ("canny", "exact")
 
 
-def edges(label_map, size, boundaries="canny"):
+def edges(label_map: np.ndarray, size: tuple[int, int], boundaries: str = "canny") -> np.ndarray:
     """Boundaries between classes at the frame's size.
 
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
@@ -39,7 +40,7 @@ def edges(label_map, size, boundaries="canny"):
     return different.astype(np.uint8) * 255
 
 
-def dilate(edge_image, dilation_width):
+def dilate(edge_image: np.ndarray, dilation_width: int) -> np.ndarray:
     """Widen edges with a square of ones, `dilation_width` pixels a side.
 
     An even width has no centre pixel: OpenCV's anchor then shifts the mask half a pixel, and the thesis keeps that.
@@ -49,12 +50,13 @@ def dilate(edge_image, dilation_width):
     return cv2.dilate(edge_image, np.ones((dilation_width, dilation_width), np.uint8))
 
 
-def keypoint_mask(label_map, size, dilation_width, boundaries="canny"):
+def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int,
+                  boundaries: str = "canny") -> np.ndarray:
     """The mask of one frame from its label map: `dilate(edges(...))`."""
     return dilate(edges(label_map, size, boundaries), dilation_width)
 
 
-def coverage(mask):
+def coverage(mask: np.ndarray) -> float:
     """Share of the frame that the mask keeps, 0 to 1."""
     return float(np.count_nonzero(mask)) / mask.size
 
@@ -66,7 +68,7 @@ class LabelMasks:
     Raises InputError when the folder or a frame's label map is missing.
     """
 
-    def __init__(self, folder, sequence, dilation_width, boundaries="canny"):
+    def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int, boundaries: str = "canny") -> None:
         self.paths = _files_of_frames(folder, sequence, "label map")
         self.size = sequence.size
         self.dilation_width = dilation_width
@@ -74,10 +76,10 @@ class LabelMasks:
         if dilation_width < 1:
             raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels")
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.paths)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int) -> np.ndarray:
         return dilate(_edges_of_file(self.paths[index], self.size, self.boundaries), self.dilation_width)
 
 
@@ -86,7 +88,7 @@ def _edges_of_file(path, size, boundaries):
     return edges(read_label_map(path), size, boundaries)
 
 
-def forget_edges():
+def forget_edges() -> None:
     """Drop the edges that LabelMasks keeps for its next width, so that the making of a mask can be timed."""
     _edges_of_file.cache_clear()
 
@@ -97,14 +99,14 @@ class MaskFolder:
     Raises InputError when the folder or a frame's mask is missing, or a mask has another size than the frame.
     """
 
-    def __init__(self, folder, sequence):
+    def __init__(self, folder: str | Path, sequence: Sequence) -> None:
         self.paths = _files_of_frames(folder, sequence, "mask")
         self.size = sequence.size
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.paths)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int) -> np.ndarray:
         mask = read_gray(self.paths[index])
         if mask.shape != self.size:
             raise InputError(f"{self.paths[index]}: {mask.shape[1]}x{mask.shape[0]} pixels, but the frames have "
@@ -115,7 +117,8 @@ class MaskFolder:
 def _files_of_frames(folder, sequence, what):
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence {sequence.name}")
+        raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence "
+                         f"{sequence.name}")
     present = {path.name for path in listed(folder)}
     missing = [path.name for path in sequence.frame_paths if path.name not in present]
     if missing:

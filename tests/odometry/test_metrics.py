@@ -10,8 +10,8 @@ from evo.core.units import Unit
 from evo.tools import file_interface
 
 from thesis_repro import InputError
-from thesis_repro.odometry import metrics
 from thesis_repro.kitti import write_kitti_poses, write_tum
+from thesis_repro.odometry import metrics
 
 
 def path(positions):
@@ -111,7 +111,6 @@ def test_rpe_by_hand():
     estimated = path([[0, 0, 1.5 * z] for z in range(5)])
     result = metrics.rpe(estimated, true)
     assert result["translation_rmse"] == pytest.approx(0.5) and result["rotation_max"] == pytest.approx(0)
-    assert metrics.rpe(estimated, true, frames=2)["translation_mean"] == pytest.approx(1.0)
     for index in range(5):
         estimated[index, :3, :3] = cv2.Rodrigues(np.array([0, np.radians(2.0) * index, 0]))[0]
     assert metrics.rpe(estimated, true)["rotation_median"] == pytest.approx(2.0)
@@ -121,9 +120,9 @@ def test_rpe_and_raw_ate_are_evos():
     true = winding()
     estimated = drifted(true)
     paths = [PosePath3D(poses_se3=list(some)) for some in (true, estimated)]
-    error = evo_metrics.RPE(evo_metrics.PoseRelation.translation_part, 3, Unit.frames, all_pairs=True)
+    error = evo_metrics.RPE(evo_metrics.PoseRelation.translation_part, 1, Unit.frames, all_pairs=True)
     error.process_data(tuple(paths))
-    assert metrics.rpe(estimated, true, 3)["translation_rmse"] == pytest.approx(error.get_all_statistics()["rmse"])
+    assert metrics.rpe(estimated, true)["translation_rmse"] == pytest.approx(error.get_all_statistics()["rmse"])
     raw = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
     raw.process_data(tuple(paths))
     assert metrics.ate(estimated, true)["max"] == pytest.approx(raw.get_all_statistics()["max"])

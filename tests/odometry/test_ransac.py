@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from thesis_repro import odometry
-from thesis_repro.odometry import five_point, pose, ransac
 from thesis_repro.kitti import Sequence
-from thesis_repro.odometry import THESIS
+from thesis_repro.odometry import THESIS, five_point, pose, ransac
 
 
 def opencv(current, previous, threshold):

@@ -6,8 +6,8 @@ import pytest
 from street import Street, Stripes
 
 from thesis_repro import InputError
-from thesis_repro.report import video
 from thesis_repro.odometry import Odometry
+from thesis_repro.report import video
 
 
 class TimedStreet(Street):
@@ -69,5 +69,5 @@ def test_a_video_that_fails_leaves_nothing(tmp_path):
 
 
 def test_the_sheet_shows_frames_side_by_side(tmp_path):
-    video.write_sheet(tmp_path / "sheet.png", TimedStreet(), count=3)
+    video.write_sheet(tmp_path / "sheet.png", TimedStreet())
     assert cv2.imread(str(tmp_path / "sheet.png")).shape == (560, 960, 3)

@@ -18,11 +18,10 @@ import numba
 import numpy as np
 
 from thesis_repro import InputError, odometry
-from thesis_repro.odometry import keypoints, pose
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, dilate
-from thesis_repro.odometry import THESIS, Odometry
+from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
 from thesis_repro.study.budget import opencv_threads
 
 REPEATS = 3
@@ -89,7 +88,7 @@ def step_cost(sequence, threads):
     bare = np.array(bare)
     return {"opencv_threads": threads, "frames": len(steps), "step_ms": float(np.median(steps)),
             "bare_ms": float(np.median(bare.sum(axis=1))),
-            "bare_by_call_ms": dict(zip(BARE_CALLS, np.median(bare, axis=0).round(3).tolist())),
+            "bare_by_call_ms": dict(zip(BARE_CALLS, np.median(bare, axis=0).round(3).tolist(), strict=True)),
             "ratio": float(np.median(steps / bare.sum(axis=1)))}
 
 
@@ -152,7 +151,7 @@ def keypoint_costs(sequence):
                 step = follower.step(frame, metres[index])
                 if index:
                     times.append(((time.thread_time() - started) * 1e3, len(step.current)))
-            costs[count] = dict(zip(("step_ms", "tracked"), np.median(times, axis=0).tolist()))
+            costs[count] = dict(zip(("step_ms", "tracked"), np.median(times, axis=0).tolist(), strict=True))
     for cost in costs.values():
         cost["ratio_to_2000"] = cost["step_ms"] / costs[2000]["step_ms"]
     return costs

@@ -15,8 +15,9 @@ their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What 
 | moved less than the gate (PySLAM's rule)    | "stationary"                                                         |
 """
 
-from thesis_repro.odometry.odometry import PRESETS, PYSLAM_2024, THESIS, Odometry, OdometrySettings, Step
+from thesis_repro.odometry.odometry import Odometry, Step
 from thesis_repro.odometry.passes import Result, run, run_many, scales, start_pose
+from thesis_repro.odometry.settings import PRESETS, PYSLAM_2024, THESIS, OdometrySettings
 
 __all__ = ["PRESETS", "PYSLAM_2024", "THESIS", "Odometry", "OdometrySettings", "Result", "Step", "run", "run_many",
            "scales", "start_pose"]

@@ -1,10 +1,14 @@
 """Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2), for one run or shared by many."""
 
+from collections.abc import Iterable
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
+
+from thesis_repro.compiled import fast
+from thesis_repro.odometry.settings import OdometrySettings
 
 QUALITY = 0.01  # of the strongest corner (inside the mask)
 BLOCK_SIZE = 5
@@ -13,8 +17,10 @@ TRACKER = {"winSize": (21, 21), "maxLevel": 3,
 
 NO_POINTS = np.empty((0, 2), np.float32)
 
+Start = tuple[np.ndarray | None, np.ndarray]  # what a run tracks from: the previous frame, and its points there (N, 2)
 
-def detect(frame, settings, mask=None):
+
+def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
     """Keypoints of a frame (height, width), strongest first: (N, 2) float32, N = 0 where there are none.
 
     `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the detector looks
@@ -43,7 +49,7 @@ def _orb(max_keypoints):
     return cv2.ORB_create(max_keypoints)
 
 
-def track(previous, current, points):
+def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: found."""
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(previous, current, points, None, **TRACKER)
     return tracked, status.ravel() == 1
@@ -55,8 +61,29 @@ class Keypoints:
     detect = staticmethod(detect)
     track = staticmethod(track)
 
-    def expect(self, frame, odometries):
+    def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
         """Nothing is shared, so nothing is prepared."""
+
+
+OWN = Keypoints()  # nothing in it changes, so one is enough
+
+
+class _Tracks(NamedTuple):
+    """Points of many runs tracked from one frame to the next, by their sorted keys (see _key)."""
+
+    previous: np.ndarray
+    current: np.ndarray
+    keys: np.ndarray
+    tracked: np.ndarray
+    found: np.ndarray
+
+
+class _Corners(NamedTuple):
+    """A frame's corner strength and its local maxima (see _ranked_maxima)."""
+
+    frame: np.ndarray
+    strength: np.ndarray
+    ranked: tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class SharedKeypoints:
@@ -66,40 +93,41 @@ class SharedKeypoints:
     every point on its own, so the first is computed once a frame and the second once for all points of all runs.
     """
 
-    def __init__(self):
-        self._frame = self._strength = self._corners = None
-        self._pair = self._tracked = self._found = self._index = None
+    def __init__(self) -> None:
+        self._tracks: _Tracks | None = None
+        self._corners: _Corners | None = None
 
-    def expect(self, frame, odometries):
+    def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
         """Track to `frame` the points of all runs that come from the same previous frame (nearly always all)."""
-        odometries = [odometry for odometry in odometries if len(odometry.points)]
-        if odometries:
-            previous = odometries[0].previous
-            self._pair = (previous, frame)
-            self._index = np.unique(np.concatenate([_key(odometry.points) for odometry in odometries
-                                                    if odometry.previous is previous]))
-            points = self._index.view(np.float32).reshape(-1, 2)
-            self._tracked, self._found = track(previous, frame, points)
+        known = [(previous, points) for previous, points in starts if previous is not None and len(points)]
+        if known:
+            first, _ = known[0]
+            keys = np.unique(np.concatenate([_key(points) for previous, points in known if previous is first]))
+            self._tracks = _Tracks(first, frame, keys, *track(first, frame, keys.view(np.float32).reshape(-1, 2)))
 
-    def track(self, previous, current, points):
-        if self._pair is None or previous is not self._pair[0] or current is not self._pair[1]:  # resumed, say
+    def track(self, previous: np.ndarray, current: np.ndarray,
+              points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        tracks = self._tracks
+        if tracks is None or previous is not tracks.previous or current is not tracks.current:  # resumed, say
             return track(previous, current, points)
-        where = np.searchsorted(self._index, _key(points))
-        return self._tracked[where], self._found[where]
+        where = np.searchsorted(tracks.keys, _key(points))
+        return tracks.tracked[where], tracks.found[where]
 
-    def detect(self, frame, settings, mask=None):
+    def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
         if settings.detector != "shi-tomasi" or settings.min_distance < 1:
             return detect(frame, settings, mask)
-        if frame is not self._frame:
-            self._frame = frame
-            self._strength = cv2.cornerMinEigenVal(frame, BLOCK_SIZE)
-            self._corners = _ranked_maxima(self._strength, cv2.dilate(self._strength, None))
+        if self._corners is None or frame is not self._corners.frame:
+            strength = cv2.cornerMinEigenVal(frame, BLOCK_SIZE)
+            self._corners = _Corners(frame, strength, _ranked_maxima(strength, cv2.dilate(strength, None)))
         inside = mask if settings.mask_mode == "detect" else None
         # As OpenCV compares: the limit in double precision, rounded to single.
-        limit = np.float32(cv2.minMaxLoc(self._strength, inside)[1] * QUALITY)
-        chosen = _spread(*self._corners, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
+        limit = np.float32(cv2.minMaxLoc(self._corners.strength, inside)[1] * QUALITY)
+        chosen = _spread(*self._corners.ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
                          settings.max_keypoints, settings.min_distance, *frame.shape)
         return _inside(chosen, settings, mask)
+
+
+Features = Keypoints | SharedKeypoints
 
 
 def _key(points):
@@ -115,7 +143,7 @@ def _ranked_maxima(strength, largest_near):
     return rows[order] + 1, columns[order] + 1, values[order]
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _spread(rows, columns, values, limit, mask, max_keypoints, min_distance, height, width):
     """The strongest corners above `limit` inside the mask (if any) that keep `min_distance` from stronger ones.
 

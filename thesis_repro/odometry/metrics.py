@@ -1,5 +1,7 @@
 """How far an estimated path is from the true one: the thesis's RMSE and MAE (Section 3.4) and the field's measures."""
 
+from typing import Any
+
 import evo
 import numpy as np
 import pandas as pd
@@ -10,12 +12,12 @@ from evo.core.units import Unit
 from thesis_repro import InputError
 
 
-def rmse(estimated, true, alignment="position"):
+def rmse(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
     """Equation 3.5, metres, over frames 1 to n-1 of two (n, 4, 4) paths laid over each other at frame 1."""
     return float(np.sqrt((_differences(estimated, true, alignment) ** 2).sum(axis=1).mean()))
 
 
-def mae(estimated, true, alignment="position"):
+def mae(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
     """Equation 3.6, metres: the mean over x, y, z and frames, laid over each other as in `rmse`."""
     return float(np.abs(_differences(estimated, true, alignment)).mean())
 
@@ -51,7 +53,7 @@ def _check(estimated, true):
 # The field's measures
 
 
-def ate(estimated, true, alignment="none"):
+def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dict[str, Any]:
     """Absolute trajectory error, metres, over all frames: {rmse, mean, median, max, scale, note}.
 
     estimated, true: (n, 4, 4) poses.
@@ -73,15 +75,13 @@ def ate(estimated, true, alignment="none"):
     return {**_statistics(error), "scale": float(scale), "note": ""}
 
 
-def rpe(estimated, true, frames=1):
-    """Relative pose error over `frames` frames: {translation_rmse, ..._mean, _median, _max} in metres, and
+def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Relative pose error from frame to frame: {translation_rmse, ..._mean, _median, _max} in metres, and
     {rotation_rmse, ...} in degrees."""
-    if not 1 <= frames < len(true):
-        raise InputError(f"frames={frames}: a path of {len(true)} poses has relative poses over 1 to {len(true) - 1}")
     result = {}
     for name, relation in (("translation", evo_metrics.PoseRelation.translation_part),
                            ("rotation", evo_metrics.PoseRelation.rotation_angle_deg)):
-        error = evo_metrics.RPE(relation, delta=frames, delta_unit=Unit.frames, all_pairs=True)
+        error = evo_metrics.RPE(relation, delta=1, delta_unit=Unit.frames, all_pairs=True)
         error.process_data(_evo_paths(estimated, true))
         result.update({f"{name}_{key}": value for key, value in _statistics(error).items()})
     return result
@@ -101,7 +101,7 @@ KITTI_LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)  # metres
 KITTI_EVERY = 10  # frames between the starts of segments
 
 
-def kitti_segments(estimated, true, lengths=KITTI_LENGTHS):
+def kitti_segments(estimated: np.ndarray, true: np.ndarray) -> pd.DataFrame:
     """The KITTI odometry benchmark's segments: a data frame of first, last, length, translation and rotation error.
 
     From every tenth frame, for each length, up to the first frame more than that many metres of true path away. The
@@ -112,7 +112,7 @@ def kitti_segments(estimated, true, lengths=KITTI_LENGTHS):
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     rows = []
     for first in range(0, len(true), KITTI_EVERY):
-        for length in lengths:
+        for length in KITTI_LENGTHS:
             last = int(np.searchsorted(travelled, travelled[first] + length, side="right"))
             if last == len(true):
                 continue
@@ -124,16 +124,16 @@ def kitti_segments(estimated, true, lengths=KITTI_LENGTHS):
     return pd.DataFrame(rows, columns=["first", "last", "length", "translation", "rotation"])
 
 
-def kitti_errors(estimated, true, lengths=KITTI_LENGTHS):
+def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
     """The KITTI benchmark's errors, means over `kitti_segments`:
     {translation_percent, rotation_deg_per_m, segments, note}.
 
     NaN, with a note, where the path is too short for a single segment; a zero would look like a perfect result.
     """
-    segments = kitti_segments(estimated, true, lengths)
+    segments = kitti_segments(estimated, true)
     note = ""
     if not len(segments):
         path = np.linalg.norm(np.diff(np.asarray(true)[:, :3, 3], axis=0), axis=1).sum()
-        note = f"too short: {path:.1f} m, the shortest segment is {min(lengths)} m"
+        note = f"too short: {path:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m"
     return {"translation_percent": float(segments["translation"].mean() * 100),
             "rotation_deg_per_m": float(segments["rotation"].mean()), "segments": len(segments), "note": note}

@@ -1,8 +1,9 @@
-"""The camera's path, frame by frame: what it is asked to do, what a frame brings, and how the pose moves on."""
+"""The camera's path, frame by frame: what a frame brings, and how the pose moves on."""
 
 import time
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -10,65 +11,11 @@ from thesis_repro import InputError
 from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
 from thesis_repro.odometry.refine import refine
+from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 SECONDS = ("detect", "track", "essential", "pose")
 ROTATION = [f"r{i}{j}" for i in range(3) for j in range(3)]
 FLAT = 4.0  # gray levels: a standard deviation below it is no picture of a street (real frames: above 50)
-
-
-@dataclass(frozen=True)
-class OdometrySettings:
-    """What the odometry does; the defaults are the thesis's.
-
-    detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
-    max_keypoints: limit of the detector, 0 for none. min_distance: between keypoints, pixels (Shi-Tomasi only).
-    mask_mode: "detect" gives the mask to the detector, which fills its quota inside; "filter" drops what lies outside.
-    redetect_below: detect again on a frame to which fewer points were tracked; all points are replaced then.
-    estimator: "ransac", or OpenCV's "usac", "usac-magsac".
-    threshold: of the estimator, in normalised coordinates.
-    permute: seed that shuffles the correspondences before the estimator, whose own seed is fixed; None: not shuffled.
-    pose: which points vote on the sign of the motion: "all" (PySLAM, audit row 13), "inliers"; or "refined": voted by
-    the inliers, then fitted to them.
-    scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
-    points, pixels.
-    rotate_first: turn the pose before moving it.
-    alignment: how the two paths are laid over each other for RMSE and MAE, see metrics.rmse.
-    """
-
-    detector: str = "shi-tomasi"
-    max_keypoints: int = 2000
-    min_distance: float = 3
-    mask_mode: str = "detect"
-    redetect_below: int = 2000
-    estimator: str = "ransac"
-    threshold: float = 0.0003
-    permute: int | None = None
-    pose: str = "all"
-    scale_gate: float = 0.1
-    shift_gate: float = 0.0
-    rotate_first: bool = False
-    alignment: str = "position"
-
-    def __post_init__(self):
-        for name, known in (("detector", ("shi-tomasi", "orb")), ("mask_mode", ("detect", "filter")),
-                            ("estimator", tuple(pose.ESTIMATORS)), ("pose", ("all", "inliers", "refined")),
-                            ("alignment", ("position", "pose"))):
-            if getattr(self, name) not in known:
-                raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
-                                 f"choose one of {', '.join(known)}")
-        for name, least in (("max_keypoints", 0), ("min_distance", 0), ("redetect_below", 0), ("permute", 0),
-                            ("scale_gate", 0), ("shift_gate", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"odometry setting {name}: {value} is below {least}; give {least} or more")
-        if not self.threshold > 0:
-            raise InputError(f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003")
-
-
-THESIS = OdometrySettings()
-PYSLAM_2024 = OdometrySettings(threshold=0.0004, rotate_first=True, shift_gate=1.5, scale_gate=0.015,
-                               alignment="pose")
-PRESETS = {"2021": THESIS, "2024": PYSLAM_2024}
 
 
 @dataclass
@@ -83,32 +30,32 @@ class Step:
     current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)  # that the next frame starts from
     motion: Motion = Motion()
-    pose: np.ndarray | None = None  # 4x4 camera to world, metres
+    pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres; see compose
     updated: bool = False
-    flags: list = field(default_factory=list)
-    seconds: dict = field(default_factory=lambda: dict.fromkeys(SECONDS, 0.0))
+    flags: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(SECONDS, 0.0))
 
     @property
-    def inliers(self):
+    def inliers(self) -> np.ndarray:
         return np.zeros(len(self.current), bool) if self.motion.inliers is None else self.motion.inliers
 
-    def copy(self):
+    def copy(self) -> "Step":
         """The same observation, for another estimate."""
         return replace(self, flags=list(self.flags), seconds=dict(self.seconds))
 
-    def row(self):
+    def row(self) -> dict[str, Any]:
         """One row of Result.frames."""
         tracked = None if self.points is None else len(self.current)
         return {"frame": self.frame, "points": self.points, "detected": self.detected, "tracked": tracked,
                "inliers": None if tracked is None else int(self.inliers.sum()),
                "pose_inliers": None if tracked is None else self.motion.pose_inliers,
                "scale": self.scale, "updated": self.updated, "flag": "; ".join(self.flags),
-               **dict(zip("xyz", self.pose[:3, 3].tolist())),
-               **dict(zip(ROTATION, self.pose[:3, :3].ravel().tolist())),
+               **dict(zip("xyz", self.pose[:3, 3].tolist(), strict=True)),
+               **dict(zip(ROTATION, self.pose[:3, :3].ravel().tolist(), strict=True)),
                **{f"{name}_seconds": value for name, value in self.seconds.items()}}
 
 
-COLUMNS = tuple(Step(0, pose=np.eye(4)).row())
+COLUMNS = tuple(Step(0).row())
 
 
 class Odometry:
@@ -119,24 +66,25 @@ class Odometry:
     after the other; only `motion` is expensive, and it depends on nothing but its own step.
     """
 
-    def __init__(self, intrinsics, settings=THESIS, start=None, features=keypoints.Keypoints()):
+    def __init__(self, intrinsics: np.ndarray, settings: OdometrySettings = THESIS, start: np.ndarray | None = None,
+                 features: keypoints.Features = keypoints.OWN):
         """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. features: a shared keypoints source."""
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
         self.features = features
         self.count = 0
-        self.previous = None  # the frame that self.points belong to
+        self.previous: np.ndarray | None = None  # the frame that self.points belong to
         self.points = keypoints.NO_POINTS
         self._gap = 0.0  # metres from there to the last frame seen
         warm_up()
 
-    def step(self, frame, scale=0.0, mask=None):
+    def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
         step = self.observe(frame, scale, mask)
         self.estimate(step)
         return self.compose(step)
 
-    def observe(self, frame, scale=0.0, mask=None):
+    def observe(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
         """Track the points to this frame and detect new ones; returns a Step without a motion."""
         step = Step(frame=self.count, scale=float(scale))
         self._check(frame, scale, mask)
@@ -149,7 +97,7 @@ class Odometry:
             return step
         started, self._gap = time.perf_counter(), 0.0
         tracked = keypoints.NO_POINTS
-        if len(self.points):
+        if self.previous is not None and len(self.points):
             step.points = len(self.points)
             tracked, found = self.features.track(self.previous, frame, self.points)
             step.previous, step.current = self.points[found], tracked[found]
@@ -171,7 +119,7 @@ class Odometry:
         step.keypoints = tracked
         return step
 
-    def estimate(self, step, essential=None):
+    def estimate(self, step: Step, essential: "Essential | None" = None) -> "Essential | None":
         """The motion from the step's correspondences; returns the essential matrix with what it was made from.
 
         essential: what another Odometry with the same settings but for `pose` returned for the same correspondences.
@@ -197,7 +145,7 @@ class Odometry:
         step.seconds["pose"] = time.perf_counter() - started
         return found
 
-    def compose(self, step):
+    def compose(self, step: Step) -> Step:
         """Move the pose by the step's motion, where it has one that can be believed."""
         motion, chosen = step.motion, self.settings
         if step.points:
@@ -214,12 +162,12 @@ class Odometry:
         step.pose = self.pose
         return step
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """What `restore` needs to go on from here, and nothing that belongs to the settings."""
         return {"pose": self.pose, "count": self.count, "previous": self.previous, "points": self.points,
                 "gap": self._gap}
 
-    def restore(self, state):
+    def restore(self, state: dict[str, Any]) -> None:
         self.pose, self.count, self.previous = state["pose"], state["count"], state["previous"]
         self.points, self._gap = state["points"], state["gap"]
 
@@ -245,7 +193,7 @@ class Odometry:
 
 
 @dataclass(frozen=True)
-class _Essential:
+class Essential:
     """An essential matrix and the normalised correspondences (N, 2) that it was estimated from."""
 
     current: np.ndarray
@@ -256,7 +204,7 @@ class _Essential:
     problem: str
     seconds: float
 
-    def in_order(self):
+    def in_order(self) -> np.ndarray:
         """The inliers in the order of the step's points."""
         if self.order is None:
             return self.inliers
@@ -274,7 +222,7 @@ def _essential(step, settings, intrinsics):
         order = np.random.default_rng((settings.permute, step.frame)).permutation(len(current))
         current, previous = current[order], previous[order]
     found = pose.essential_matrix(current, previous, settings.threshold, settings.estimator)
-    return _Essential(current, previous, order, *found, time.perf_counter() - started)
+    return Essential(current, previous, order, *found, time.perf_counter() - started)
 
 
 def _by_chance(inliers):
@@ -288,7 +236,7 @@ def _mean_shift(step):
 
 
 @lru_cache
-def warm_up():
+def warm_up() -> None:
     """Load the compiled functions (compile them the first time ever), so that no frame's time holds that."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
     pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)

@@ -2,7 +2,7 @@
 
 import hashlib
 import time
-from collections.abc import Iterable, Mapping, Sequence as List
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +16,8 @@ from thesis_repro import InputError, stages
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
-from thesis_repro.odometry.odometry import COLUMNS, ROTATION, THESIS, Odometry, OdometrySettings, Step
+from thesis_repro.odometry.odometry import COLUMNS, ROTATION, Odometry, Step
+from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 CHECKPOINT = 300  # frames
 # What the observed points depend on, and what the essential matrix depends on besides: runs that agree share the work
@@ -100,10 +101,10 @@ class _Run:
 
 @dataclass
 class _Estimate:
-    """Runs of one essential matrix at one frame: each with its own copy of the step, and the thread that works on it."""
+    """Runs of one essential matrix at one frame: each with its own copy of the step, and the thread at work on it."""
 
-    runs: List[_Run]
-    steps: List[Step]
+    runs: list[_Run]
+    steps: list[Step]
     mask_seconds: float
     future: Future | None = None
 
@@ -124,7 +125,7 @@ class _Estimate:
                 one.flags[step.frame] = flag
 
 
-def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]], features: Any,
+def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]], features: keypoints.Features,
          description: str | None, checkpoint: Path | None, workers: int) -> dict[str, Result]:
     members = {name: _Run(Odometry(sequence.intrinsics, settings, start_pose(sequence), features), masks,
                           np.full((len(sequence), len(NUMBERS)), np.nan))
@@ -138,7 +139,7 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
         waiting: list[_Estimate] = []
         for index in _with_bar(range(done, len(sequence)), description, len(sequence)):
             frame = sequence.frame(index)
-            features.expect(frame, [leader.odometry for leader in leaders])
+            features.expect(frame, [(leader.odometry.previous, leader.odometry.points) for leader in leaders])
             observed = []
             for leader, group in zip(leaders, groups, strict=True):
                 started = time.perf_counter()
@@ -193,25 +194,18 @@ def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
             "columns": NUMBERS, "runs": {name: asdict(one.odometry.settings) for name, one in members.items()}}
 
 
-def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: List[_Run]) -> None:
+def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: list[_Run]) -> None:
+    last = leaders[0].odometry.state()  # which frame was the last to be tracked to, all runs agree
     arrays = {"numbers": np.array([one.numbers[:done] for one in members.values()]),
-              "poses": np.array([one.odometry.pose for one in members.values()])}
-    frames: list[np.ndarray] = []  # nearly always one, the last; more where some runs passed over it
-    where = []
-    for index, leader in enumerate(leaders):
-        state = leader.odometry.state()
-        previous = state["previous"]
-        if previous is not None and not any(previous is frame for frame in frames):
-            frames.append(previous)
-        number = next((number for number, frame in enumerate(frames) if frame is previous), None)
-        where.append({"count": state["count"], "gap": state["gap"], "frame": number})
-        arrays[f"points {index}"] = state["points"]
-    arrays |= {f"frame {number}": frame for number, frame in enumerate(frames)}
-    stages.store(checkpoint, {"job": job, "done": done, "leaders": where,
-                              "flags": {name: one.flags for name, one in members.items()}}, arrays)
+              "poses": np.array([one.odometry.pose for one in members.values()]),
+              **{f"points {index}": leader.odometry.points for index, leader in enumerate(leaders)}}
+    if last["previous"] is not None:
+        arrays["previous"] = last["previous"]
+    flags = {name: one.flags for name, one in members.items()}
+    stages.store(checkpoint, {"job": job, "done": done, "gap": last["gap"], "flags": flags}, arrays)
 
 
-def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: List[_Run]) -> int:
+def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
     """Number of frames done according to the checkpoint, 0 where there is none of this job."""
     try:
         kept = stages.resume(checkpoint) if checkpoint else None
@@ -221,15 +215,13 @@ def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], lea
         return 0
     state, arrays = kept
     done = int(state["done"])
-    for name, one, numbers, pose in zip(members, members.values(), arrays["numbers"], arrays["poses"], strict=True):
+    for (name, one), numbers, pose in zip(members.items(), arrays["numbers"], arrays["poses"], strict=True):
         one.numbers[:done] = numbers
         one.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
         one.odometry.pose = pose
-    frames = {None: None} | {number: arrays[f"frame {number}"] for number in range(len(arrays))
-                             if f"frame {number}" in arrays}
-    for index, (leader, where) in enumerate(zip(leaders, state["leaders"], strict=True)):
-        leader.odometry.restore({"pose": leader.odometry.pose, "count": where["count"], "gap": where["gap"],
-                                 "previous": frames[where["frame"]], "points": arrays[f"points {index}"]})
+    for index, leader in enumerate(leaders):
+        leader.odometry.restore({"pose": leader.odometry.pose, "count": done, "previous": arrays.get("previous"),
+                                 "points": arrays[f"points {index}"], "gap": state["gap"]})
     return done
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
+from thesis_repro.compiled import fast
 from thesis_repro.odometry import ransac
 
 PROBABILITY = 0.999  # of RANSAC
@@ -30,7 +30,7 @@ class Motion:
     problem: str = ""
 
 
-def normalise(points, intrinsics):
+def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Pixels (N, 2) to normalised image coordinates (N, 2) in double precision.
 
     u * (1 / fx) + (-cx / fx), which is the inverse camera matrix times (u, v, 1) to the last bit. RANSAC amplifies the
@@ -40,7 +40,8 @@ def normalise(points, intrinsics):
     return points * (1 / focal) + (-intrinsics[:2, 2] / focal)
 
 
-def essential_matrix(current, previous, threshold, estimator="ransac"):
+def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float,
+                     estimator: str = "ransac") -> tuple[np.ndarray | None, np.ndarray, str]:
     """The essential matrix of normalised correspondences (N, 2): (matrix, inliers, problem).
 
     `matrix` is None, and `problem` says why, where there is none or more than one: OpenCV stacks all solutions of
@@ -57,14 +58,15 @@ def essential_matrix(current, previous, threshold, estimator="ransac"):
                                                    method=ESTIMATORS[estimator], prob=PROBABILITY, threshold=threshold)
     except cv2.error:  # the USAC estimators raise on degenerate points
         matrix = None
-    if matrix is None or not np.isfinite(matrix).all():
+    if matrix is None or inliers is None or not np.isfinite(matrix).all():
         return None, none, "no essential matrix"
     if matrix.shape != (3, 3):
         return None, none, "several essential matrices"
     return matrix, inliers.ravel() > 0, ""
 
 
-def recover_pose(matrix, current, previous):
+def recover_pose(matrix: np.ndarray, current: np.ndarray,
+                 previous: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
     """cv2.recoverPose(matrix, current, previous) without its inlier mask, to the last bit: (votes, R, t).
 
     An essential matrix allows four motions; the one that puts most points in front of both cameras, and nearer than
@@ -96,7 +98,7 @@ def _triangulate_and_count(current, previous, rotation, translation):
         return int((good & (points[2] < MAX_DEPTH) & (depth > 0) & (depth < MAX_DEPTH)).sum())
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _count_in_front(current, previous, rotation, t):
     """Votes for (rotation, t), for (rotation, -t), and the indices of points too close to a limit to be sure."""
     margin = 1e-7
@@ -137,7 +139,7 @@ def _count_in_front(current, previous, rotation, t):
     return forward, backward, doubtful[:doubts]
 
 
-@njit(cache=True, nogil=True)
+@fast
 def _least_eigenvector(b):
     """Unit eigenvector of the least eigenvalue of b (lower triangle; overwritten) and whether it is sure."""
     for j in range(4):  # Cholesky

@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 
 from thesis_repro import InputError
-from thesis_repro.odometry import keypoints
 from thesis_repro.files import atomic, progress, write_png
-from thesis_repro.odometry import THESIS, Odometry, scales, start_pose
+from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pose
 
 # blue, green, red, as OpenCV draws; blue and orange can be told apart by most people
 KEPT, DISCARDED, OUTLINE = (255, 140, 30), (60, 60, 230), (0, 220, 255)
 INLIER, OUTLIER = (120, 220, 0), (0, 140, 255)
 TRUE, ESTIMATED, TEXT, PAPER = (90, 90, 90), (200, 80, 0), (40, 40, 40), (255, 255, 255)
+SHEET = 4  # pictures on a still
 MAP_SHARE = 0.75  # height of the map below the frame, in heights of the frame
 
 
@@ -97,8 +97,8 @@ def pictures(sequence, settings=THESIS, masks=None, description=None):
         frame, mask = sequence.frame(index), None if masks is None else masks[index]
         step = odometry.step(frame, metres[index], mask)
         poses.append(step.pose)
-        limits = tuple(pick(old, new) for pick, old, new in zip((np.minimum, np.maximum), limits,
-                                                                _limits(true, np.array(poses))))
+        low, high = _limits(true, np.array(poses))
+        limits = np.minimum(limits[0], low), np.maximum(limits[1], high)
         upper = draw_frame(frame, step, settings, mask)
         height, width = frame.shape
         lower = draw_map((int(MAP_SHARE * height), width), true, np.array(poses), limits)
@@ -148,10 +148,10 @@ def write_video(path, sequence, settings=THESIS, masks=None, description=None):
                 writer.release()
 
 
-def write_sheet(path, sequence, settings=THESIS, masks=None, count=4, description=None):
-    """Write a still of the video's `count` evenly spaced frames, one below the other in two columns."""
-    wanted = set(np.linspace(1 if len(sequence) > 1 else 0, len(sequence) - 1, count).round().astype(int).tolist())
-    chosen = [picture for index, picture in enumerate(pictures(sequence, settings, masks, description))
+def write_sheet(path, sequence, masks=None, description=None):
+    """Write a still of SHEET evenly spaced frames, one below the other in two columns."""
+    wanted = set(np.linspace(1 if len(sequence) > 1 else 0, len(sequence) - 1, SHEET).round().astype(int).tolist())
+    chosen = [picture for index, picture in enumerate(pictures(sequence, masks=masks, description=description))
               if index in wanted]
     if len(chosen) % 2 and len(chosen) > 1:
         chosen.append(np.full_like(chosen[0], PAPER))

@@ -1,0 +1,61 @@
+"""What the odometry is asked to do: the thesis's way, PySLAM's later one, and choices beside them."""
+
+from dataclasses import dataclass
+
+from thesis_repro import InputError
+from thesis_repro.odometry import pose
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """What the odometry does; the defaults are the thesis's.
+
+    detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
+    max_keypoints: limit of the detector, 0 for none. min_distance: between keypoints, pixels (Shi-Tomasi only).
+    mask_mode: "detect" gives the mask to the detector, which fills its quota inside; "filter" drops what lies outside.
+    redetect_below: detect again on a frame to which fewer points were tracked; all points are replaced then.
+    estimator: "ransac", or OpenCV's "usac", "usac-magsac".
+    threshold: of the estimator, in normalised coordinates.
+    permute: seed that shuffles the correspondences before the estimator, whose own seed is fixed; None: not shuffled.
+    pose: which points vote on the sign of the motion: "all" (PySLAM, audit row 13), "inliers"; or "refined": voted by
+    the inliers, then fitted to them.
+    scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
+    points, pixels.
+    rotate_first: turn the pose before moving it.
+    alignment: how the two paths are laid over each other for RMSE and MAE, see metrics.rmse.
+    """
+
+    detector: str = "shi-tomasi"
+    max_keypoints: int = 2000
+    min_distance: float = 3
+    mask_mode: str = "detect"
+    redetect_below: int = 2000
+    estimator: str = "ransac"
+    threshold: float = 0.0003
+    permute: int | None = None
+    pose: str = "all"
+    scale_gate: float = 0.1
+    shift_gate: float = 0.0
+    rotate_first: bool = False
+    alignment: str = "position"
+
+    def __post_init__(self) -> None:
+        for name, known in (("detector", ("shi-tomasi", "orb")), ("mask_mode", ("detect", "filter")),
+                            ("estimator", tuple(pose.ESTIMATORS)), ("pose", ("all", "inliers", "refined")),
+                            ("alignment", ("position", "pose"))):
+            if getattr(self, name) not in known:
+                raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
+                                 f"choose one of {', '.join(known)}")
+        for name, least in (("max_keypoints", 0), ("min_distance", 0), ("redetect_below", 0), ("permute", 0),
+                            ("scale_gate", 0), ("shift_gate", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(f"odometry setting {name}: {value} is below {least}; give {least} or more")
+        if not self.threshold > 0:
+            raise InputError(f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003")
+
+
+THESIS = OdometrySettings()
+PYSLAM_2024 = OdometrySettings(threshold=0.0004, rotate_first=True, shift_gate=1.5, scale_gate=0.015,
+                               alignment="pose")
+PRESETS = {"2021": THESIS, "2024": PYSLAM_2024}
