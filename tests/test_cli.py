@@ -1,6 +1,8 @@
 import json
 import subprocess
 import sys
+from importlib import metadata
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,7 +19,39 @@ def odometry(*options):
 
 def test_help_lists_the_commands():
     text = subprocess.run([sys.executable, "-m", "thesis_repro", "--help"], capture_output=True, text=True, check=True)
-    assert all(command in text.stdout for command in ("synthesize", "check-data", "predict", "odometry"))
+    assert all(command in text.stdout for command in ("synthesize", "check-data", "predict", "masks", "odometry", "plan"))
+
+
+def test_the_console_script_is_the_same_and_tells_its_version():
+    script = Path(sys.executable).with_name("thesis-repro")
+    assert script.is_file(), "install the package: make setup"
+    told = [subprocess.run([*command, "--version"], capture_output=True, text=True, check=True).stdout
+            for command in ([script], [sys.executable, "-m", "thesis_repro"])]
+    assert told[0] == told[1] == f"thesis-repro {metadata.version('thesis-repro')}\n"
+
+
+def test_written_masks_are_read_by_the_odometry_and_give_the_same_path(small_world, small_labels, tmp_path, capsys):
+    where = ["--kitti", small_world / "kitti", "--sequence", "00"]
+    labels = ["--labels", small_labels / "00"]
+
+    def masks(*options):
+        return main(["masks", *map(str, [*where, *labels, *options])])
+
+    assert masks("--dilation", 5, "--output", tmp_path / "mask5") == 0
+    assert sorted(path.name for path in (tmp_path / "mask5").glob("*.png")) == [f"{n:06d}.png" for n in range(12)]
+    assert odometry(*where, "--masks", tmp_path / "mask5", "--output", tmp_path / "one.txt") == 0
+    assert odometry(*where, *labels, "--dilation", 5, "--output", tmp_path / "two.txt") == 0
+    assert (tmp_path / "one.txt").read_bytes() == (tmp_path / "two.txt").read_bytes()
+    assert masks("--dilation", 1, 2, "--boundaries", "exact", "--output", tmp_path / "both") == 0
+    assert sorted(path.name for path in (tmp_path / "both").iterdir()) == ["mask1", "mask2"]
+    capsys.readouterr()
+    assert masks("--dilation", *range(1, 1000), "--output", tmp_path / "many") == 1
+    assert "999 widths of 12 frames would be 11,988 files" in capsys.readouterr().err
+    assert not (tmp_path / "many").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("mine")
+    assert masks("--dilation", 5, "--output", tmp_path / "mine") == 1
+    assert "did not make" in capsys.readouterr().err
 
 
 def test_odometry_writes_one_row_and_one_pose_a_frame(small_world, tmp_path, capsys):

@@ -1,12 +1,16 @@
-"""The command line: python -m thesis_repro COMMAND."""
+"""The command line: thesis-repro COMMAND, or python -m thesis_repro COMMAND."""
 
 import argparse
 import json
 import sys
 from dataclasses import fields, replace
+from importlib.metadata import version
 from pathlib import Path
 
 from thesis_repro import InputError
+
+
+DESCRIPTION = "Keypoint masks from semantic segmentation for monocular visual odometry: a thesis, reproduced."
 
 
 def synthesize(options):
@@ -57,6 +61,27 @@ def predict(options):
     print(f"{options.output}: {len(paths)} label maps")
 
 
+MANY_MASKS = 10_000  # files; more of them must be asked for
+
+
+def masks(options):
+    """write the keypoint masks of a sequence (A.8): one 8-bit PNG a frame, 255 keep, 0 ignore, for odometry --masks"""
+    from thesis_repro.kitti import Sequence
+    from thesis_repro.masks import LabelMasks, write_masks
+
+    sequence, widths = Sequence(options.kitti, options.sequence), sorted(set(options.dilation))
+    made = [LabelMasks(options.labels, sequence, width, options.boundaries) for width in widths]
+    count = len(made) * len(sequence)
+    if count > MANY_MASKS and not options.many:
+        raise InputError(f"--dilation: {len(made)} widths of {len(sequence)} frames would be {count:,} files. The odometry "
+                         "makes masks from label maps as it needs them (odometry --labels); to write them all the same, "
+                         "add --many")
+    for some in made:
+        folder = options.output if len(made) == 1 else options.output / f"mask{some.dilation_width}"
+        write_masks(some, folder)
+        print(f"{folder}: {len(some)} masks of width {some.dilation_width}")
+
+
 def odometry(options):
     """run the visual odometry over one sequence and print its errors, keypoints and time"""
     from thesis_repro import odometry
@@ -78,7 +103,7 @@ def odometry(options):
     if options.masks:
         masks = MaskFolder(options.masks, sequence)
     elif options.labels:
-        masks = LabelMasks(options.labels, sequence, options.dilation)
+        masks = LabelMasks(options.labels, sequence, options.dilation, options.boundaries)
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
     summary = {
@@ -120,7 +145,8 @@ def plan(options):
 
 
 def build_parser():
-    parser = argparse.ArgumentParser(prog="python -m thesis_repro", description=sys.modules["thesis_repro"].__doc__)
+    parser = argparse.ArgumentParser(prog="thesis-repro", description=DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"thesis-repro {version('thesis-repro')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
     def command(function):
@@ -146,6 +172,20 @@ def build_parser():
                      help="a trained model (.keras, .hdf5), several for the mean of their probabilities; "
                           "without it the model in the package")
 
+    def add_boundaries(sub):
+        sub.add_argument("--boundaries", choices=("canny", "exact"), default="canny",
+                         help="Canny on enlarged label ids as in the thesis (canny), or every change of class (exact)")
+
+    sub = command(masks)
+    sub.add_argument("--labels", type=Path, required=True, metavar="DIR", help="one label map a frame")
+    sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
+    sub.add_argument("--sequence", required=True, metavar="NN", help="sequence, 00 to 10")
+    sub.add_argument("--dilation", type=int, nargs="+", required=True, metavar="W",
+                     help="dilation width in pixels; several get a folder each")
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the masks")
+    sub.add_argument("--many", action="store_true", help=f"write more than {MANY_MASKS:,} files")
+    add_boundaries(sub)
+
     sub = command(odometry)
     sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
     sub.add_argument("--sequence", required=True, metavar="NN", help="sequence, 00 to 10")
@@ -153,6 +193,7 @@ def build_parser():
     source.add_argument("--masks", type=Path, metavar="DIR", help="one mask a frame, 255 keep, 0 ignore")
     source.add_argument("--labels", type=Path, metavar="DIR", help="one label map a frame, with --dilation")
     sub.add_argument("--dilation", type=int, metavar="W", help="dilation width in pixels of masks from label maps")
+    add_boundaries(sub)
     sub.add_argument("--pyslam", choices=("2021", "2024"), default="2021",
                      help="the preset: PySLAM of the thesis (default), or its later algorithm; what follows changes it")
     sub.add_argument("--pose", metavar="all|inliers|refined",

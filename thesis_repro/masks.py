@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thesis_repro import InputError
+from thesis_repro import InputError, stages
 from thesis_repro.cityscapes import read_label_map
-from thesis_repro.files import listed, read_gray
+from thesis_repro.files import listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence
 
 CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
@@ -91,6 +91,18 @@ def _edges_of_file(path, size, boundaries):
 def forget_edges() -> None:
     """Drop the edges that LabelMasks keeps for its next width, so that the making of a mask can be timed."""
     _edges_of_file.cache_clear()
+
+
+def write_masks(masks: LabelMasks, folder: str | Path) -> None:
+    """Write the mask of every frame as a PNG named like the frame (A.8), for `MaskFolder` to read.
+
+    The folder is a stage (see stages): a stopped run goes on, masks of other label maps or widths in it are deleted.
+    """
+    folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, boundaries=masks.boundaries,
+                          dilation_width=masks.dilation_width, code=stages.code("masks"))
+    for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
+        if not (folder / path.name).is_file():
+            write_png(folder / path.name, masks[index])
 
 
 class MaskFolder:

@@ -96,12 +96,15 @@ def figure_4_01(history):
     return figure
 
 
-def figure_4_02(image, label_map, prediction):
-    """An image of the Cityscapes validation split, its label map and its prediction (Section 4.1)."""
+def figure_4_02(image, label_map, prediction, whose):
+    """An image of the Cityscapes validation split, its label map and its prediction (Section 4.1).
+
+    whose: the model's name, as "the model of this run".
+    """
     figure, axes = new_figure(1, 3, height=3.0)
     show_image(axes[0], image, "image")
     show_image(axes[1], colorize(label_map), "label map")
-    show_image(axes[2], colorize(prediction), "prediction")
+    show_image(axes[2], colorize(prediction), f"prediction of {whose}")
     _class_legend(figure, label_map, prediction)
     return figure
 
