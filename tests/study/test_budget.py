@@ -33,6 +33,16 @@ def test_every_stage_of_both_variants_takes_time(sequence, model):
     assert by_variant["all keypoints"] == [stage for stage in budget.STAGES if stage not in ("segmentation", "mask")]
 
 
+def test_the_masks_may_have_another_width(sequence, model, monkeypatch):
+    asked = []
+    keypoint_mask = masks.keypoint_mask
+    monkeypatch.setattr(masks, "keypoint_mask", lambda *given: asked.append(given[2:]) or keypoint_mask(*given))
+    for measure in (budget.measure, budget.measure_overlapped):
+        table = measure(sequence, model, frames=2, width=5, boundaries="exact")
+        assert list(table["variant"].unique()) == ["all keypoints", "masked, width 5"]
+    assert set(asked) == {(5, "exact")}
+
+
 def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
     fast = budget.measure(sequence, model, frames=4).set_index(["variant", "stage"])["milliseconds"]
     keypoint_mask = masks.keypoint_mask
@@ -45,8 +55,9 @@ def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
 def test_its_masks_are_those_from_written_label_maps(sequence, model, tmp_path):
     prediction.write_label_maps(model, sequence.frame_paths[:1], tmp_path)
     frame = sequence.frame(0)
-    mask = budget._mask(budget._segment(model, frame), frame.shape)
-    assert np.array_equal(mask, masks.LabelMasks(tmp_path, sequence.subset(1), 10)[0])
+    for width, boundaries in ((10, "canny"), (5, "exact")):
+        mask = budget._mask(budget._segment(model, frame), frame.shape, width, boundaries)
+        assert np.array_equal(mask, masks.LabelMasks(tmp_path, sequence.subset(1), width, boundaries)[0])
 
 
 def test_its_steps_are_those_of_a_run(sequence, model, monkeypatch):
@@ -80,6 +91,8 @@ def test_it_is_measured_once_for_a_model(sequence, model, tmp_path, monkeypatch)
     monkeypatch.setattr(training, "load_model", lambda path: pytest.fail("measured again"))
     second = budget.kept(tmp_path / "budget", sequence, training_file, frames=3)
     assert all(one.equals(other) for one, other in zip(first, second))
+    with pytest.raises(pytest.fail.Exception, match="measured again"):
+        budget.kept(tmp_path / "budget", sequence, training_file, frames=3, width=5)
     monkeypatch.setattr(stages, "content", lambda path: "another model")
     with pytest.raises(pytest.fail.Exception, match="measured again"):
         budget.kept(tmp_path / "budget", sequence, training_file, frames=3)

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -147,10 +148,10 @@ def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, sm
     jobs, kitti = first_jobs(["00"], ()), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
     record = runner.stages.made_from(tmp_path / "00")
-    call = kitti, small_labels
-    elsewhere = runner._run_pass(jobs, *call, tmp_path / "elsewhere", None, runner.odometry.THESIS, record, 1)
+    study = runner._Study(kitti, small_labels, tmp_path, frames=None, boundaries="canny")
+    elsewhere = runner._run_pass(jobs, replace(study, folder=tmp_path / "elsewhere"), record, 1)
     assert "same folders under the same paths" in elsewhere[jobs[0]]
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
-    older = runner._run_pass(jobs, *call, tmp_path, None, runner.odometry.THESIS, record, 1)
+    older = runner._run_pass(jobs, study, record, 1)
     assert "another version of thesis_repro or of OpenCV" in older[jobs[0]]

@@ -11,23 +11,26 @@ from thesis_repro.__main__ import main
 from thesis_repro.study import plan, runner
 from thesis_repro.study.jobs import first_jobs, mask_control_jobs
 
-EXCERPT = plan.Excerpt("00 from frame 2", jobs=(168, 30), series=(1.68 + 0.05, 0.3 + 0.05), shared=0.05,
-                       row_bytes=500.0, worker_bytes=200_000_000)
-CALIBRATION = plan.Calibration((EXCERPT,), timing=0.5, networks=dict.fromkeys(plan.MODELS, 1.0),
-                               network_bytes=2_000_000_000, label_bytes=6000.0, seconds=30.0, repetitions=2)
+SERIES = plan.FIRST_SERIES, plan.SECOND_SERIES
+EXCERPT = plan.Excerpt("00 from frame 2", jobs=dict(zip(SERIES, (168, 30))),
+                       series=dict(zip(SERIES, (1.68 + 0.05, 0.3 + 0.05))), shared=0.05, row_bytes=500.0,
+                       worker_bytes=200_000_000)
+CALIBRATION = plan.Calibration([EXCERPT], timing=0.5, networks=dict.fromkeys(plan.MODELS, 1.0),
+                               network_bytes=2_000_000_000, label_bytes=6000.0, seconds=30.0)
 
 
 def test_the_complete_benchmark_is_added_up(tmp_path):
     made = plan.make(tmp_path, kitti.FRAME_COUNTS, CALIBRATION, 2, (1, 4, 64))
     # 34 thesis runs without the 2 reduced, refined baseline and masks, 5 mask controls under both estimators
-    assert made.jobs == (11 * (32 + 4 + 20), 11 * (2 + 4 + 4))
+    assert made.jobs == dict(zip(SERIES, (11 * (32 + 4 + 20), 11 * (2 + 4 + 4))))
     assert made.label_hours == dict.fromkeys(plan.MODELS, pytest.approx(23201 / 3600))
     # one pass a sequence: what all share, and a hundredth of a second a job
-    assert made.odometry_hours == pytest.approx((23201 * (0.05 + 0.56) / 3600, 23201 * (0.05 + 0.1) / 3600))
+    assert made.odometry_hours == pytest.approx(dict(zip(SERIES, (23201 * (0.05 + 0.56) / 3600,
+                                                                  23201 * (0.05 + 0.1) / 3600))))
     assert made.timing_hours == pytest.approx(11 * 200 * 0.5 / 3600)
     assert made.label_bytes == 23201 * 6000 and made.result_bytes == pytest.approx(23201 * 66 * 500)
     hours = made.wall_hours
-    assert hours[1] == pytest.approx(sum(made.odometry_hours) + made.timing_hours)
+    assert hours[1] == pytest.approx(sum(made.odometry_hours.values()) + made.timing_hours)
     assert hours[1] / 4 < hours[4] < hours[1] / 3 and hours[64] < hours[4]
     # no faster than the longest sequence with what no cut can take from it
     assert hours[64] * 3600 > 2 * 4661 * 0.05
@@ -88,9 +91,10 @@ def test_the_calibration_is_near_what_a_run_takes(small_world, tmp_path):
     started = time.process_time()
     runner.run(jobs, sequence.root, tmp_path / "labels", tmp_path / "results")
     seconds = time.process_time() - started
-    assert excerpt.jobs[0] == len(jobs)
-    assert 1 / 3 < excerpt.series[0] * (len(sequence) - 1) / seconds < 3
-    assert 0 < excerpt.shared < excerpt.series[0] and 200 < excerpt.row_bytes < 2000
+    assert excerpt.jobs[plan.FIRST_SERIES] == len(jobs)
+    cost = excerpt.series[plan.FIRST_SERIES]
+    assert 1 / 3 < cost * (len(sequence) - 1) / seconds < 3
+    assert 0 < excerpt.shared < cost and 200 < excerpt.row_bytes < 2000
 
 
 @pytest.mark.parametrize("options, says", [
@@ -108,9 +112,9 @@ def test_a_damaged_frame_is_named_where_the_user_has_it(tiny_kitti, monkeypatch)
     path = tiny_kitti / "sequences/00/image_0/000002.png"
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(InputError, match="kitti/sequences/00/image_0/000002.png: the image is truncated"):
-        plan.calibrate(tiny_kitti)
+        plan.calibrate(tiny_kitti, 1)
 
 
 def test_too_short_a_sequence_is_one_clear_line(tiny_kitti):
     with pytest.raises(InputError, match="too short to plan from; one of 6 frames"):
-        plan.calibrate(tiny_kitti)
+        plan.calibrate(tiny_kitti, 1)

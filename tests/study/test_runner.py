@@ -108,6 +108,36 @@ def test_a_broken_label_map_costs_only_the_runs_that_need_it(small_world, small_
             f"{broken}: the image is truncated") in capsys.readouterr().out
 
 
+def test_the_boundaries_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path, monkeypatch):
+    kitti, jobs = small_world / "kitti", [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)]
+
+    def keypoints(**chosen):
+        summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=4, **chosen)
+        return summary.set_index("variant")["mean_keypoints"]
+
+    thesis = keypoints()
+    assert thesis["masked"] != thesis["exact-boundaries"]
+    exact = keypoints(boundaries="exact")  # in the same folder: nothing of the others is left
+    assert exact["masked"] == exact["exact-boundaries"] == thesis["exact-boundaries"]
+    # the times of these runs are those of their own masks
+    asked = []
+    monkeypatch.setattr(budget, "masks_of", lambda *given: asked.append(given[-1]) or runner.masks_of(*given))
+    budget.time_runs(jobs, kitti, small_labels, tmp_path, frames=3)
+    assert asked == ["exact"]
+
+
+def test_unknown_boundaries_are_one_clear_line_and_cost_no_result(small_world, small_labels, finished):
+    folder, jobs, _ = finished
+    with pytest.raises(InputError, match="boundaries='fuzzy': unknown; choose one of canny, exact"):
+        runner.run(jobs, small_world / "kitti", small_labels, folder, boundaries="fuzzy")
+    assert list(folder.rglob("*.csv"))
+
+
+def test_times_without_runs_are_one_clear_line(small_world, small_labels, tmp_path):
+    with pytest.raises(InputError, match="00: holds no odometry runs; they are timed after runner.run"):
+        budget.time_runs([Job("00", "baseline")], small_world / "kitti", small_labels, tmp_path, frames=3)
+
+
 def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finished, monkeypatch):
     folder, jobs, _ = finished
     first = [job for job in jobs if job.variant != "reduced"]

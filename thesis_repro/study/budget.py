@@ -20,10 +20,10 @@ from thesis_repro import InputError, masks, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
-from thesis_repro.study.runner import variants
+from thesis_repro.study.runner import masks_of
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
-PLAIN, MASKED = "all keypoints", f"masked, width {CONTROL_WIDTH}"
+PLAIN = "all keypoints"  # the variant without network and mask; the other is "masked, width 10" or whatever width
 WARM_UP = 3  # frames that load compiled code and fill caches, not counted
 
 
@@ -47,7 +47,8 @@ def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, f
 
     Only the first `frames` frames are timed; the first two steps are left out, since they load compiled code. The jobs
     of a sequence take turns at every frame, so that what else the machine does falls on all of them alike.
-    To be called after `runner.run`, whose folder it shares.
+    To be called after `runner.run`, whose folder and whose boundaries it shares. Raises InputError where there are no
+    runs.
     """
     jobs = list(jobs)
     files = {name: folder / name / f"seconds-{frames}.csv" for name in sorted({job.sequence for job in jobs})}
@@ -55,25 +56,35 @@ def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, f
     waiting = {name: of_name for name, of_name in waiting.items() if not files[name].is_file()
                or not {job.name for job in of_name} <= set(pd.read_csv(files[name])["run"])}
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")(
-        joblib.delayed(_time_jobs)(of_name, Sequence(kitti, name).subset(frames), labels, files[name])
+        joblib.delayed(_time_jobs)(of_name, Sequence(kitti, name).subset(frames), labels, _boundaries(folder / name),
+                                   files[name])
         for name, of_name in waiting.items())
     for _ in progress(work, "timing", total=len(waiting), unit="sequence"):
         pass
     return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in files.values()], ignore_index=True)
 
 
-def _time_jobs(jobs: list[Job], sequence: Sequence, labels: Path, path: Path) -> None:
+def _boundaries(folder: Path) -> str:
+    """Those of the runs in a folder."""
+    record = stages.record(folder)
+    if record is None:
+        raise InputError(f"{folder}: holds no odometry runs; they are timed after runner.run has made them")
+    return str(record["boundaries"])
+
+
+def _time_jobs(jobs: list[Job], sequence: Sequence, labels: Path, boundaries: str, path: Path) -> None:
     scales = odometry.scales(sequence)
-    runs, _ = variants(jobs, sequence, labels, odometry.THESIS)
-    followers = {job: odometry.Odometry(sequence.intrinsics, chosen) for job, (chosen, _) in runs.items()}
-    seconds = dict.fromkeys(runs, 0.0)
+    sources, _ = masks_of(jobs, sequence, labels, boundaries)
+    followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in sources}
+    seconds = dict.fromkeys(sources, 0.0)
     with opencv_threads(1):  # one thread makes times comparable
         for index in range(len(sequence)):
             frame = sequence.frame(index)
-            for job, (_, some_masks) in runs.items():
+            for job, follower in followers.items():
                 masks.forget_edges()  # each run of its own would have to make them
-                mask, masking = (None, 0.0) if some_masks is None else _timed(some_masks.__getitem__, index)
-                step = followers[job].step(frame, scales[index], mask)
+                source = sources[job]
+                mask, masking = (None, 0.0) if source is None else _timed(source.__getitem__, index)
+                step = follower.step(frame, scales[index], mask)
                 if index > 1:
                     # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
                     seconds[job] += masking + sum(step.seconds.values())
@@ -86,26 +97,28 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, labels: Path, path: Path) ->
 # A whole frame, with the network
 
 
-def measure(sequence: Sequence, model: Any, *, frames: int = 20) -> pd.DataFrame:
+def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CONTROL_WIDTH,
+            boundaries: str = "canny") -> pd.DataFrame:
     """Milliseconds a frame of every stage: a table of variant, stage and milliseconds, medians over `frames` frames.
 
     Variants: "all keypoints", without network and mask, and "masked, width 10". Stages: read (decode the PNG),
     segmentation (stretch to the model's input, network, class of every pixel), mask (label map to 320x320, edges,
     dilation), detection, tracking, pose (essential matrix, then rotation and translation).
-    model: a Keras model of `segmentation`. The variants take turns at every frame.
-    Raises InputError for a sequence with too few frames.
+    model: a Keras model of `segmentation`. width: pixels, and boundaries, see `masks.edges`, of the masks.
+    The variants take turns at every frame. Raises InputError for a sequence with too few frames.
     """
     sequence, metres = _start(sequence, frames)
-    runs = {name: odometry.Odometry(sequence.intrinsics) for name in (PLAIN, MASKED)}
+    masked = _masked(width)
+    runs = {name: odometry.Odometry(sequence.intrinsics) for name in (PLAIN, masked)}
     rows = []
     with opencv_threads(-1):
         for index in progress(range(len(sequence)), "budget"):
             frame, read = _timed(sequence.frame, index)
             label_map, network = _timed(_segment, model, frame)
-            mask, masking = _timed(_mask, label_map, frame.shape)
+            mask, masking = _timed(_mask, label_map, frame.shape, width, boundaries)
             for name, run in runs.items():
-                seconds = run.step(frame, metres[index], mask if name == MASKED else None).seconds
-                before = {"read": read, **({"segmentation": network, "mask": masking} if name == MASKED else {})}
+                seconds = run.step(frame, metres[index], mask if name == masked else None).seconds
+                before = {"read": read, **({"segmentation": network, "mask": masking} if name == masked else {})}
                 if index >= WARM_UP:
                     rows.append({"variant": name, **before, "detection": seconds["detect"],
                                  "tracking": seconds["track"], "pose": seconds["essential"] + seconds["pose"]})
@@ -113,7 +126,8 @@ def measure(sequence: Sequence, model: Any, *, frames: int = 20) -> pd.DataFrame
     return medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds").dropna().reset_index()
 
 
-def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20) -> pd.DataFrame:
+def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CONTROL_WIDTH,
+                       boundaries: str = "canny") -> pd.DataFrame:
     """Milliseconds between frames where reading, network and mask of the next frame go on beside the odometry of this.
 
     A table of variant and milliseconds (medians). A frame's own way takes as long as before or longer; more frames a
@@ -122,11 +136,11 @@ def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20) -> p
     sequence, metres = _start(sequence, frames)
     rows = []
     with opencv_threads(-1), ThreadPoolExecutor(1) as pool:
-        for name in (PLAIN, MASKED):
+        for name in (PLAIN, _masked(width)):
 
-            def front(index: int, name: str = name) -> tuple[np.ndarray, np.ndarray | None]:
+            def front(index: int, plain: bool = name == PLAIN) -> tuple[np.ndarray, np.ndarray | None]:
                 frame = sequence.frame(index)
-                return frame, _mask(_segment(model, frame), frame.shape) if name == MASKED else None
+                return frame, None if plain else _mask(_segment(model, frame), frame.shape, width, boundaries)
 
             run, times = odometry.Odometry(sequence.intrinsics), []
             waiting = pool.submit(front, 0)
@@ -140,15 +154,16 @@ def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20) -> p
     return pd.DataFrame(rows)
 
 
-def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20) -> tuple[pd.DataFrame, pd.DataFrame]:
+def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20, width: int = CONTROL_WIDTH,
+         boundaries: str = "canny") -> tuple[pd.DataFrame, pd.DataFrame]:
     """(`measure`, `measure_overlapped`) of the first frames with the model in a file, measured once and kept in folder.
 
-    Measured anew when the frames, the model or the code become others.
+    Measured anew when the frames, the masks, the model or the code become others.
     """
     short = sequence.subset(frames + WARM_UP)
-    folder = stages.stage(folder, code=stages.code("odometry", "segmentation/prediction"),
+    folder = stages.stage(folder, code=stages.code("study/budget"),
                           model=stages.content(model_file), opencv=cv2.__version__,
-                          frames=stages.listing(short.frame_paths))
+                          frames=stages.listing(short.frame_paths), width=width, boundaries=boundaries)
     files = {folder / "budget.csv": measure, folder / "overlapped.csv": measure_overlapped}
     missing = {path: function for path, function in files.items() if not path.is_file()}
     if missing:
@@ -156,9 +171,13 @@ def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20
 
         model = training.load_model(model_file)
     for path, function in missing.items():
-        write_text(path, function(short, model, frames=frames).to_csv(index=False))
+        write_text(path, function(short, model, frames=frames, width=width, boundaries=boundaries).to_csv(index=False))
     measured, overlapped = (pd.read_csv(path) for path in files)
     return measured, overlapped
+
+
+def _masked(width: int) -> str:
+    return f"masked, width {width}"
 
 
 def _start(sequence: Sequence, frames: int) -> tuple[Sequence, np.ndarray]:
@@ -184,9 +203,9 @@ def _segment(model: Any, frame: np.ndarray) -> np.ndarray:
     return prediction.predict(model, image[None])[0]
 
 
-def _mask(label_map: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def _mask(label_map: np.ndarray, size: tuple[int, int], width: int, boundaries: str) -> np.ndarray:
     from thesis_repro.segmentation import prediction
 
     # the same as from a written label map, whose size is the thesis's whatever the model's is
     label_map = cv2.resize(label_map, (prediction.SIZE,) * 2, interpolation=cv2.INTER_NEAREST)
-    return masks.keypoint_mask(label_map, size, CONTROL_WIDTH)
+    return masks.keypoint_mask(label_map, size, width, boundaries)

@@ -5,7 +5,9 @@ it returned) in the order in which they end. Of a call whose worker died for goo
 """
 
 import logging
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any, Protocol
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -15,8 +17,14 @@ from thesis_repro import InputError
 TIMEOUT = 8  # seconds for a scheduler to answer
 
 
+class Pool(Protocol):
+    size: int
+
+    def run(self, function: Callable, calls: Sequence[tuple]) -> Iterator[tuple[int, Any]]: ...
+
+
 @contextmanager
-def open_pool(processes, scheduler=None):
+def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """The pool of a Dask scheduler ("tcp://host:8786"), or `processes` processes of this machine where it is None."""
     if scheduler is None:
         yield _Processes(processes)
@@ -40,10 +48,10 @@ def open_pool(processes, scheduler=None):
 
 
 class _Processes:
-    def __init__(self, processes):
+    def __init__(self, processes: int) -> None:
         self.size = processes
 
-    def run(self, function, calls):
+    def run(self, function: Callable, calls: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
         work = joblib.Parallel(n_jobs=self.size, return_as="generator_unordered")(
             joblib.delayed(_numbered)(index, function, call) for index, call in enumerate(calls))
         try:
@@ -53,16 +61,16 @@ class _Processes:
                              "start again, with fewer processes (JOBS)") from None
 
 
-def _numbered(index, function, call):
+def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:
     return index, function(*call)
 
 
 class _Workers:
-    def __init__(self, client):
+    def __init__(self, client: Any) -> None:
         self.client = client
         self.size = sum(client.nthreads().values())
 
-    def run(self, function, calls):
+    def run(self, function: Callable, calls: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
         """A call whose worker dies is started again on another one, by Dask, up to three times."""
         from dask.distributed import as_completed
 

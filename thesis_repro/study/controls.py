@@ -4,43 +4,42 @@ If the odometry gains as much from them, it is not the segmentation that helps. 
 those of `masks`.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 
-from thesis_repro import odometry
+from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, dilate
+from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import SharedKeypoints
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
 CLOSE = 0.002  # of the frame: a difference of coverage that is none
 SAMPLE = 12  # frames on which a distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
+SEED = 0  # of the random lines
 
 
-def true_labels(kitti, name):
+def true_labels(kitti: Path, name: str) -> Path:
     """Where a sequence's true label maps are, if it has any (the embedded world's have)."""
     return Path(kitti) / "sequences" / name / "labels_0"
-
-
-def masks(variant, labels, sequence, dilation_width):
-    """The masks of one of MASKS for a sequence whose predicted label maps are in the folder `labels`."""
-    return MASKS[variant](labels, sequence, dilation_width)
 
 
 class OtherFrame:
     """The mask of the frame half a sequence away: as many boundaries, of the same kind, in the wrong place."""
 
-    def __init__(self, labels, sequence, dilation_width):
-        self.masks = LabelMasks(labels, sequence, dilation_width)
+    def __init__(self, labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> None:
+        self.masks = LabelMasks(labels, sequence, dilation_width, boundaries)
         self.paths = self.masks.paths
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.masks)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int) -> np.ndarray:
         count = len(self)
         return self.masks[(index + count // 2) % count]
 
@@ -48,18 +47,14 @@ class OtherFrame:
 class Mirrored(OtherFrame):
     """The frame's own mask, left and right exchanged: the layout of a street, but not of this one."""
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int) -> np.ndarray:
         return np.ascontiguousarray(self.masks[index][:, ::-1])
 
 
 class RandomLines(OtherFrame):
     """Random segments, dilated as the boundaries are, as many as cover what the frame's mask covers."""
 
-    def __init__(self, labels, sequence, dilation_width, seed=0):
-        super().__init__(labels, sequence, dilation_width)
-        self.seed = seed
-
-    def __getitem__(self, index):
+    def __getitem__(self, index: int) -> np.ndarray:
         mask = self.masks[index]
         wanted = np.count_nonzero(mask)
         for number in (2**8, 2**11, 2**14):
@@ -70,9 +65,9 @@ class RandomLines(OtherFrame):
         count = np.abs(np.concatenate([[0], covered]) - wanted).argmin()
         return np.where(first < count, np.uint8(255), np.uint8(0))
 
-    def _first_segments(self, index, number, shape):
+    def _first_segments(self, index: int, number: int, shape: tuple[int, ...]) -> np.ndarray:
         """The number of the first of the dilated segments that covers a pixel, `number` where none does."""
-        random = np.random.default_rng((self.seed, index))
+        random = np.random.default_rng((SEED, index))
         height, width = shape
         start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
         length = length * height / 2
@@ -87,11 +82,11 @@ class RandomLines(OtherFrame):
 class ImageEdges(OtherFrame):
     """The strongest Canny edges of the frame itself, dilated, that cover what its mask covers: no network at all."""
 
-    def __init__(self, labels, sequence, dilation_width):
-        super().__init__(labels, sequence, dilation_width)
+    def __init__(self, labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> None:
+        super().__init__(labels, sequence, dilation_width, boundaries)
         self.sequence = sequence
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int) -> np.ndarray:
         frame, wanted = self.sequence.frame(index), np.count_nonzero(self.masks[index])
         across, down = cv2.spatialGradient(frame)
         low, high = 1, LARGEST_GRADIENT  # thresholds that cover too much, and not enough
@@ -112,29 +107,43 @@ class ImageEdges(OtherFrame):
         return best
 
 
-def _exact_boundaries(labels, sequence, dilation_width):
-    return LabelMasks(labels, sequence, dilation_width, boundaries="exact")
+def _exact_boundaries(labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> LabelMasks:
+    return LabelMasks(labels, sequence, dilation_width, "exact")
 
 
-def _true_labels(labels, sequence, dilation_width):
-    return LabelMasks(true_labels(sequence.root, sequence.name), sequence, dilation_width)
+def _true_labels(labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> LabelMasks:
+    return LabelMasks(true_labels(sequence.root, sequence.name), sequence, dilation_width, boundaries)
 
 
-MASKS = {"other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges,
-         "exact-boundaries": _exact_boundaries, "true-labels": _true_labels}
+ControlMasks: TypeAlias = LabelMasks | OtherFrame  # both know the `paths` of the label maps that they read
+MASKS: dict[str, Callable[[Path, Sequence, int, str], ControlMasks]] = {
+    "other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges,
+    "exact-boundaries": _exact_boundaries, "true-labels": _true_labels}
 
 
-def min_distance(sequence, number, settings=odometry.THESIS):
+def masks(variant: str, labels: Path, sequence: Sequence, dilation_width: int,
+          boundaries: str = "canny") -> ControlMasks:
+    """The masks of one of MASKS for a sequence whose predicted label maps are in the folder `labels`.
+
+    boundaries: of the label maps, see `masks.edges`; "exact-boundaries" has its own.
+    """
+    return MASKS[variant](labels, sequence, dilation_width, boundaries)
+
+
+def min_distance(sequence: Sequence, number: float) -> float:
     """The distance between keypoints, pixels, at which the detector finds `number` of them on average.
 
-    Looked for on SAMPLE frames of the sequence, never below the distance in `settings`.
+    Looked for on SAMPLE frames of the sequence, never below the distance of the thesis.
     """
     chosen = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
     frames = [(sequence.frame(index), SharedKeypoints()) for index in chosen]
 
-    def found(steps):
-        at = replace(settings, min_distance=round(settings.min_distance + steps * STEP, 6))
-        return np.mean([len(keypoints.detect(frame, at)) for frame, keypoints in frames])
+    def distance(steps: int) -> float:
+        return round(THESIS.min_distance + steps * STEP, 6)
+
+    def found(steps: int) -> float:
+        settings = replace(THESIS, min_distance=distance(steps))
+        return float(np.mean([len(keypoints.detect(frame, settings)) for frame, keypoints in frames]))
 
     low, high = 0, round(min(sequence.size) / STEP)
     counts = {low: found(low)}
@@ -143,4 +152,4 @@ def min_distance(sequence, number, settings=odometry.THESIS):
         counts[middle] = found(middle)
         low, high = (middle, high) if counts[middle] > number else (low, middle)
     best = min(counts, key=lambda steps: abs(counts[steps] - number))
-    return round(settings.min_distance + best * STEP, 6)
+    return distance(best)

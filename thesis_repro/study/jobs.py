@@ -6,17 +6,19 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks
-from thesis_repro.odometry.odometry import OdometrySettings
-from thesis_repro.odometry.passes import Masks
+from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.study import controls
 
-CONTROL_WIDTH = 10  # pixels: the width of Section 3.6 and Figure 3.6, chosen before any run
-POSES = ("all", "refined")  # the thesis's estimator, and the one with the far smaller spread
+# Pixels: the width of Section 3.6 and of Figures 3.6 and 4.5, at which masks are put to the test. It was fixed before
+# any run. (The code of appendix A.8 dilates by 5, audit row 26.)
+CONTROL_WIDTH = 10
+POSES = {"all": "thesis's estimator", "refined": "refined estimator"}  # the second spreads far less
 PIECES = 4  # passes for each of several workers, at the least
 
 
@@ -48,19 +50,23 @@ class Job:
         parts = (self.variant, width, self.max_keypoints, distance, pose, self.repetition)
         return "-".join(str(part) for part in parts if part is not None)
 
-    def settings(self, settings: OdometrySettings) -> OdometrySettings:
-        """What the odometry does in this job, where `settings` are those of all."""
-        changes = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
-                   "permute": self.repetition or None, "pose": self.pose}
-        return replace(settings, **{name: value for name, value in changes.items() if value is not None})
+    @property
+    def settings(self) -> OdometrySettings:
+        """What the odometry does in this job: what the thesis does, but for what the job itself says."""
+        said: dict[str, Any] = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
+                                "permute": self.repetition or None, "pose": self.pose}
+        return replace(THESIS, **{name: value for name, value in said.items() if value is not None})
 
-    def masks(self, sequence: Sequence, labels: Path) -> Masks | None:
-        """Its masks, where the folder `labels` holds a folder of label maps a sequence; None for all keypoints."""
+    def masks(self, sequence: Sequence, labels: Path, boundaries: str = "canny") -> controls.ControlMasks | None:
+        """Its masks; None where the detector may look everywhere.
+
+        labels: a folder that holds one folder of label maps a sequence. boundaries: see `masks.edges`.
+        """
+        if self.dilation_width is None:
+            return None
         if self.variant == "masked":
-            return LabelMasks(labels / self.sequence, sequence, self.dilation_width)
-        if self.variant in controls.MASKS:
-            return controls.masks(self.variant, labels / self.sequence, sequence, self.dilation_width)
-        return None
+            return LabelMasks(labels / self.sequence, sequence, self.dilation_width, boundaries)
+        return controls.masks(self.variant, labels / self.sequence, sequence, self.dilation_width, boundaries)
 
 
 def first_jobs(names: Iterable[str], widths: Iterable[int], repetitions: int = 1) -> list[Job]:
@@ -70,17 +76,20 @@ def first_jobs(names: Iterable[str], widths: Iterable[int], repetitions: int = 1
             for repetition in range(repetitions)]
 
 
-def mask_control_jobs(kitti: Path, names: Iterable[str], repetitions: int = 1) -> list[Job]:
+def mask_control_jobs(kitti: Path, names: Iterable[str], repetitions: int = 1,
+                      width: int = CONTROL_WIDTH) -> list[Job]:
     """The controls that depend on no other run, under both estimators; baseline and masks under the refined one.
 
-    The true label maps take part where a sequence has them, in a folder labels_0 beside its frames.
+    width: pixels, of all masks. Under the thesis's estimator baseline and masks are those of `first_jobs`, so this has
+    to be one of its widths. The true label maps take part where a sequence has them, in a folder labels_0 beside its
+    frames.
     """
     jobs = []
     for name in names:
-        jobs += [Job(name, variant, width, pose="refined", repetition=repetition)
-                 for variant, width in (("baseline", None), ("masked", CONTROL_WIDTH))
+        jobs += [Job(name, variant, its_width, pose="refined", repetition=repetition)
+                 for variant, its_width in (("baseline", None), ("masked", width))
                  for repetition in range(repetitions)]
-        jobs += [Job(name, variant, CONTROL_WIDTH, pose=pose, repetition=repetition)
+        jobs += [Job(name, variant, width, pose=pose, repetition=repetition)
                  for variant in controls.MASKS
                  if variant != "true-labels" or controls.true_labels(kitti, name).is_dir()
                  for pose in POSES for repetition in range(repetitions)]
@@ -105,11 +114,15 @@ def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: i
     jobs = []
     for name, number in keypoints.items():
         distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
-        jobs += [Job(name, variant, pose=pose, repetition=repetition, **setting)
-                 for variant, setting in (("fewer", {"max_keypoints": _whole(number)}),
-                                          ("spread", {"min_distance": distance}))
-                 for pose in POSES for repetition in range(repetitions)]
+        jobs += keypoint_controls(name, number, distance, repetitions)
     return jobs
+
+
+def keypoint_controls(name: str, number: float, distance: float, repetitions: int) -> list[Job]:
+    """`keypoint_control_jobs` of one sequence; distance: pixels, that leaves `number` keypoints."""
+    limits = [Job(name, "fewer", max_keypoints=_whole(number)), Job(name, "spread", min_distance=distance)]
+    return [replace(limit, pose=pose, repetition=repetition) for limit in limits for pose in POSES
+            for repetition in range(repetitions)]
 
 
 def _whole(number: float) -> int:

@@ -5,31 +5,54 @@ Each finished run is one CSV file, so that a stopped or failed series goes on wh
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, odometry, stages
+from thesis_repro import InputError, masks, odometry, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
-from thesis_repro.odometry import OdometrySettings, metrics
-from thesis_repro.odometry.passes import Masks, poses_of
+from thesis_repro.odometry import metrics
+from thesis_repro.odometry.passes import poses_of
 from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes, longest_first
 
-Sequences = Mapping[str, Sequence]
+
+@dataclass(frozen=True)
+class _Study:
+    """What all jobs of one call have in common, and where each of them keeps its files."""
+
+    kitti: Path
+    labels: Path
+    folder: Path
+    frames: int | None
+    boundaries: str
+
+    def sequence(self, name: str) -> Sequence:
+        return Sequence(self.kitti, name).subset(self.frames)
+
+    def result(self, job: Job) -> Path:
+        """One row a frame, written when the job is done."""
+        return self.folder / job.sequence / f"{job.name}.csv"
+
+    def state(self, jobs: list[Job]) -> Path:
+        """The checkpoint of jobs that go over their sequence together."""
+        digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
+        return self.folder / jobs[0].sequence / f"pass-{digest}.npz"
 
 
-def run(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, frames: int | None = None, processes: int = 1,
-        scheduler: str | None = None, settings: OdometrySettings = odometry.THESIS) -> pd.DataFrame:
+def run(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, boundaries: str = "canny",
+        frames: int | None = None, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
     """Run the jobs that have no result yet; returns the summary of all that succeeded, one row a job.
 
-    kitti: the odometry root. labels: folder with one folder of label maps a sequence. folder: where results are kept.
+    kitti: the odometry root. labels: folder with one folder of label maps a sequence. folder: where results are kept;
+    those of other data, code or boundaries are deleted. boundaries: how all masks find them, see `masks.edges`.
     frames: how many of each sequence, None for all. processes: how many work at once on this machine.
     scheduler: address of a Dask scheduler ("tcp://host:8786"); its workers do the work then, with the same results.
     They need this package, and the three folders under the same paths. One thread a worker is best.
@@ -38,23 +61,25 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, frames:
     cost), in as many passes as it takes to keep everyone busy. A job that fails is printed with its reason and does
     not stop the others. What was running when everything stopped goes on from its checkpoint.
     """
+    if boundaries not in masks.BOUNDARIES:
+        raise InputError(f"boundaries={boundaries!r}: unknown; choose one of {', '.join(masks.BOUNDARIES)}")
+    study = _Study(kitti, labels, folder, frames, boundaries)
     jobs = list(dict.fromkeys(jobs))
-    sequences = _open(jobs, kitti, labels, folder, frames, settings)
+    sequences = _open(jobs, study)
     failures: dict[Job, str] = {}
     with cluster.open_pool(processes, scheduler) as pool:
-        passes = _passes(jobs, sequences, folder, pool.size)
+        passes = _passes(jobs, {name: len(sequence) for name, sequence in sequences.items()}, study, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
-        calls = [(one, kitti, labels, folder, frames, settings, stages.made_from(folder / one[0].sequence), threads)
-                 for one in passes]
+        calls = [(one, study, stages.made_from(folder / one[0].sequence), threads) for one in passes]
         for one, failed in progress(pool.run(_run_pass, calls), "odometry", total=len(passes), unit="pass"):
             failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[one], failed)
     for (name, reason), names in _by_reason(failures).items():
         more = f" and {len(names) - 3} more" * (len(names) > 3)
         print(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}")
-    done = [job for job in jobs if _result(folder, job).is_file()]
+    done = [job for job in jobs if study.result(job).is_file()]
     if not done:
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
-    return pd.DataFrame([_summarize(job, sequences[job.sequence], folder) for job in done])
+    return pd.DataFrame([_summarize(job, sequences[job.sequence], study.result(job)) for job in done])
 
 
 def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
@@ -64,15 +89,14 @@ def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
     return names
 
 
-def _open(jobs: list[Job], kitti: Path, labels: Path, folder: Path, frames: int | None,
-          settings: OdometrySettings) -> Sequences:
-    """The jobs' sequences by name; what the folder holds of other data, settings or code is deleted."""
-    sequences = {name: Sequence(kitti, name).subset(frames) for name in sorted({job.sequence for job in jobs})}
+def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
+    """The jobs' sequences by name; what the folder holds of other data, code or boundaries is deleted."""
+    sequences = {name: study.sequence(name) for name in sorted({job.sequence for job in jobs})}
     for name, sequence in sequences.items():
-        true_labels = controls.true_labels(kitti, name)
-        stages.stage(folder / name, **_versions(), frames=stages.listing(sequence.frame_paths),
+        true_labels = controls.true_labels(study.kitti, name)
+        stages.stage(study.folder / name, **_versions(), frames=stages.listing(sequence.frame_paths),
                      poses=stages.content(sequence.root / "poses" / f"{name}.txt"),
-                     labels=stages.made_from(labels / name), settings=asdict(settings),
+                     labels=stages.made_from(study.labels / name), boundaries=study.boundaries,
                      true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None)
     return sequences
 
@@ -81,16 +105,16 @@ def _versions() -> dict[str, str]:
     return {"code": stages.code("odometry", "study/jobs"), "opencv": cv2.__version__}
 
 
-def _passes(jobs: list[Job], sequences: Sequences, folder: Path, workers: int) -> list[list[Job]]:
+def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: int) -> list[list[Job]]:
     """What is to be run, as lists of jobs, each for one pass over its sequence: one that was stopped goes on as it was,
-    the rest is cut anew.
+    the rest is cut anew. frames: of each sequence.
     """
-    frames = {name: len(sequence) for name, sequence in sequences.items()}
-    passes, rest = [], []
-    for name in sequences:
+    passes: list[list[Job]] = []
+    rest: list[Job] = []
+    for name in frames:
         of_name = {job.name: job for job in jobs if job.sequence == name}
-        waiting = {key: job for key, job in of_name.items() if not _result(folder, job).is_file()}
-        for state in sorted((folder / name).glob("pass-*.npz")):
+        waiting = {key: job for key, job in of_name.items() if not study.result(job).is_file()}
+        for state in sorted((study.folder / name).glob("pass-*.npz")):
             keys = _jobs_in(state)
             if not of_name.keys() >= set(keys):
                 continue  # somebody may ask for these again
@@ -103,12 +127,6 @@ def _passes(jobs: list[Job], sequences: Sequences, folder: Path, workers: int) -
     return longest_first(passes + in_passes(rest, frames, workers), frames)
 
 
-def _state(jobs: list[Job], folder: Path) -> Path:
-    """The checkpoint of what goes over a sequence together."""
-    digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
-    return folder / jobs[0].sequence / f"pass-{digest}.npz"
-
-
 def _jobs_in(state: Path) -> list[str]:
     """The names of the jobs in a checkpoint, none where it is damaged."""
     try:
@@ -118,35 +136,37 @@ def _jobs_in(state: Path) -> list[str]:
     return list(kept[0]["job"]["runs"]) if kept else []
 
 
-def _result(folder: Path, job: Job) -> Path:
-    return folder / job.sequence / f"{job.name}.csv"
-
-
-def variants(jobs: Iterable[Job], sequence: Sequence, labels: Path, settings: OdometrySettings
-             ) -> tuple[dict[Job, tuple[OdometrySettings, Masks | None]], dict[Job, str]]:
-    """What the odometry needs to know of each job, {job: (settings, masks)}, and {job: reason} of those it cannot run.
+def masks_of(jobs: Iterable[Job], sequence: Sequence, labels: Path, boundaries: str
+             ) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
+    """The masks of each job over a sequence, {job: masks}, and {job: reason} of those whose masks cannot be made.
 
     Jobs with the same masks get the same object: so `run_many` knows that they share the work.
     """
-    made: dict[tuple, Masks | InputError | None] = {}
-    found, failures = {}, {}
+    made: dict[tuple, controls.ControlMasks | InputError | None] = {}
+    found: dict[Job, controls.ControlMasks | None] = {}
+    failures: dict[Job, str] = {}
     for job in jobs:
         source = (job.variant, job.dilation_width)
         if source not in made:
-            try:
-                masks = job.masks(sequence, labels)
-                for path in getattr(masks, "paths", ()):
-                    _check_label_map(path)  # here, since in the middle of a pass it would stop all of it
-                made[source] = masks
-            except InputError as error:
-                made[source] = error
+            made[source] = _checked_masks(job, sequence, labels, boundaries)
         masks_or_error = made[source]
         if isinstance(masks_or_error, InputError):
             failures[job] = str(masks_or_error)
         else:
-            found[job] = job.settings(settings), masks_or_error
+            found[job] = masks_or_error
     _check_label_map.cache_clear()
     return found, failures
+
+
+def _checked_masks(job: Job, sequence: Sequence, labels: Path, boundaries: str
+                   ) -> controls.ControlMasks | InputError | None:
+    try:
+        its_masks = job.masks(sequence, labels, boundaries)
+        for path in () if its_masks is None else its_masks.paths:
+            _check_label_map(path)  # here, since in the middle of a pass it would stop all of it
+        return its_masks
+    except InputError as error:
+        return error
 
 
 @cache
@@ -154,29 +174,28 @@ def _check_label_map(path: Path) -> None:
     read_label_map(path)
 
 
-def _run_pass(jobs: list[Job], kitti: Path, labels: Path, folder: Path, frames: int | None,
-              settings: OdometrySettings, record: str, threads: int) -> dict[Job, str]:
+def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict[Job, str]:
     """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason} of those that failed."""
     cv2.setNumThreads(1)  # the processes already use every core
-    name, state = jobs[0].sequence, _state(jobs, folder)
+    name, state = jobs[0].sequence, study.state(jobs)
     failures: dict[Job, str] = {}
     try:
-        _check_machine(folder / name, record)
-        sequence = Sequence(kitti, name).subset(frames)
+        _check_machine(study.folder / name, record)
+        sequence = study.sequence(name)
         # all of them where there is a checkpoint to go on from, for it is one of all of them
-        waiting = jobs if state.is_file() else [job for job in jobs if not _result(folder, job).is_file()]
-        runs, failures = variants(waiting, sequence, labels, settings)
-        if not runs:  # or Dask does again what it lost the answer of
+        waiting = jobs if state.is_file() else [job for job in jobs if not study.result(job).is_file()]
+        found, failures = masks_of(waiting, sequence, study.labels, study.boundaries)
+        if not found:  # or Dask does again what it lost the answer of
             return failures
-        results = odometry.run_many(sequence, {job.name: variant for job, variant in runs.items()},
+        results = odometry.run_many(sequence, {job.name: (job.settings, its_masks) for job, its_masks in found.items()},
                                     checkpoint=state, workers=threads)
-        for job in runs:
-            if not _result(folder, job).is_file():
-                write_text(_result(folder, job), results.pop(job.name).frames.to_csv(index=False))
+        for job in found:
+            if not study.result(job).is_file():
+                write_text(study.result(job), results.pop(job.name).frames.to_csv(index=False))
         state.unlink(missing_ok=True)
     except Exception as error:  # whatever it is, the others go on and the reason is reported
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        failures = dict.fromkeys((job for job in jobs if not _result(folder, job).is_file()), reason) | failures
+        failures = dict.fromkeys((job for job in jobs if not study.result(job).is_file()), reason) | failures
     return failures
 
 
@@ -189,8 +208,8 @@ def _check_machine(folder: Path, digest: str) -> None:
         raise InputError("this worker has another version of thesis_repro or of OpenCV; install the same on all")
 
 
-def _summarize(job: Job, sequence: Sequence, folder: Path) -> dict:
-    frames = pd.read_csv(_result(folder, job), keep_default_na=False, na_values={"detected": "", "tracked": ""})
+def _summarize(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
+    frames = pd.read_csv(result, keep_default_na=False, na_values={"detected": "", "tracked": ""})
     poses = poses_of(frames)
     return {
         "sequence": job.sequence, "run": job.name, "variant": job.variant, "dilation_width": job.dilation_width,
