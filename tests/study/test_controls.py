@@ -132,6 +132,31 @@ def _named(series, variant):
     return next(name for name in series.index if name.startswith(variant))
 
 
+def test_another_width_is_that_of_every_mask(small_world, small_labels, tmp_path):
+    kitti = small_world / "kitti"
+    jobs = [*first_jobs(["00"], (5, WIDTH)), *mask_control_jobs(kitti, ["00"], width=5)]
+    assert {job.dilation_width for job in jobs if job.variant in controls.MASKS} == {5}
+    summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=4)
+    number = summary.set_index("run")["mean_keypoints"]
+    assert results.tested_width(summary) == 5 and number["masked-05-0"] < number["masked-10-0"]
+    left = results.keypoints_left(summary)
+    assert left["00"] == number["masked-05-0"]
+    fewer = [job for job in keypoint_control_jobs(left, kitti, frames=4) if job.variant == "fewer"]
+    assert {job.max_keypoints for job in fewer} == {round(left["00"])}
+
+
+def test_all_masks_have_the_boundaries_that_are_asked_for(sequence, small_labels, made):
+    exact = masks.LabelMasks(small_labels / "00", sequence, WIDTH, "exact")
+    chosen = {variant: controls.masks(variant, small_labels / "00", sequence, WIDTH, "exact")
+              for variant in controls.MASKS}
+    assert not np.array_equal(exact[5], made["masked"][5])
+    assert np.array_equal(chosen["other-frame"][5], exact[11])
+    assert np.array_equal(chosen["exact-boundaries"][5], exact[5])
+    assert np.array_equal(chosen["mirrored"][5], cv2.flip(exact[5], 1))
+    for variant in ("random-lines", "image-edges"):
+        assert masks.coverage(chosen[variant][5]) == pytest.approx(masks.coverage(exact[5]), abs=0.01)
+
+
 def test_without_true_label_maps_that_control_is_left_out(tiny_kitti):
     variants = {job.variant for job in mask_control_jobs(tiny_kitti, ["00"])}
     assert variants == {"baseline", "masked", *controls.MASKS} - {"true-labels"}

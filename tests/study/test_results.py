@@ -3,6 +3,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from thesis_repro import InputError
 from thesis_repro.report import findings, outcome, tables
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.report.style import markdown
@@ -13,15 +14,16 @@ ELEVEN = [f"{number:02d}" for number in range(11)]
 OTHERS = [variant for variant in results.CONTROLS if variant != "masked"]
 
 
-def summary_of(names, errors, repetitions=5, noise=0.0, widths=(5, 10, 15), controls=OTHERS, seed=0):
+def summary_of(names, errors, repetitions=5, noise=0.0, widths=(5, 10, 15), controls=OTHERS, seed=0, tested=10):
     """A summary of runs with made-up errors in metres.
 
     errors(sequence, variant, width) -> RMSE, MAE is half of it. noise: relative spread of repetitions.
+    tested: the width of the controls.
     """
     generator = np.random.default_rng(seed)
     runs = [("baseline", None, "all"), *(("masked", width, "all") for width in widths), ("reduced", None, "all"),
-            ("baseline", None, "refined"), ("masked", 10, "refined")]
-    runs += [(variant, None if variant in ("fewer", "spread") else 10, pose)
+            ("baseline", None, "refined"), ("masked", tested, "refined")]
+    runs += [(variant, None if variant in ("fewer", "spread") else tested, pose)
              for variant in controls for pose in results.POSES]
     rows = []
     for name in names:
@@ -88,7 +90,7 @@ def test_the_interval_covers_the_true_mean_about_as_often_as_it_says():
     generator = np.random.default_rng(1)
     covered = 0
     for _ in range(300):
-        low, high = results.interval(generator.normal(7, 30, 11), draws=1000)
+        low, high = results.interval(generator.normal(7, 30, 11))
         covered += low <= 7 <= high
     assert 0.85 < covered / 300 < 0.98  # a percentile bootstrap of eleven is a little too narrow
 
@@ -196,6 +198,36 @@ def test_the_spread_over_repetitions_is_of_the_mean_over_sequences():
     assert (row["rmse_lowest"], row["rmse_highest"], row["rmse"]) == (0, 150, 75)
 
 
+def narrow_is_good(name, variant, width):
+    """Masks of width 5 halve the error, wider ones double it."""
+    return (1.0 if variant != "masked" else 0.5 if width == 5 else 2.0) * (1 + int(name) / 10)
+
+
+def test_the_width_that_is_tested_is_that_of_the_runs():
+    summary = summary_of(ELEVEN, narrow_is_good, noise=0.02, tested=5)
+    assert results.tested_width(summary) == 5 and (results.keypoints_left(summary) == 505).all()
+    for pose in results.POSES:
+        assert set(results.of_control(summary, "masked", pose)["dilation_width"]) == {5}
+        assert results.control_changes(summary, "rmse", pose)["masked"].mean() == pytest.approx(-50, abs=3)
+    table = tables.table_of_change(summary, "rmse", "thesis").set_index("sequence")
+    assert table.loc["00", "width 5 (%)"] == pytest.approx(-50, abs=3) and "width 10 (%)" not in table
+    assert "segmentation mask, width 5" in set(tables.table_controls(summary)["keypoints"])
+    figure = outcome.figure_controls(summary)
+    assert "segmentation mask, width 5" in [tick.get_text() for tick in figure.axes[0].get_yticklabels()]
+    plt.close(figure)
+    text = findings.words(summary, "made up")
+    assert text.count("Masks of width 5 and the controls") == 2 and "in place of Section 3.6's 10" in text
+    assert text.count("Masks help here, and the segmentation matters") == 2
+
+
+def test_runs_without_a_test_have_the_width_of_the_thesis_and_two_tests_have_none():
+    summary = summary_of(ELEVEN, narrow_is_good)
+    assert results.tested_width(summary[summary["pose"] == "all"]) == 10
+    both = pd.concat([summary, summary_of(ELEVEN, narrow_is_good, tested=5)])
+    with pytest.raises(InputError, match="masked runs of the widths 5, 10 under the refined estimator"):
+        results.tested_width(both)
+
+
 def test_apart_names_sequences_whose_repetitions_do_not_overlap():
     summary = summary_of(["00", "01", "02"], lambda *_: 1.0, noise=0.3)
     masked, baseline = results.of_control(summary, "masked"), results.of_control(summary, "baseline")
@@ -217,6 +249,13 @@ def test_words_follow_the_numbers():
     text = findings.words(summary_of(ELEVEN, lambda *a: 1 / segmentation_matters(*a), noise=0.02), "made up")
     assert text.count("**Masks do harm here, and the segmentation is not shown to matter") == 2
     assert "It is larger than with exact class boundaries (+" in text
+
+
+def test_it_is_said_where_the_tested_width_comes_from():
+    text = findings.words(summary_of(ELEVEN, narrow_is_good), "made up")
+    assert "width 10, that of Section 3.6, fixed before any run; it is the best width of no sequence." in text
+    text = findings.words(thesis_summary(REPORTED["table_4_2_rmse_percent_change"]), "made up")
+    assert "width 10, that of Section 3.6, fixed before any run.\n" in text and "of no sequence" not in text
 
 
 def test_noise_is_not_taken_for_a_result():
@@ -296,7 +335,7 @@ def test_time_savings_follow_equation_4_2():
     seconds = pd.DataFrame([(name, variant, width, spent) for name in ("00", "01") for variant, width, spent in
                             (("baseline", np.nan, 10.0), ("masked", 5, 9.0), ("masked", 10, 11.0))],
                            columns=["sequence", "variant", "dilation_width", "seconds"])
-    assert outcome.time_savings(seconds).to_dict() == pytest.approx({5: -10, 10: 10})
+    assert results.time_savings(seconds).to_dict() == pytest.approx({5: -10, 10: 10})
 
 
 def test_the_budget_adds_up():

@@ -38,8 +38,8 @@ CHAPTERS = {
         "figure_2_11": ("Keypoints change with the viewpoint", "The same scene from two places: keypoints that are "
                         "found again, and those that are lost or new."),
         "figure_2_12": ("Keypoints on a frame and on its label map", "Shi-Tomasi on a frame covers every texture; on "
-                        "the label map of that frame it finds far fewer points, all of them where classes meet. This "
-                        "is the idea of the thesis."),
+                        "the label map of that frame its points lie where classes meet. That those are fewer and "
+                        "better is the idea of the thesis; the titles count them."),
     },
     "Chapter 3: method": {
         "table_3_1": ("Cityscapes categories", "Categories and label ids as the thesis lists them. There are 36, and "
@@ -63,7 +63,7 @@ CHAPTERS = {
                         "measures them: the mean over 35 classes in each batch, where a class that is neither "
                         "present nor predicted scores 1. This is not the mIoU of the Cityscapes benchmark."),
         "figure_4_02": ("Prediction on a validation image", "An image of the validation split, its label map, and the "
-                        "trained network's prediction. The thesis calls the split its test images."),
+                        "network's prediction. The thesis calls the split its test images."),
         "figure_4_03": ("Prediction on an odometry frame", "A frame of the odometry data and its predicted label map. "
                         "The thesis shows sequence 10, frame 192; the title says which frame this is."),
         "figure_4_04": ("Keypoints along predicted boundaries", "The edges of the predicted label map, and the "
@@ -77,12 +77,15 @@ CHAPTERS = {
                         "one line a sequence."),
         "figure_4_08": ("Keypoints that jump", "One object in consecutive frames: the predicted boundary moves, and "
                         "the keypoints along it with it. The thesis sees in this a cause of its errors."),
-        "figure_4_09": ("RMSE against dilation width", "Root mean square distance from the true path (Equation 3.5), "
-                        "one line a sequence; below, one panel a sequence with the bands that the repetitions "
+        "figure_4_09": ("RMSE against dilation width", "Root mean square distance from the true path (Equation 3.5) "
+                        "where both paths are laid over each other at frame 1, frame 0 left out; one line a "
+                        "sequence. Below, one panel a sequence with the bands that the repetitions "
                         "span with masks and with all keypoints."),
-        "figure_4_10": ("MAE against dilation width", "Mean absolute error (Equation 3.6), drawn as Figure 4.9."),
-        "table_4_1": ("Best dilation width", "The width with the lowest RMSE on each sequence, and the mean number of "
-                      "keypoints that it leaves. The width is chosen on the sequence that it is judged on."),
+        "figure_4_10": ("MAE against dilation width", "Mean absolute error (Equation 3.6), measured and drawn as in "
+                        "Figure 4.9."),
+        "table_4_1": ("Best dilation width", "The width with the lowest RMSE on each sequence (the thesis says RMSE "
+                      "and/or MAE), and the mean number of keypoints that it leaves. The width is chosen on the "
+                      "sequence that it is judged on."),
         "figure_4_11": ("Paths with each sequence's best width", "Estimated against true paths with the masks of Table "
                         "4.1."),
         "figure_4_12": ("Paths with plainly fewer keypoints", "No masks: the detector is limited to the mean number of "
@@ -97,8 +100,9 @@ CHAPTERS = {
                       "thesis's aggregate is the sum of the percentages; mean, its interval and median are below it. "
                       "Intervals of chosen widths are too narrow: the choices share most of their data."),
         "table_4_3": ("Change of MAE", "As Table 4.2, for the mean absolute error."),
-        "figure_4_17": ("Time saved", "Change of the total time of all sequences for each dilation width (Equation "
-                        "4.2; negative is time saved). Masks are counted, the network that predicts the label maps is "
+        "figure_4_17": ("Time saved", "Change of the time for each dilation width (Equation 4.2; negative is time "
+                        "saved), added up over the first frames of every sequence, which alone are timed; the thesis "
+                        "adds up whole sequences. Masks are counted, the network that predicts the label maps is "
                         "not, as in the thesis; the budget below counts everything."),
     },
     "Appendix": {

@@ -10,7 +10,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from thesis_repro.study import results
 from thesis_repro.report.style import (BASELINE, BLUE, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, RED, REDUCED, SKY, TRUTH,
                                   line_style, new_figure)
-from thesis_repro.odometry.metrics import percent_change
 
 VARIANTS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
             "reduced": ("plainly reduced", REDUCED, "..")}
@@ -196,7 +195,8 @@ def figure_controls(summary):
             panel.grid(axis="y", visible=False)
         axes[1, column].set_xlabel("change from all keypoints (%)")
         _percent_scale(axes[:, column], min(extreme), max(extreme))
-    axes[0, 0].set_yticks(range(len(variants)), [results.CONTROLS[variant] for variant in variants])
+    names = results.control_names(summary)
+    axes[0, 0].set_yticks(range(len(variants)), [names[variant] for variant in variants])
     axes[0, 0].set_ylim(len(variants) - 0.5, -0.6)
     figure.suptitle("Grey: sequences. Marker and bar: their mean and its "
                     f"{results.LEVEL} % interval. Left of 0 is better than all keypoints.", fontsize=8)
@@ -218,26 +218,15 @@ def _percent_scale(panels, lowest, highest):
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.0f}" if value else "0"))
 
 
-def time_savings(seconds):
-    """Equation 4.2 for each dilation width, from the table of `budget.time_runs`: percent by which the total
-    time of all sequences changes.
-
-    Negative where time is saved, as the thesis defines it. Mask making is included, prediction is not.
-    """
-    baseline = seconds[seconds["variant"] == "baseline"]["seconds"].sum()
-    masked = seconds[seconds["variant"] == "masked"].groupby("dilation_width")["seconds"].sum()
-    return percent_change(masked, baseline)
-
-
 def figure_4_17(seconds):
-    """Percent time savings of each dilation width (Equation 4.2)."""
-    savings = time_savings(seconds)
+    """Percent time savings of each dilation width (Equation 4.2), from the table of `budget.time_runs`."""
+    savings = results.time_savings(seconds)
     figure, axes = new_figure(height=3.0)
     axes.bar(savings.index.astype(int), savings, color=MASKED)
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xticks(savings.index.astype(int))
-    axes.set(xlabel="dilation width (pixels)", ylabel="change of total time (%)",
-             title="Time against all keypoints (negative: time saved)")
+    axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)",
+             title="Time of the timed frames against all keypoints (negative: time saved)")
     axes.grid(axis="x", visible=False)
     return figure
 

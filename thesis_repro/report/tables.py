@@ -8,18 +8,16 @@ import pandas as pd
 
 from thesis_repro.study import results
 from thesis_repro.report.captions import REPORTED
-from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.results import best_widths
 
-SHORT = {"masked": f"width {CONTROL_WIDTH}", "exact-boundaries": "exact", "true-labels": "true",
-         "other-frame": "other frame", "mirrored": "mirrored", "random-lines": "random lines",
-         "image-edges": "image edges", "fewer": "fewer", "spread": "spread out"}  # the controls as columns
+SHORT = {"exact-boundaries": "exact", "true-labels": "true", "other-frame": "other frame", "mirrored": "mirrored",
+         "random-lines": "random lines", "image-edges": "image edges", "fewer": "fewer",
+         "spread": "spread out"}  # the controls as columns
 INTERVAL = f"mean, {results.LEVEL} % interval"
 
 
 def table_4_1(summary, reported_as):
     """Best dilation width and mean number of keypoints of each sequence, the thesis's numbers beside them."""
-    best = best_widths(summary)
+    best = results.best_widths(summary)
     reported = {row["sequence"]: row for row in REPORTED["table_4_1"]}
     return pd.DataFrame({
         "sequence": best.index,
@@ -47,12 +45,13 @@ def table_of_change(summary, metric, reported_as):
     key = {"rmse": "table_4_2_rmse_percent_change", "mae": "table_4_3_mae_percent_change"}[metric]
     reported = pd.Series(REPORTED[key])
     theirs = f"change (%), {reported_as}"
+    short = {"masked": f"width {results.tested_width(summary)}", **SHORT}
     changes = pd.DataFrame({
         "change (%)": chosen[f"best_{metric}"],
         theirs: reported.reindex(baseline.index),
         "one width for all (%)": chosen[f"fixed_{metric}"],
         "left-out width (%)": chosen[f"left_out_{metric}"],
-        **{f"{SHORT[variant]} (%)": change
+        **{f"{short[variant]} (%)": change
            for variant, change in results.control_changes(summary, metric).items()},
     })
     label = metric.upper()
@@ -107,7 +106,7 @@ def table_widths(summary):
 def table_controls(summary):
     """Masks of one width and every control under both estimators: mean changes from all keypoints, with intervals."""
     table = results.controls(summary)
-    names = {"baseline": "all keypoints", **results.CONTROLS}
+    names = {"baseline": "all keypoints", **results.control_names(summary)}
     shown = pd.DataFrame({"estimator": table["pose"].map(results.POSES), "keypoints": table["variant"].map(names),
                           "mean number": table["keypoints"].round().astype(int), "sequences": table["sequences"]})
     for metric in ("rmse", "mae"):
