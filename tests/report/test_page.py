@@ -2,8 +2,11 @@
 
 import json
 import os
+import platform
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import unquote
 
@@ -27,6 +30,7 @@ class Reader(HTMLParser):
         self.feed(text)
         self.close()
         assert not self.open
+        self.text = " ".join(self.text.split())
 
     def handle_starttag(self, tag, attributes):
         self.elements.append((tag, dict(attributes)))
@@ -97,7 +101,7 @@ def test_every_link_of_the_page_leads_somewhere(run):
     shown = read(run)
     ids = {attributes["id"] for _, attributes in shown.elements if "id" in attributes}
     links = shown.of("a", "href") + shown.of("img", "src")
-    assert any("08_results.html" in link for link in links)
+    assert any("08_results.html" in link for link in links) and "#top" in links
     for link in links:
         assert link[1:] in ids if link.startswith("#") else (run.settings.figures / unquote(link)).is_file(), link
 
@@ -110,6 +114,33 @@ def test_nothing_is_loaded_from_elsewhere_and_no_folder_of_the_machine_is_named(
         assert "script" not in {tag for tag, _ in shown.elements}
         assert not re.search(r"https?:|url\(|@import|file:", text)
         assert str(ROOT) not in text and str(run.settings.figures.parent) not in text
+
+
+def test_the_page_in_git_has_no_link_out_of_its_folder(run):
+    tracked = replace(run.settings, figures=ROOT / "figures")  # read, not written
+    shown = Reader(page.build(tracked))
+    links = [link for link in shown.of("a", "href") + shown.of("img", "src") if not link.startswith("#")]
+    assert len(links) > 100 and not [link for link in links if "/" in link]
+    assert "notebook 08_results" in shown.text and str(Path("my build", "embedded-demo", "notebooks")) in shown.text
+
+
+def test_hostile_names_and_texts_stay_text(run, tmp_path):
+    attack = '<img src=x onerror="alert(1)">\'&'
+    kitti = tmp_path / f"kitti{attack}"
+    kitti.mkdir()
+    settings = replace(run.settings, kitti=kitti, kitti_is_embedded=False, run=f"run{attack}")
+    (settings.figures / "table_4_2.csv").write_text(f'sequence,"{attack.replace(chr(34), chr(34) * 2)}"\n<script>,1\n')
+    (settings.figures / "findings.md").write_text(f"# {attack}\n\n[a](javascript:alert(1)) <script>alert(1)</script>")
+    run.executed.rename(run.executed.with_name(f"09{attack}.ipynb".replace("/", "")))
+    page.update(settings)
+    text = run.page.read_text()
+    shown = Reader(text)
+    assert not {"script", "onerror"} & {name for tag, attributes in shown.elements for name in (tag, *attributes)}
+    assert "javascript" not in "".join(shown.of("a", "href")) and "x" not in shown.of("img", "src")
+    assert shown.text.count(attack) >= 5  # the run, the folder, the notebook, the table's header, the text
+    for link in shown.of("a", "href"):
+        if not link.startswith("#"):
+            assert (settings.figures / unquote(link)).is_file(), link
 
 
 def test_the_executed_notebook_keeps_its_results_and_leads_back(run):
@@ -145,8 +176,8 @@ def test_the_embedded_world_is_named_at_the_top_where_it_was_used(run, tmp_path,
 
 def test_what_was_run_is_told_from_the_run_itself(run):
     text = read(run).text
-    assert "29 February 2024, 12:34 to 12:34 UTC" in text and "3.11.99" in text
-    assert "tensorflow 2." in text and "not installed" not in text
+    assert "29 February 2024" in text and f"{platform.python_version()} on" in text
+    assert "tensorflow 2." in text and "network 160x160 with 8 filters" in text
 
 
 def test_tables_are_tables_with_numbers_to_the_right(run):
