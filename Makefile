@@ -32,13 +32,14 @@ export TF_CPP_MIN_LOG_LEVEL := 3
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 
-.PHONY: help setup figures test lab bench weights clean check-data
+.PHONY: help setup figures test lint lab bench weights clean check-data
 
 help:
 	@echo "make figures     every table and figure into figures/, on embedded data"
 	@echo "                 KITTI=/path CITYSCAPES=/path   on your own data"
 	@echo "                 PROFILE=smoke|demo|thesis      how large (demo)"
 	@echo "make test        unit tests, and every notebook on the smallest profile"
+	@echo "make lint        style (Ruff) and types (mypy)"
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path"
 	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
@@ -70,7 +71,7 @@ $(error the settings above are wrong)
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
-SOURCES := $(filter-out %/page.py %/html_parts.py %/page.css,$(shell find thesis_repro -type f -not -name '*.pyc'))
+SOURCES := $(shell find thesis_repro -type f -not -name '*.pyc' -not -path '*/report/page.*' -not -name '*.html')
 DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
         $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*))
 
@@ -86,15 +87,11 @@ $(RUN)/checked: .venv/ready $(DATA)
 # Each notebook needs the one before it: they hand results on through files.
 define execute
 $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
-	@mkdir -p $$(@D); started=$$$$SECONDS; echo "$(basename $(1))"; \
-	if THESIS_REPRO_PROGRESS=/proc/$$$$$$$$/fd/2 $(BIN)/jupyter nbconvert --to notebook --execute \
-	  --ExecutePreprocessor.kernel_name=python3 --ExecutePreprocessor.timeout=-1 \
-	  --log-level=ERROR --output-dir $$(@D) --output .$(1) $$< 2> $$(@D)/$(basename $(1)).log; \
-	then mv $$(@D)/.$(1) $$@; echo "  done in $$$$((SECONDS - started)) s"; \
-	else echo "$(basename $(1)) failed:" >&2; \
-	  sed 's/\x1b\[[0-9;]*m//g' $$(@D)/$(basename $(1)).log | grep -E '^[A-Za-z_.]*(Error|Exception|Interrupt|Exit|Died)' | grep -v CellExecutionError \
-    | tail -n 1 >&2; \
-	  echo "the whole report: $$(@D)/$(basename $(1)).log; the same command goes on from here" >&2; exit 1; fi
+	@mkdir -p $$(@D)
+	@$(BIN)/jupyter nbconvert --to notebook --execute --log-level=CRITICAL \
+	  --NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution \
+	  --Execution.log_file=$$(@D)/$(basename $(1)).log --output-dir $$(@D) --output .$(1) $$<
+	@mv $$(@D)/.$(1) $$@
 endef
 previous :=
 $(foreach notebook,$(notdir $(NOTEBOOKS)),\
@@ -108,8 +105,12 @@ check-data: setup
 test: setup
 	@$(BIN)/python -m pytest -q
 
+lint: setup
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+
 lab: setup
-	@$(BIN)/jupyter lab notebooks
+	@$(BIN)/jupyter lab notebooks $(if $(filter 0,$(shell id -u)),--allow-root)
 
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
@@ -121,5 +122,5 @@ weights: setup
 	@$(BIN)/python -m thesis_repro.segmentation.shipped "$(CAMVID)" build/shipped
 
 clean:
-	rm -rf .venv build figures/*/ *.egg-info .pytest_cache
+	rm -rf .venv build figures/*/ *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
+import nbformat
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -16,13 +18,15 @@ FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" f
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
 
 
-def make_figures(tmp_path, *options):
+def make_figures(tmp_path, *options, root=ROOT):
     # make's own variables would hand the outer make's options on to this one
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(("MAKE", "MFLAGS", "THESIS_REPRO_"))}
+    if root != ROOT:
+        environment["PYTHONPATH"] = str(root)
     return subprocess.run(["make", "figures", "PROFILE=smoke", f"BUILD={tmp_path / 'build'}",
                            f"FIGURES={tmp_path / 'figures'}", *options],
-                          cwd=ROOT, env=environment, capture_output=True, text=True)
+                          cwd=root, env=environment, capture_output=True, text=True)
 
 
 def names(folder, suffix):
@@ -44,9 +48,48 @@ def test_all_notebooks_run_and_leave_every_artefact(tmp_path):
     assert [name for name in texts if "embedded world" not in (figures / name).read_text()] == []
     page = (figures / "index.html").read_text()
     assert "41 of 41" in page and "embedded world" in page
+    outputs = "".join(path.read_text() for path in executed.glob("*.ipynb"))
+    assert "Segmentation Models: using" not in outputs and "oneDNN" not in outputs and "frame/s]" not in outputs
     assert len(list(executed.glob("*.html"))) == len(NOTEBOOKS)
     again = make_figures(tmp_path)
     assert again.returncode == 0 and "load_images" not in again.stdout, again.stdout
+
+
+@pytest.mark.notebooks
+def test_only_what_changed_is_made_again(tmp_path):
+    """On a copy of the project with two small notebooks, the second of which fails at first."""
+    root = tmp_path / "project"
+    shutil.copytree(ROOT / "thesis_repro", root / "thesis_repro", ignore=shutil.ignore_patterns("__pycache__"))
+    (root / ".venv").symlink_to(ROOT / ".venv")
+    for name in ("Makefile", "environment.txt", "pyproject.toml"):
+        shutil.copy(ROOT / name, root)
+    (root / "notebooks").mkdir()
+
+    def write(name, code):
+        nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(code)]), root / "notebooks" / name)
+
+    def make():
+        done = make_figures(tmp_path, "-o", ".venv/ready", root=root)
+        return done, [name for name in ("01_one", "02_two") if name in done.stdout.splitlines()]
+
+    write("01_one.ipynb", "from thesis_repro.report import style\nprint('by hand')")
+    write("02_two.ipynb", "from thesis_repro import InputError\nraise InputError('labels: missing; run notebook 5')")
+    failed, executed = make()
+    assert failed.returncode != 0 and executed == ["01_one", "02_two"]
+    assert "02_two failed: InputError: labels: missing; run notebook 5\nthe whole report: " in failed.stderr
+    results = tmp_path / "build" / "embedded-smoke" / "notebooks"
+    assert "raise InputError" in (results / "02_two.log").read_text()
+    assert sorted(path.name for path in results.glob("*.ipynb")) == ["01_one.ipynb"]  # hidden ones included
+
+    write("02_two.ipynb", "print('mended')")
+    assert make()[1] == ["02_two"]
+    page = tmp_path / "figures" / "embedded-smoke" / "index.html"
+    first = page.stat().st_mtime_ns
+    assert make()[1] == [] and page.stat().st_mtime_ns == first
+    (root / "thesis_repro" / "report" / "template.html").touch()
+    assert make()[1] == [] and page.stat().st_mtime_ns > first
+    (root / "thesis_repro" / "report" / "style.py").touch()
+    assert make()[1] == ["01_one", "02_two"]
 
 
 @pytest.mark.notebooks

@@ -1,0 +1,126 @@
+"""Executing notebooks: what is shown, what is kept out, and how it fails."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from thesis_repro.report.execute import LOGGED, shown_progress
+from thesis_repro.settings import ROOT
+
+COMMAND = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--log-level=CRITICAL",
+           "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
+           "--Execution.log_file=out/one.log", "--output-dir=out", "--output=done.ipynb", "one.ipynb"]
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Starts nbconvert as the Makefile does, on a notebook of the cells that are given."""
+
+    def started(*cells):
+        cells = [nbformat.v4.new_code_cell(cell) for cell in cells]
+        nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "one.ipynb")
+        (tmp_path / "out").mkdir()
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        return subprocess.Popen(COMMAND, cwd=tmp_path, env=environment, stdout=subprocess.PIPE,
+                                stderr=subprocess.PIPE, text=True)
+
+    return started
+
+
+def is_alive(pid):
+    shown = subprocess.run(["ps", "-p", str(pid), "-o", "stat="], capture_output=True, text=True)
+    return shown.stdout[:1] not in ("", "Z")
+
+
+def test_progress_is_shown_and_what_libraries_log_stays_out(start, tmp_path):
+    process = start(
+        "import os, sys\n"
+        "open(os.environ['THESIS_REPRO_PROGRESS'], 'a').write('half way\\n')\n"
+        "print('mine\\nSegmentation Models: using `tf.keras` framework.\\nmine too')\n"
+        "print('mine as well', file=sys.stderr)",
+        "print('2026-01-01 00:00:00.1: I tensorflow/core/util/port.cc:153] oneDNN custom operations are on.')")
+    stdout, stderr = process.communicate()
+    assert process.returncode == 0 and stderr == "half way\n"
+    assert stdout.startswith("one\n  done in ")
+    first, second = nbformat.read(tmp_path / "out" / "done.ipynb", 4).cells
+    assert [(output.name, output.text) for output in first.outputs] == [
+        ("stdout", "mine\nmine too\n"), ("stderr", "mine as well\n")]
+    assert second.outputs == []
+
+
+def test_a_failure_is_one_line_a_report_and_no_notebook(start, tmp_path):
+    process = start("from thesis_repro import InputError\nprint('so far')",
+                    "raise InputError('00.txt: no such file; check KITTI\\nmore of it')")
+    _, stderr = process.communicate()
+    assert process.returncode == 1 and stderr.splitlines() == [
+        "one failed: InputError: 00.txt: no such file; check KITTI",
+        "the whole report: out/one.log; the same command goes on from here"]
+    log = (tmp_path / "out" / "one.log").read_text()
+    assert "raise InputError" in log and "more of it" in log and "\x1b" not in log
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["one.log"]
+
+
+def test_a_kernel_that_dies_is_said_to_have_died(start, tmp_path):
+    process = start("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
+    _, stderr = process.communicate()
+    assert process.returncode == 1 and stderr.startswith("one failed: the kernel died")
+    assert "Traceback" not in stderr and "DeadKernelError" in (tmp_path / "out" / "one.log").read_text()
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_notebook_leaves_no_kernel_running(start, tmp_path, sent):
+    process = start("import os, time\nfrom pathlib import Path\n"
+                    "try:\n    Path('pid').write_text(str(os.getpid()))\n    time.sleep(100)\n"
+                    "finally:\n    Path('tidied').touch()")
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "pid").is_file() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    time.sleep(0.5)
+    process.send_signal(sent)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert stderr.splitlines() == ["one was interrupted; the same command goes on from here"]
+    assert (tmp_path / "tidied").is_file() and not is_alive((tmp_path / "pid").read_text())
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["one.log"]
+
+
+def test_progress_goes_to_a_terminal_by_its_name(monkeypatch):
+    here, terminal = os.openpty()
+    with os.fdopen(here), open(terminal, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        with shown_progress() as path:
+            assert path == os.ttyname(terminal)
+
+
+def test_progress_reaches_a_standard_error_that_is_no_terminal(capfd):
+    with shown_progress() as path:
+        for line in ("one", "two"):  # opened anew for each bar
+            with open(path, "a") as file:
+                print(line, file=file)
+    assert capfd.readouterr().err == "one\ntwo\n"
+    assert not Path(path).exists()
+
+
+@pytest.mark.parametrize("line", [
+    "Segmentation Models: using `tf.keras` framework.",
+    "WARNING: All log messages before absl::InitializeLog() is called are written to STDERR",
+    "E0000 00:00:1732199999.123456    1234 cuda_dnn.cc:8579] Unable to register cuDNN factory",
+    "2026-01-01 10:00:00.123456: I external/local_xla/xla/tsl/cuda/cudart_stub.cc:31] Could not find cuda drivers",
+    "To enable the following instructions: AVX2 FMA, in other operations, rebuild TensorFlow with the appropriate "
+    "compiler flags.",
+])
+def test_only_whole_lines_of_libraries_are_dropped(line):
+    assert LOGGED.sub("", f"before\n{line}\nafter") == "before\nafter" and LOGGED.sub("", line) == ""
+    assert LOGGED.sub("", f"I print: {line}") == f"I print: {line}"
+
+
+@pytest.mark.parametrize("line", ["I0 [1]", "E = 5: frame 3]", "2026-01-01 00:00:00: done",
+                                  "Segmentation Models: using it"])
+def test_lines_of_ones_own_stay(line):
+    assert LOGGED.sub("", f"{line}\n") == f"{line}\n"
