@@ -9,9 +9,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from thesis_repro import cityscapes, kitti
+from thesis_repro.cityscapes import ID, LABELS
 from thesis_repro.report import background, methods, style
 from thesis_repro.study import flicker
-from thesis_repro.cityscapes import ID, LABELS
 
 
 @pytest.fixture(autouse=True)

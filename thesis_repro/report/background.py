@@ -5,8 +5,21 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon, Rectangle
 
-from thesis_repro.report.style import (BASELINE, BLUE, GREEN, KEYPOINT, ORANGE, PINK, RED, SKY, TRUTH, frame_panels,
-                                  label_colors, new_figure, show_image)
+from thesis_repro.report.style import (
+    BASELINE,
+    BLUE,
+    GREEN,
+    KEYPOINT,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    TRUTH,
+    frame_panels,
+    label_colors,
+    new_figure,
+    show_image,
+)
 
 GRAY = "#777777"
 
@@ -85,9 +98,9 @@ def figure_2_03():
     return figure
 
 
-def figure_2_04(seed=0):
+def figure_2_04():
     """A 4x4 array under 2x2 max pooling with stride 2."""
-    values = np.random.default_rng(seed).permutation(np.arange(1, 17)).reshape(4, 4)
+    values = np.random.default_rng(0).permutation(np.arange(1, 17)).reshape(4, 4)
     pooled = values.reshape(2, 2, 2, 2).max(axis=(1, 3))
     figure, axes = new_figure(height=2.6)
     axes.set(xlim=(0, 9.4), ylim=(4.9, -0.1), aspect="equal")
@@ -108,9 +121,9 @@ def figure_2_04(seed=0):
     return figure
 
 
-def figure_2_05(seed=0):
+def figure_2_05():
     """A feature vector through a dense layer and softmax to class scores."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     features, weights = rng.normal(size=5).round(1), rng.normal(size=(5, 3)).round(1)
     logits = features @ weights
     scores = np.exp(logits) / np.exp(logits).sum()
@@ -139,9 +152,10 @@ def figure_2_05(seed=0):
     return figure
 
 
-def figure_2_06(seed=0, steps=40, rate=0.1, noise=1.2):
+def figure_2_06():
     """Steps of stochastic gradient descent on a loss surface with two valleys."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
+    steps, rate, noise = 40, 0.1, 1.2
 
     def loss(x, y):
         return 0.5 * (x**2 - 1.5) ** 2 + 0.6 * y**2 + 0.35 * x
@@ -259,15 +273,15 @@ def figure_2_08(poses, title):
     return figure
 
 
-def figure_2_09(first, second, title, matches_shown=60):
-    """ORB matches between two frames of one sequence, the best ones (smallest descriptor distance)."""
+def figure_2_09(first, second, title):
+    """ORB matches between two frames of one sequence, the 60 best ones (smallest descriptor distance)."""
     orb = cv2.ORB_create(1000)
     points, descriptors = orb.detectAndCompute(first, None)
     others, other_descriptors = orb.detectAndCompute(second, None)
     matches = []
     if points and others:
         matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors, other_descriptors)
-    best = sorted(matches, key=lambda match: match.distance)[:matches_shown]
+    best = sorted(matches, key=lambda match: match.distance)[:60]
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
     both = np.vstack([first, gap, second])
     figure, axes = frame_panels(both)

@@ -5,8 +5,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from thesis_repro.cityscapes import LABELS, colorize
-from thesis_repro.report.style import (BLUE, KEYPOINT, ORANGE, PAGE_WIDTH, PINK, SKY, frame_panels, label_colors, line_style,
-                                  new_figure, show_image)
+from thesis_repro.report.style import (
+    BLUE,
+    KEYPOINT,
+    ORANGE,
+    PAGE_WIDTH,
+    PINK,
+    SKY,
+    frame_panels,
+    label_colors,
+    line_style,
+    new_figure,
+    show_image,
+)
 
 EDGE = (255, 140, 0)  # red, green, blue of edges drawn on a frame
 
@@ -44,14 +55,14 @@ def figure_3_03(image, label_map, prediction, label):
     return figure
 
 
-def figure_3_04(alpha=1.0):
-    """Focal loss against the probability of the true class for several gamma (Equation 3.7)."""
+def figure_3_04():
+    """Focal loss against the probability of the true class for several gamma, alpha being 1 (Equation 3.7)."""
     p = np.linspace(0.005, 1, 400)
     figure, axes = new_figure(height=3.0)
     for index, gamma in enumerate((0, 0.5, 1, 2, 5)):
         name = f"γ = {gamma:g}" + (" (cross-entropy)" if gamma == 0 else "")
-        axes.plot(p, -alpha * (1 - p) ** gamma * np.log(p), label=name, **line_style(index))
-    axes.set(xlabel="probability p of the true class (no unit)", ylabel=f"focal loss, α = {alpha:g} (no unit)",
+        axes.plot(p, -((1 - p) ** gamma) * np.log(p), label=name, **line_style(index))
+    axes.set(xlabel="probability p of the true class (no unit)", ylabel="focal loss, α = 1 (no unit)",
              xlim=(0, 1), ylim=(0, 5))
     axes.legend()
     return figure

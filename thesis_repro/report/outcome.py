@@ -7,9 +7,22 @@ at the mean over repetitions; bands and error bars go from the lowest to the hig
 import numpy as np
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
+from thesis_repro.report.style import (
+    BASELINE,
+    BLUE,
+    GREEN,
+    MASKED,
+    ORANGE,
+    PAGE_WIDTH,
+    PINK,
+    RED,
+    REDUCED,
+    SKY,
+    TRUTH,
+    line_style,
+    new_figure,
+)
 from thesis_repro.study import results
-from thesis_repro.report.style import (BASELINE, BLUE, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, RED, REDUCED, SKY, TRUTH,
-                                  line_style, new_figure)
 
 VARIANTS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
             "reduced": ("plainly reduced", REDUCED, "..")}

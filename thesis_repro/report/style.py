@@ -1,7 +1,7 @@
 """One style for every figure and table, and the writing of both: SVG and PNG, CSV and Markdown.
 
-The functions that draw are in figures_background (chapter 2), figures_methods (chapter 3, training, prediction,
-masks) and figures_results (the odometry of chapter 4). Each takes arrays or a table and returns a matplotlib figure.
+The functions that draw are in background (chapter 2), methods (chapter 3, training, prediction, masks) and outcome
+(the odometry of chapter 4). Each takes arrays or a table and returns a matplotlib figure.
 """
 
 from pathlib import Path
@@ -82,7 +82,8 @@ def show_image(axes, image, title, **options):
 def save_figure(figure, folder, name, note):
     """Write folder/name.svg and .png with the data note at the foot."""
     folder = Path(folder)
-    # A tight box lets legends at the figure's edge slip down onto the note, so they are pinned where the layout put them.
+    # A tight box lets legends at the figure's edge slip down onto the note, so they are pinned where the layout put
+    # them.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for legend in figure.legends:
@@ -97,11 +98,10 @@ def save_figure(figure, folder, name, note):
 
 
 def save_table(table, folder, name, note):
-    """Write folder/name.csv and .md with the data note under the Markdown table; returns the table."""
+    """Write folder/name.csv and .md with the data note under the Markdown table."""
     folder = Path(folder)
     write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
     write_text(folder / f"{name}.md", f"{markdown(table)}\n{note}\n")
-    return table
 
 
 def markdown(table):

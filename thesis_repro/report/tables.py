@@ -6,8 +6,8 @@
 import numpy as np
 import pandas as pd
 
-from thesis_repro.study import results
 from thesis_repro.report.captions import REPORTED
+from thesis_repro.study import results
 
 SHORT = {"exact-boundaries": "exact", "true-labels": "true", "other-frame": "other frame", "mirrored": "mirrored",
          "random-lines": "random lines", "image-edges": "image edges", "fewer": "fewer",
