@@ -19,7 +19,8 @@ def odometry(*options):
 
 def test_help_lists_the_commands():
     text = subprocess.run([sys.executable, "-m", "thesis_repro", "--help"], capture_output=True, text=True, check=True)
-    assert all(command in text.stdout for command in ("synthesize", "check-data", "predict", "masks", "odometry", "plan"))
+    commands = ("synthesize", "check-data", "predict", "masks", "odometry", "plan")
+    assert all(command in text.stdout for command in commands)
 
 
 def test_the_console_script_is_the_same_and_tells_its_version():

@@ -71,3 +71,19 @@ def test_the_check_of_the_imports_can_fail(tmp_path):
                       "from thesis_repro.report.style import BLUE\n")
     assert imports(module) == {"study.__init__", "study.runner", "report.style"}
     assert imports(module, "study") == {"study.runner", "report.style"}
+
+
+def test_public_signatures_of_the_method_have_types():
+    bare = []
+    for path in [PACKAGE / "masks.py", PACKAGE / "kitti.py",
+                 *(path for folder in ("odometry", "study") for path in (PACKAGE / folder).glob("*.py"))]:
+        tree = ast.parse(path.read_text())
+        for node in [*tree.body, *(inner for one in tree.body if isinstance(one, ast.ClassDef) for inner in one.body)]:
+            if not isinstance(node, ast.FunctionDef) or node.name.startswith("_") or any(
+                    isinstance(name, ast.Name) and name.id == "fast" for name in node.decorator_list):
+                continue  # what is compiled gets its types from its arguments
+            arguments = [*node.args.args, *node.args.kwonlyargs]
+            typed = all(one.annotation for one in arguments if one.arg not in ("self", "cls"))
+            if node.returns is None or not typed:
+                bare.append(f"{path.relative_to(PACKAGE)}: {node.name}")
+    assert bare == []

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from thesis_repro import InputError
 
-
 DESCRIPTION = "Keypoint masks from semantic segmentation for monocular visual odometry: a thesis, reproduced."
 
 
@@ -73,9 +72,9 @@ def masks(options):
     made = [LabelMasks(options.labels, sequence, width, options.boundaries) for width in widths]
     count = len(made) * len(sequence)
     if count > MANY_MASKS and not options.many:
-        raise InputError(f"--dilation: {len(made)} widths of {len(sequence)} frames would be {count:,} files. The odometry "
-                         "makes masks from label maps as it needs them (odometry --labels); to write them all the same, "
-                         "add --many")
+        raise InputError(f"--dilation: {len(made)} widths of {len(sequence)} frames would be {count:,} files. The "
+                         "odometry makes masks from label maps as it needs them (odometry --labels); to write them "
+                         "all the same, add --many")
     for some in made:
         folder = options.output if len(made) == 1 else options.output / f"mask{some.dilation_width}"
         write_masks(some, folder)

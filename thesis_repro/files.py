@@ -122,7 +122,8 @@ def progress(iterable=None, description="", total=None, unit="frame", initial=0)
             pass
     live = stream.isatty()
     return tqdm(iterable, desc=description, total=total, unit=unit, initial=initial, dynamic_ncols=live,
-                file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live, delay=BAR_DELAY)
+                file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live,
+                delay=BAR_DELAY)
 
 
 class _Lines:

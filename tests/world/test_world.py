@@ -1,14 +1,13 @@
 """The embedded world: exact poses and label maps, the same bytes for a seed, both layouts, faults and resuming."""
 
-import json
 
 import cv2
 import numpy as np
 import pytest
 
 from thesis_repro import InputError, cityscapes, kitti
-from thesis_repro.world import dataset, props, render, street, textures
 from thesis_repro.cityscapes import ID
+from thesis_repro.world import dataset, props, render, street, textures
 
 SMALL = {"sequences": ("00", "07"), "frames": 12, "scale": 0.2, "train_images": 2, "validation_images": 1, "jobs": 1}
 

@@ -1,6 +1,5 @@
 """Loss, metrics and the input of training (A.5), and what lets a long training go on after a stop."""
 
-import json
 import os
 import zlib
 from hashlib import sha256
@@ -138,7 +137,10 @@ class GoingOn(keras.callbacks.Callback):
     COUNTERS = ("wait", "best", "best_epoch", "stopped_epoch")
 
     def __init__(self, folder, model, batches, others=()):
-        """model: compiled, its optimizer built. Raises InputError where the folder holds the state of another network, or a damaged one."""
+        """model: compiled, its optimizer built.
+
+        Raises InputError where the folder holds the state of another network, or a damaged one.
+        """
         super().__init__()
         self.folder, self.batches, self.others = Path(folder), batches, others
         self.rows, self._counters, self._bar = [], [], None
@@ -159,7 +161,7 @@ class GoingOn(keras.callbacks.Callback):
         return pd.DataFrame(self.rows)
 
     def first_epoch(self, epochs):
-        """The epoch to go on with; `epochs`, which leaves nothing to do, where early stopping has ended the training."""
+        """The epoch to go on with; `epochs`, which leaves nothing to do, where early stopping has ended it."""
         stopped = any(counters.get("stopped_epoch") and counters["wait"] >= other.patience
                       for other, counters in zip(self.others, self._counters))
         return epochs if stopped else min(len(self.rows), epochs)
@@ -180,8 +182,8 @@ class GoingOn(keras.callbacks.Callback):
     def on_epoch_end(self, epoch, logs=None):
         self._bar.set_postfix_str(f"epoch {epoch + 1}, validation loss {logs['val_loss']:.3f}")
         self.rows.append({"epoch": epoch + 1} | {name: float(value) for name, value in logs.items()})
-        self._counters = [{name: float(vars(other)[name]) for name in self.COUNTERS if vars(other).get(name) is not None}
-                          for other in self.others]
+        self._counters = [{name: float(value) for name, value in vars(other).items()
+                           if name in self.COUNTERS and value is not None} for other in self.others]
         files.write_text(self.folder / HISTORY, self.history.to_csv(index=False))
         stages.store(self.folder / STATE, {"rows": self.rows, "counters": self._counters},
                      {f"{index}": variable.numpy() for index, variable in enumerate(self._variables)})

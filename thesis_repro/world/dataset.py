@@ -13,9 +13,9 @@ import numpy as np
 from joblib import Parallel, cpu_count, delayed
 
 from thesis_repro import InputError, kitti, stages
-from thesis_repro.world import render, street, textures
 from thesis_repro.cityscapes import ID
 from thesis_repro.files import progress, write_png, write_text
+from thesis_repro.world import render, street, textures
 from thesis_repro.world.street import AHEAD, BEHIND, STEP, Style, Track
 
 SEQUENCES = tuple(kitti.CAMERAS)

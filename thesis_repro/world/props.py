@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesis_repro.world import render
 from thesis_repro.cityscapes import ID
+from thesis_repro.world import render
 from thesis_repro.world.sprites import PROFILES, WIDTHS
 from thesis_repro.world.surfaces import FACADE_TILE, FACADES, SHOP_TILE, TILE
 

@@ -8,10 +8,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesis_repro.world import render
 from thesis_repro.cityscapes import ID
+from thesis_repro.world import render
 from thesis_repro.world.props import (
-    Faces, Footprint, building, cut_out, cyclist, lamp, place, sign, traffic_light, vehicle)
+    Faces,
+    Footprint,
+    building,
+    cut_out,
+    cyclist,
+    lamp,
+    place,
+    sign,
+    traffic_light,
+    vehicle,
+)
 from thesis_repro.world.sprites import PERSONS, SIGNS, TREES
 from thesis_repro.world.surfaces import TILE, noise
 
