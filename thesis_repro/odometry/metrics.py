@@ -22,7 +22,7 @@ def mae(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") ->
     return float(np.abs(_differences(estimated, true, alignment)).mean())
 
 
-def percent_change(value, benchmark):
+def percent_change(value: Any, benchmark: Any) -> Any:
     """Equations 4.1 and 4.2: how much larger, in percent, a value is than its benchmark; negative where smaller."""
     return (value - benchmark) / benchmark * 100
 
