@@ -71,7 +71,7 @@ def workers(scheduler, tmp_path):
 
     try:
         with Client(scheduler, set_as_default=False) as client:
-            client.wait_for_workers(2, timeout=30)
+            client.wait_for_workers(2, timeout=120)
         yield {process.pid: process for process in processes}, log
     finally:
         for process in processes:
@@ -79,7 +79,7 @@ def workers(scheduler, tmp_path):
             process.wait()
 
 
-def wait_for(condition, what, seconds=30):
+def wait_for(condition, what, seconds=120):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, f"waited {seconds} s for {what}"
