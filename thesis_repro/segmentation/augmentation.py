@@ -21,7 +21,7 @@ def transform_list(size, fill_mask=NOTHING):
     """The transforms of A.3 for images of size x size, for `albumentations.Compose`.
 
     The appendix transforms one-hot masks of 35 float channels. Every transform here resamples masks with nearest
-    neighbour, so integer label maps give the same labels at a thirtieth of the memory, provided that what comes from
+    neighbour, so integer label maps give the same labels at one byte a pixel instead of 140, provided that what comes from
     outside of the image is no label at all; `fill_mask` is that value (0 where the masks are one-hot).
     """
     return [
@@ -83,7 +83,7 @@ def validation_augmenter(size, full=False):
     """What the validation set is augmented with: by a slip of the appendix, a blur and nothing else.
 
     A.3 draws Figure 3.1 between the two sets and leaves `transform` bound to the last thing drawn, the blur.
-    `full` gives the validation set the transforms of the training set, as Section 3.5.2 says.
+    `full` gives the validation set the transforms of the training set, as Section 3.5.1 says.
     """
     return training_augmenter(size) if full else Augmenter([_blur()])
 

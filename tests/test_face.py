@@ -1,0 +1,50 @@
+"""What the package offers by name, and the example on the front page."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import thesis_repro as tr
+from thesis_repro.cityscapes import read_label_map
+
+README = Path(__file__).resolve().parent.parent / "README.md"
+
+
+def test_what_is_offered_is_there():
+    assert set(tr.__all__) <= set(dir(tr))
+    assert tr.THESIS == tr.OdometrySettings() and tr.Sequence.__module__ == "thesis_repro.kitti"
+    assert tr.keypoint_mask(np.full((8, 8), 7, np.uint8), (16, 32), 3).shape == (16, 32)
+    assert tr.build_unet((32, 32, 1), 35, 2).output_shape == (None, 32, 32, 35)
+
+
+def test_tensorflow_is_not_loaded_before_it_is_asked_for():
+    code = ("import sys, thesis_repro as tr; tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run; "
+            "assert 'tensorflow' not in sys.modules and 'keras' not in sys.modules; tr.build_unet; "
+            "assert 'keras' in sys.modules")
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+
+
+def test_an_unknown_name_is_an_ordinary_attribute_error():
+    assert not hasattr(tr, "mistyped")
+
+
+def test_bad_input_is_one_line_in_a_notebook():
+    assert tr.InputError("frames: none")._render_traceback_() == ["InputError: frames: none"]
+
+
+def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, capsys):
+    (example,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (tmp_path / "world").symlink_to(small_world)
+    monkeypatch.chdir(tmp_path)
+
+    def label_map_of(index):
+        return read_label_map(small_world / "kitti" / "sequences" / "00" / "labels_0" / f"{index:06d}.png")
+
+    names = {"label_map_of": label_map_of}
+    exec(example, names)
+    assert len(names["every"].poses) == len(names["masked"].poses) == 12
+    assert names["masked"].frames["detected"].mean() < names["every"].frames["detected"].mean()
+    assert len(example.splitlines()) <= 14 and capsys.readouterr().out
