@@ -49,10 +49,25 @@ def test_all_notebooks_run_and_leave_every_artefact(tmp_path):
     page = (figures / "index.html").read_text()
     assert "41 of 41" in page and "embedded world" in page
     outputs = "".join(path.read_text() for path in executed.glob("*.ipynb"))
+    assert outputs.count("to the bit: True") >= 10 and "to the bit: False" not in outputs and "EDITED" not in outputs
     assert "Segmentation Models: using" not in outputs and "oneDNN" not in outputs and "frame/s]" not in outputs
     assert len(list(executed.glob("*.html"))) == len(NOTEBOOKS)
     again = make_figures(tmp_path)
     assert again.returncode == 0 and "load_images" not in again.stdout, again.stdout
+
+
+@pytest.mark.notebooks
+@pytest.mark.parametrize(("name", "first"), [("02_augmentation", "01_load_images_and_labels"),
+                                             ("07_visual_odometry", "06_keypoint_masks")])
+def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path, name, first):
+    environment = os.environ | {"THESIS_REPRO_PROFILE": "smoke", "THESIS_REPRO_BUILD": str(tmp_path / "build")}
+    done = subprocess.run(
+        [ROOT / ".venv/bin/jupyter", "nbconvert", "--to", "notebook", "--execute", "--log-level=CRITICAL",
+         "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
+         f"--Execution.log_file={tmp_path / 'log'}", "--output-dir", tmp_path, ROOT / "notebooks" / f"{name}.ipynb"],
+        env=environment, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert f"not there yet; run notebook {first} first" in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.notebooks
