@@ -141,11 +141,16 @@ def test_matches_of_a_frame_without_corners_are_none():
 
 
 def test_the_same_figure_gives_the_same_files_with_its_note(tmp_path):
-    for folder in ("one", "two"):
-        style.save_figure(background.figure_2_06(), tmp_path / folder, "figure", "a note")
-    for name in ("figure.svg", "figure.png"):
+    blank = np.full((60, 120), 128, np.uint8)
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        style.save_figure(background.figure_2_03(), folder, "plot", "a note")
+        style.save_figure(background.figure_2_09(blank, blank, "title"), folder, "picture", "a note")
+        assert sorted(path.name for path in folder.iterdir()) == ["picture.webp", "plot.svg"]
+    for name in ("plot.svg", "picture.webp"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-    assert "a note" in (tmp_path / "one" / "figure.svg").read_text()
+        assert b"a note" in (tmp_path / "one" / name).read_bytes()
+    style.save_figure(background.figure_2_03(), tmp_path / "one", "picture", "a note")  # has become a plot
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == ["picture.svg", "plot.svg"]
 
 
 def test_figures_of_frames_on_the_world(small_world, tmp_path):

@@ -18,16 +18,18 @@ from pathlib import Path
 import mistune
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from PIL import Image
 
 from thesis_repro import InputError
 from thesis_repro.files import write_text
-from thesis_repro.report import captions
+from thesis_repro.report import captions, style
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
 HERE = Path(__file__).parent
 THESIS = [name for artefacts in captions.CHAPTERS.values() for name in artefacts]
-ENDINGS = {"figure": (".svg", ".png"), "table": (".csv", ".md"), "text": (".md",)}  # the first is the one shown
+ENDINGS = {"figure": (".svg", ".webp"), "table": (".csv", ".md"), "text": (".md",)}  # the first there is shown
+CSS_DPI = 96  # a browser's pixels an inch
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # what numbers depend on most
 TEMPLATES = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
                         lstrip_blocks=True)
@@ -140,20 +142,20 @@ def _commit():
 
 def _artefact(settings, kind, name, title, caption, makers):
     """What the template needs to show a table, a figure or a text, or to say that it is missing."""
-    path = settings.figures / f"{name}{ENDINGS[kind][0]}"
+    files = [path for ending in ENDINGS[kind] if (path := settings.figures / f"{name}{ending}").is_file()]
+    path = files[0] if files else None
     number = None
     if name in THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
         _, chapter, count = name.split("_")
         number = f"{kind.capitalize()} {chapter.upper()}.{int(count)}"
-    there = path.is_file()
     return {
         "kind": kind, "id": name if number or kind == "text" else f"{kind}-{name}", "number": number,
-        "title": f"{number}. {title}" if number else title, "caption": caption, "there": there,
-        "files": [f"{name}{ending}" for ending in ENDINGS[kind] if (settings.figures / f"{name}{ending}").is_file()],
+        "title": f"{number}. {title}" if number else title, "caption": caption,
+        "there": path is not None, "files": [path.name for path in files],
         "makers": makers.get(name, []), "reported": _reported(settings, name), "here": None,
-        "size": _size(path) if there and kind == "figure" else None,
-        "table": _table(path) if there and kind == "table" else None,
-        "html": _markdown(path.read_text(encoding="utf-8")) if there and kind == "text" else None,
+        "size": _size(path) if path and kind == "figure" else None,
+        "table": _table(path) if path and kind == "table" else None,
+        "html": _markdown(path.read_text(encoding="utf-8")) if path and kind == "text" else None,
     }
 
 
@@ -241,7 +243,10 @@ def _table(path):
 
 
 def _size(path):
-    """Width and height in pixels as an SVG file says, so that the page keeps its place while it loads."""
+    """Width and height in a browser's pixels, so that the page keeps its place while it loads."""
+    if path.suffix == ".webp":
+        with Image.open(path) as image:
+            return [round(side * CSS_DPI / style.STYLE["savefig.dpi"]) for side in image.size]
     with open(path, encoding="utf-8") as file:
         head = file.read(2000)
     sides = [re.search(rf'<svg[^>]*?\s{side}="([\d.]+)pt"', head) for side in ("width", "height")]

@@ -10,6 +10,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from PIL import ExifTags, Image
 
 from thesis_repro.cityscapes import colorize
 from thesis_repro.files import atomic, write_text
@@ -80,7 +81,10 @@ def show_image(axes, image, title, **options):
 
 
 def save_figure(figure, folder, name, note):
-    """Write folder/name.svg and .png with the data note at the foot."""
+    """Write folder/name with the data note at the foot: .webp where the figure shows pictures, else .svg.
+
+    Either is what a browser shows best at the least size; the note stands in the file's text as well.
+    """
     folder = Path(folder)
     # A tight box lets legends at the figure's edge slip down onto the note, so they are pinned where the layout put
     # them.
@@ -92,9 +96,17 @@ def save_figure(figure, folder, name, note):
         legend.set_loc("lower left")
         legend.set_bbox_to_anchor((box.x0, box.y0), transform=figure.transFigure)
     figure.text(0.5, -0.08 / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
-    for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
-        with atomic(folder / f"{name}{suffix}") as temporary:
-            figure.savefig(temporary, metadata=metadata, bbox_inches="tight", pad_inches=0.04)
+    pictures = any(axes.images for axes in figure.axes)
+    if pictures:
+        note_in_file = Image.Exif()
+        note_in_file[ExifTags.Base.ImageDescription] = note
+        options = {"pil_kwargs": {"quality": 90, "method": 6, "exif": note_in_file}}
+    else:
+        options = {"metadata": {"Date": None, "Creator": None, "Description": note}}
+    written, other = (".webp", ".svg") if pictures else (".svg", ".webp")
+    with atomic(folder / f"{name}{written}") as temporary:
+        figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
+    (folder / f"{name}{other}").unlink(missing_ok=True)  # of a run in which it was the other kind
 
 
 def save_table(table, folder, name, note):
