@@ -54,7 +54,7 @@ def run(tmp_path):
                               "THESIS_REPRO_FIGURES": str(tmp_path / "figures")})
     settings.figures.mkdir()
     for kind, name in [*((name.split("_")[0], name) for name in page.THESIS), *captions.ADDED]:
-        for ending in page.ENDINGS[kind]:
+        for ending in page.ENDINGS[kind][:1 if kind == "figure" else None]:  # a figure is one file
             text = {".svg": SVG, ".csv": CSV, ".md": "**What** <b>it</b> shows"}.get(ending, "")
             (settings.figures / f"{name}{ending}").write_text(text)
     executed = settings.build / "notebooks" / "08_results.ipynb"

@@ -21,8 +21,8 @@ def transform_list(size, fill_mask=NOTHING):
     """The transforms of A.3 for images of size x size, for `albumentations.Compose`.
 
     The appendix transforms one-hot masks of 35 float channels. Every transform here resamples masks with nearest
-    neighbour, so integer label maps give the same labels at one byte a pixel instead of 140, provided that what comes from
-    outside of the image is no label at all; `fill_mask` is that value (0 where the masks are one-hot).
+    neighbour, so integer label maps give the same labels at one byte a pixel instead of 140, provided that what comes
+    from outside of the image is no label at all; `fill_mask` is that value (0 where the masks are one-hot).
     """
     return [
         A.HorizontalFlip(p=0.5),
