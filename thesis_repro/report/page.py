@@ -143,7 +143,8 @@ def _commit():
 def _artefact(settings, kind, name, title, caption, makers):
     """What the template needs to show a table, a figure or a text, or to say that it is missing."""
     files = [path for ending in ENDINGS[kind] if (path := settings.figures / f"{name}{ending}").is_file()]
-    path = files[0] if files else None
+    shown = ENDINGS[kind] if kind == "figure" else ENDINGS[kind][:1]
+    path = next((path for path in files if path.suffix in shown), None)
     number = None
     if name in THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
         _, chapter, count = name.split("_")
