@@ -127,15 +127,15 @@ def test_two_images_of_one_name(model, frames, tmp_path):
         prediction.write_label_maps(model, [frames[0], frames[0]], tmp_path)
 
 
-def test_no_memory_for_the_batch(model, monkeypatch, tmp_path):
+def test_no_memory_for_the_batch(model, monkeypatch):
     labels = IMAGES[..., 0] // 8
     monkeypatch.setattr(memory, "available", lambda: memory.needed(model, 3, training=False) - 1)
     with pytest.raises(InputError, match="batch_size=3: no memory for a batch of 3 images of 64x64"):
         prediction.predict(model, IMAGES, batch_size=3)
     with pytest.raises(InputError, match="batch_size=7: no memory"):
         quality.quality(model, IMAGES, labels, batch_size=7)
-    with pytest.raises(InputError, match="batch_size=7: no memory"):
-        training.train(IMAGES, labels, IMAGES, labels, tmp_path, batch_size=7)
+    with pytest.raises(InputError, match="batch_size=3: no memory"):  # which takes far more
+        memory.require(model, 3, training=True)
     assert prediction.predict(model, IMAGES, batch_size=2).shape == (7, SIZE, SIZE)
 
 
@@ -178,7 +178,7 @@ def test_quality_agrees_with_keras_and_with_a_plain_count(model):
     labels = np.random.default_rng(1).choice(np.array([7, 11, 23, 26], np.uint8), IMAGES.shape[:3])
     measured = quality.quality(model, IMAGES, labels, batch_size=3)
     batches = training.Batches([(IMAGES, labels)], 3)
-    training.compile_model(model)
+    model.compile("adam", training.total_loss(), metrics=training.metrics())
     expected = model.evaluate(batches.dataset(), verbose=0, return_dict=True)
     predicted = most_probable(model, IMAGES)
 
@@ -217,11 +217,14 @@ def test_backbones_predict_like_any_model(name, tmp_path):
     assert (labels == most_probable(model, IMAGES[:2])).mean() > 0.999
 
 
-def test_a_backbone_trains(tmp_path):
+def test_a_backbone_trains():
     labels = np.where(IMAGES[..., 0] > 127, 7, 11).astype(np.uint8)
-    model = training.train(IMAGES, labels, IMAGES[:2], labels[:2], tmp_path, batch_size=4, epochs=1,
-                           build=backbones.backbone_unet("resnet18"))
+    model = backbones.backbone_unet("resnet18")((SIZE, SIZE, 1), 35)
+    model.compile("adam", training.total_loss())
+    before = model.get_weights()
+    model.fit(training.Batches([(IMAGES, labels)], 4, seed=0).dataset(), verbose=0)
 
+    assert any((one != other).any() for one, other in zip(before, model.get_weights()))
     assert prediction.predict(model, IMAGES[:1]).shape == (1, SIZE, SIZE)
 
 

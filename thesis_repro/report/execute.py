@@ -70,7 +70,8 @@ class Execution(ExecutePreprocessor):
                     yield
                 except KeyboardInterrupt:
                     logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
-                    run_sync(self.km.interrupt_kernel)()  # so that the cell tidies up before its kernel ends
+                    run_sync(self.km.interrupt_kernel)()  # so that the cell tidies up before its kernel ends,
+                    time.sleep(1)  # for which it needs a moment
                     raise
 
     def preprocess_cell(self, cell, resources, index):

@@ -1,5 +1,6 @@
 """Loss, metrics and the input of training (A.5), and what lets a long training go on after a stop."""
 
+import json
 import os
 import zlib
 from hashlib import sha256
@@ -113,9 +114,11 @@ def made_from(model, batches, validation):
     true = augmentation.one_hot(random.integers(0, N_CLASSES, (2, 16, 16), np.uint8), N_CLASSES)
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
     weights = sha256(b"".join(variable.numpy().tobytes() for variable in model.variables))
+    network = sha256(json.dumps(model.get_config(), default=str).encode())
+    optimizer = {key: value for key, value in model.optimizer.get_config().items() if key != "name"}  # adam, adam_1
     return {
-        "code": stages.code("segmentation/training"), "network": sha256(model.to_json().encode()).hexdigest()[:12],
-        "first_weights": weights.hexdigest()[:12], "optimizer": model.optimizer.get_config(),
+        "code": stages.code("segmentation/training"), "network": network.hexdigest()[:12],
+        "first_weights": weights.hexdigest()[:12], "optimizer": optimizer,
         "loss": float(np.asarray(model.loss(true, predicted)).mean()),
         "images": [len(images) for images, _ in (*batches.sets, *validation.sets)],
         "pixels": [zlib.crc32(np.ascontiguousarray(array)) for some in (batches, validation) for one in some.sets
