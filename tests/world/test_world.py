@@ -7,7 +7,8 @@ import pytest
 
 from thesis_repro import InputError, cityscapes, kitti
 from thesis_repro.cityscapes import ID
-from thesis_repro.world import dataset, props, render, street, textures
+from thesis_repro.world import dataset, drives, layout, raster, render, street, textures
+from thesis_repro.world.faces import Faces
 
 SMALL = {"sequences": ("00", "07"), "frames": 12, "scale": 0.2, "train_images": 2, "validation_images": 1, "jobs": 1}
 
@@ -46,7 +47,7 @@ def test_layouts_are_read_by_the_readers_of_real_data(out):
 def test_scaled_intrinsics_keep_the_rays_of_the_image_borders():
     camera = kitti.CAMERAS["00"]
     for scale in (0.2, 0.5, 1.0):
-        (height, width), matrix = dataset.scaled_camera("00", scale)
+        (height, width), matrix = drives.scaled_camera("00", scale)
         for edge, full in ((-0.5, -0.5), (width - 0.5, camera.width - 0.5)):
             assert (edge - matrix[0, 2]) / matrix[0, 0] == pytest.approx((full - camera.cx) / camera.fx)
         assert (height - 0.5 - matrix[1, 2]) / matrix[1, 1] == pytest.approx(
@@ -57,7 +58,7 @@ def test_scaled_intrinsics_keep_the_rays_of_the_image_borders():
 @pytest.mark.parametrize("frames", [12, 60, 400])
 @pytest.mark.parametrize("name", dataset.SEQUENCES)
 def test_drives_are_realistic(name, frames):
-    poses = dataset.relative_to_first(dataset.way(name, frames, seed=0)[1])
+    poses = drives.relative_to_first(drives.way(name, frames, seed=0)[1])
     assert np.array_equal(poses[0], np.eye(4))
     rotations = poses[:, :3, :3]
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (frames, 1, 1)), atol=1e-12)
@@ -74,7 +75,7 @@ def test_drives_are_realistic(name, frames):
 
 
 def test_sequences_have_different_paths():
-    ends = [dataset.relative_to_first(dataset.way(name, 60, seed=0)[1])[-1, :3, 3] for name in dataset.SEQUENCES]
+    ends = [drives.relative_to_first(drives.way(name, 60, seed=0)[1])[-1, :3, 3] for name in dataset.SEQUENCES]
     for first in range(len(ends)):
         for second in range(first):
             assert np.linalg.norm(ends[first] - ends[second]) > 1.0
@@ -98,9 +99,9 @@ def epipolar_errors(before, after, relative, intrinsics, keep):
 
 def test_tracked_points_keep_to_the_true_poses():
     frames = 30
-    _, scene_poses, _ = dataset.way("05", frames, seed=0)
-    poses = dataset.relative_to_first(scene_poses)
-    _, intrinsics = dataset.scaled_camera("05", 0.5)
+    _, scene_poses, _ = drives.way("05", frames, seed=0)
+    poses = drives.relative_to_first(scene_poses)
+    _, intrinsics = drives.scaled_camera("05", 0.5)
     true, turned = [], []
     wrong = np.eye(4)
     angle = np.radians(0.3)
@@ -118,17 +119,15 @@ def test_tracked_points_keep_to_the_true_poses():
 
 
 def one_square(z=10.0, half=2.0, texture="concrete", label="building"):
-    names = textures.build(0)[0]
-    faces = props.Faces(names)
+    faces = Faces(textures.build(0).names)
     faces.add((-half, half, z), (2 * half, 0, 0), (0, -2 * half, 0), texture, label)
     return faces.matrix()
 
 
-def view(faces, size=(80, 120), focal=100.0, pose=None):
-    intrinsics = np.array([[focal, 0, 59.5], [0, focal, 39.5], [0, 0, 1]])
-    environment, horizon, labels = street._sky(np.random.default_rng(0), street.Style())
-    return render.render(faces, textures.build(0), np.eye(4) if pose is None else pose, intrinsics, size, environment,
-                         horizon, labels)
+def view(faces, size=(80, 120)):
+    intrinsics = np.array([[100.0, 0, 59.5], [0, 100.0, 39.5], [0, 0, 1]])
+    environment = layout.environment(np.random.default_rng(0), street.Style())
+    return render.render(faces, textures.build(0).packed, np.eye(4), intrinsics, size, environment)
 
 
 @pytest.mark.parametrize("half", [1.9, 2.0, 2.03, 2.06, 2.1])
@@ -155,9 +154,9 @@ def test_nearer_surface_hides_the_farther_in_any_order():
 def test_cut_out_is_labelled_exactly_where_it_is_opaque():
     # Four pixels a texel, so that the picture shows the texture's middle 20 by 30 texels.
     _, labels = view(one_square(half=102.4, texture="tree0", label="traffic light"))
-    names, (data, _, alpha, _) = textures.build(0)
-    offset = alpha[names["tree0"], 0, 0]
-    opaque = data[offset:offset + 512 * 512].reshape(512, 512) >= render.OPAQUE
+    names, packed = textures.build(0)
+    offset = packed.alpha[names["tree0"], 0, 0]
+    opaque = packed.data[offset:offset + 512 * 512].reshape(512, 512) >= raster.OPAQUE
     shown = opaque[246:266, 241:271].astype(np.uint8)
     sure = cv2.erode(shown, np.ones((3, 3))) == cv2.dilate(shown, np.ones((3, 3)))  # not between two texels
     sure[[0, -1]] = sure[:, [0, -1]] = False
@@ -167,8 +166,7 @@ def test_cut_out_is_labelled_exactly_where_it_is_opaque():
 
 
 def test_neighbouring_faces_leave_no_crack():
-    names = textures.build(0)[0]
-    faces = props.Faces(names)
+    faces = Faces(textures.build(0).names)
     rng = np.random.default_rng(3)
     ring = [np.array([3 * np.cos(a), 3 * np.sin(a), 10.0]) for a in np.linspace(0, 2 * np.pi, 40)]
     middle = np.array([*rng.uniform(-0.5, 0.5, 2), 10.0])
@@ -176,6 +174,12 @@ def test_neighbouring_faces_leave_no_crack():
         faces.add(middle, first - middle, second - middle, "concrete", "building", triangle=1)
     _, labels = view(faces.matrix())
     assert (labels[20:60, 40:80] == ID["building"]).all()
+
+
+def test_what_is_compiled_ahead_is_what_is_used():
+    render.compile_for_all()
+    view(one_square())
+    assert len(raster.draw.signatures) == 1
 
 
 def test_same_seed_gives_the_same_bytes_for_any_number_of_processes(out, tmp_path):

@@ -1,71 +1,30 @@
-"""What stands and drives in the streets of the embedded world: buildings, vehicles, signs and lamps as faces."""
+"""What stands and drives in the streets of the embedded world: buildings, vehicles, signs and lamps.
+
+Each function returns faces, (n, COLUMNS), in coordinates of the thing's own: metres, y = 0 on the ground, x and z
+around its foot. `names` maps textures to their indices. `faces.place` puts them in the street.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from thesis_repro.cityscapes import ID
-from thesis_repro.world import render
-from thesis_repro.world.sprites import PROFILES, WIDTHS
+from thesis_repro.world.faces import Faces
+from thesis_repro.world.sprites import PROFILES, TREES, WIDTHS
 from thesis_repro.world.surfaces import FACADE_TILE, FACADES, SHOP_TILE, TILE
 
-
-class Faces:
-    """Rows of the face matrix in the making. Rectangles are seen from outside: s to the right, t up."""
-
-    def __init__(self, names):
-        self.names, self.rows = names, []
-
-    def add(self, corner, edge_s, edge_t, texture, label, repeats=(1.0, 1.0), uv=None, gain=1.0, triangle=0, ground=0,
-            casts=1, lit=1):
-        uv = uv or (0.0, repeats[0], 0.0, 1.0, 0.0, -repeats[1])
-        self.rows.append((*corner, *edge_s, *edge_t, *uv, self.names[texture], ID[label], gain, triangle, ground,
-                          casts, lit))
-
-    def box(self, x, y, z, texture, label, metres=1.0, gain=1.0, casts=1, top=None, front=None):
-        """An upright box between (low, high) of each axis; y low is the top. `metres` covers one repeat."""
-        (x0, x1), (top_y, bottom), (z0, z1) = x, y, z
-        w, h, l = x1 - x0, bottom - top_y, z1 - z0
-        up = (0, -h, 0)
-        settings = {"gain": gain, "casts": casts}
-        across, along = (w / metres, h / metres), (l / metres, h / metres)
-        if front:
-            self.add((x0, bottom, z0), (w, 0, 0), up, front, label, (1, 1), **settings)
-        else:
-            self.add((x0, bottom, z0), (w, 0, 0), up, texture, label, across, **settings)
-        self.add((x1, bottom, z1), (-w, 0, 0), up, texture, label, across, **settings)
-        self.add((x1, bottom, z0), (0, 0, l), up, texture, label, along, **settings)
-        self.add((x0, bottom, z1), (0, 0, -l), up, texture, label, along, **settings)
-        self.add((x0, top_y, z0), (w, 0, 0), (0, 0, l), top or texture, label, (w / metres, l / metres), **settings)
-
-    def matrix(self):
-        return np.array(self.rows, np.float64).reshape(-1, render.COLUMNS)
-
-
-def place(faces, x, z, yaw, y=0.0):
-    """Turn local faces by yaw (right positive) and move them to (x, y, z)."""
-    placed = faces.copy()
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    for start in (render.CORNER, render.EDGE_S, render.EDGE_T):
-        local_x, local_z = faces[:, start], faces[:, start + 2]
-        placed[:, start] = cosine * local_x + sine * local_z
-        placed[:, start + 2] = cosine * local_z - sine * local_x
-    placed[:, render.CORNER] += x
-    placed[:, render.CORNER + 1] += y
-    placed[:, render.CORNER + 2] += z
-    return placed
-
-
+# What the profile of a vehicle is made of from front to rear: front, paint, glass, rear.
 _BODY = {"sedan": "FFPGPGPRR", "hatch": "FFPGPGRR", "estate": "FFPGPGRR", "van": "FFPGPGR", "truck": "FPGPPPPP",
          "bus": "FPGPPPR"}
 _LABEL_OF = {"truck": "truck", "bus": "bus"}
 
 
-def vehicle(names, kind, paint):
-    """A vehicle that stands on the ground and looks along z, its middle at the origin.
+def vehicle(names, rng, kind):
+    """A vehicle that looks along z, its middle at the origin.
 
-    The side view is cut out of two panels a side, the upper one leaning in; the skin between them follows its profile.
+    kind: of `sprites.PROFILES`; its paint is drawn from rng. The side view is cut out of two panels a side, the upper
+    one leaning in; the skin between them follows the profile, two triangles for each of its parts.
     """
+    paint = int(rng.choice([0, 2])) if kind in ("truck", "bus") else int(rng.integers(0, 6))
     faces = Faces(names)
     label = _LABEL_OF.get(kind, "car")
     profile = np.array(PROFILES[kind])
@@ -103,16 +62,31 @@ def vehicle(names, kind, paint):
     return faces.matrix()
 
 
-def cut_out(names, texture, label, width, height, crossed=False, gain=1.0, base=0.0):
-    """An upright picture in front view, or two that cross."""
+def cut_out(names, texture, label, width, height, crossed=False, gain=1.0):
+    """An upright picture that looks at -z, or two that cross."""
     faces = Faces(names)
-    faces.add((-width / 2, -base, 0), (width, 0, 0), (0, -height, 0), texture, label, lit=0, gain=gain)
+    faces.add((-width / 2, 0, 0), (width, 0, 0), (0, -height, 0), texture, label, lit=0, gain=gain)
     if crossed:
-        faces.add((0, -base, -width / 2), (0, 0, width), (0, -height, 0), texture, label, lit=0, gain=gain)
+        faces.add((0, 0, -width / 2), (0, 0, width), (0, -height, 0), texture, label, lit=0, gain=gain)
     return faces.matrix()
 
 
+def tree(names, rng, height=None, kind=None):
+    """A tree of a height (metres) and kind, which are drawn where they are not given."""
+    kind = int(rng.integers(0, TREES)) if kind is None else kind
+    height = rng.uniform(5, 9.5) if height is None else height
+    return cut_out(names, f"tree{kind}", "vegetation", height * rng.uniform(0.85, 1.05), height, True,
+                   rng.uniform(0.85, 1.2))
+
+
+def bush(names, rng):
+    """A bush of some width."""
+    width = rng.uniform(1.4, 3.0)
+    return cut_out(names, f"bush{rng.integers(0, 2)}", "vegetation", width, width * 0.55, True)
+
+
 def cyclist(names):
+    """A bicycle with its rider, riding along z."""
     faces = Faces(names)
     faces.add((0, 0, -0.9), (0, 0, 1.8), (0, -1.05, 0), "bicycle", "bicycle", lit=0)
     faces.add((0.02, -0.42, -0.62), (0, 0, 1.25), (0, -1.3, 0), "rider", "rider", lit=0)
@@ -120,6 +94,7 @@ def cyclist(names):
 
 
 def lamp(names, height, arm):
+    """A street lamp whose arm reaches along x."""
     faces = Faces(names)
     faces.box((-0.07, 0.07), (-height, 0), (-0.07, 0.07), "metal", "pole", 2.0)
     faces.box((0, arm), (-height, -height + 0.09), (-0.05, 0.05), "metal", "pole", 2.0)
@@ -128,6 +103,7 @@ def lamp(names, height, arm):
 
 
 def sign(names, kind, size, height, half_pole=0.035):
+    """A traffic sign that looks at -z, its lower edge at `height`; kind: below `sprites.SIGNS`."""
     faces = Faces(names)
     faces.box((-half_pole, half_pole), (-height - size / 2, 0), (0.01, 0.01 + 2 * half_pole), "metal", "pole", 2.0)
     faces.add((-size / 2, -height, 0), (size, 0, 0), (0, -size, 0), f"sign{kind}", "traffic sign", lit=0, gain=1.05)
@@ -136,6 +112,7 @@ def sign(names, kind, size, height, half_pole=0.035):
 
 
 def traffic_light(names):
+    """A traffic light that looks at -z."""
     faces = Faces(names)
     faces.box((-0.06, 0.06), (-2.4, 0), (0.02, 0.14), "metal", "pole", 2.0)
     faces.box((-0.19, 0.19), (-3.3, -2.35), (-0.1, 0.15), "bin", "traffic light", 0.5, front="light")
@@ -143,7 +120,10 @@ def traffic_light(names):
 
 
 def building(names, rng, width, depth, floors, pitched):
-    """A house whose front stands at z = 0 and looks at -z; the walls take whole bays of a facade."""
+    """A house whose front stands at z = 0 and looks at -z; the walls take whole bays of a facade.
+
+    floors: above the ground floor; pitched: a roof with a ridge instead of a flat one.
+    """
     faces = Faces(names)
     kind = int(rng.integers(0, FACADES))
     ground, height = 3.5, 3.5 + 3.0 * floors
@@ -177,6 +157,7 @@ def building(names, rng, width, depth, floors, pitched):
                   "building", 8.0, gain=gain * 0.8)
     return faces.matrix()
 
+
 @dataclass
 class Footprint:
     """The ground plan of a building: middle of its front, yaw, half its width and its depth."""
@@ -188,21 +169,25 @@ class Footprint:
     depth: float
 
     def near(self, x, z):
+        """Whether a point may lie within it; quicker to say than `covers`."""
         return (x - self.x) ** 2 + (z - self.z) ** 2 < (self.half + self.depth + 1.0) ** 2
 
     def points(self):
+        """35 points spread over it: x and z."""
         across, along = np.meshgrid(np.linspace(-self.half, self.half, 7), np.linspace(0.0, self.depth, 5))
         across, along = across.ravel(), along.ravel()
         return (self.x + np.cos(self.yaw) * across + np.sin(self.yaw) * along,
                 self.z - np.sin(self.yaw) * across + np.cos(self.yaw) * along)
 
     def covers(self, x, z, margin=-0.3):
+        """Whether it reaches within `margin` metres of any of the points; a negative margin lets walls touch."""
         dx, dz = x - self.x, z - self.z
         across = np.cos(self.yaw) * dx - np.sin(self.yaw) * dz
         along = np.sin(self.yaw) * dx + np.cos(self.yaw) * dz
         return bool(np.any((np.abs(across) < self.half + margin) & (along > -margin) & (along < self.depth + margin)))
 
     def overlaps(self, other):
+        """Whether two buildings stand in each other."""
         if np.hypot(self.x - other.x, self.z - other.z) > 45:
             return False
         return self.covers(*other.points()) or other.covers(*self.points())

@@ -1,6 +1,7 @@
 """Painted things of the embedded world that are cut out along their outline: trees, persons, vehicles, signs, fences.
 
-Each painter returns gray float32 (rows, columns) of albedo 0 to 255, most also an alpha (0 to 255) of the same size.
+Each painter takes a NumPy random generator and returns gray float32 (rows, columns) of albedo 0 to 255, most also an
+alpha (0 to 255) of the same size.
 """
 
 import cv2
@@ -11,9 +12,9 @@ from thesis_repro.world.surfaces import noise, speckle
 TREES, PERSONS, SIGNS = 6, 6, 6
 
 
-def _outline(shape, polygons, ellipses=(), scale=2):
+def _outline(shape, polygons, ellipses=()):
     """Antialiased alpha of polygons and ellipses given in parts of the size."""
-    rows, columns = shape[0] * scale, shape[1] * scale
+    rows, columns = shape[0] * 2, shape[1] * 2
     mask = np.zeros((rows, columns), np.uint8)
     for polygon in polygons:
         points = np.rint(np.asarray(polygon, float) * (columns, rows)).astype(np.int32)
@@ -24,6 +25,7 @@ def _outline(shape, polygons, ellipses=(), scale=2):
 
 
 def leaves(rng, shape, dark=38, light=118, leaf=4):
+    """Foliage in clumps: dark to light gray, leaves of that many pixels; no alpha."""
     image = np.full(shape, float(dark), np.float32)
     clumps = noise(rng, shape, 64, 5, 0.75)
     rows, columns = shape
@@ -38,6 +40,7 @@ def leaves(rng, shape, dark=38, light=118, leaf=4):
 
 
 def tree(rng, kind, leaves):
+    """A tree in side view; kind: below TREES, the last two are conifers; leaves: (512, 512), what its crown shows."""
     shape = (512, 512)
     crown = np.zeros(shape, np.float32)
     y, x = np.mgrid[0:512, 0:512].astype(np.float32)
@@ -111,6 +114,7 @@ def person(rng, kind):
 
 
 def bicycle(rng):
+    """A bicycle from the side, 1.8 m by 1.05 m."""
     shape = (128, 256)
     mask = np.zeros((512, 1024), np.uint8)
     for x in (190, 834):
@@ -163,6 +167,7 @@ _WHEELS = {"sedan": (0.85, 3.6, 0.31), "hatch": (0.75, 3.2, 0.3), "estate": (0.9
 
 
 def side(rng, kind, paint):
+    """A vehicle from the side, looking right; kind: of PROFILES; paint: its gray value."""
     profile = np.array(PROFILES[kind])
     length, height = profile[:, 0].max(), profile[:, 1].max() + 0.04
     shape = (256, 512)
@@ -225,7 +230,7 @@ def side(rng, kind, paint):
 
 
 def end(rng, paint, front):
-    """Front or rear of a vehicle, from the bumper to the beltline."""
+    """Front or rear of a vehicle, from the bumper to the beltline; paint: its gray value; no alpha."""
     shape = (128, 256)
     image = paint + 4 * noise(rng, shape, 32, 4) + np.linspace(14, -18, 128, dtype=np.float32)[:, None]
     image[92:] = paint * 0.5 + 10
@@ -243,6 +248,7 @@ def end(rng, paint, front):
 
 
 def glass(rng):
+    """A windscreen or rear window, between whose frames the seats are seen; no alpha."""
     image = 62 + 14 * noise(rng, (128, 128), 64, 4) + np.linspace(55, -25, 128, dtype=np.float32)[:, None]
     image[:6], image[-6:], image[:, :6], image[:, -6:] = 30, 30, 30, 30
     cv2.rectangle(image, (22, 80), (48, 122), 35.0, -1)  # seats seen through it
@@ -251,6 +257,7 @@ def glass(rng):
 
 
 def sign(rng, kind):
+    """The front of a traffic sign; kind: below SIGNS."""
     shape = (128, 128)
     image = np.full(shape, 232.0, np.float32)
     if kind == 0:  # speed limit
@@ -287,6 +294,7 @@ def sign(rng, kind):
 
 
 def traffic_light(rng):
+    """The front of a traffic light that shows its upper lamp; no alpha."""
     image = 38 + 4 * noise(rng, (128, 64), 16, 4)
     image[:5], image[-5:], image[:, :4], image[:, -4:] = 215, 215, 215, 215
     for y, value in ((24, 235.0), (64, 82.0), (104, 70.0)):
@@ -296,6 +304,7 @@ def traffic_light(rng):
 
 
 def bars(rng, kind):
+    """A stretch of "picket" or "wire" fence, or of a guard "rail"."""
     shape = (128, 256)
     alpha = np.zeros(shape, np.float32)
     if kind == "picket":

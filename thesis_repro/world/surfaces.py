@@ -1,7 +1,7 @@
 """Painted surfaces of the embedded world: asphalt, slabs and facades, and the noise that all textures share.
 
-Gray float32 (rows, columns), albedo 0 to 255. Every surface mixes noise of many scales with structure, so that corners
-are found on it from near and from far.
+Each painter takes a NumPy random generator and returns gray float32 (rows, columns), albedo 0 to 255. Every surface
+mixes noise of many scales with structure, so that corners are found on it from near and from far.
 """
 
 import cv2
@@ -20,7 +20,11 @@ SHOP_TILE = (12.0, 3.5)
 
 
 def noise(rng, shape, cell, octaves=4, persistence=0.6):
-    """Periodic noise with unit deviation: octaves of smooth random grids, the first with `cell` pixels a knot."""
+    """Periodic noise with unit deviation: octaves of smooth random grids, the first with `cell` pixels a knot.
+
+    persistence: the weight of each octave relative to the one before, whose cell is twice as large. Sides and cell are
+    powers of two.
+    """
     rows, columns = max(1, shape[0] // cell), max(1, shape[1] // cell)
     total = rng.standard_normal((rows, columns), dtype=np.float32)
     weight = 1.0
@@ -43,12 +47,14 @@ def _enlarged(image, shape):
 
 
 def speckle(rng, shape, sigma=1.0):
+    """Periodic fine grain with unit deviation, blurred by sigma pixels."""
     grain = rng.standard_normal(shape, dtype=np.float32)
-    grain = cv2.GaussianBlur(np.pad(grain, 4, mode="wrap"), (0, 0), sigma)[4:-4, 4:-4] if sigma else grain
+    grain = cv2.GaussianBlur(np.pad(grain, 4, mode="wrap"), (0, 0), sigma)[4:-4, 4:-4]
     return grain / grain.std()
 
 
 def asphalt(rng, shape, base, patches):
+    """Asphalt of gray value `base` with so many repaired squares and cracks."""
     rows, columns = shape
     image = base + 5 * noise(rng, shape, 128, 3) + 5 * noise(rng, shape, 16, 3) + 5 * speckle(rng, shape, 0.8)
     for _ in range(patches):  # repaired squares with dark tar seams
@@ -70,7 +76,7 @@ def asphalt(rng, shape, base, patches):
 
 
 def marking(rng, image, x0, x1, dashes, value=205.0):
-    """Paint worn lane markings between two columns (parts of the width), dashed or full."""
+    """Paint a worn lane marking between two columns (parts of the width): so many dashes, or 0 for a full line."""
     rows, columns = image.shape
     line = np.zeros(image.shape, bool)
     left, right = int(round(x0 * columns)), max(int(round(x1 * columns)), int(round(x0 * columns)) + 1)
@@ -82,6 +88,7 @@ def marking(rng, image, x0, x1, dashes, value=205.0):
 
 
 def road(rng):
+    """A lane's asphalt with wheel tracks, (2048, 512)."""
     image = asphalt(rng, (2048, 512), 98, 22)
     column = np.linspace(-1, 1, 512, dtype=np.float32)
     image += 5 * np.cos(column * 3 * np.pi)[None]  # wheel tracks
@@ -89,7 +96,10 @@ def road(rng):
 
 
 def tiles(rng, shape, rows, columns, joint, offset=True, spread=9.0):
-    """Slabs or bricks: a random tone for each, dark joints."""
+    """Slabs or bricks, to be added to a surface: a random tone for each (deviation `spread`), dark joints.
+
+    rows, columns: of slabs in the shape; joint: pixels; offset: every other row is shifted by half a slab.
+    """
     height, width = shape
     y, x = np.mgrid[0:height, 0:width]
     row = y * rows // height
@@ -130,6 +140,7 @@ def _window(rng, image, x, y, w, h, frame, style):
 
 
 def facade(rng, kind):
+    """Two floors of four bays of a house, (512, 1024); kind: below FACADES."""
     shape = (512, 1024)
     base = (172, 128, 200, 150, 112, 186, 142, 160)[kind]
     image = base + 6 * noise(rng, shape, 256, 4) + 4 * speckle(rng, shape)
@@ -167,7 +178,7 @@ def facade(rng, kind):
 
 
 def shop(rng, kind):
-    """A ground floor: doors, shop windows or a plinth with small windows."""
+    """A ground floor, (256, 1024): doors, garages, shop windows or a plinth with small windows; kind: below FACADES."""
     shape = (256, 1024)
     base = (150, 118, 176, 132)[kind % 4]
     image = base + 6 * noise(rng, shape, 128, 4) + 4 * speckle(rng, shape)

@@ -1,0 +1,159 @@
+"""The drives of the embedded world: eleven sequences, their cameras, and how a car is driven along them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thesis_repro import kitti
+from thesis_repro.world.street import Style
+from thesis_repro.world.track import STEP, Track
+
+BEHIND, AHEAD = 30.0, 170.0  # metres of street behind the first and ahead of the last camera
+CAMERA_HEIGHT = 1.65
+TURN_RATE = np.radians(3.6)  # a driver slows down for more than this a frame
+ACCELERATION = 0.03  # metres a frame, a frame: 3 m/s^2
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One sequence: where the road leads, how it is driven and what it looks like."""
+
+    pieces: tuple  # of the road, repeated: metres, degrees to the right
+    pace: float  # metres a frame
+    style: Style
+    lane: float = 1.7  # metres right of the road's middle
+    stops: bool = False  # waits once on the way, and every 150 frames
+    noise: float = 2.0  # deviation of the sensor's noise, gray values
+    level: float = 104.0  # the mean gray that the exposure aims at
+
+
+_CITY = ("blocks", "houses", "park", "wall")
+_GREEN = ("houses", "park", "wall", "field")
+_OPEN = ("field", "park", "houses")
+
+DRIVES = {
+    # City with right-angled turns both ways.
+    "00": Drive(((18, 0), (15, 90), (30, 0), (15, 90), (26, 0), (15, -90), (40, 0)), 0.9,
+                Style(sun=(0.7, 0.75), sky=(140, 190, 0.25))),
+    # Highway: fast, wide, little texture, cars that overtake.
+    "01": Drive(((40, 0), (90, 14), (60, 0), (80, -18)), 1.5,
+                Style(half=7.5, road="highway", parking=(0, 0), zones=("field", "park"), weights=(0.8, 0.2),
+                      sun=(-1.0, 0.9), sky=(170, 225, 0.5), haze=0.004, bridge=95.0), lane=0.0, noise=1.6, level=122),
+    # Suburb of S-curves.
+    "02": Drive(((10, 0), (28, 50), (12, 0), (34, -75), (15, 0), (26, 45)), 1.0,
+                Style(half=3.6, road="lane", parking=(0, 0), zones=_GREEN, weights=(0.5, 0.3, 0.1, 0.1), trees=0.7,
+                      sun=(2.4, 0.7), sky=(150, 200, 0.6)), noise=2.2),
+    # Lane between fields and gardens in long bends.
+    "03": Drive(((8, 0), (40, -38), (30, 22), (45, 40), (30, -28)), 0.85,
+                Style(half=3.3, parking=(0, 0), sidewalk=1.6, zones=_OPEN, weights=(0.35, 0.4, 0.25), trees=0.3,
+                      sunny=False, sky=(185, 228, 0.8), haze=0.006, persons=0.02), lane=1.6, noise=2.6),
+    # Straight on behind another car.
+    "04": Drive(((200, 0),), 1.3, Style(half=4.2, parking=(2.2, 0), zones=_CITY, weights=(0.4, 0.2, 0.3, 0.1),
+                                        leader=22.0, traffic=0.02, sun=(-0.6, 0.6), sky=(135, 180, 0.3)), noise=1.8),
+    # Old town with one turn to the left and one to the right.
+    "05": Drive(((14, 0), (16, -90), (34, 0), (15, 90), (25, 0), (24, 50)), 0.75,
+                Style(half=3.6, sidewalk=2.2, parking=(2.2, 0), zones=_CITY, weights=(0.75, 0.1, 0.1, 0.05), trees=0.2,
+                      persons=0.1, sunny=False, sky=(175, 222, 0.7)), noise=2.4),
+    # Up a wide street, round its end and back beside it.
+    "06": Drive(((30, 0), (13, 90), (7, 0), (13, 90), (40, 0), (13, 90), (7, 0), (13, 90), (10, 0)), 1.05,
+                Style(half=4.0, parking=(0, 0), zones=("park", "houses", "field"), weights=(0.6, 0.25, 0.15), trees=1.0,
+                      sun=(0.2, 0.55), sky=(120, 165, 0.2)), noise=1.6),
+    # Waits while others cross.
+    "07": Drive(((60, 0), (15, 90), (40, 0), (15, 90)), 0.8,
+                Style(parking=(2.2, 2.2), sun=(1.9, 0.8), sky=(150, 205, 0.5), crossing=30.0, parked=0.45,
+                      traffic=0.004), stops=True, noise=2.0),
+    # Residential streets: gentle bends, then a sharp one.
+    "08": Drive(((12, 0), (20, 30), (14, 0), (15, -90), (20, 0), (22, -35), (25, 0)), 0.8,
+                Style(zones=_CITY, weights=(0.25, 0.55, 0.1, 0.1), parking=(2.2, 2.2), parked=0.7, sun=(-2.2, 0.85),
+                      sky=(155, 210, 0.6)), noise=2.2),
+    # Round a small block, again and again.
+    "09": Drive(((6, 0), (15, 90), (6, 0), (15, 90), (6, 0), (15, 90), (6, 0), (15, 90)), 0.7,
+                Style(half=3.4, road="lane", parking=(0, 0), zones=("blocks", "houses", "park"),
+                      weights=(0.45, 0.35, 0.2), sunny=False, sky=(165, 215, 0.9), haze=0.004), noise=2.4),
+    # A long tightening bend through a narrow street.
+    "10": Drive(((10, 0), (30, 35), (24, 50), (10, 0), (40, -60)), 0.65,
+                Style(half=3.3, road="lane", sidewalk=1.8, parking=(0, 2.2), zones=_CITY, weights=(0.5, 0.2, 0.1, 0.2),
+                      sun=(1.2, 0.65), sky=(130, 175, 0.3)), lane=1.3, noise=2.8, level=96),
+}
+
+
+# What random numbers are drawn for; each has generators of its own.
+SWAY, SENSOR, IMAGE, STREET = 1, 2, 3, 4
+
+
+def generator(seed, purpose, *key):
+    """A random generator that depends on the seed, the purpose and further whole numbers alone."""
+    return np.random.default_rng(np.random.SeedSequence((seed, purpose, *key)))
+
+
+def scaled_camera(name, scale):
+    """Size (height, width) and intrinsics (3x3, pixels) of a sequence's camera at a scale.
+
+    Whole coordinates are pixel centres, so the principal point moves by half a pixel before and after scaling.
+    """
+    camera = kitti.CAMERAS[name]
+    width, height = round(camera.width * scale), round(camera.height * scale)
+    x, y = width / camera.width, height / camera.height
+    return (height, width), np.array([[camera.fx * x, 0, (camera.cx + 0.5) * x - 0.5],
+                                      [0, camera.fy * y, (camera.cy + 0.5) * y - 0.5], [0, 0, 1.0]])
+
+
+def _driven(drive, track, frames, phase):
+    """Metres along the road at each frame, (frames,): the pace, slower before and in bends, and the stops.
+
+    Under a steady acceleration a the pace v keeps v^2 within 2 a ds of its neighbour's, from behind and from ahead.
+    """
+    limit = drive.pace * (1 + 0.12 * np.sin(track.s / 11 + phase))
+    limit = np.minimum(limit, TURN_RATE / np.maximum(np.abs(track.curvature), 1e-9))
+    gain = 2 * ACCELERATION * STEP
+    for k in range(len(limit) - 2, -1, -1):
+        limit[k] = min(limit[k], np.sqrt(limit[k + 1] ** 2 + gain))
+    for k in range(1, len(limit)):
+        limit[k] = min(limit[k], np.sqrt(limit[k - 1] ** 2 + gain))
+    share = np.ones(frames)
+    if drive.stops:
+        start, length = max(4, min(18, frames // 3)), max(4, min(14, frames // 4))
+        share = np.interp(np.arange(frames) % 150, [start - 4, start, start + length, start + length + 7],
+                          [1, 0, 0, 1])
+    driven = np.zeros(frames)
+    for k in range(1, frames):
+        driven[k] = driven[k - 1] + share[k] * np.interp(driven[k - 1], track.s, limit)
+    return driven
+
+
+def pose(x, y, z, heading, pitch, roll):
+    """Camera-to-world, 4x4: turned right by heading, up by pitch, clockwise by roll (radians)."""
+    ch, sh, cp, sp, cr, sr = (f(a) for a in (heading, pitch, roll) for f in (np.cos, np.sin))
+    turn = np.array([[ch, 0, sh], [0, 1, 0], [-sh, 0, ch]])
+    nod = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    lean = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1.0]])
+    result = np.eye(4)
+    result[:3, :3] = turn @ nod @ lean
+    result[:3, 3] = x, y, z
+    return result
+
+
+def way(name, frames, seed):
+    """One sequence's `Track`, camera-to-world poses in the street, (frames, 4, 4), and metres driven, (frames,)."""
+    drive = DRIVES[name]
+    track = Track(drive.pieces, -BEHIND, frames * drive.pace * 1.15 + AHEAD)
+    phase = generator(seed, SWAY, int(name)).uniform(0, 2 * np.pi, 6)
+    driven = _driven(drive, track, frames, phase[0])
+    # The body sways with the way driven, so that a standing car stands still.
+    x, z, heading = track.at(driven, drive.lane + 0.06 * np.sin(driven / 6 + phase[1]))
+    pitch = np.radians(0.12) * np.sin(driven / 1.9 + phase[2]) + np.radians(0.08) * np.sin(driven / 0.83 + phase[3])
+    roll = np.radians(0.12) * np.sin(driven / 2.7 + phase[4])
+    y = -CAMERA_HEIGHT + 0.008 * np.sin(driven / 1.3 + phase[5])
+    poses = np.array([pose(*values) for values in zip(x, y, z, heading, pitch, roll)])
+    return track, poses, driven
+
+
+def relative_to_first(poses):
+    """The same poses, (n, 4, 4), in the first camera's frame; the first is the identity to the last bit."""
+    rotation, position = poses[0, :3, :3], poses[0, :3, 3]
+    result = np.tile(np.eye(4), (len(poses), 1, 1))
+    for k in range(1, len(poses)):
+        # Sums of products in fixed order, so that no linear algebra library rounds them its own way.
+        result[k, :3, :3] = (rotation[:, :, None] * poses[k, :3, None, :3]).sum(axis=0)
+        result[k, :3, 3] = (rotation * (poses[k, :3, 3] - position)[:, None]).sum(axis=0)
+    return result
