@@ -14,6 +14,16 @@ import pytest
 SHARED = Path(__file__).resolve().parent.parent.parent / "shared"
 
 
+# what these make or read takes seconds
+SLOW_FIXTURES = {"small_world", "small_labels", "kitti_real", "camvid_real", "reference"}
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if SLOW_FIXTURES & set(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
+
+
 def _shared(*parts):
     folder = SHARED.joinpath(*parts)
     if not folder.is_dir():

@@ -10,6 +10,8 @@ from street import Street
 from thesis_repro import odometry
 from thesis_repro.bench import odometry as bench_odometry
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def kitti(tmp_path):

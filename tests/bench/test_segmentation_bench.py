@@ -9,6 +9,8 @@ from thesis_repro import cityscapes
 from thesis_repro.bench import segmentation as bench_segmentation
 from thesis_repro.segmentation.unet import build_unet
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_input_is_set_against_the_training():
     found = bench_segmentation.input_speed(32, 2, 4, images=8, repeats=1)

@@ -13,6 +13,8 @@ import pytest
 from thesis_repro.report.execute import LOGGED, shown_progress
 from thesis_repro.settings import ROOT
 
+pytestmark = pytest.mark.slow
+
 COMMAND = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--log-level=CRITICAL",
            "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
            "--Execution.log_file=out/one.log", "--output-dir=out", "--output=done.ipynb", "one.ipynb"]

@@ -14,6 +14,8 @@ from thesis_repro.segmentation import backbones, memory, prediction, quality, tr
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.study.flicker import flicker
 
+pytestmark = pytest.mark.slow
+
 SIZE = 64
 random = np.random.default_rng(0)
 IMAGES = random.integers(0, 256, (7, SIZE, SIZE, 1), np.uint8)

@@ -8,6 +8,8 @@ from thesis_repro import InputError, cityscapes
 from thesis_repro.segmentation import prediction, quality, shipped
 from thesis_repro.segmentation.shipped import Phase, Preset
 
+pytestmark = pytest.mark.slow
+
 TINY = Preset(base_filters=2, phases=(Phase(32, 2, 2, 1e-2, 6), Phase(48, 1, 1, 1e-3, 4)))
 
 

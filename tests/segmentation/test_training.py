@@ -14,6 +14,8 @@ from thesis_repro import InputError
 from thesis_repro.segmentation import augmentation, training
 from thesis_repro.segmentation.unet import build_unet
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 SIZE = 32
 

@@ -13,6 +13,8 @@ from thesis_repro.segmentation import prediction, training
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.study import budget
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def model():

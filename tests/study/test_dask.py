@@ -17,6 +17,8 @@ from thesis_repro import InputError
 from thesis_repro.study import cluster, runner
 from thesis_repro.study.jobs import first_jobs
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES, CHECKPOINT = 12, 4
 # loaded by the workers: slow enough to be killed in the middle, and telling which frames they read

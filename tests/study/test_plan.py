@@ -11,6 +11,8 @@ from thesis_repro.__main__ import main
 from thesis_repro.study import plan, runner
 from thesis_repro.study.jobs import first_jobs, mask_control_jobs
 
+pytestmark = pytest.mark.slow
+
 SERIES = plan.FIRST_SERIES, plan.SECOND_SERIES
 EXCERPT = plan.Excerpt("00 from frame 2", jobs=dict(zip(SERIES, (168, 30))),
                        series=dict(zip(SERIES, (1.68 + 0.05, 0.3 + 0.05))), shared=0.05, row_bytes=500.0,

@@ -10,6 +10,8 @@ from thesis_repro.cityscapes import ID
 from thesis_repro.world import dataset, drives, layout, raster, render, street, textures
 from thesis_repro.world.faces import Faces
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"sequences": ("00", "07"), "frames": 12, "scale": 0.2, "train_images": 2, "validation_images": 1, "jobs": 1}
 
 
