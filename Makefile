@@ -10,7 +10,7 @@ PROFILE ?= demo
 BIN := .venv/bin
 
 # A misspelled setting must not pass for the default.
-KNOWN := KITTI CITYSCAPES CAMVID PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON
+KNOWN := KITTI CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
@@ -43,7 +43,7 @@ help:
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path"
 	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
-	@echo "make weights     trains the model that ships anew, CAMVID=/path/to/camvid"
+	@echo "make weights     trains the model that ships from nothing, CAMVID=/path KITTI_SEMANTIC=/path"
 	@echo "make setup       only .venv with the pinned packages"
 	@echo "make clean       removes .venv, build and the figures of other data and profiles"
 
@@ -119,7 +119,8 @@ bench: setup
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.segmentation.shipped "$(CAMVID)" build/shipped
+	@$(if $(KITTI_SEMANTIC),,echo "KITTI_SEMANTIC must name the folder of KITTI's street scenes (train, trainannot)" >&2; exit 1)
+	@$(BIN)/python -m thesis_repro.segmentation.shipped "$(CAMVID)" "$(KITTI_SEMANTIC)" build/shipped
 
 clean:
 	rm -rf .venv build figures/*/ *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -18,7 +18,7 @@ from thesis_repro.cityscapes import read_image
 from thesis_repro.segmentation import memory, training
 
 SIZE = 320  # pixels, both ways, of written label maps
-SHIPPED = Path(__file__).parent / "weights" / "camvid.keras"
+SHIPPED = Path(__file__).parent / "weights" / "streets.keras"
 CALL = 4  # images in one call of the network on a CPU; the activations of more fall out of its cache
 
 
