@@ -45,6 +45,12 @@ def test_written_masks_are_read_by_the_odometry_and_give_the_same_path(small_wor
     assert (tmp_path / "one.txt").read_bytes() == (tmp_path / "two.txt").read_bytes()
     assert masks("--dilation", 1, 2, "--boundaries", "exact", "--output", tmp_path / "both") == 0
     assert sorted(path.name for path in (tmp_path / "both").iterdir()) == ["mask1", "mask2"]
+    corrected = ["--boundaries", "exact", "--symmetric", "--without-movable", "--classes", "road", "--margin", 4]
+    assert masks("--dilation", 5, *corrected, "--output", tmp_path / "corrected") == 0
+    assert odometry(*where, "--masks", tmp_path / "corrected", "--output", tmp_path / "one.txt") == 0
+    assert odometry(*where, *labels, "--dilation", 5, *corrected, "--output", tmp_path / "three.txt") == 0
+    assert (tmp_path / "one.txt").read_bytes() == (tmp_path / "three.txt").read_bytes()
+    assert (tmp_path / "one.txt").read_bytes() != (tmp_path / "two.txt").read_bytes()
     capsys.readouterr()
     assert masks("--dilation", *range(1, 1000), "--output", tmp_path / "many") == 1
     assert "999 widths of 12 frames would be 11,988 files" in capsys.readouterr().err
@@ -88,6 +94,8 @@ def test_limited_and_masked_runs_use_fewer_keypoints(small_world, tmp_path, caps
     (["--sequence", "00", "--labels", "somewhere"], "--labels: needs --dilation"),
     (["--sequence", "00", "--dilation", "3"], "--dilation: needs --labels"),
     (["--sequence", "00", "--masks", "nowhere"], "nowhere: no such folder"),
+    (["--sequence", "00", "--symmetric"], "--margin: need --labels"),
+    (["--sequence", "00", "--labels", "somewhere", "--dilation", "3", "--margin", "-1"], "margin=-1: must be 0 or"),
     (["--sequence", "00", "--max-keypoints", "-3"], "max_keypoints: -3 is below"),
 ])
 def test_bad_input_is_one_line_and_nothing_is_written(small_world, tmp_path, capsys, options, says):

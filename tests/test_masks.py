@@ -78,3 +78,107 @@ def test_faults_are_named(labelled, tmp_path):
         masks.MaskFolder(folder, sequence)
     with pytest.raises(InputError, match="unknown; choose one of canny, exact"):
         masks.edges(halves("road", "sky"), (48, 64), boundaries="fuzzy")
+
+
+# The corrections, each by itself
+
+PLAIN = masks.MaskSettings()
+
+
+def streets():
+    """A label map of blocks of a few classes; none of its boundaries lies on a pixel's centre when enlarged to SIZE."""
+    return np.random.default_rng(0).choice([7, 8, 11, 23, 26], (20, 20)).astype(np.uint8).repeat(16, 0).repeat(16, 1)
+
+
+SIZE = (376, 1240)
+
+
+def test_without_corrections_masks_are_the_thesiss_to_the_bit():
+    enlarged = cv2.resize(streets(), SIZE[::-1])
+    theirs = cv2.dilate(cv2.Canny(enlarged, 5, 15), np.ones((10, 10), np.uint8))
+    assert np.array_equal(masks.keypoint_mask(streets(), SIZE, 10), theirs)
+    assert np.array_equal(masks.keypoint_mask(streets(), SIZE, 10, PLAIN), theirs)
+    assert np.array_equal(masks.keypoint_mask(streets(), SIZE, 10, "exact"),
+                          masks.keypoint_mask(streets(), SIZE, 10, masks.MaskSettings(boundaries="exact")))
+
+
+@pytest.mark.parametrize("width", [2, 5, 10])
+def test_a_symmetric_mask_of_a_mirrored_label_map_is_the_mirrored_mask(width):
+    def differing(settings):
+        made = masks.keypoint_mask(streets(), SIZE, width, settings)
+        return [(masks.keypoint_mask(cv2.flip(streets(), axis), SIZE, width, settings) != cv2.flip(made, axis)).mean()
+                for axis in (0, 1)]
+
+    assert differing(masks.MaskSettings("exact", symmetric=True)) == [0, 0]
+    assert max(differing(masks.MaskSettings("exact"))) > 0.01
+
+
+def test_a_symmetric_band_lies_in_the_middle_of_its_boundary():
+    def columns(width, settings):  # the boundary is between columns 47 and 48
+        return np.unique(np.nonzero(masks.keypoint_mask(halves("road", "sky"), (64, 96), width, settings))[1])
+
+    assert columns(10, masks.MaskSettings("exact", symmetric=True)).tolist() == list(range(43, 53))
+    assert columns(5, masks.MaskSettings("exact", symmetric=True)).tolist() == list(range(45, 51))
+    assert columns(5, masks.MaskSettings("exact")).tolist() == list(range(45, 50))
+    point = np.zeros((41, 41), np.uint8)
+    point[20, 20] = 255
+    rows, across = np.nonzero(masks.dilate(point, 10, symmetric=True))
+    assert rows.mean() == across.mean() == 20 and len(rows) == 81
+
+
+def thirds():
+    label_map = np.full((32, 48), ID["road"], np.uint8)
+    label_map[:, 16:32], label_map[:, 32:] = ID["car"], ID["building"]
+    return label_map
+
+
+@pytest.mark.parametrize("boundaries", masks.BOUNDARIES)
+def test_boundaries_of_chosen_classes_alone(boundaries):
+    def around(*classes):  # whether the boundary road/car, at column 32, and car/building, at 64, is found
+        found = masks.keypoint_mask(thirds(), (64, 96), 3, masks.MaskSettings(boundaries, classes=classes)).any(axis=0)
+        assert not np.delete(found, np.r_[28:37, 60:69]).any()
+        return bool(found[28:37].any()), bool(found[60:69].any())
+
+    assert around("road") == (True, False) and around("building") == (False, True)
+    assert around("car") == around() == (True, True)
+    assert around("pole") == (False, False)
+
+
+def test_no_keypoints_on_movable_classes():
+    label_map = thirds()
+    without = {grown: masks.keypoint_mask(label_map, (64, 96), 9, masks.MaskSettings("exact", movable=grown)) > 0
+               for grown in (None, 0, 2)}
+    assert without[None][:, 32:36].all()  # on the car, along its boundary
+    assert not without[0][:, 32:64].any() and without[0][:, 28:32].all() and without[0][:, 64:68].all()
+    assert not without[2][:, 30:66].any() and without[2][:, 28:30].all() and without[2][:, 66:68].all()
+
+
+def test_nothing_is_kept_within_the_margin():
+    mask = masks.keypoint_mask(streets(), SIZE, 5, masks.MaskSettings(margin=7))
+    plain = masks.keypoint_mask(streets(), SIZE, 5)
+    assert np.array_equal(mask[7:-7, 7:-7], plain[7:-7, 7:-7]) and plain[:7].any()
+    inside = np.zeros_like(mask)
+    inside[7:-7, 7:-7] = 1
+    assert not mask[inside == 0].any()
+    assert not masks.keypoint_mask(streets(), SIZE, 5, masks.MaskSettings(margin=200)).any()
+
+
+def test_label_masks_and_written_ones_have_the_corrections_that_are_asked_for(labelled, tmp_path):
+    sequence, folder = labelled
+    settings = masks.MaskSettings("exact", symmetric=True, classes=("sky",), movable=1, margin=3)
+    made = masks.LabelMasks(folder, sequence, 4, settings)
+    expected = masks.keypoint_mask(halves("road", "sky"), (48, 64), 4, settings)
+    assert np.array_equal(made[1], expected) and not np.array_equal(masks.LabelMasks(folder, sequence, 4)[1], expected)
+    masks.write_masks(made, tmp_path / "masks")
+    assert np.array_equal(masks.MaskFolder(tmp_path / "masks", sequence)[1], expected)
+    masks.write_masks(masks.LabelMasks(folder, sequence, 4), tmp_path / "masks")  # nothing of the others is left
+    assert not np.array_equal(masks.MaskFolder(tmp_path / "masks", sequence)[1], expected)
+
+
+@pytest.mark.parametrize("settings, says", [
+    ({"boundaries": "fuzzy"}, "boundaries='fuzzy': unknown; choose one of canny, exact"),
+    ({"classes": ("hedge",)}, "classes: 'hedge' is no label; known are unlabeled, "),
+    ({"movable": -1}, "movable=-1: must be 0 or more"), ({"margin": -3}, "margin=-3: must be 0 or more")])
+def test_settings_that_cannot_be_are_refused(settings, says):
+    with pytest.raises(InputError, match=says):
+        masks.MaskSettings(**settings)

@@ -63,13 +63,20 @@ def predict(options):
 MANY_MASKS = 10_000  # files; more of them must be asked for
 
 
+def _mask_settings(options):
+    from thesis_repro.masks import MaskSettings
+
+    return MaskSettings(options.boundaries, options.symmetric, tuple(options.classes), options.without_movable,
+                        options.margin)
+
+
 def masks(options):
     """write the keypoint masks of a sequence (A.8): one 8-bit PNG a frame, 255 keep, 0 ignore, for odometry --masks"""
     from thesis_repro.kitti import Sequence
     from thesis_repro.masks import LabelMasks, write_masks
 
     sequence, widths = Sequence(options.kitti, options.sequence), sorted(set(options.dilation))
-    made = [LabelMasks(options.labels, sequence, width, options.boundaries) for width in widths]
+    made = [LabelMasks(options.labels, sequence, width, _mask_settings(options)) for width in widths]
     count = len(made) * len(sequence)
     if count > MANY_MASKS and not options.many:
         raise InputError(f"--dilation: {len(made)} widths of {len(sequence)} frames would be {count:,} files. The "
@@ -86,7 +93,7 @@ def odometry(options):
     from thesis_repro import odometry
     from thesis_repro.files import write_text
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
-    from thesis_repro.masks import LabelMasks, MaskFolder
+    from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings
     from thesis_repro.odometry import metrics
     from thesis_repro.report import video
 
@@ -96,13 +103,16 @@ def odometry(options):
         raise InputError("--dilation: needs --labels DIR, the label maps whose boundaries are dilated")
     chosen = {name: value for name, value in vars(options).items() if value is not None
               and name in {field.name for field in fields(odometry.OdometrySettings)}}
+    if _mask_settings(options) != MaskSettings() and not options.labels:
+        raise InputError("--boundaries, --symmetric, --classes, --without-movable, --margin: need --labels DIR, "
+                         "the label maps that masks are made from")
     settings = replace(odometry.PRESETS[options.pyslam], **chosen)
     sequence = Sequence(options.kitti, options.sequence)
     masks = None
     if options.masks:
         masks = MaskFolder(options.masks, sequence)
     elif options.labels:
-        masks = LabelMasks(options.labels, sequence, options.dilation, options.boundaries)
+        masks = LabelMasks(options.labels, sequence, options.dilation, _mask_settings(options))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
     summary = {
@@ -171,9 +181,16 @@ def build_parser():
                      help="a trained model (.keras, .hdf5), several for the mean of their probabilities; "
                           "without it the model in the package")
 
-    def add_boundaries(sub):
+    def add_mask_settings(sub):
         sub.add_argument("--boundaries", choices=("canny", "exact"), default="canny",
                          help="Canny on enlarged label ids as in the thesis (canny), or every change of class (exact)")
+        sub.add_argument("--symmetric", action="store_true",
+                         help="masks in the middle of the boundaries, not half a pixel beside them")
+        sub.add_argument("--classes", nargs="+", default=(), metavar="NAME",
+                         help="boundaries of these classes alone, by their names in Cityscapes")
+        sub.add_argument("--without-movable", type=int, nargs="?", const=0, metavar="PIXELS",
+                         help="nothing on people and vehicles, nor so many pixels around them (0)")
+        sub.add_argument("--margin", type=int, default=0, metavar="PIXELS", help="nothing along the frame's rim (0)")
 
     sub = command(masks)
     sub.add_argument("--labels", type=Path, required=True, metavar="DIR", help="one label map a frame")
@@ -183,7 +200,7 @@ def build_parser():
                      help="dilation width in pixels; several get a folder each")
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the masks")
     sub.add_argument("--many", action="store_true", help=f"write more than {MANY_MASKS:,} files")
-    add_boundaries(sub)
+    add_mask_settings(sub)
 
     sub = command(odometry)
     sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
@@ -192,7 +209,7 @@ def build_parser():
     source.add_argument("--masks", type=Path, metavar="DIR", help="one mask a frame, 255 keep, 0 ignore")
     source.add_argument("--labels", type=Path, metavar="DIR", help="one label map a frame, with --dilation")
     sub.add_argument("--dilation", type=int, metavar="W", help="dilation width in pixels of masks from label maps")
-    add_boundaries(sub)
+    add_mask_settings(sub)
     sub.add_argument("--pyslam", choices=("2021", "2024"), default="2021",
                      help="the preset: PySLAM of the thesis (default), or its later algorithm; what follows changes it")
     sub.add_argument("--pose", metavar="all|inliers|refined",

@@ -3,6 +3,7 @@
 A mask is uint8 of the frame's size: keypoints may lie where it is 255 and not where it is 0.
 """
 
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,15 +11,53 @@ import cv2
 import numpy as np
 
 from thesis_repro import InputError, stages
-from thesis_repro.cityscapes import read_label_map
+from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence
 
 CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
 BOUNDARIES = ("canny", "exact")
+NEAR = 5  # pixels a side: a Canny edge within two pixels of a change of class is taken to be that change
+MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked ones too
 
 
-def edges(label_map: np.ndarray, size: tuple[int, int], boundaries: str = "canny") -> np.ndarray:
+@dataclass(frozen=True)
+class MaskSettings:
+    """How a mask is made from a label map. The defaults are the thesis's way; each field is one correction of it.
+
+    boundaries: "canny" finds edges in label ids, "exact" every change of class (see `edges`).
+    symmetric: the mask of a mirrored label map is the mirrored mask: no half pixel to one side (see `edges`, `dilate`).
+    classes: names of labels; boundaries of these alone, with whatever they touch. Empty: of all classes.
+    movable: pixels; nothing is kept on people and vehicles, whose areas grow by so many pixels first. None: kept.
+    margin: pixels along the frame's rim where nothing is kept: there, points are lost in the next frame, and networks
+    that pad with zeros see boundaries that are none.
+    Raises InputError for an unknown name and a negative number.
+    """
+
+    boundaries: str = "canny"
+    symmetric: bool = False
+    classes: tuple[str, ...] = ()
+    movable: int | None = None
+    margin: int = 0
+
+    def __post_init__(self) -> None:
+        if self.boundaries not in BOUNDARIES:
+            raise InputError(f"boundaries={self.boundaries!r}: unknown; choose one of {', '.join(BOUNDARIES)}")
+        for name in self.classes:
+            if name not in ID:
+                raise InputError(f"classes: {name!r} is no label; known are {', '.join(ID)}")
+        for name, pixels in (("movable", self.movable or 0), ("margin", self.margin)):
+            if pixels < 0:
+                raise InputError(f"{name}={pixels}: must be 0 or more pixels")
+
+    @classmethod
+    def of(cls, settings: "MaskSettings | str") -> "MaskSettings":
+        """The settings themselves; a string names the boundaries alone."""
+        return cls(settings) if isinstance(settings, str) else settings
+
+
+def edges(label_map: np.ndarray, size: tuple[int, int], boundaries: str = "canny", symmetric: bool = False,
+          classes: tuple[str, ...] = ()) -> np.ndarray:
     """Boundaries between classes at the frame's size.
 
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
@@ -26,34 +65,80 @@ def edges(label_map: np.ndarray, size: tuple[int, int], boundaries: str = "canny
     boundaries "canny" is the thesis: enlarge bilinearly (which invents ids along every boundary), then Canny (5, 15)
     on the ids themselves, so that a boundary shows only where two ids are far enough apart. "exact" is the correction:
     enlarge with nearest neighbour and mark every pixel whose right or lower neighbour has another class.
+    symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary. OpenCV's plain nearest
+    neighbour looks half a pixel to the upper left, and a mark on one side lies half a pixel beside the boundary.
+    classes: names of labels; only boundaries of these. A Canny edge, which knows no classes, is one of theirs where it
+    lies within two pixels of it.
     """
+    MaskSettings(boundaries, classes=classes)  # refuses what is unknown
     height, width = size
     if boundaries == "canny":
-        enlarged = cv2.resize(label_map, (width, height))
-        return cv2.Canny(enlarged, CANNY_LOW, CANNY_HIGH)
-    if boundaries != "exact":
-        raise InputError(f"boundaries={boundaries!r}: unknown; choose one of {', '.join(BOUNDARIES)}")
-    enlarged = cv2.resize(label_map, (width, height), interpolation=cv2.INTER_NEAREST)
-    different = np.zeros((height, width), bool)
-    different[:, :-1] |= enlarged[:, :-1] != enlarged[:, 1:]
-    different[:-1] |= enlarged[:-1] != enlarged[1:]
+        found = cv2.Canny(cv2.resize(label_map, (width, height)), CANNY_LOW, CANNY_HIGH)
+        return found & dilate(edges(label_map, size, "exact", True, classes), NEAR, True) if classes else found
+    enlarged = _enlarged(label_map, size, symmetric)
+    chosen = np.isin(enlarged, [ID[name] for name in classes]) if classes else np.ones(size, bool)
+    different = np.zeros(size, bool)
+    for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        change = (enlarged[one] != enlarged[other]) & (chosen[one] | chosen[other])
+        different[one] |= change
+        if symmetric:
+            different[other] |= change
     return different.astype(np.uint8) * 255
 
 
-def dilate(edge_image: np.ndarray, dilation_width: int) -> np.ndarray:
+def _enlarged(label_map, size, symmetric):
+    """The label map at the frame's size, without ids that it does not hold."""
+    nearest = cv2.INTER_NEAREST_EXACT if symmetric else cv2.INTER_NEAREST
+    return cv2.resize(label_map, size[::-1], interpolation=nearest)
+
+
+def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False) -> np.ndarray:
     """Widen edges with a square of ones, `dilation_width` pixels a side.
 
     An even width has no centre pixel: OpenCV's anchor then shifts the mask half a pixel, and the thesis keeps that.
+    symmetric: an even square is made one pixel smaller. Around exact boundaries, which are then marked on both sides,
+    the mask is as wide as an even width says.
     """
     if dilation_width < 1:
         raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels")
-    return cv2.dilate(edge_image, np.ones((dilation_width, dilation_width), np.uint8))
+    side = dilation_width - (dilation_width % 2 == 0) if symmetric else dilation_width
+    return cv2.dilate(edge_image, np.ones((side, side), np.uint8))
+
+
+def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> np.ndarray:
+    """Where no keypoint may lie, whatever the boundaries: (height, width) booleans, movable areas and the margin."""
+    height, width = size
+    never = np.ones(size, bool)
+    never[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
+    if settings.movable is not None:
+        moving = np.isin(_enlarged(label_map, size, True), MOVABLE).astype(np.uint8)
+        never |= dilate(moving, 2 * settings.movable + 1) > 0
+    return never
 
 
 def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int,
-                  boundaries: str = "canny") -> np.ndarray:
-    """The mask of one frame from its label map: `dilate(edges(...))`."""
-    return dilate(edges(label_map, size, boundaries), dilation_width)
+                  settings: MaskSettings | str = MaskSettings()) -> np.ndarray:
+    """The mask of one frame from its label map: `dilate(edges(...))`, less what is `forbidden`.
+
+    settings: a string stands for `MaskSettings(boundaries=...)`.
+    """
+    settings = MaskSettings.of(settings)
+    return _mask(_parts(label_map, size, settings), dilation_width, settings)
+
+
+def _parts(label_map, size, settings):
+    """What of a mask does not depend on its width: edges, and where nothing may lie (None: no such place)."""
+    found = edges(label_map, size, settings.boundaries, settings.symmetric, settings.classes)
+    plain = settings.movable is None and not settings.margin
+    return found, None if plain else forbidden(label_map, size, settings)
+
+
+def _mask(parts, dilation_width, settings):
+    edge_image, never = parts
+    mask = dilate(edge_image, dilation_width, settings.symmetric)
+    if never is not None:
+        mask[never] = 0
+    return mask
 
 
 def coverage(mask: np.ndarray) -> float:
@@ -64,15 +149,16 @@ def coverage(mask: np.ndarray) -> float:
 class LabelMasks:
     """Masks of a sequence made from its label maps when they are asked for: masks[i] for frame i.
 
-    folder holds one label map a frame, of any size, named like the frame.
+    folder holds one label map a frame, of any size, named like the frame. settings: as in `keypoint_mask`.
     Raises InputError when the folder or a frame's label map is missing.
     """
 
-    def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int, boundaries: str = "canny") -> None:
+    def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int,
+                 settings: MaskSettings | str = MaskSettings()) -> None:
         self.paths = _files_of_frames(folder, sequence, "label map")
         self.size = sequence.size
         self.dilation_width = dilation_width
-        self.boundaries = boundaries
+        self.settings = MaskSettings.of(settings)
         if dilation_width < 1:
             raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels")
 
@@ -80,17 +166,17 @@ class LabelMasks:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return dilate(_edges_of_file(self.paths[index], self.size, self.boundaries), self.dilation_width)
+        return _mask(_parts_of_file(self.paths[index], self.size, self.settings), self.dilation_width, self.settings)
 
 
 @lru_cache(maxsize=8)  # the variants of one frame differ in their dilation alone
-def _edges_of_file(path, size, boundaries):
-    return edges(read_label_map(path), size, boundaries)
+def _parts_of_file(path, size, settings):
+    return _parts(read_label_map(path), size, settings)
 
 
 def forget_edges() -> None:
     """Drop the edges that LabelMasks keeps for its next width, so that the making of a mask can be timed."""
-    _edges_of_file.cache_clear()
+    _parts_of_file.cache_clear()
 
 
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:
@@ -98,7 +184,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 
     The folder is a stage (see stages): a stopped run goes on, masks of other label maps or widths in it are deleted.
     """
-    folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, boundaries=masks.boundaries,
+    folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, **asdict(masks.settings),
                           dilation_width=masks.dilation_width, code=stages.code("masks"))
     for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
         if not (folder / path.name).is_file():
