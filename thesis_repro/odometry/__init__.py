@@ -13,6 +13,14 @@ their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What 
 | none or several essential matrices          | "no essential matrix", "several essential matrices"                  |
 | agreement no better than chance (scene cut) | "no agreement"                                                       |
 | moved less than the gate (PySLAM's rule)    | "stationary"                                                         |
+
+With pose="refined" two more, in which the pose moves on (see continuity):
+
+| motion                                      | flag and rule                                                        |
+|---------------------------------------------|----------------------------------------------------------------------|
+| unlike the steps before, or left open by    | "ambiguous motion": the best of those that go on from the steps      |
+| its points (on one line, say)               | before, if nearly as many points are near it and they determine it   |
+| the same, and no such motion                | "motion not determined": the last motion again, over this step's way |
 """
 
 from thesis_repro.odometry.odometry import Odometry, Step

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from thesis_repro import InputError
-from thesis_repro.odometry import keypoints, pose
+from thesis_repro.odometry import continuity, guided, keypoints, pose
 from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refine import refine
+from thesis_repro.odometry.refine import fit
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 SECONDS = ("detect", "track", "essential", "pose")
@@ -63,7 +63,7 @@ class Odometry:
 
     `step(frame, scale, mask)` takes the next gray frame (height, width), the metres moved since the frame before, and
     an optional mask of the same size (0: no keypoints there), and returns a Step. It is the three methods below, one
-    after the other; only `motion` is expensive, and it depends on nothing but its own step.
+    after the other; only `estimate` is expensive, and it depends on nothing but its own step.
     """
 
     def __init__(self, intrinsics: np.ndarray, settings: OdometrySettings = THESIS, start: np.ndarray | None = None,
@@ -72,6 +72,7 @@ class Odometry:
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
+        self.course = continuity.START  # of refined poses alone
         self.features = features
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame that self.points belong to
@@ -135,13 +136,13 @@ class Odometry:
             return found
         started = time.perf_counter()
         current, previous, inliers = found.current, found.previous, found.inliers
-        if chosen.pose == "all":
-            votes, rotation, translation = pose.recover_pose(found.matrix, current, previous)
-        else:
-            votes, rotation, translation = pose.recover_pose(found.matrix, current[inliers], previous[inliers])
         if chosen.pose == "refined":
-            rotation, translation = refine(rotation, translation, current, previous, inliers, chosen.threshold)
-        step.motion = Motion(rotation, translation, found.in_order(), votes)
+            motion = fit(*pose.smaller_rotation(found.matrix), current, previous, inliers, chosen.threshold)
+            step.motion = replace(motion, inliers=found.in_order())
+        else:
+            voters = inliers if chosen.pose == "inliers" else slice(None)
+            votes, rotation, translation = pose.recover_pose(found.matrix, current[voters], previous[voters])
+            step.motion = Motion(rotation, translation, found.in_order(), votes)
         step.seconds["pose"] = time.perf_counter() - started
         return found
 
@@ -151,25 +152,38 @@ class Odometry:
         if step.points:
             if motion.rotation is None:
                 step.flags.append(motion.problem)
+                self.course = self.course.lost()
             elif _by_chance(motion.inliers):
                 step.flags.append("no agreement")
+                self.course = self.course.lost()
             elif (step.scale <= chosen.scale_gate
                   or chosen.shift_gate and _mean_shift(step) < chosen.shift_gate):
                 step.flags.append("stationary")
             else:
-                self.pose = self._moved(motion, step.scale)
+                if chosen.pose == "refined":
+                    self._believe(step)
+                self.pose = self._moved(step.motion, step.scale)
                 step.updated = True
         step.pose = self.pose
         return step
 
+    def _believe(self, step):
+        started = time.perf_counter()
+        current, previous = (pose.normalise(points, self.intrinsics) for points in (step.current, step.previous))
+        step.motion, self.course, flag = continuity.believe(step.motion, current, previous, step.scale,
+                                                            self.settings.threshold, self.course)
+        if flag:
+            step.flags.append(flag)
+        step.seconds["pose"] += time.perf_counter() - started
+
     def state(self) -> dict[str, Any]:
         """What `restore` needs to go on from here, and nothing that belongs to the settings."""
-        return {"pose": self.pose, "count": self.count, "previous": self.previous, "points": self.points,
-                "gap": self._gap}
+        return {"pose": self.pose, "course": self.course, "count": self.count, "previous": self.previous,
+                "points": self.points, "gap": self._gap}
 
     def restore(self, state: dict[str, Any]) -> None:
-        self.pose, self.count, self.previous = state["pose"], state["count"], state["previous"]
-        self.points, self._gap = state["points"], state["gap"]
+        self.pose, self.course, self.count = state["pose"], state["course"], state["count"]
+        self.previous, self.points, self._gap = state["previous"], state["points"], state["gap"]
 
     def _moved(self, motion, scale):
         moved, rotation = np.eye(4), self.pose[:3, :3]
@@ -241,4 +255,6 @@ def warm_up() -> None:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
     pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
     pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
-    refine(np.eye(3), np.array([0.0, 0.0, 1.0]), points, points, np.ones(8, bool), 1.0)
+    ahead = np.array([0.0, 0.0, 1.0])
+    fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)
+    guided.find(points, points[::-1], 1.0, np.eye(3), ahead, 180.0, 180.0)

@@ -16,6 +16,7 @@ from thesis_repro import InputError, stages
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
+from thesis_repro.odometry.continuity import Course
 from thesis_repro.odometry.odometry import COLUMNS, ROTATION, Odometry, Step
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
@@ -202,7 +203,8 @@ def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], 
     if last["previous"] is not None:
         arrays["previous"] = last["previous"]
     flags = {name: one.flags for name, one in members.items()}
-    stages.store(checkpoint, {"job": job, "done": done, "gap": last["gap"], "flags": flags}, arrays)
+    courses = {name: one.odometry.course.numbers() for name, one in members.items()}
+    stages.store(checkpoint, {"job": job, "done": done, "gap": last["gap"], "flags": flags, "courses": courses}, arrays)
 
 
 def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
@@ -218,9 +220,9 @@ def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], lea
     for (name, one), numbers, pose in zip(members.items(), arrays["numbers"], arrays["poses"], strict=True):
         one.numbers[:done] = numbers
         one.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
-        one.odometry.pose = pose
+        one.odometry.pose, one.odometry.course = pose, Course.of(state["courses"][name])
     for index, leader in enumerate(leaders):
-        leader.odometry.restore({"pose": leader.odometry.pose, "count": done, "previous": arrays.get("previous"),
+        leader.odometry.restore({**leader.odometry.state(), "count": done, "previous": arrays.get("previous"),
                                  "points": arrays[f"points {index}"], "gap": state["gap"]})
     return done
 

@@ -28,6 +28,10 @@ class Motion:
     inliers: np.ndarray | None = None  # N booleans: correspondences that agree with the essential matrix
     pose_inliers: int = 0  # correspondences that lie in front of both cameras and not too far away
     problem: str = ""
+    # Of refined motions alone:
+    support: int = 0  # correspondences near the motion
+    turn_sd: float = 0.0  # standard deviation of the rotation in its least certain direction, degrees
+    swing_sd: float = 0.0  # the same of the translation's direction
 
 
 def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -86,6 +90,43 @@ def recover_pose(matrix: np.ndarray, current: np.ndarray,
     candidates = ((first, direction), (second, direction), (first, -direction), (second, -direction))
     best = int(np.argmax(votes))  # the first of equals, as in OpenCV
     return int(votes[best]), *candidates[best]
+
+
+def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """An essential matrix's smaller rotation (3x3), and the translation (3, unit length) up to its sign.
+
+    The other rotation is the twisted pair's: turned by 180 degrees about the translation, as no car is from frame to
+    frame.
+    """
+    first, second, translation = cv2.decomposeEssentialMat(matrix)
+    return (first if np.trace(first) >= np.trace(second) else second), translation.ravel()
+
+
+@fast
+def sides(rotation, t, current, previous, parallax):
+    """How many correspondences (N, 2) lie in front of both cameras under (rotation, t), and under (rotation, -t).
+
+    Points whose rays meet at less than `parallax` (the sine of an angle) say nothing about the sign and do not vote. So
+    that is what limits their depth, and not 50 translations, which in a slow step are a few metres.
+    """
+    forward, backward = 0, 0
+    for k in range(len(current)):
+        x, y = current[k, 0], current[k, 1]
+        # The rays a, turned into the previous camera's coordinates, and b; they meet where depth a + t = other b.
+        a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
+        a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
+        a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
+        b0, b1 = previous[k, 0], previous[k, 1]
+        n0, n1, n2 = a1 - a2 * b1, a2 * b0 - a0, a0 * b1 - a1 * b0  # a x b
+        if n0 * n0 + n1 * n1 + n2 * n2 <= parallax * parallax * (x * x + y * y + 1) * (b0 * b0 + b1 * b1 + 1):
+            continue
+        depth = n0 * (b1 * t[2] - t[1]) + n1 * (t[0] - b0 * t[2]) + n2 * (b0 * t[1] - b1 * t[0])  # n (b x t)
+        other = n0 * (a1 * t[2] - a2 * t[1]) + n1 * (a2 * t[0] - a0 * t[2]) + n2 * (a0 * t[1] - a1 * t[0])  # n (a x t)
+        if depth > 0 and other > 0:
+            forward += 1
+        elif depth < 0 and other < 0:
+            backward += 1
+    return forward, backward
 
 
 def _triangulate_and_count(current, previous, rotation, translation):

@@ -105,6 +105,22 @@ def _agree(e, x, y, u, v, limit):
 
 
 @fast
+def draw(state, count, chosen):
+    """Write the indices of SAMPLE of `count` correspondences, drawn as OpenCV does; returns the generator's state."""
+    taken = 0
+    while taken < SAMPLE:
+        state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
+        index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
+        new = True
+        for k in range(taken):
+            new = new and chosen[k] != index
+        if new:
+            chosen[taken] = index
+            taken += 1
+    return state
+
+
+@fast
 def _next_better(columns, limit, state, sample, samples, best):
     """Draw samples until one may have more than `best` inliers, or until there are `samples` of them.
 
@@ -116,16 +132,7 @@ def _next_better(columns, limit, state, sample, samples, best):
     five = np.empty((SAMPLE, 4))
     while sample < samples:
         sample += 1
-        taken = 0
-        while taken < SAMPLE:
-            state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
-            index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
-            new = True
-            for k in range(taken):
-                new = new and chosen[k] != index
-            if new:
-                chosen[taken] = index
-                taken += 1
+        state = draw(state, count, chosen)
         for k in range(SAMPLE):
             for j in range(4):
                 five[k, j] = columns[j, chosen[k]]

@@ -8,10 +8,29 @@ import numpy as np
 
 from thesis_repro.compiled import fast
 from thesis_repro.odometry import epipolar
-from thesis_repro.odometry.pose import MIN_CORRESPONDENCES
+from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion, sides
 
 REFINE_STEPS = 10
 REFINE_ROUNDS = 3
+NEAR = 2  # thresholds within which a correspondence supports a motion
+WIDE = (4, 1)  # thresholds: scales of the second start
+ELSEWHERE = np.cos(np.radians(15.0))  # of the angle between two directions of motion
+BETTER = 0.99  # of the first start's cost: more than what rounding makes of one and the same minimum
+
+
+def fit(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
+        inliers: np.ndarray, threshold: float) -> Motion:
+    """The motion that `refine` makes of a start whose translation (unit) has any sign, with all that a Motion tells.
+
+    The points near it vote on the sign: see pose.sides.
+    """
+    turned, direction = refine(rotation, translation, current, previous, inliers, threshold)
+    support = near(turned, direction, current, previous, NEAR * threshold)
+    current, previous = current[support], previous[support]
+    forward, backward = sides(turned, direction, current, previous, threshold)
+    turn_sd, swing_sd = _deviations(turned, direction, current, previous, threshold / 2)
+    return Motion(turned, direction if forward >= backward else -direction, inliers, max(forward, backward),
+                  support=len(current), turn_sd=turn_sd, swing_sd=swing_sd)
 
 
 def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
@@ -21,29 +40,58 @@ def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, p
     Levenberg-Marquardt over the rotation and the two angles of the translation's direction, on Sampson distances with
     Cauchy weights at half the estimator's threshold: RANSAC's answer goes through five points, this one uses them all.
     It starts from `inliers` (N booleans), and twice fits again to what lies within two thresholds, so that the chance
-    by which RANSAC chose its inliers is gone as well. An essential matrix does not know the sign of the translation,
-    so the sign that was voted for is kept.
+    by which RANSAC chose its inliers is gone as well. So narrow a scale has many minima; therefore it starts a second
+    time from the motion found, on all correspondences at wider scales first, and keeps the better of both. What lies
+    farther away than ELSEWHERE is another motion, between which the fit does not choose. An essential matrix does not
+    know the sign of the translation, so the sign that was given is kept.
     """
-    turned, direction, chosen = np.ascontiguousarray(rotation), np.ascontiguousarray(translation), inliers
-    for _ in range(REFINE_ROUNDS):
-        if chosen.sum() < MIN_CORRESPONDENCES:
-            break
-        turned, direction = _refine(turned, direction, current[chosen], previous[chosen], threshold / 2)
-        chosen = _near(turned, direction, current, previous, 2 * threshold)
+    turned, direction = _rounds(np.ascontiguousarray(rotation), np.ascontiguousarray(translation), current, previous,
+                                inliers, threshold)
+    again = turned, direction
+    for scale in WIDE:
+        again = _refine(*again, current, previous, scale * threshold)
+    again = _rounds(*again, current, previous, near(*again, current, previous, NEAR * threshold), threshold)
+    if (abs(again[1] @ direction) > ELSEWHERE and _normal_equations(*again, current, previous, threshold / 2)[0]
+            < BETTER * _normal_equations(turned, direction, current, previous, threshold / 2)[0]):
+        turned, direction = again
     return turned, direction if direction @ translation >= 0 else -direction
 
 
+def _rounds(rotation, translation, current, previous, chosen, threshold):
+    for _ in range(REFINE_ROUNDS):
+        if chosen.sum() < MIN_CORRESPONDENCES:
+            break
+        rotation, translation = _refine(rotation, translation, current[chosen], previous[chosen], threshold / 2)
+        chosen = near(rotation, translation, current, previous, NEAR * threshold)
+    return rotation, translation
+
+
+def _deviations(rotation, translation, current, previous, scale):
+    """Standard deviations, degrees, of the rotation and of the translation's direction, each where it is largest.
+
+    From the inverse of the Gauss-Newton matrix, for residuals whose own is `scale`. Points that leave the motion open,
+    all on one line in space, say, make them large.
+    """
+    hessian = _normal_equations(rotation, translation, current, previous, scale)[1]
+    values, vectors = np.linalg.eigh(hessian)
+    if len(current) < MIN_CORRESPONDENCES or not values[0] > 1e-12 * values[-1]:
+        return np.inf, np.inf
+    covariance = scale * scale * (vectors / values) @ vectors.T
+    return tuple(float(np.degrees(np.sqrt(np.linalg.eigvalsh(part)[-1])))
+                 for part in (covariance[:3, :3], covariance[3:, 3:]))
+
+
 @fast
-def _near(r, t, current, previous, limit):
+def near(r, t, current, previous, limit):
     """N booleans: the correspondences whose Sampson distance from the motion is below the limit."""
     essential = epipolar.entries(np.dot(_skew(t), r))
-    near = np.empty(len(current), np.bool_)
+    mask = np.empty(len(current), np.bool_)
     for index in range(len(current)):
         x, y = current[index, 0], current[index, 1]
         u, v = previous[index, 0], previous[index, 1]
         algebraic, l0, l1, m0, m1 = epipolar.lines(essential, x, y, u, v)
-        near[index] = algebraic * algebraic < limit * limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
-    return near
+        mask[index] = algebraic * algebraic < limit * limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+    return mask
 
 
 @fast

@@ -17,8 +17,9 @@ class OdometrySettings:
     estimator: "ransac", or OpenCV's "usac", "usac-magsac".
     threshold: of the estimator, in normalised coordinates.
     permute: seed that shuffles the correspondences before the estimator, whose own seed is fixed; None: not shuffled.
-    pose: which points vote on the sign of the motion: "all" (PySLAM, audit row 13), "inliers"; or "refined": voted by
-    the inliers, then fitted to them.
+    pose: "all" (PySLAM) and "inliers": RANSAC's motion, on whose sign and rotation these points vote (audit rows 13,
+    29); or "refined": fitted to the points near it, with the smaller of the two rotations, and held against the steps
+    before (see continuity).
     scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
     points, pixels.
     rotate_first: turn the pose before moving it.

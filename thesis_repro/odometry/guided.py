@@ -1,0 +1,96 @@
+"""RANSAC among the motions near an expected one.
+
+With few points, or points far away, two motions may explain the correspondences nearly as well: a turn looks like a
+shift to the side. RANSAC then keeps the one that its samples happen to favour. Here only essential matrices whose
+motion lies within given angles of an expected one are counted, so the other cannot win.
+"""
+
+import numpy as np
+
+from thesis_repro.compiled import fast
+from thesis_repro.odometry import epipolar
+from thesis_repro.odometry.five_point import SAMPLE, solve
+from thesis_repro.odometry.ransac import MAX_SAMPLES, SEED, draw
+
+
+def find(current: np.ndarray, previous: np.ndarray, threshold: float, rotation: np.ndarray, translation: np.ndarray,
+         turn: float, swing: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """The motion (rotation 3x3, unit translation) with most inliers among those near an expected one; None for none.
+
+    current, previous: normalised correspondences (N, 2), N of five or more. rotation, translation: the expected motion.
+    turn, swing: degrees by which a rotation and a translation's direction may differ from it; the translation's sign
+    is not looked at.
+    """
+    columns = np.ascontiguousarray(np.hstack([current, previous]).T)
+    found, turned, direction = _best(columns, threshold * threshold, np.ascontiguousarray(rotation),
+                                     np.ascontiguousarray(translation), np.cos(np.radians(min(turn, 180.0))),
+                                     np.cos(np.radians(min(swing, 90.0))), np.uint64(SEED))
+    return (turned, direction) if found else None
+
+
+@fast
+def _best(columns, limit, rotation, translation, cos_turn, cos_swing, state):
+    count = columns.shape[1]
+    chosen, five = np.empty(SAMPLE, np.int64), np.empty((SAMPLE, 4))
+    r, t = np.empty((3, 3)), np.empty(3)
+    most, best_r, best_t = 0, np.empty((3, 3)), np.empty(3)
+    for _ in range(MAX_SAMPLES):
+        state = draw(state, count, chosen)
+        for k in range(SAMPLE):
+            for j in range(4):
+                five[k, j] = columns[j, chosen[k]]
+        sure, solutions, _ = solve(five)
+        if not sure:
+            continue
+        for e in solutions:
+            _translation(e, t)
+            if abs((t * translation).sum()) < cos_swing:
+                continue
+            near = False
+            for _ in range(2):
+                _rotation(e, t, r)
+                near = near or ((r * rotation).sum() - 1) / 2 >= cos_turn
+                if near:
+                    break
+                t *= -1.0
+            if not near:
+                continue
+            entries = e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
+            inliers = 0
+            for k in range(count):
+                algebraic, l0, l1, m0, m1 = epipolar.lines(entries, columns[0, k], columns[1, k], columns[2, k],
+                                                           columns[3, k])
+                inliers += 1 if algebraic * algebraic <= limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) else 0
+            if inliers > most:
+                most, best_r, best_t = inliers, r.copy(), t.copy()
+    return most, best_r, best_t
+
+
+@fast
+def _translation(e, t):
+    """Write the unit translation of an essential matrix (9), one of its two signs: it is normal to all columns."""
+    largest = -1.0
+    for a in range(3):
+        b = (a + 1) % 3
+        c0 = e[3 + a] * e[6 + b] - e[6 + a] * e[3 + b]
+        c1 = e[6 + a] * e[b] - e[a] * e[6 + b]
+        c2 = e[a] * e[3 + b] - e[3 + a] * e[b]
+        size = c0 * c0 + c1 * c1 + c2 * c2
+        if size > largest:
+            largest, t[0], t[1], t[2] = size, c0, c1, c2
+    t /= np.sqrt(largest)
+
+
+@fast
+def _rotation(e, t, r):
+    """Write the rotation that makes an essential matrix (9, unit norm) [t]x R; the other sign of t gives the other one.
+
+    Horn (1990), Recovering baseline and orientation from essential matrix: R = cof(E) - [t]x E for unit t.
+    """
+    size = np.sqrt(2.0)  # the norm of [t]x R
+    for i in range(3):
+        i1, i2 = 3 * ((i + 1) % 3), 3 * ((i + 2) % 3)
+        for j in range(3):
+            j1, j2 = (j + 1) % 3, (j + 2) % 3
+            cofactor = e[i1 + j1] * e[i2 + j2] - e[i1 + j2] * e[i2 + j1]
+            r[i, j] = size * size * cofactor - size * (t[(i + 1) % 3] * e[i2 + j] - t[(i + 2) % 3] * e[i1 + j])
