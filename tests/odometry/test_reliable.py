@@ -9,7 +9,7 @@ from street import Street
 
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.odometry import THESIS, Odometry, continuity, guided, pose, refine
+from thesis_repro.odometry import THESIS, Odometry, continuity, guided, metrics, pose, refine
 from thesis_repro.odometry.continuity import AMBIGUOUS, NOT_DETERMINED, START, Course
 
 AHEAD = np.array([0.0, 0.0, 1.0])
@@ -78,19 +78,6 @@ def test_points_on_one_line_leave_the_motion_open():
     assert known.turn_sd < 0.02 and known.swing_sd < 0.3
     few = seen(street(4), turn(1), AHEAD)
     assert np.isinf(fitted(turn(1), AHEAD, *few).turn_sd)
-
-
-def test_a_second_start_leaves_a_poor_minimum():
-    current, previous = seen(street(400, seed=3), turn(1), AHEAD, noise=1e-4)
-    motions = []
-    for seed in range(20):
-        random = np.random.default_rng(seed)
-        rotation = turn(1 + random.normal(0, 0.3))
-        direction = AHEAD + random.normal(0, 0.1, 3)
-        start = direction / np.linalg.norm(direction)
-        close = refine.near(rotation, start, current, previous, THESIS.threshold)
-        motions.append(refine.refine(rotation, start, current, previous, close, THESIS.threshold))
-    assert max(degrees_apart(turn(1), rotation) for rotation, _ in motions) < 0.02
 
 
 # One step after others
@@ -176,7 +163,7 @@ def test_a_line_beside_the_road_costs_one_flagged_step(seed):
     flagged = result.frames.loc[result.frames["flag"] != "", ["frame", "flag"]].to_numpy().tolist()
     assert flagged == [[5, NOT_DETERMINED]]
     assert result.frames["updated"][1:].all()
-    assert odometry.metrics.rmse(result.poses, drive.poses) < 0.05
+    assert metrics.rmse(result.poses, drive.poses) < 0.05
 
 
 def test_a_plain_drive_is_not_flagged():
@@ -196,8 +183,20 @@ def test_few_keypoints_keep_their_way_through_a_turn(kitti_real, seed):
     flags = set()
     for index in range(128, 151):
         step = follower.step(sequence.frame(index), metres[index] if index > 128 else 0.0)
-        flags |= set(step.flags)
         if index > 128:
+            flags |= set(step.flags)
             true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
             assert degrees_apart(true[:3, :3], step.motion.rotation) < 0.5, index
     assert flags <= {AMBIGUOUS}
+
+
+@pytest.mark.real
+def test_a_second_start_leaves_a_poor_minimum(kitti_real):
+    """05, frames 0 and 1: fitted once, six orders of 300 points end in directions up to 11 degrees apart."""
+    sequence = Sequence(kitti_real, "05")
+    directions = []
+    for seed in range(6):
+        follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=300, permute=seed or None))
+        follower.step(sequence.frame(0))
+        directions.append(follower.step(sequence.frame(1), 1.0).motion.translation)
+    assert max(np.degrees(np.arccos(one @ other)) for one in directions for other in directions) < 4
