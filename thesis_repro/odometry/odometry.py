@@ -72,7 +72,7 @@ class Odometry:
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
-        self.course = continuity.START  # of refined poses alone
+        self.course = continuity.Course()  # of refined poses alone
         self.features = features
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame that self.points belong to
@@ -152,10 +152,8 @@ class Odometry:
         if step.points:
             if motion.rotation is None:
                 step.flags.append(motion.problem)
-                self.course = self.course.lost()
             elif _by_chance(motion.inliers):
                 step.flags.append("no agreement")
-                self.course = self.course.lost()
             elif (step.scale <= chosen.scale_gate
                   or chosen.shift_gate and _mean_shift(step) < chosen.shift_gate):
                 step.flags.append("stationary")

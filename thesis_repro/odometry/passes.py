@@ -199,12 +199,13 @@ def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], 
     last = leaders[0].odometry.state()  # which frame was the last to be tracked to, all runs agree
     arrays = {"numbers": np.array([one.numbers[:done] for one in members.values()]),
               "poses": np.array([one.odometry.pose for one in members.values()]),
+              **{f"course {part}": np.array([getattr(one.odometry.course, part) for one in members.values()])
+                 for part in Course._fields},
               **{f"points {index}": leader.odometry.points for index, leader in enumerate(leaders)}}
     if last["previous"] is not None:
         arrays["previous"] = last["previous"]
     flags = {name: one.flags for name, one in members.items()}
-    courses = {name: one.odometry.course.numbers() for name, one in members.items()}
-    stages.store(checkpoint, {"job": job, "done": done, "gap": last["gap"], "flags": flags, "courses": courses}, arrays)
+    stages.store(checkpoint, {"job": job, "done": done, "gap": last["gap"], "flags": flags}, arrays)
 
 
 def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
@@ -217,10 +218,12 @@ def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], lea
         return 0
     state, arrays = kept
     done = int(state["done"])
-    for (name, one), numbers, pose in zip(members.items(), arrays["numbers"], arrays["poses"], strict=True):
+    courses = zip(*(arrays[f"course {part}"] for part in Course._fields), strict=True)
+    for (name, one), numbers, pose, course in zip(members.items(), arrays["numbers"], arrays["poses"], courses,
+                                                  strict=True):
         one.numbers[:done] = numbers
         one.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
-        one.odometry.pose, one.odometry.course = pose, Course.of(state["courses"][name])
+        one.odometry.pose, one.odometry.course = pose, Course(*course)
     for index, leader in enumerate(leaders):
         leader.odometry.restore({**leader.odometry.state(), "count": done, "previous": arrays.get("previous"),
                                  "points": arrays[f"points {index}"], "gap": state["gap"]})
