@@ -155,18 +155,41 @@ def test_the_first_step_is_believed_where_the_camera_looks_elsewhere():
 # Whole runs
 
 
+def column_at(drive, index):
+    """Masks of a drive that leave everything, but in one frame nothing but a column of points."""
+    masks = {k: np.full(drive.frame(0).shape, 255, np.uint8) for k in range(len(drive))}
+    masks[index] = np.zeros_like(masks[0])
+    masks[index][:, 100:102] = 255
+    return masks
+
+
 @pytest.mark.parametrize("seed", [None, 1, 2])
 def test_a_line_beside_the_road_costs_one_flagged_step(seed):
-    """One frame in which the mask leaves nothing but a column of points."""
     drive = Street(8)
-    masks = {index: np.full(drive.frame(0).shape, 255, np.uint8) for index in range(8)}
-    masks[4] = np.zeros_like(masks[0])
-    masks[4][:, 100:102] = 255
-    result = odometry.run(drive, replace(REFINED, permute=seed), masks)
+    result = odometry.run(drive, replace(REFINED, permute=seed), column_at(drive, 4))
     flagged = result.frames.loc[result.frames["flag"] != "", ["frame", "flag"]].to_numpy().tolist()
     assert flagged == [[5, NOT_DETERMINED]]
     assert result.frames["updated"][1:].all()
     assert metrics.rmse(result.poses, drive.poses) < 0.05
+
+
+def test_a_stopped_pass_knows_its_course(tmp_path, monkeypatch):
+    """The first frame after the checkpoint is one that goes on along the course."""
+    monkeypatch.setattr(odometry.passes, "CHECKPOINT", 5)
+
+    class Stopped(Street):
+        def frame(self, index):
+            if index == 5:
+                raise KeyboardInterrupt
+            return super().frame(index)
+
+    drive = Street(8)
+    runs, file = {"line": (REFINED, column_at(drive, 4))}, tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        odometry.run_many(Stopped(8), runs, checkpoint=file)
+    resumed = odometry.run_many(drive, runs, checkpoint=file)["line"]
+    assert resumed.frames["flag"][5] == NOT_DETERMINED
+    np.testing.assert_array_equal(resumed.poses, odometry.run(drive, *runs["line"]).poses)
 
 
 def test_a_plain_drive_is_not_flagged():

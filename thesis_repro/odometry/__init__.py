@@ -18,9 +18,10 @@ With pose="refined" two more, in which the pose moves on (see continuity):
 
 | motion                                      | flag and rule                                                        |
 |---------------------------------------------|----------------------------------------------------------------------|
-| unlike the steps before, or left open by    | "ambiguous motion": the best of those that go on from the steps      |
-| its points (on one line, say)               | before, if nearly as many points are near it and they determine it   |
-| the same, and no such motion                | "motion not determined": the last motion again, over this step's way |
+| unlike the step before                      | "ambiguous motion": the best of those that go on from the step       |
+|                                             | before, if nearly as many points are near it; if not, as estimated   |
+| left open by its points (on one line, say)  | the same, or "motion not determined" where that is left open too:    |
+|                                             | the motion before again, over this step's length                     |
 """
 
 from thesis_repro.odometry.odometry import Odometry, Step
