@@ -49,9 +49,9 @@ def drive(name, frames, scale, seed):
     return Scene(street, poses, driven, intrinsics, size)
 
 
-def render_frame(name, index, frames=60, scale=0.5, seed=0):
-    """Frame `index` of a sequence of that many frames: image and label map, both uint8 (height, width)."""
-    scene, plan = drive(name, frames, scale, seed), drives.DRIVES[name]
+def render_frame(name, index, frames=None, scale=0.5, seed=0):
+    """Frame `index` of a sequence of that many frames, by default its own number: image and label map, both uint8 (height, width)."""
+    scene, plan = drive(name, frames or drives.DRIVES[name].frames, scale, seed), drives.DRIVES[name]
     image, labels = scene.street.view(scene.poses[index], scene.intrinsics, scene.size, index, scene.driven[index])
     return _expose(drives.generator(seed, drives.SENSOR, int(name), index), image, plan.level, plan.noise), labels
 
@@ -65,7 +65,7 @@ def render_image(split, index, scale=0.5, seed=0):
               (60.0, 0.0))
     sky = (rng.uniform(120, 190), rng.uniform(175, 235), rng.uniform(0.1, 0.9))
     style = dataclasses.replace(
-        plan.style, leader=None, crossing=None, sky=sky, sunny=bool(rng.random() < 0.65),
+        plan.style, leaders=(), crossing=None, sky=sky, sunny=bool(rng.random() < 0.65),
         sun=(rng.uniform(-np.pi, np.pi), rng.uniform(0.45, 1.0)), persons=rng.uniform(0.05, 0.25),
         traffic=rng.uniform(0.01, 0.05), parked=rng.uniform(0.3, 0.8), trees=rng.uniform(0.1, 0.9))
     track = Track(pieces, -drives.BEHIND, drives.AHEAD, repeat=False)
@@ -116,11 +116,11 @@ def _bonnet(rng, picture, labels):
     labels[inside] = ID["ego vehicle"]
 
 
-def write(out, *, sequences=SEQUENCES, frames=60, scale=1.0, train_images=100, validation_images=20, seed=0, jobs=-1,
+def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100, validation_images=20, seed=0, jobs=-1,
           replace=False):
     """Write the embedded world to OUT/kitti and OUT/cityscapes; goes on where a stopped run left off.
 
-    sequences: names among 00 to 10; frames: of each; scale: of KITTI's image size (and of 1024x512 for the training
+    sequences: names among 00 to 10; frames: of each, None for its own number, from 46 to 156; scale: of KITTI's image size (and of 1024x512 for the training
     images); jobs: processes, -1 for one a core. A complete world of the same parameters is left as it is.
     replace: delete an embedded world of other parameters first; nothing else is ever deleted.
     Raises InputError for a folder that holds something else, a world of other parameters, or a bad parameter.
@@ -142,7 +142,7 @@ def write(out, *, sequences=SEQUENCES, frames=60, scale=1.0, train_images=100, v
             bar.update(count)
     for name in parameters["sequences"]:
         if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # the last of them
-            _write_sequence_texts(out, name, parameters["frames"], parameters["scale"], parameters["seed"])
+            _write_sequence_texts(out, name, frames or drives.DRIVES[name].frames, scale, seed)
 
 
 def _parameters(sequences, frames, scale, train_images, validation_images, seed):
@@ -150,13 +150,13 @@ def _parameters(sequences, frames, scale, train_images, validation_images, seed)
     unknown = [name for name in sequences if name not in drives.DRIVES]
     if unknown or not sequences:
         raise InputError(f"sequences: the embedded world has 00 to 10, not {unknown[0] if unknown else 'none'!r}")
-    for name, value, low in (("frames", frames, 2), ("train_images", train_images, 0),
+    for name, value, low in (("frames", 2 if frames is None else frames, 2), ("train_images", train_images, 0),
                              ("validation_images", validation_images, 0), ("seed", seed, 0)):
         if value != int(value) or value < low:
             raise InputError(f"{name}: must be a whole number of at least {low}, not {value!r}")
     if not 0.1 <= scale <= 1:
         raise InputError(f"scale: must lie between 0.1 and 1 (KITTI's full size), not {scale!r}")
-    return {"sequences": list(sequences), "frames": int(frames), "scale": float(scale),
+    return {"sequences": list(sequences), "frames": frames and int(frames), "scale": float(scale),
             "train_images": int(train_images), "validation_images": int(validation_images), "seed": int(seed)}
 
 
@@ -164,7 +164,7 @@ def _pictures(root, sequences, frames, scale, train_images, validation_images, s
     """Every picture of a world: (function that renders it, image path, label path)."""
     for name in sequences:
         folder = root / "kitti" / "sequences" / name
-        for index in range(frames):
+        for index in range(frames or drives.DRIVES[name].frames):
             picture = f"{index:06d}.png"
             yield (partial(render_frame, name, index, frames, scale, seed),
                    folder / "image_0" / picture, folder / "labels_0" / picture)

@@ -12,6 +12,7 @@ BEHIND, AHEAD = 30.0, 170.0  # metres of street behind the first and ahead of th
 CAMERA_HEIGHT = 1.65
 TURN_RATE = np.radians(3.6)  # a driver slows down for more than this a frame
 ACCELERATION = 0.03  # metres a frame, a frame: 3 m/s^2
+BRAKING, WAITING, STARTING, ROUND = 16, 12, 18, 150  # frames at a stop, and from one to the next
 
 
 @dataclass(frozen=True)
@@ -20,9 +21,11 @@ class Drive:
 
     pieces: tuple  # of the road, repeated: metres, degrees to the right
     pace: float  # metres a frame
+    frames: int  # how many show all of the drive
     style: Style
     lane: float = 1.7  # metres right of the road's middle
-    stops: bool = False  # waits once on the way, and every 150 frames
+    closed: bool = False  # the pieces lead back to the start, on the same road
+    stop: int | None = None  # frame at which it has come to a stop, and every ROUND frames
     noise: float = 2.0  # deviation of the sensor's noise, gray values
     level: float = 104.0  # the mean gray that the exposure aims at
 
@@ -33,45 +36,46 @@ _OPEN = ("field", "park", "houses")
 
 DRIVES = {
     # City with right-angled turns both ways.
-    "00": Drive(((18, 0), (15, 90), (30, 0), (15, 90), (26, 0), (15, -90), (40, 0)), 0.9,
+    "00": Drive(((14, 0), (16, 90), (13, 0), (16, -90), (40, 0)), 1.15, 84,
                 Style(sun=(0.7, 0.75), sky=(140, 190, 0.25))),
     # Highway: fast, wide, little texture, cars that overtake.
-    "01": Drive(((40, 0), (90, 14), (60, 0), (80, -18)), 1.5,
+    "01": Drive(((120, 0), (90, 14), (60, 0), (80, -18)), 1.95, 46,
                 Style(half=7.5, road="highway", parking=(0, 0), zones=("field", "park"), weights=(0.8, 0.2),
                       sun=(-1.0, 0.9), sky=(170, 225, 0.5), haze=0.004, bridge=95.0), lane=0.0, noise=1.6, level=122),
-    # Suburb of S-curves.
-    "02": Drive(((10, 0), (28, 50), (12, 0), (34, -75), (15, 0), (26, 45)), 1.0,
+    # Suburb: an S.
+    "02": Drive(((8, 0), (28, 65), (6, 0), (34, -85), (15, 0), (26, 45)), 1.15, 62,
                 Style(half=3.6, road="lane", parking=(0, 0), zones=_GREEN, weights=(0.5, 0.3, 0.1, 0.1), trees=0.7,
                       sun=(2.4, 0.7), sky=(150, 200, 0.6)), noise=2.2),
     # Lane between fields and gardens in long bends.
-    "03": Drive(((8, 0), (40, -38), (30, 22), (45, 40), (30, -28)), 0.85,
+    "03": Drive(((8, 0), (40, -38), (30, 22), (45, 40), (30, -28)), 1.2, 55,
                 Style(half=3.3, parking=(0, 0), sidewalk=1.6, zones=_OPEN, weights=(0.35, 0.4, 0.25), trees=0.3,
                       sunny=False, sky=(185, 228, 0.8), haze=0.006, persons=0.02), lane=1.6, noise=2.6),
-    # Straight on behind another car.
-    "04": Drive(((200, 0),), 1.3, Style(half=4.2, parking=(2.2, 0), zones=_CITY, weights=(0.4, 0.2, 0.3, 0.1),
-                                        leader=22.0, traffic=0.02, sun=(-0.6, 0.6), sky=(135, 180, 0.3)), noise=1.8),
+    # Straight on in much traffic: two cars ahead, many that come towards it.
+    "04": Drive(((200, 0),), 1.3, 50, Style(half=4.2, parking=(2.2, 0), zones=_CITY, weights=(0.4, 0.2, 0.3, 0.1),
+                                             leaders=(12.0, 26.0), traffic=0.08, sun=(-0.6, 0.6),
+                                            sky=(135, 180, 0.3)), noise=1.8),
     # Old town with one turn to the left and one to the right.
-    "05": Drive(((14, 0), (16, -90), (34, 0), (15, 90), (25, 0), (24, 50)), 0.75,
+    "05": Drive(((12, 0), (16, -90), (34, 0), (15, 90), (25, 0), (24, 50)), 1.05, 70,
                 Style(half=3.6, sidewalk=2.2, parking=(2.2, 0), zones=_CITY, weights=(0.75, 0.1, 0.1, 0.05), trees=0.2,
                       persons=0.1, sunny=False, sky=(175, 222, 0.7)), noise=2.4),
     # Up a wide street, round its end and back beside it.
-    "06": Drive(((30, 0), (13, 90), (7, 0), (13, 90), (40, 0), (13, 90), (7, 0), (13, 90), (10, 0)), 1.05,
-                Style(half=4.0, parking=(0, 0), zones=("park", "houses", "field"), weights=(0.6, 0.25, 0.15), trees=1.0,
+    "06": Drive(((20, 0), (12, -90), (5, 0), (12, -90), (60, 0), (12, -90), (5, 0), (12, -90), (40, 0)), 1.2, 88,
+                Style(half=4.0, parking=(0, 0), zones=("park", "houses", "field"), weights=(0.6, 0.25, 0.15), trees=0.8,
                       sun=(0.2, 0.55), sky=(120, 165, 0.2)), noise=1.6),
-    # Waits while others cross.
-    "07": Drive(((60, 0), (15, 90), (40, 0), (15, 90)), 0.8,
-                Style(parking=(2.2, 2.2), sun=(1.9, 0.8), sky=(150, 205, 0.5), crossing=30.0, parked=0.45,
-                      traffic=0.004), stops=True, noise=2.0),
-    # Residential streets: gentle bends, then a sharp one.
-    "08": Drive(((12, 0), (20, 30), (14, 0), (15, -90), (20, 0), (22, -35), (25, 0)), 0.8,
+    # Waits at a light while others cross.
+    "07": Drive(((75, 0), (15, 90), (40, 0), (15, 90)), 1.25, 82,
+                Style(parking=(2.2, 2.2), sun=(1.9, 0.8), sky=(150, 205, 0.5), crossing=38.0, parked=0.45,
+                      traffic=0.004), stop=30, noise=2.0),
+    # Residential streets: a gentle bend, then a sharp one.
+    "08": Drive(((10, 0), (20, 30), (10, 0), (15, -90), (20, 0), (22, -35), (25, 0)), 1.05, 72,
                 Style(zones=_CITY, weights=(0.25, 0.55, 0.1, 0.1), parking=(2.2, 2.2), parked=0.7, sun=(-2.2, 0.85),
                       sky=(155, 210, 0.6)), noise=2.2),
-    # Round a small block, again and again.
-    "09": Drive(((6, 0), (15, 90), (6, 0), (15, 90), (6, 0), (15, 90), (6, 0), (15, 90)), 0.7,
+    # Round a block, back to the start.
+    "09": Drive(((8, 0), (15, -90), (8, 0), (15, -90), (14, 0), (15, -90), (8, 0), (15, -90), (6, 0)), 1.0, 156,
                 Style(half=3.4, road="lane", parking=(0, 0), zones=("blocks", "houses", "park"),
-                      weights=(0.45, 0.35, 0.2), sunny=False, sky=(165, 215, 0.9), haze=0.004), noise=2.4),
+                      weights=(0.5, 0.4, 0.1), sunny=False, sky=(165, 215, 0.9), haze=0.004), closed=True, noise=2.4),
     # A long tightening bend through a narrow street.
-    "10": Drive(((10, 0), (30, 35), (24, 50), (10, 0), (40, -60)), 0.65,
+    "10": Drive(((10, 0), (30, 35), (24, 50), (10, 0), (40, -60)), 1.2, 54,
                 Style(half=3.3, road="lane", sidewalk=1.8, parking=(0, 2.2), zones=_CITY, weights=(0.5, 0.2, 0.1, 0.2),
                       sun=(1.2, 0.65), sky=(130, 175, 0.3)), lane=1.3, noise=2.8, level=96),
 }
@@ -111,13 +115,13 @@ def _driven(drive, track, frames, phase):
     for k in range(1, len(limit)):
         limit[k] = min(limit[k], np.sqrt(limit[k - 1] ** 2 + gain))
     share = np.ones(frames)
-    if drive.stops:
-        start, length = max(4, min(18, frames // 3)), max(4, min(14, frames // 4))
-        share = np.interp(np.arange(frames) % 150, [start - 4, start, start + length, start + length + 7],
-                          [1, 0, 0, 1])
+    if drive.stop is not None:
+        stop = max(4, min(drive.stop, frames // 3))
+        share = np.interp(np.arange(frames) % ROUND,
+                          np.cumsum([max(stop - BRAKING, 0), min(stop, BRAKING), WAITING, STARTING]), [1, 0, 0, 1])
     driven = np.zeros(frames)
     for k in range(1, frames):
-        driven[k] = driven[k - 1] + share[k] * np.interp(driven[k - 1], track.s, limit)
+        driven[k] = driven[k - 1] + share[k] * np.interp(track.along(driven[k - 1]), track.s, limit)
     return driven
 
 
@@ -136,7 +140,10 @@ def pose(x, y, z, heading, pitch, roll):
 def way(name, frames, seed):
     """One sequence's `Track`, camera-to-world poses in the street, (frames, 4, 4), and metres driven, (frames,)."""
     drive = DRIVES[name]
-    track = Track(drive.pieces, -BEHIND, frames * drive.pace * 1.15 + AHEAD)
+    if drive.closed:
+        track = Track(drive.pieces, 0.0, sum(length for length, _ in drive.pieces), closed=True)
+    else:
+        track = Track(drive.pieces, -BEHIND, frames * drive.pace * 1.15 + AHEAD)
     phase = generator(seed, SWAY, int(name)).uniform(0, 2 * np.pi, 6)
     driven = _driven(drive, track, frames, phase[0])
     # The body sways with the way driven, so that a standing car stands still.

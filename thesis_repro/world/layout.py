@@ -33,13 +33,14 @@ def _roads(rng, track, style):
         roads.append(Road(Track([], start, stop, (x, z), heading + turn), half, lower=LAYER * len(roads)))
 
     for corner in track.corners:  # at a sharp turn the old direction goes on as a side road
-        if corner < track.s[-1] - 40:
+        if track.closed or corner < track.s[-1] - 40:
             add(corner - 4.0, 0.0, style.half * 0.9)
     s = track.s[0] + 60
     while s < track.s[-1] - 20 and style.road != "highway":
         s += rng.uniform(35, 80)
         if np.interp(s, track.s, np.abs(track.curvature)) < 0.01:
-            add(s, np.pi / 2 * rng.choice([-1, 1]), style.half * 0.85)
+            side = -np.sign(track.heading[-1] - track.heading[0]) if track.closed else rng.choice([-1, 1])
+            add(s, np.pi / 2 * side, style.half * 0.85)
     if style.crossing is not None:
         add(style.crossing, -np.pi / 2, style.half, -75.0, 75.0)
     return roads

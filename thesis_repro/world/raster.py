@@ -443,6 +443,23 @@ def draw(faces, brightness, textures, view, environment):
     dark, haze, horizon = 1.0 - environment.shadow, environment.haze, environment.horizon
     for i in range(height):
         for j in range(width):
+            index = nearest[2 * i, 2 * j]
+            if index == nearest[2 * i, 2 * j + 1] and index == nearest[2 * i + 1, 2 * j] and (
+                    index == nearest[2 * i + 1, 2 * j + 1]):  # most pixels show one surface
+                y, x = 2 * i + 0.5, 2 * j + 0.5
+                if index >= 0:
+                    w = coefficients[index, W] + coefficients[index, W_Y] * y + coefficients[index, W_X] * x
+                    value = _surface_value(faces, coefficients, index, y, x, w, 2 * SHARPNESS, data, gray, sides)
+                    shaded = (shadow[2 * i, 2 * j] + shadow[2 * i, 2 * j + 1] + shadow[2 * i + 1, 2 * j]
+                              + shadow[2 * i + 1, 2 * j + 1])
+                    clear = math.exp(-haze / w)
+                    image[i, j] = value * brightness[index] * (1.0 - dark * shaded / 4) * clear + horizon * (1 - clear)
+                    label_map[i, j] = int(faces[index, LABEL])
+                else:
+                    image[i, j], label_map[i, j] = _background(
+                        (x - centre[0]) / focal[0], (y - centre[1]) / focal[1], rotation, environment, skyline,
+                        skyline_labels, data, clouds, leaves)
+                continue
             # The texture of each face in the pixel is read once, in the middle of its samples.
             found, total = 0, 0.0
             for k in range(4):

@@ -154,11 +154,11 @@ def _traffic_lights(plan, side):
 
 
 def _traffic(plan, side):
-    """Oncoming cars and a cyclist on the left, on the right perhaps a car that drives ahead."""
+    """Oncoming cars and a cyclist on the left, on the right perhaps cars that drive ahead."""
     rng, style, track = plan.rng, plan.style, plan.main.track
     if side > 0:
-        if style.leader is not None:
-            _drive(plan, track, style.leader, None, style.half / 2, 0.0, "estate")
+        for k, distance in enumerate(style.leaders):
+            _drive(plan, track, distance, None, style.half / 2, 0.0, ("estate", "van")[k % 2])
         return
     for s in _along(plan, 1 / max(style.traffic, 1e-4)):
         _drive(plan, track, s + 40, -rng.uniform(0.7, 1.1), -style.half / 2, np.pi)

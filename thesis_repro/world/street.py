@@ -35,7 +35,7 @@ class Style:
     sun: tuple = (0.5, 0.8)  # azimuth the light comes from, elevation (radians)
     sky: tuple = (150.0, 205.0, 0.4)  # zenith, horizon, clouds
     haze: float = 0.003
-    leader: float | None = None  # distance of a car that drives ahead at the camera's pace
+    leaders: tuple = ()  # distances of cars that drive ahead at the camera's pace
     crossing: float | None = None  # s of a crossing with cars that pass ahead of a waiting camera
     bridge: float | None = None  # s of a bridge over the road
 

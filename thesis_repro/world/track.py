@@ -14,16 +14,17 @@ class Track:
     """The middle line of a road, its points stored every STEP metres.
 
     s, x, z, heading, curvature: (n,), metres, radians to the right of z, and 1/m, positive to the right.
-    corners: s at which sharp turns begin.
+    corners: s at which sharp turns begin. closed: whether it ends where it starts, so that s goes on round it.
     """
 
-    def __init__(self, pieces, start, stop, origin=(0.0, 0.0), heading=0.0, repeat=True):
+    def __init__(self, pieces, start, stop, origin=(0.0, 0.0), heading=0.0, repeat=True, closed=False):
         """pieces: (metres, degrees to the right) each, from s = 0, repeated up to `stop` or followed by a straight.
 
         start, stop: s of both ends, start <= 0; before s = 0 the road is straight. origin, heading: at s = 0.
         """
         self.s = start + STEP * np.arange(int(np.ceil((stop - start) / STEP)) + 1)
         self.corners = []
+        self.closed = closed
         curvature = np.zeros(len(self.s))
         where = 0.0
         while pieces and where < stop:
@@ -47,8 +48,13 @@ class Track:
         z = np.concatenate([[0.0], np.cumsum(np.cos(middle)) * STEP])
         self.x, self.z = origin[0] + x - x[first], origin[1] + z - z[first]
 
+    def along(self, s):
+        """s itself, or on a closed track the same place between both ends."""
+        return s % self.s[-1] if self.closed else s
+
     def at(self, s, d=0.0):
         """(x, z, heading) of places (s, d), numbers or arrays of one shape."""
+        s = self.along(s)
         heading = np.interp(s, self.s, self.heading)
         x = np.interp(s, self.s, self.x) + d * np.cos(heading)
         z = np.interp(s, self.s, self.z) - d * np.sin(heading)
