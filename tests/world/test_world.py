@@ -57,15 +57,16 @@ def test_scaled_intrinsics_keep_the_rays_of_the_image_borders():
     assert matrix[0].tolist() == [camera.fx, 0, camera.cx]
 
 
-@pytest.mark.parametrize("frames", [12, 60, 400])
+@pytest.mark.parametrize("frames", [12, None, 400])
 @pytest.mark.parametrize("name", dataset.SEQUENCES)
 def test_drives_are_realistic(name, frames):
+    frames = frames or drives.DRIVES[name].frames
     poses = drives.relative_to_first(drives.way(name, frames, seed=0)[1])
     assert np.array_equal(poses[0], np.eye(4))
     rotations = poses[:, :3, :3]
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (frames, 1, 1)), atol=1e-12)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    assert steps.max() < 1.8
+    assert steps.max() < (2.25 if name == "01" else 1.5)
     turns = np.degrees(np.arccos(np.clip((np.trace(rotations[:-1].transpose(0, 2, 1) @ rotations[1:], axis1=1,
                                                    axis2=2) - 1) / 2, -1, 1)))
     assert turns.max() < 4.5
@@ -74,6 +75,31 @@ def test_drives_are_realistic(name, frames):
     # Forwards along z and level: a camera that looks elsewhere would give another shape of path.
     assert (np.diff(poses[:3, 2, 3]) > 0.1).all()
     assert np.abs(poses[:, 1, 3]).max() < 0.03 + 0.002 * steps.sum()
+
+
+def test_each_drive_shows_what_it_is_for():
+    paths = {name: drives.relative_to_first(drives.way(name, drive.frames, seed=0)[1])
+             for name, drive in drives.DRIVES.items()}
+    lengths = {name: np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() for name, poses in paths.items()}
+    assert 600 <= sum(map(len, paths.values())) <= 900 and len({len(poses) for poses in paths.values()}) > 8
+    assert all(57 < length < 200 for length in lengths.values())
+    # radians to the right of the start, unwrapped
+    turned = {name: np.unwrap(np.arctan2(poses[:, 0, 2], poses[:, 2, 2])) for name, poses in paths.items()}
+    assert np.linalg.norm(paths["09"][-1, :3, 3]) < 1 and turned["09"][-1] == pytest.approx(-2 * np.pi, abs=0.1)
+    for name, least, most in (("00", 0, 85), ("02", 0, 60), ("05", -85, 0), ("06", -170, 0)):
+        assert np.degrees(turned[name].min()) < least + 5 and np.degrees(turned[name].max()) > most - 5
+    assert np.abs(turned["00"][-1]) < 0.2  # to the right and back
+    for name in ("01", "04", "07"):
+        assert np.degrees(np.abs(turned[name]).max()) < 2
+    assert lengths["01"] > 80
+
+
+def test_a_closed_track_goes_on_round():
+    track = drives.way("09", 60, seed=0)[0]
+    around = track.s[-1]
+    assert track.closed
+    assert np.allclose(track.at(5.0, 1.0)[:2], track.at(around + 5.0, 1.0)[:2], atol=1e-9)
+    assert np.hypot(track.x[-1] - track.x[0], track.z[-1] - track.z[0]) < 0.01
 
 
 def test_sequences_have_different_paths():

@@ -1,6 +1,7 @@
 """The figures of chapter 2, drawn anew from the project's own network and data: networks, odometry, keypoints."""
 
 import cv2
+import matplotlib
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon, Rectangle
@@ -22,6 +23,7 @@ from thesis_repro.report.style import (
 )
 
 GRAY = "#777777"
+MARKED = "#d40000"  # what a text calls red
 
 
 def figure_2_01():
@@ -79,8 +81,13 @@ def figure_2_02(patch, kernel, feature_map, activated, where):
     for panel, text in zip(axes, ("gray value", "weight", "response", "activation"), strict=True):
         figure.colorbar(panel.images[0], ax=panel, location="bottom", shrink=0.85, pad=0.03, label=text)
     for panel, radius in ((axes[0], reach + 0.5), (axes[2], 0.5), (axes[3], 0.5)):
-        panel.add_patch(Rectangle((column - radius, row - radius), 2 * radius, 2 * radius, fill=False, edgecolor=RED,
+        panel.add_patch(Rectangle((column - radius, row - radius), 2 * radius, 2 * radius, fill=False, edgecolor=MARKED,
                                   linewidth=1.4))
+    for panel, values, digits in ((axes[2], feature_map, 2), (axes[3], activated, 2)):
+        below = row < values.shape[0] / 2  # where there is room for it
+        panel.annotate(f"{values[row, column]:.{digits}f}", (column, row), (0, -11 if below else 11),
+                       textcoords="offset points", ha="center", va="center", fontsize=8, color=MARKED,
+                       bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85})
     return figure
 
 
@@ -88,13 +95,20 @@ def figure_2_03():
     """Sigmoid against ReLU, with their derivatives."""
     x = np.linspace(-6, 6, 241)
     sigmoid = 1 / (1 + np.exp(-x))
-    figure, axes = new_figure(1, 2, height=2.5)
-    for panel, value, slope, title in ((axes[0], sigmoid, sigmoid * (1 - sigmoid), "sigmoid, 1 / (1 + exp(-x))"),
-                                       (axes[1], np.maximum(x, 0), (x > 0) * 1.0, "ReLU, max(0, x)")):
-        panel.plot(x, value, color=BLUE, label="activation")
-        panel.plot(x, slope, color=RED, linestyle="--", label="its derivative")
-        panel.set(title=title, xlabel="x (no unit)", ylabel="activation (no unit)")
-        panel.legend(loc="upper left")
+    figure, axes = new_figure(2, 2, height=3.6, sharex=True, sharey="row")
+    step = (np.array([-6, 0]), np.zeros(2)), (np.array([0, 6]), np.ones(2))
+    for column, (title, value, slopes) in enumerate((
+            ("sigmoid, 1 / (1 + exp(-x))", sigmoid, [(x, sigmoid * (1 - sigmoid))]),
+            ("ReLU, max(0, x)", np.maximum(x, 0), step))):
+        axes[0, column].plot(x, value, color=BLUE)
+        axes[0, column].set_title(title)
+        for slope in slopes:
+            axes[1, column].plot(*slope, color=RED)
+        axes[1, column].set_xlabel("x (no unit)")
+    axes[1, 1].plot(0, 0, "o", color=RED, markersize=4, markerfacecolor="white")  # at 0 it has none
+    axes[1, 1].plot(0, 1, "o", color=RED, markersize=4, markerfacecolor="white")
+    axes[0, 0].set_ylabel("activation (no unit)")
+    axes[1, 0].set_ylabel("its derivative (no unit)")
     return figure
 
 
@@ -176,7 +190,11 @@ def figure_2_06():
               label=f"after {steps} steps")
     axes.set(xlabel="first weight (no unit)", ylabel="second weight (no unit)", xlim=(-2.2, 2.2), ylim=(-1.6, 2.2))
     axes.grid(visible=False)
-    axes.legend(loc="lower right", labelcolor="white")
+    for sign in (-1, 1):  # along y = 0 the valleys lie where the slope 2 x (x^2 - 1.5) + 0.35 vanishes
+        at = next(root.real for root in np.roots([2, 0, -3, 0.35]) if sign * root.real > 1)
+        axes.annotate(f"valley of loss {loss(at, 0):.2f}", (at, 0), (at, -0.75), color="white", ha="center", fontsize=8,
+                      arrowprops={"arrowstyle": "-", "color": "white", "lw": 0.8})
+    axes.legend(loc="lower right", labelcolor="white", ncols=2)
     figure.colorbar(levels, label="loss (no unit)")
     return figure
 
@@ -214,7 +232,8 @@ def figure_2_07(model):
     for name, sources in skips.items():
         _, right, y = min(places[source] for source in sources)
         left, _, level = places[name]
-        _arrow(axes, (right + 0.05, y), (left - 0.05, level), GRAY, zorder=0)  # behind what it is joined with
+        axes.plot((right + 0.05, left - 0.1), (y, level), color=GRAY, linewidth=0.9, zorder=0)  # behind the boxes
+        _arrow(axes, (left - 0.22, level), (left - 0.01, level), GRAY, zorder=2)
     order = [place for _, place in sorted(places.items(), key=lambda item: item[1])]
     for (_, right, y), (left, _, below) in zip(order, order[1:]):
         axes.plot((right, left), (y, below), color="#bbbbbb", linewidth=0.8, zorder=0)
@@ -287,10 +306,13 @@ def figure_2_09(first, second, title):
     figure, axes = frame_panels(both)
     show_image(axes[0], both, f"{title}: the {len(best)} best of {len(matches)} ORB matches")
     lower = first.shape[0] + gap.shape[0]
-    for index, match in enumerate(best):
+    distances = [match.distance for match in best] or [0, 1]
+    scale = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(min(distances), max(distances)), "plasma")
+    for match in reversed(best):  # the best on top
         (u, v), (x, y) = points[match.queryIdx].pt, others[match.trainIdx].pt
-        axes[0].plot((u, x), (v, y + lower), linewidth=0.7, color=(SKY, ORANGE, GREEN)[index % 3], marker="o",
+        axes[0].plot((u, x), (v, y + lower), linewidth=0.8, color=scale.to_rgba(match.distance), marker="o",
                      markersize=2)
+    figure.colorbar(scale, ax=axes[0], location="right", shrink=0.7, pad=0.01, label="bits of 256 that differ")
     return figure
 
 

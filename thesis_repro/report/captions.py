@@ -15,23 +15,27 @@ CHAPTERS = {
         "figure_2_01": ("Basic CNN", "The stages of a convolutional network that classifies: convolution, activation, "
                         "pooling, dense layer, softmax. A diagram."),
         "figure_2_02": ("One convolution, in numbers", "A patch of an image, one kernel of the trained U-Net's first "
-                        "layer, the feature map it gives, and what normalisation and activation leave of it. A "
-                        "marked neighbourhood and the kernel give the marked value."),
+                        "layer, the feature map it gives, and what normalisation and activation leave of it. The "
+                        "neighbourhood framed in red and the kernel give the value framed in red, which is printed."),
         "figure_2_03": ("Sigmoid and ReLU", "Both activation functions and their derivatives. The sigmoid's derivative "
-                        "vanishes on both sides, which is what slows training; that of ReLU does not."),
+                        "vanishes on both sides, which is what slows training; that of ReLU is a step: it is 1 for all "
+                        "positive x."),
         "figure_2_04": ("Max pooling", "A 4x4 array under 2x2 max pooling with stride 2: of every block the largest "
                         "value is kept."),
         "figure_2_05": ("Dense layer and softmax", "A feature vector, weighted and summed for each class, becomes "
                         "scores; softmax turns them into probabilities that sum to one."),
         "figure_2_06": ("Stochastic gradient descent", "Steps down a loss surface with two valleys. Each follows a "
-                        "gradient that is known only roughly, so the path trembles."),
-        "figure_2_07": ("U-Net", "The network drawn from the Keras model itself: sizes and channels of every stage, "
-                        "the way down, the way up, and the skip connections between them."),
+                        "gradient that is known only roughly, so the path trembles. It ends in the valley that "
+                        "it comes to first, which need not be the deeper one: their losses are written beside them."),
+        "figure_2_07": ("U-Net", "The network drawn from the Keras model itself, with two convolutions in a row in "
+                        "each block as Section 2.1.6 has it: sizes and channels of every stage, the way down, the way "
+                        "up, and the skip connections between them. In the thesis's code the second convolution "
+                        "of a block starts at the block's input again, which leaves the first without effect."),
         "figure_2_08": ("Poses and relative motions", "Camera poses C of one sequence seen from above, with the "
                         "relative transforms T that lead from one to the next (Equations 2.2 and 2.3). Visual odometry "
                         "estimates each T and multiplies them."),
         "figure_2_09": ("ORB matches", "Keypoints found by ORB in two frames of one sequence and matched by their "
-                        "descriptors; the closest matches are drawn."),
+                        "descriptors; the closest matches are drawn, in the colour of their distance."),
         "figure_2_10": ("Drift", "An estimated path leaves the true one, and the distance between them along the "
                         "way: each step adds its own error to all later positions. Drift too small to be "
                         "seen is drawn a second time, enlarged."),
@@ -64,10 +68,11 @@ CHAPTERS = {
                         "present nor predicted scores 1. This is not the mIoU of the Cityscapes benchmark."),
         "figure_4_02": ("Prediction on a validation image", "An image of the validation split, its label map, and the "
                         "network's prediction. The thesis calls the split its test images."),
-        "figure_4_03": ("Prediction on an odometry frame", "A frame of the odometry data and its predicted label map. "
+        "figure_4_03": ("Prediction on an odometry frame", "A frame of the odometry data and its predicted label map, "
+                        "below them the true one where the data has it. "
                         "The thesis shows sequence 10, frame 192; the title says which frame this is."),
         "figure_4_04": ("Keypoints along predicted boundaries", "The edges of the predicted label map, and the "
-                        "keypoints that the mask around them leaves."),
+                        "keypoints that the mask around them leaves, on the frame made brighter."),
         "figure_4_05": ("The procedure", "Frame, all Shi-Tomasi keypoints, prediction, dilated edges, and the "
                         "keypoints that are kept. The thesis shows sequence 10, frame 637; the title says which "
                         "frame this is."),
@@ -76,11 +81,14 @@ CHAPTERS = {
         "figure_4_07": ("Keypoints kept", "The part of the keypoints that masks of increasing dilation width leave, "
                         "one line a sequence."),
         "figure_4_08": ("Keypoints that jump", "One object in consecutive frames: the predicted boundary moves, and "
-                        "the keypoints along it with it. The thesis sees in this a cause of its errors."),
+                        "the keypoints along it with it. The thesis sees in this a cause of its errors. Picked is the "
+                        "object from which most keypoints jump from the first of these frames to the second. Rings "
+                        "are the keypoints of the frame before as far as Lucas-Kanade could follow them and they are "
+                        "still in the picture, so there may be fewer than that frame has."),
         "figure_4_09": ("RMSE against dilation width", "Root mean square distance from the true path (Equation 3.5) "
                         "where both paths are laid over each other at frame 1, frame 0 left out; one line a "
-                        "sequence. Below, one panel a sequence with the bands that the repetitions "
-                        "span with masks and with all keypoints."),
+                        "sequence. Below, one panel a sequence with the bands from the lowest to the highest of the "
+                        "repetitions, with masks and with all keypoints."),
         "figure_4_10": ("MAE against dilation width", "Mean absolute error (Equation 3.6), measured and drawn as in "
                         "Figure 4.9."),
         "table_4_1": ("Best dilation width", "The width with the lowest RMSE on each sequence (the thesis says RMSE "
@@ -101,7 +109,8 @@ CHAPTERS = {
                       "Intervals of chosen widths are too narrow: the choices share most of their data."),
         "table_4_3": ("Change of MAE", "As Table 4.2, for the mean absolute error."),
         "figure_4_17": ("Time saved", "Change of the time for each dilation width (Equation 4.2; negative is time "
-                        "saved), added up over the first frames of every sequence, which alone are timed; the thesis "
+                        "saved), added up over the first frames of every sequence, which alone are timed; dots are "
+                        "single sequences. The thesis "
                         "adds up whole sequences. Masks are counted, the network that predicts the label maps is "
                         "not, as in the thesis; the budget below counts everything."),
     },

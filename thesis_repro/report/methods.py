@@ -89,6 +89,8 @@ def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
     show_image(axes[1], label_colors(label_map, frame), "predicted label map")
     show_image(axes[2], edge_image, "Canny edges (5, 15) of the label map")
     show_image(axes[3], mask, f"edges dilated by {dilation_width}x{dilation_width}")
+    figure.set_figheight(figure.get_figheight() + 0.45)  # the legend's
+    _class_legend(figure, label_map)
     return figure
 
 
@@ -120,21 +122,24 @@ def figure_4_02(image, label_map, prediction, whose):
     return figure
 
 
-def figure_4_03(frame, prediction, title):
-    """A KITTI frame and its predicted label map at the network's size."""
-    figure, axes = frame_panels(frame, 2)
+def figure_4_03(frame, prediction, title, label_map=None):
+    """A KITTI frame, its predicted label map at the network's size, and its true one where there is any."""
+    maps = {"prediction": prediction} | ({} if label_map is None else {"true label map": label_map})
+    figure, axes = frame_panels(frame, 1 + len(maps), width=PAGE_WIDTH)
     figure.set_figheight(figure.get_figheight() + 0.45)  # the legend's
     show_image(axes[0], frame, title)
-    show_image(axes[1], label_colors(prediction, frame), "prediction")
-    _class_legend(figure, prediction)
+    for panel, (text, shown) in zip(axes[1:], maps.items(), strict=True):
+        show_image(panel, label_colors(shown, frame), text)
+    _class_legend(figure, *maps.values())
     return figure
 
 
 def figure_4_04(frame, edge_image, keypoints, title):
     """Keypoints, (n, 2) pixels, that the mask left along the predicted boundaries."""
     figure, (axes,) = frame_panels(frame)
-    show_image(axes, _with_edges(frame, edge_image), title)
-    axes.scatter(*keypoints.T, **KEYPOINT)
+    brighter = np.clip(230 * (frame / max(np.percentile(frame, 98), 1)) ** 0.6, 0, 255).astype(np.uint8)
+    show_image(axes, _with_edges(brighter, edge_image), title)
+    axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
     return figure
 
 
@@ -148,6 +153,8 @@ def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation
     show_image(axes[3], mask, f"(d) Canny edges dilated by {dilation_width}x{dilation_width}")
     show_image(axes[4], frame, f"(e) the {len(kept_keypoints)} keypoints that the mask keeps")
     axes[4].scatter(*kept_keypoints.T, **KEYPOINT)
+    figure.set_figheight(figure.get_figheight() + 0.45)  # the legend's
+    _class_legend(figure, prediction)
     return figure
 
 
@@ -157,7 +164,7 @@ def figure_4_08(views, title):
     for panel, view in zip(axes, views, strict=True):
         text = f"frame {view.frame}: {len(view.keypoints)} keypoints"
         if view.expected is not None:
-            text += f",\n{view.jumped} of {len(view.expected)} of before gone"
+            text += f",\n{view.jumped} of {len(view.expected)} tracked here gone"
         show_image(panel, _with_edges(view.crop, view.edges), text)
         panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
         if view.expected is not None:
@@ -168,7 +175,8 @@ def figure_4_08(views, title):
         Patch(color=np.array(EDGE) / 255, label="edges of the predicted label map"),
         Line2D([], [], linestyle="none", marker="o", markersize=4, color=KEYPOINT["color"], label="keypoints"),
         Line2D([], [], linestyle="none", marker="o", markersize=6, markerfacecolor="none", color=PINK,
-               label="keypoints of the frame before, tracked to here")], loc="outside lower center", ncols=3)
+               label="keypoints of the frame before that could be tracked to here")],
+        loc="outside lower center", ncols=3)
     figure.suptitle(title, fontsize=9)
     return figure
 

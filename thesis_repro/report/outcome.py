@@ -25,10 +25,10 @@ from thesis_repro.report.style import (
 from thesis_repro.study import results
 
 VARIANTS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
-            "reduced": ("plainly reduced", REDUCED, "..")}
+            "reduced": ("plainly reduced", REDUCED, "\\\\")}
 FRAME_MS = 100  # KITTI's cameras take ten frames a second
 STAGES = {"read": (SKY, ""), "segmentation": (RED, ""), "mask": (ORANGE, "//"), "detection": (BLUE, ""),
-          "tracking": (GREEN, ".."), "pose": (PINK, "")}
+          "tracking": (GREEN, "\\\\"), "pose": (PINK, "")}
 
 
 def figure_paths(truths, rows, paths, variant, title):
@@ -49,8 +49,8 @@ def figure_paths(truths, rows, paths, variant, title):
             bold = {"linewidth": 1.2, "label": "estimated path", "zorder": 3}
             panel.plot(positions[:, 0], positions[:, 2], color=color, **(faint if order else bold))
         row = errors.loc[name]
-        span = f" ({row['lowest']:.2g} to {row['highest']:.2g})" if len(runs) > 1 else ""
-        panel.set_title(f"{name}: {row['mean']:.2g} m{span}", fontsize=7.5)
+        span = f"\n{row['lowest']:.2f} to {row['highest']:.2f} m" if len(runs) > 1 else ""
+        panel.set_title(f"{name}: {row['mean']:.2f} m{span}", fontsize=7.5)
         panel.set_aspect("equal", adjustable="datalim")
         panel.tick_params(labelsize=7)
         panel.xaxis.set_major_locator(MaxNLocator(4))
@@ -115,12 +115,15 @@ def figure_against_width(summary, metric):
     panels = below.subplots(rows, columns, squeeze=False, sharex=True)
     for panel, name in zip(panels.flat, names):
         errors = results.over_orders(masked[masked["sequence"] == name], metric, by="dilation_width")
-        panel.fill_between(errors.index, errors["lowest"], errors["highest"], color=MASKED, alpha=0.25, linewidth=0)
-        panel.plot(errors.index, errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1, label="masked")
+        panel.fill_between(errors.index, errors["lowest"], errors["highest"], color=MASKED, alpha=0.25, linewidth=0,
+                           label="lowest to highest, masked")
+        panel.plot(errors.index, errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1,
+                   label="mean, masked")
         if name in baseline.index:
             row = baseline.loc[name]
-            panel.axhspan(row["lowest"], row["highest"], color=BASELINE, alpha=0.2, linewidth=0)
-            panel.axhline(row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints")
+            panel.axhspan(row["lowest"], row["highest"], color=BASELINE, alpha=0.2, linewidth=0,
+                          label="lowest to highest, all keypoints")
+            panel.axhline(row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="mean, all keypoints")
         panel.set_title(name, fontsize=8, pad=3)
         panel.set_ylim(0, None)
         panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
@@ -132,7 +135,9 @@ def figure_against_width(summary, metric):
         panel.set_xlabel("width (pixels)", fontsize=8)
     for panel in panels[:, 0]:
         panel.set_ylabel(label, fontsize=8)
-    below.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    named = {text: handle for handle, text in zip(*panels[0, 0].get_legend_handles_labels())}
+    below.legend([named[text] for text in sorted(named, reverse=True)], sorted(named, reverse=True),
+                 loc="outside lower center", ncols=2)
     return figure
 
 
@@ -206,8 +211,8 @@ def figure_controls(summary):
                 extreme += list(values)
             panel.set_title(f"{metric.upper()}, {text}")
             panel.grid(axis="y", visible=False)
-        axes[1, column].set_xlabel("change from all keypoints (%)")
-        _percent_scale(axes[:, column], min(extreme), max(extreme))
+        scaled = _percent_scale(axes[:, column], min(extreme), max(extreme))
+        axes[1, column].set_xlabel("change from all keypoints (%)" + scaled * ",\non the scale of the errors' ratio")
     names = results.control_names(summary)
     axes[0, 0].set_yticks(range(len(variants)), [names[variant] for variant in variants])
     axes[0, 0].set_ylim(len(variants) - 0.5, -0.6)
@@ -217,9 +222,12 @@ def figure_controls(summary):
 
 
 def _percent_scale(panels, lowest, highest):
-    """A scale of percent changes on which half and double are equally far from 0, where changes are that large."""
+    """A scale of percent changes on which half and double are equally far from 0, where changes are that large.
+
+    Returns whether they are.
+    """
     if highest <= 100:
-        return
+        return False
     low, high = (100 + max(lowest, -99)) / 115 - 1, (100 + highest) / 100 * 1.15 - 1
     step = 2.0 if (1 + high) / (1 + low) < 16 else 4.0  # as many times the error from tick to tick
     for panel in panels:
@@ -229,13 +237,20 @@ def _percent_scale(panels, lowest, highest):
         panel.xaxis.set_major_locator(FixedLocator(100 * (step ** np.arange(-2, 9) - 1)))
         panel.xaxis.set_minor_locator(NullLocator())
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.0f}" if value else "0"))
+    return True
 
 
 def figure_4_17(seconds):
-    """Percent time savings of each dilation width (Equation 4.2), from the table of `budget.time_runs`."""
+    """Percent time savings of each dilation width (Equation 4.2), from the table of `budget.time_runs`; dots:
+    of single sequences."""
     savings = results.time_savings(seconds)
     figure, axes = new_figure(height=3.0)
-    axes.bar(savings.index.astype(int), savings, color=MASKED)
+    axes.bar(savings.index.astype(int), savings, color=MASKED, label="all sequences together")
+    single = [results.time_savings(rows) for _, rows in seconds.groupby("sequence")]
+    for number, of_one in enumerate(single):
+        axes.plot(of_one.index.astype(int), of_one, "o", color="#333333", alpha=0.5, markersize=3, markeredgewidth=0,
+                  label="one sequence" if number == 0 else None)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xticks(savings.index.astype(int))
     axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)",

@@ -50,7 +50,10 @@ def drive(name, frames, scale, seed):
 
 
 def render_frame(name, index, frames=None, scale=0.5, seed=0):
-    """Frame `index` of a sequence of that many frames, by default its own number: image and label map, both uint8 (height, width)."""
+    """Frame `index` of a sequence of that many frames: image and label map, both uint8 (height, width).
+
+    frames: None for the drive's own number.
+    """
     scene, plan = drive(name, frames or drives.DRIVES[name].frames, scale, seed), drives.DRIVES[name]
     image, labels = scene.street.view(scene.poses[index], scene.intrinsics, scene.size, index, scene.driven[index])
     return _expose(drives.generator(seed, drives.SENSOR, int(name), index), image, plan.level, plan.noise), labels
@@ -120,8 +123,9 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
           replace=False):
     """Write the embedded world to OUT/kitti and OUT/cityscapes; goes on where a stopped run left off.
 
-    sequences: names among 00 to 10; frames: of each, None for its own number, from 46 to 156; scale: of KITTI's image size (and of 1024x512 for the training
-    images); jobs: processes, -1 for one a core. A complete world of the same parameters is left as it is.
+    sequences: names among 00 to 10; frames: of each, None for as many as show its whole drive, from 46 to 156; scale:
+    of KITTI's image size (and of 1024x512 for the training images); jobs: processes, -1 for one a core. A complete
+    world of the same parameters is left as it is.
     replace: delete an embedded world of other parameters first; nothing else is ever deleted.
     Raises InputError for a folder that holds something else, a world of other parameters, or a bad parameter.
     """
@@ -142,7 +146,7 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
             bar.update(count)
     for name in parameters["sequences"]:
         if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # the last of them
-            _write_sequence_texts(out, name, frames or drives.DRIVES[name].frames, scale, seed)
+            _write_sequence_texts(out, name, parameters["frames"] or drives.DRIVES[name].frames, scale, seed)
 
 
 def _parameters(sequences, frames, scale, train_images, validation_images, seed):
@@ -156,7 +160,7 @@ def _parameters(sequences, frames, scale, train_images, validation_images, seed)
             raise InputError(f"{name}: must be a whole number of at least {low}, not {value!r}")
     if not 0.1 <= scale <= 1:
         raise InputError(f"scale: must lie between 0.1 and 1 (KITTI's full size), not {scale!r}")
-    return {"sequences": list(sequences), "frames": frames and int(frames), "scale": float(scale),
+    return {"sequences": list(sequences), "frames": None if frames is None else int(frames), "scale": float(scale),
             "train_images": int(train_images), "validation_images": int(validation_images), "seed": int(seed)}
 
 

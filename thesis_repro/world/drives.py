@@ -59,7 +59,7 @@ DRIVES = {
                 Style(half=3.6, sidewalk=2.2, parking=(2.2, 0), zones=_CITY, weights=(0.75, 0.1, 0.1, 0.05), trees=0.2,
                       persons=0.1, sunny=False, sky=(175, 222, 0.7)), noise=2.4),
     # Up a wide street, round its end and back beside it.
-    "06": Drive(((20, 0), (12, -90), (5, 0), (12, -90), (60, 0), (12, -90), (5, 0), (12, -90), (40, 0)), 1.2, 88,
+    "06": Drive(((20, 0), (12, -90), (5, 0), (12, -90), (60, 0), (12, -90), (5, 0), (12, -90), (40, 0)), 1.2, 90,
                 Style(half=4.0, parking=(0, 0), zones=("park", "houses", "field"), weights=(0.6, 0.25, 0.15), trees=0.8,
                       sun=(0.2, 0.55), sky=(120, 165, 0.2)), noise=1.6),
     # Waits at a light while others cross.

@@ -16,6 +16,7 @@ from thesis_repro.world.surfaces import FACADE_TILE, FACADES, SHOP_TILE, TILE
 _BODY = {"sedan": "FFPGPGPRR", "hatch": "FFPGPGRR", "estate": "FFPGPGRR", "van": "FFPGPGR", "truck": "FPGPPPPP",
          "bus": "FPGPPPR"}
 _LABEL_OF = {"truck": "truck", "bus": "bus"}
+_NARROW = 0.15  # metres by which a car is narrower at its ends, on each side
 
 
 def vehicle(names, rng, kind):
@@ -31,17 +32,27 @@ def vehicle(names, rng, kind):
     length, top, half = profile[:, 0].max(), profile[:, 1].max() + 0.04, WIDTHS[kind] / 2
     belt, lean = (0.96, 0.28) if label == "car" and kind != "van" else (1.2, 0.06)
 
-    def half_at(y):
-        return half - lean * max(0.0, y - belt)
+    # Seen from above the ends of a car are narrower, between them and a point of its profile each.
+    knots, narrower = [0.0, length], [0.0, 0.0]
+    if label == "car":
+        front = max(z for z in profile[:, 0] if z < length - 0.7)
+        rear = max((z for z in profile[:, 0] if z < 1.0), default=0.0)
+        knots, narrower = [0.0, max(rear, 0.3), front, length], [_NARROW, 0.0, 0.0, _NARROW]
+
+    def half_at(y, z):
+        return half - lean * max(0.0, y - belt) - np.interp(z, knots, narrower)
 
     side, split, z0 = f"{kind}{paint}", belt / top, -length / 2
     inward = lean * (top - belt)
     for sign in (1, -1):
-        z, s = (z0, length) if sign > 0 else (-z0, -length)
-        u = (0.0, 1.0) if sign > 0 else (1.0, -1.0)
-        faces.add((sign * half, 0, z), (0, 0, s), (0, -belt, 0), side, label, uv=(*u, 0, 1, 0, -split))
-        faces.add((sign * half, -belt, z), (0, 0, s), (-sign * inward, belt - top, 0), side, label,
-                  uv=(*u, 0, 1 - split, 0, split - 1))
+        for za, zb in list(zip(knots, knots[1:]))[::sign]:
+            first, second = (za, zb) if sign > 0 else (zb, za)
+            u = (first / length, (second - first) / length)
+            xa, xb = (sign * half_at(0.0, z) for z in (first, second))
+            along = (xb - xa, 0, second - first)
+            faces.add((xa, 0, first + z0), along, (0, -belt, 0), side, label, uv=(*u, 0, 1, 0, -split))
+            faces.add((xa, -belt, first + z0), along, (-sign * inward, belt - top, 0), side, label,
+                      uv=(*u, 0, 1 - split, 0, split - 1))
     body = _BODY[kind]
     for index, material in enumerate(body):
         (za, ya), (zb, yb) = profile[index], profile[index + 1]  # from front to rear over the roof
@@ -50,7 +61,7 @@ def vehicle(names, rng, kind):
         if material in "FR" and body.count(material) == 2:  # one picture over two parts
             upper = (material == "F") == (index > 0 and body[index - 1] == material)
             v_top, v_bottom = (0.0, 0.5) if upper else (0.5, 1.0)
-        wa, wb = half_at(ya), half_at(yb)
+        wa, wb = half_at(ya, za), half_at(yb, zb)
         va, vb = (v_bottom, v_top) if ya < yb else (v_top, v_bottom)
         first = np.array((-wb, -yb, zb + z0))
         faces.add(first, (2 * wb, 0, 0), np.array((-wa, -ya, za + z0)) - first, texture, label, triangle=1,

@@ -45,12 +45,13 @@ def tree(rng, kind, leaves):
     crown = np.zeros(shape, np.float32)
     y, x = np.mgrid[0:512, 0:512].astype(np.float32)
     if kind < 4:
-        for _ in range(16 if kind != 3 else 9):
+        crown = 1.15 - ((x - 256) / 95) ** 2 - ((y - 205) / 120) ** 2  # around the trunk
+        for _ in range(16 if kind != 3 else 11):
             angle, reach = rng.uniform(0, 2 * np.pi), 130 * np.sqrt(rng.random())
             cx, cy = 256 + reach * np.cos(angle) * 1.05, 190 + reach * np.sin(angle) * (0.95, 0.8, 1.0, 1.0)[kind]
             radius = rng.uniform(45, 85) * (1, 1, 0.9, 0.75)[kind]
             crown = np.maximum(crown, 1 - ((x - cx) ** 2 + (y - cy) ** 2) / radius ** 2)
-        threshold = (0.35, 0.42, 0.5, 0.62)[kind]
+        threshold = (0.3, 0.36, 0.42, 0.48)[kind]
         top, bottom = 30, 350
     else:  # conifer
         crown = 1.2 - np.abs(x - 256) / (20 + (y - 10) * 0.42) - np.maximum(0, y - 440) * 0.1
@@ -60,7 +61,7 @@ def tree(rng, kind, leaves):
         threshold = 0.45
         top, bottom = 10, 450
     ragged = noise(rng, shape, 32, 5, 0.8)
-    body = np.clip(crown, 0, 1.3) + 0.28 * ragged
+    body = np.clip(crown, 0, 1.3) + 0.22 * ragged
     mask = (body > threshold) & (crown > 0)
     image = leaves * (1.15 - 0.5 * (y - top) / (bottom - top)) * (0.9 + 0.12 * ragged)
     trunk = np.zeros(shape, np.uint8)
@@ -69,11 +70,13 @@ def tree(rng, kind, leaves):
     cv2.fillPoly(trunk, [np.array([[256 - half, 512], [256 - half // 2 + bend, 150], [256 + half // 2 + bend, 150],
                                    [256 + half, 512]], np.int32)], 255)
     if kind < 4:
+        branches = np.zeros(shape, np.uint8)
         for _ in range(7):
             y0 = int(rng.integers(240, 330))
             end = (256 + int(rng.integers(-110, 110)), y0 - int(rng.integers(60, 140)))
-            cv2.line(trunk, (256 + bend // 2, y0), end, 255, int(rng.integers(3, 7)))
-        trunk[(crown < 0.15) & (y < 350)] = 0  # no branch sticks out of the crown
+            cv2.line(branches, (256 + bend // 2, y0), end, 255, int(rng.integers(3, 7)))
+        branches[(crown < 0.15) & (y < 350)] = 0  # none sticks out of the crown, which hides where they leave the trunk
+        trunk |= branches
     bark = 52 + 14 * noise(rng, shape, 16, 4) + np.linspace(-14, 14, 512, dtype=np.float32)[None] * 2
     wood = (trunk > 0) & ~mask
     image[wood] = bark[wood]
@@ -95,22 +98,31 @@ def person(rng, kind):
             [(0.5, 0.5), (0.5 + hip, 0.5), (0.51 + stride + 0.06, 0.97), (0.51 + stride - 0.05, 0.97)]]
     arms = [[(0.5 - shoulder, 0.2), (0.5 - shoulder + 0.09, 0.22), (0.46 - shoulder, 0.52), (0.39 - shoulder, 0.5)],
             [(0.5 + shoulder, 0.2), (0.5 + shoulder - 0.09, 0.22), (0.54 + shoulder, 0.52), (0.61 + shoulder, 0.5)]]
-    head = [(0.5, 0.105, 0.085, 0.075)]
-    alpha = _outline(shape, [torso, *legs, *arms, [(0.46, 0.14), (0.54, 0.14), (0.55, 0.2), (0.45, 0.2)]], head)
-    coat, trousers = float(rng.uniform(25, 190)), float(rng.uniform(20, 95))
+    head, neck = [(0.5, 0.092, 0.098, 0.06)], [(0.46, 0.14), (0.54, 0.14), (0.56, 0.2), (0.44, 0.2)]
+    shoulders = [(0.5 - shoulder + 0.05, 0.215, 0.055, 0.03), (0.5 + shoulder - 0.05, 0.215, 0.055, 0.03)]
+    alpha = _outline(shape, [torso, *legs, *arms, neck], [*head, *shoulders])
+    coat, trousers = float(rng.uniform(40, 190)), float(rng.uniform(42, 100))
     image = np.full(shape, trousers, np.float32)
     image[:int(0.53 * 256)] = coat
     if kind % 3 == 2:
         image[:int(0.66 * 256)] = coat
-    upper = _outline(shape, arms) > 127
-    image[upper] = coat * 0.85 + 8
-    image[_outline(shape, [], head) > 127] = 152
-    image[:int(0.085 * 256)] = rng.uniform(25, 90)  # hair
-    image[int(0.945 * 256):] = 30
-    if kind % 2:  # bag or stripes
-        cv2.rectangle(image, (70, 60), (92, 110), float(rng.choice([35.0, 205.0])), -1)
-    image += 7 * noise(rng, shape, 16, 4) + np.linspace(10, -10, 128, dtype=np.float32)[None]
-    return image, alpha
+    image[(_outline(shape, arms) > 127) & (_outline(shape, [torso]) <= 127)] = coat * 0.82
+    y, x = np.mgrid[0:256, 0:128].astype(np.float32)
+    if kind % 3 != 2:
+        image[(np.abs(x - 64) < 1.5) & (y > 0.53 * 256)] *= 0.6  # between the legs
+    image[(np.abs(x - 64) < 1) & (y > 0.2 * 256) & (y < 0.52 * 256)] *= 0.7  # a zip
+    image[_outline(shape, [neck]) > 127] = 112
+    image[_outline(shape, [], head) > 127] = 142
+    image[(_outline(shape, [], head) > 127) & (y < (0.085 if kind % 2 else 0.07) * 256)] = rng.uniform(30, 110)  # hair
+    for side in (-1, 1):  # hands
+        cv2.circle(image, (int((0.5 + side * (shoulder + 0.075)) * 128), int(0.505 * 256)), 5, 138.0, -1)
+    image[int(0.945 * 256):] = 34
+    if kind % 2:  # a bag by the side, on its strap
+        cv2.line(image, (50, 50), (80, 112), coat * 0.55, 3)
+        cv2.rectangle(image, (72, 112), (92, 142), coat * 0.55, -1)
+    # light from one side, and folds along the limbs instead of spots
+    folds = noise(rng, (16, 128), 8, 2).repeat(16, axis=0)
+    return image * (1 + np.linspace(0.16, -0.2, 128, dtype=np.float32)[None]) + 2.5 * folds, alpha
 
 
 def bicycle(rng):
@@ -145,7 +157,7 @@ def rider(rng):
     image[:130] = rng.uniform(110, 200)
     image[_outline(shape, [], head) > 127] = 150
     image[:22] = 215
-    return image + 7 * noise(rng, shape, 16, 4), alpha
+    return image + 2.5 * noise(rng, shape, 32, 3), alpha
 
 
 # Side views: (x, y) in metres from the rear bumper on the ground up; the order runs from front to rear over the roof.
@@ -181,9 +193,12 @@ def side(rng, kind, paint):
     wheels = [(x / length, 1 - radius / height, radius / length, radius / height) for x in (rear, front)]
     arches = [(x, y, rx * 1.22, ry * 1.22) for x, y, rx, ry in wheels]
     alpha = _outline(shape, [parts(profile)], wheels)
-    image = paint + 4 * noise(rng, shape, 64, 5)
-    image += np.linspace(22, -26, 256, dtype=np.float32)[:, None]
+    image = paint + 1.5 * noise(rng, shape, 128, 3)
     top = profile[:, 1].max()
+    # Doors bulge: above the crease they mirror the sky, below it the street.
+    up = top * (1 - np.arange(256, dtype=np.float32)[:, None] / 256)
+    image *= np.interp(up, (0.2, 0.5, 0.62, 0.66, 0.9, 1.0, 1.6), (0.62, 0.8, 0.86, 1.12, 0.98, 1.2, 1.1)).astype(
+        np.float32)
     roof = profile[profile[:, 1] > top - 0.1, 0]
     if kind in ("truck", "bus"):
         panes = []
@@ -208,8 +223,9 @@ def side(rng, kind, paint):
                  [(pillar + 0.05, sill), (foot_front - 0.15, sill), (ahead - 0.08, top), (pillar + 0.05, top)]]
     for pane in panes:
         glass = _outline(shape, [parts(pane)]) > 127
-        tone = 48 + 22 * noise(rng, shape, 128, 3)
-        image[glass] = np.clip(tone, 18, 120)[glass]
+        tone = 52 + 4 * noise(rng, shape, 128, 3) + np.linspace(75, -30, 128, dtype=np.float32).repeat(2)[:, None]
+        image[glass] = np.clip(tone, 30, 135)[glass]
+        cv2.polylines(image, [np.rint(np.asarray(parts(pane)) * (512, 256)).astype(np.int32)], True, 26.0, 3)
     if kind not in ("truck", "bus"):
         for x in (foot_rear + 0.15, pillar, foot_front + 0.05):  # door gaps and handles
             column = int(x / length * 512)
@@ -232,15 +248,26 @@ def side(rng, kind, paint):
 def end(rng, paint, front):
     """Front or rear of a vehicle, from the bumper to the beltline; paint: its gray value; no alpha."""
     shape = (128, 256)
-    image = paint + 4 * noise(rng, shape, 32, 4) + np.linspace(14, -18, 128, dtype=np.float32)[:, None]
-    image[92:] = paint * 0.5 + 10
-    for left in (8, 198):
-        cv2.rectangle(image, (left, 28), (left + 50, 62), 235.0 if front else 70.0, -1)
-        cv2.rectangle(image, (left + 12, 36), (left + 32, 54), 180.0 if front else 120.0, -1)
+    image = paint + 1.5 * noise(rng, shape, 64, 3)
+    image *= np.interp(np.arange(128), (0, 18, 22, 66, 90, 127), (1.18, 1.06, 0.94, 0.9, 1.02, 0.6)).astype(
+        np.float32)[:, None]
+    image *= 1 - 0.3 * np.linspace(-1, 1, 256, dtype=np.float32)[None] ** 4  # round the corners
+    for middle, inwards in ((34, 1), (222, -1)):
+        if front:  # a lamp behind glass
+            cv2.ellipse(image, (middle, 44), (32, 15), 8 * inwards, 0, 360, 60.0, -1)
+            cv2.ellipse(image, (middle, 43), (29, 12), 8 * inwards, 0, 360, 190.0, -1)
+            cv2.circle(image, (middle + 8 * inwards, 44), 9, 245.0, -1)
+        else:
+            cv2.ellipse(image, (middle - 6 * inwards, 40), (26, 17), 0, 0, 360, 62.0, -1)
+            cv2.ellipse(image, (middle + 4 * inwards, 36), (10, 6), 0, 0, 360, 150.0, -1)
     if front:
-        image[34:66, 70:186] = 40 + 45 * (np.arange(32)[:, None] % 8 < 3)
+        grille = np.zeros(shape, np.uint8)
+        cv2.fillPoly(grille, [np.array([[76, 36], [180, 36], [170, 62], [86, 62]], np.int32)], 255)
+        image[grille > 0] = (34 + 40 * (np.arange(128)[:, None] % 7 < 2) + np.zeros(shape))[grille > 0]
+        cv2.rectangle(image, (60, 100), (196, 116), 34.0, -1)  # air intake
     else:
-        cv2.line(image, (0, 20), (255, 20), paint * 0.6, 2)
+        cv2.line(image, (20, 66), (236, 66), paint * 0.6, 2)
+        cv2.line(image, (0, 96), (255, 96), paint * 0.7, 2)
     cv2.rectangle(image, (92, 70), (164, 90), 225.0, -1)
     for k in range(6):
         cv2.rectangle(image, (98 + 10 * k, 74), (103 + 10 * k, 86), 40.0, -1)
@@ -249,11 +276,13 @@ def end(rng, paint, front):
 
 def glass(rng):
     """A windscreen or rear window, between whose frames the seats are seen; no alpha."""
-    image = 62 + 14 * noise(rng, (128, 128), 64, 4) + np.linspace(55, -25, 128, dtype=np.float32)[:, None]
-    image[:6], image[-6:], image[:, :6], image[:, -6:] = 30, 30, 30, 30
-    cv2.rectangle(image, (22, 80), (48, 122), 35.0, -1)  # seats seen through it
-    cv2.rectangle(image, (80, 80), (106, 122), 35.0, -1)
-    return image
+    y, x = np.mgrid[0:128, 0:128].astype(np.float32)
+    image = 64 + 3 * noise(rng, (128, 128), 64, 3) + 60 * np.clip(1.1 - y / 70 - 0.3 * np.sin(x / 40), 0, 1)  # sky
+    for left in (36, 92):  # seats seen through it
+        cv2.ellipse(image, (left, 78), (10, 9), 0, 0, 360, 40.0, -1)
+        cv2.ellipse(image, (left, 122), (19, 34), 0, 180, 360, 40.0, -1)
+    image[:5], image[-5:], image[:, :5], image[:, -5:] = 28, 28, 28, 28
+    return cv2.GaussianBlur(image, (0, 0), 1.0)
 
 
 def sign(rng, kind):

@@ -177,6 +177,38 @@ def facade(rng, kind):
     return image - 7 * stain
 
 
+def _shop_window(rng, image, x):
+    """A shop window from column x on, with a sign above: dim goods on shelves behind glass that mirrors the street."""
+    inside = np.full((155, 200), 66.0, np.float32) + np.linspace(-14, 16, 155, dtype=np.float32)[:, None]
+    for shelf in (60, 105, 150):
+        left = int(rng.integers(8, 24))
+        while left < 180:
+            wide, high = int(rng.integers(7, 22)), int(rng.integers(10, 34))
+            tone = float(rng.uniform(74, 128))
+            if rng.random() < 0.5:
+                cv2.rectangle(inside, (left, shelf - high), (left + wide, shelf), tone, -1)
+            else:
+                cv2.ellipse(inside, (left + wide // 2, shelf - high // 2), (wide // 2, high // 2), 0, 0, 360, tone, -1)
+            left += wide + int(rng.integers(3, 26))
+        cv2.line(inside, (0, shelf + 2), (199, shelf + 2), 92.0, 2)
+    inside = cv2.GaussianBlur(inside, (0, 0), 1.6)
+    y, x_in = np.mgrid[0:155, 0:200].astype(np.float32)
+    sky = np.clip((60 + rng.uniform(-20, 20) + 0.25 * (x_in - 100) - y) / 12, 0, 1)  # above the roofs opposite
+    glass = inside * (1 - 0.45 * sky) + 62 * sky
+    glass[np.abs((x_in + 0.6 * y) % 210 - 120) < 9] += 14
+    image[60:215, x:x + 200] = glass
+    for post in (x, x + 98, x + 196):
+        cv2.rectangle(image, (post, 60), (post + 4, 215), 44.0, -1)
+    cv2.rectangle(image, (x, 60), (x + 200, 64), 44.0, -1)
+    ground = float(rng.choice([58.0, 90.0, 214.0]))
+    cv2.rectangle(image, (x - 8, 14), (x + 208, 48), ground, -1)
+    word = str(rng.choice(["CAFE", "OPTIK", "BLUMEN", "PAPIER", "MODE", "FRISEUR", "APOTHEKE", "BROT"]))
+    (wide, _), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_DUPLEX, 0.85, 2)
+    cv2.putText(image, word, (x + 100 - wide // 2, 40), cv2.FONT_HERSHEY_DUPLEX, 0.85,
+                35.0 if ground > 150 else 225.0, 2, cv2.LINE_AA)
+    image[48:58, x - 8:x + 208] *= 0.72  # the sign's shadow
+
+
 def shop(rng, kind):
     """A ground floor, (256, 1024): doors, garages, shop windows or a plinth with small windows; kind: below FACADES."""
     shape = (256, 1024)
@@ -187,15 +219,8 @@ def shop(rng, kind):
     for bay in range(4):
         x = bay * 256 + 28
         what = rng.integers(0, 4)
-        if what == 0:  # shop window with a sign above
-            cv2.rectangle(image, (x, 60), (x + 200, 215), 58.0, -1)
-            for _ in range(14):
-                px, py = int(rng.integers(x + 5, x + 180)), int(rng.integers(110, 200))
-                cv2.rectangle(image, (px, py), (px + int(rng.integers(6, 30)), 213), float(rng.uniform(70, 200)), -1)
-            cv2.rectangle(image, (x - 8, 14), (x + 208, 50), float(rng.choice([60.0, 225.0])), -1)
-            for k in range(7):
-                left = x + 14 + k * 26
-                cv2.rectangle(image, (left, 22), (left + 14, 42), float(rng.choice([120.0, 160.0])), -1)
+        if what == 0:
+            _shop_window(rng, image, x)
         elif what == 1:  # door
             cv2.rectangle(image, (x + 60, 40), (x + 140, 254), 205.0, -1)
             cv2.rectangle(image, (x + 66, 46), (x + 134, 254), 62.0, -1)

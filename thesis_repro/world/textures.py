@@ -143,7 +143,7 @@ def build(seed):
     add("bin", 62 + 9 * noise(rng, (64, 64), 16, 4) - 25 * (np.arange(64)[None] % 16 < 2))
     add("glass", sprites.glass(rng))
     for paint_index, paint in enumerate((205, 150, 90, 52, 38, 178)):
-        add(f"paint{paint_index}", paint + 5 * noise(rng, (128, 128), 64, 5) + np.linspace(
+        add(f"paint{paint_index}", 1.08 * paint + 1.5 * noise(rng, (128, 128), 64, 3) + np.linspace(
             12, -12, 128, dtype=np.float32)[:, None])
         add(f"front{paint_index}", sprites.end(rng, paint, True))
         add(f"rear{paint_index}", sprites.end(rng, paint, False))
