@@ -21,10 +21,11 @@ endif
 absolute = $(if $(filter /% ~%,$(firstword $(1))),$(1),$(CURDIR)/$(1))
 
 export THESIS_REPRO_PROFILE := $(PROFILE)
-$(foreach name,KITTI CITYSCAPES BUILD FIGURES,$(if $($(name)),\
+$(foreach name,KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES,$(if $($(name)),\
   $(eval export THESIS_REPRO_$(name) := $(call absolute,$($(name))))))
 $(foreach name,JOBS DASK_SCHEDULER,$(if $($(name)),$(eval export THESIS_REPRO_$(name) := $($(name)))))
-DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)")
+DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)") \
+                $(if $(KITTI_SEMANTIC),--kitti-semantic "$(KITTI_SEMANTIC)")
 # what the libraries would otherwise say or look up
 export SM_FRAMEWORK := tf.keras
 export NO_ALBUMENTATIONS_UPDATE := 1
@@ -37,11 +38,12 @@ export PYDEVD_DISABLE_FILE_VALIDATION := 1
 help:
 	@echo "make figures     every table and figure into figures/, on embedded data"
 	@echo "                 KITTI=/path CITYSCAPES=/path   on your own data"
+	@echo "                 KITTI_SEMANTIC=/path           label maps judged on KITTI's street scenes too"
 	@echo "                 PROFILE=smoke|demo|thesis      how large (demo)"
 	@echo "make test        unit tests, and every notebook on the smallest profile"
 	@echo "make lint        style (Ruff) and types (mypy)"
 	@echo "make lab         JupyterLab on the notebooks"
-	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path"
+	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
 	@echo "make weights     trains the model that ships from nothing, CAMVID=/path KITTI_SEMANTIC=/path"
 	@echo "make setup       only .venv with the pinned packages"
@@ -64,7 +66,7 @@ setup: .venv/ready
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 ifneq (,$(filter figures,$(MAKECMDGOALS)))
 # ($(shell) of this make does not see what is exported.)
-RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES BUILD FIGURES JOBS,THESIS_REPRO_$(name)='$(THESIS_REPRO_$(name))') \
+RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS,THESIS_REPRO_$(name)='$(THESIS_REPRO_$(name))') \
          $(PYTHON) -m thesis_repro.settings)
 ifeq (,$(RUN))
 $(error the settings above are wrong)
@@ -73,7 +75,7 @@ EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
 SOURCES := $(shell find thesis_repro -type f -not -name '*.pyc' -not -path '*/report/page.*' -not -name '*.html')
 DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
-        $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*))
+        $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*)) $(if $(KITTI_SEMANTIC),$(wildcard $(KITTI_SEMANTIC)/*))
 
 figures: $(EXECUTED)
 	@$(BIN)/python -m thesis_repro.report.page
@@ -81,7 +83,7 @@ figures: $(EXECUTED)
 
 $(RUN)/checked: .venv/ready $(DATA)
 	@mkdir -p $(@D)
-	@$(if $(KITTI)$(CITYSCAPES),$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS),true)
+	@$(if $(KITTI)$(CITYSCAPES)$(KITTI_SEMANTIC),$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS),true)
 	@touch $@
 
 # Each notebook needs the one before it: they hand results on through files.

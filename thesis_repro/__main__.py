@@ -22,14 +22,15 @@ def synthesize(options):
 
 
 def check_data(options):
-    """say what is there, what is missing or wrong in a KITTI and a Cityscapes folder"""
+    """say what is there, what is missing or wrong in folders of KITTI, Cityscapes and KITTI's street scenes"""
     from thesis_repro import check
 
-    if not options.kitti and not options.cityscapes:
-        raise InputError("nothing to check: name a folder with --kitti or --cityscapes "
-                         "(make check-data KITTI=... CITYSCAPES=...)")
+    if not options.kitti and not options.cityscapes and not options.kitti_semantic:
+        raise InputError("nothing to check: name a folder with --kitti, --cityscapes or --kitti-semantic "
+                         "(make check-data KITTI=... CITYSCAPES=... KITTI_SEMANTIC=...)")
     problems = []
-    for root, look in ((options.kitti, check.check_kitti), (options.cityscapes, check.check_cityscapes)):
+    for root, look in ((options.kitti, check.check_kitti), (options.cityscapes, check.check_cityscapes),
+                       (options.kitti_semantic, check.check_kitti_semantic)):
         if root:
             facts, wrong = look(root)
             print("\n".join([str(root), *(f"  {fact}" for fact in facts)]))
@@ -172,6 +173,7 @@ def build_parser():
     sub.add_argument("--kitti", type=Path, metavar="ROOT", help="folder that holds sequences and poses")
     sub.add_argument("--cityscapes", type=Path, metavar="ROOT",
                      help="folder that holds leftImg8bit and gtFine, or train, trainannot, val and valannot")
+    sub.add_argument("--kitti-semantic", type=Path, metavar="ROOT", help="folder that holds train and trainannot")
 
     sub = command(predict)
     sub.add_argument("--images", type=Path, required=True, metavar="DIR_OR_SEQUENCE",

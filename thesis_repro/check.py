@@ -52,10 +52,10 @@ def _wrong_poses(sequence):
     return problems
 
 
-def check_cityscapes(root):
+def check_cityscapes(root, splits=("train", "val")):
     """Check the training and validation split; returns (lines that describe, problems)."""
     facts, problems = [], []
-    for split in ("train", "val"):
+    for split in splits:
         try:
             found = cityscapes.pairs(root, split)
         except InputError as error:
@@ -74,6 +74,11 @@ def _check_pair(pair):
         raise InputError(f"{pair.label}: {label_map.shape[1]}x{label_map.shape[0]} pixels, but {pair.image.name} has "
                          f"{image.shape[1]}x{image.shape[0]}; a label map must have the size of its image")
     return np.unique(label_map)
+
+
+def check_kitti_semantic(root):
+    """Check KITTI's street scenes with label maps, which have a training split alone."""
+    return check_cityscapes(root, ("train",))
 
 
 def _failures(check, items, description):

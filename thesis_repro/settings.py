@@ -17,6 +17,7 @@ VARIABLES = {
     "PROFILE": "size of the run: smoke, demo or thesis",
     "KITTI": "folder of the KITTI odometry benchmark (sequences, poses)",
     "CITYSCAPES": "folder of Cityscapes, in the official or in the flat layout",
+    "KITTI_SEMANTIC": "folder of KITTI's street scenes with label maps (train, trainannot), to judge label maps by",
     "BUILD": "folder for everything that can be made again",
     "FIGURES": "folder for the tables and figures",
     "JOBS": "processes that work at once; as many as there are cores when not set",
@@ -84,6 +85,7 @@ class Settings:
     world: Path  # where the embedded world is written
     jobs: int
     scheduler: str | None = None  # of a Dask cluster
+    kitti_semantic: Path | None = None  # the user's street scenes of KITTI with label maps
     seed: int = SEED
 
     @property
@@ -97,6 +99,7 @@ class Settings:
 
     def __str__(self):
         rows = {"run": self.run, "odometry data": self.kitti, "training data": self.cityscapes,
+                **({"KITTI semantic": self.kitti_semantic} if self.kitti_semantic else {}),
                 "results": self.build, "figures": self.figures, "processes": self.jobs, "seed": self.seed,
                 **{key.replace("_", " "): value for key, value in asdict(self.sizes).items()
                    if not key.startswith("world_") or self.kitti_is_embedded or self.cityscapes_is_embedded}}
@@ -121,16 +124,18 @@ def read_settings(environment=None):
     build = Path(given.get("BUILD", ROOT / "build")).absolute()
     figures = Path(given.get("FIGURES", ROOT / "figures")).absolute()
     world = build / f"world-{profile}"
-    kitti, cityscapes = (_data_folder(name, given.get(name)) for name in ("KITTI", "CITYSCAPES"))
+    kitti, cityscapes, kitti_semantic = (_data_folder(name, given.get(name))
+                                         for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC"))
     data = "_".join(_short_name(name, path) for name, path in (("kitti", kitti), ("cityscapes", cityscapes)) if path)
-    run = f"{data or 'embedded'}-{profile}"
+    judged = f"_{_short_name('semantic', kitti_semantic)}" if kitti_semantic else ""
+    run = f"{data or 'embedded'}{judged}-{profile}"
     return Settings(
         profile=profile, sizes=PROFILES[profile], kitti=kitti or world / "kitti",
         cityscapes=cityscapes or world / "cityscapes", kitti_is_embedded=kitti is None,
         cityscapes_is_embedded=cityscapes is None, run=run, build=build / run,
         # the default run's figures are what visitors see; those of all others go into folders beside them
         figures=figures if run == "embedded-demo" else figures / run,
-        world=world, jobs=int(jobs), scheduler=given.get("DASK_SCHEDULER"))
+        world=world, jobs=int(jobs), scheduler=given.get("DASK_SCHEDULER"), kitti_semantic=kitti_semantic)
 
 
 def _data_folder(name, value):

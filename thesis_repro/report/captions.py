@@ -7,6 +7,8 @@ the figure's own title says which one is shown instead.
 import json
 from pathlib import Path
 
+from thesis_repro.report import gap
+
 REPORTED = json.loads((Path(__file__).parent / "reported.json").read_text(encoding="utf-8"))
 
 # The 36 figures and 5 tables: chapter, then name of the file: title, caption.
@@ -120,9 +122,24 @@ CHAPTERS = {
     },
 }
 
+# What depends on label maps, so that their quality stands beside it.
+ON_LABEL_MAPS = {*(f"figure_4_{number:02d}" for number in (3, 4, 5, *range(7, 18))), "table_4_1", "table_4_2",
+                 "table_4_3", "widths", "controls"}
+
 # What is not in the thesis: (kind, name of the file), title, caption.
 ADDED = {
     ("text", "findings"): ("What the runs show", ""),
+    ("text", "claims"): ("Section 4.1's claims about label maps", ""),
+    ("figure", "domain_gap"): ("The gap between domains", "IoU of each class (Cityscapes' measure, over the whole set) "
+                               "of the run's model and of the model in the package: on validation images of the run's "
+                               "training data, on the odometry's own frames where these have exact label maps, and on "
+                               "KITTI's street scenes where KITTI_SEMANTIC names them. The model in the package was "
+                               "trained on CamVid, on some of those scenes and on images of the embedded world; its "
+                               "card says on which."),
+    ("table", "domain_gap"): ("The gap between domains, in numbers", "Each model at its own size. " + gap.BOUNDARY
+                              + " " + gap.SHADOW + " Flicker is the share of pixels whose class changes between "
+                              "consecutive frames after the motion has been taken out; exact label maps show the floor "
+                              "of that measure."),
     ("table", "widths"): ("A fair choice of width", "The thesis's best width of each sequence beside one width for all "
                           "and the width that the other sequences choose, as changes in percent from all keypoints; "
                           "and how far the best width is chance. The intervals of chosen widths are too narrow: the "

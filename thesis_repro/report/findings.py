@@ -30,9 +30,12 @@ def verdict(differences):
     return -1 if high < 0 else 1 if low > 0 else 0
 
 
-def words(summary, data):
-    """A Markdown text on what a summary of runs shows; data: one line that says where they come from."""
-    parts = [_about(summary, data), _chance(summary), _choice(summary)]
+def words(summary, data, label_maps=None):
+    """A Markdown text on what a summary of runs shows; data: one line that says where they come from.
+
+    label_maps: one line on how good these are (`gap.line`).
+    """
+    parts = [_about(summary, data), _label_maps(label_maps), _chance(summary), _choice(summary)]
     parts += [_against_controls(summary, pose) for pose in POSES]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -53,6 +56,10 @@ def _about(summary, data):
         text += (" A difference is called one only where its interval excludes zero, which one comparison in twenty "
                  "does by chance.")
     return text
+
+
+def _label_maps(said):
+    return said and f"**How good the label maps are.** {said[0].upper()}{said[1:]}."
 
 
 def _chance(summary):

@@ -22,7 +22,7 @@ from PIL import Image
 
 from thesis_repro import InputError
 from thesis_repro.files import write_text
-from thesis_repro.report import captions, style
+from thesis_repro.report import captions, gap, style
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
@@ -108,6 +108,8 @@ def _facts(settings):
                                for row in sequences.to_dict("records") if row.get("frames")),
         "training data": "embedded world" if settings.cityscapes_is_embedded
                          else f"Cityscapes folder “{settings.cityscapes.name}”",
+        "KITTI's street scenes": settings.kitti_semantic and f"folder “{settings.kitti_semantic.name}”",
+        "label maps": (said := gap.line(settings.build)) and said.removeprefix("label maps "),
         "profile": f"{settings.profile}: network {sizes.image_size}x{sizes.image_size} with {sizes.base_filters} "
                    f"filters in the first block, up to {sizes.epochs} epochs on {images}; {frames} of each sequence, "
                    f"{len(sizes.widths)} dilation widths, {sizes.repetitions} repetitions",
@@ -154,6 +156,7 @@ def _artefact(settings, kind, name, title, caption, makers):
         "title": f"{number}. {title}" if number else title, "caption": caption,
         "there": path is not None, "files": [path.name for path in files],
         "makers": makers.get(name, []), "reported": _reported(settings, name), "here": None,
+        "label_maps": gap.line(settings.build) if name in captions.ON_LABEL_MAPS else None,
         "size": _size(path) if path and kind == "figure" else None,
         "table": _table(path) if path and kind == "table" else None,
         "html": _markdown(path.read_text(encoding="utf-8")) if path and kind == "text" else None,

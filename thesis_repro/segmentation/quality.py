@@ -12,9 +12,7 @@ import tensorflow as tf
 from thesis_repro import InputError, files
 from thesis_repro.cityscapes import LABELS, N_CLASSES
 from thesis_repro.segmentation import memory, training
-
-# The ids that the Cityscapes benchmark evaluates; pixels of all others are left out of its confusion matrix.
-EVALUATED = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)
+from thesis_repro.segmentation.errors import EVALUATED
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from thesis_repro.odometry import THESIS, keypoints
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom, pixels; the last two just outside
 
+EXACT = "exact label maps"  # what the flicker of those of a world is called; it is the floor of the measure
 CONSISTENT = 1.0  # pixels; forward and backward flow must cancel to this, or the pixel is left out
 
 
