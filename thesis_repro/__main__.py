@@ -41,24 +41,43 @@ def check_data(options):
 
 
 def predict(options):
-    """write label maps (8-bit ids, 320x320 PNG, named like the frames) for a folder of images or a sequence"""
-    from thesis_repro.files import listed
-    from thesis_repro.segmentation import backbones, prediction, training
+    """write label maps (8-bit ids, 320x320 PNG, named like the frames) for folders of images or sequences"""
+    from thesis_repro.segmentation import prediction
+    from thesis_repro.study import cluster
 
-    images = options.images / "image_0" if (options.images / "image_0").is_dir() else options.images
+    names = [folder.resolve().name for folder in options.images]
+    if len(set(names)) < len(names):
+        raise InputError("--images: two folders have one name, so their label maps would share a folder; give them to "
+                         "two commands")
+    outputs = [options.output] if len(names) == 1 else [options.output / name for name in names]
+    sequences = [(_images(folder, output), output) for folder, output in zip(options.images, outputs)]
+    model_files = options.model or [prediction.SHIPPED]
+    if options.dask:
+        with cluster.open_pool(1, options.dask) as pool:
+            prediction.spread_label_maps(pool.run, model_files, sequences)
+    else:
+        model = prediction.load(tuple(model_files)) if options.model else prediction.load_shipped()
+        for paths, output in sequences:
+            prediction.write_label_maps(model, paths, output)
+    for paths, output in sequences:
+        print(f"{output}: {len(paths)} label maps")
+
+
+def _images(folder, output):
+    """The images of a folder or of a KITTI sequence folder, whose label maps are to be written to another one."""
+    from thesis_repro.files import listed
+
+    images = folder / "image_0" if (folder / "image_0").is_dir() else folder
     if not images.is_dir():
-        raise InputError(f"{options.images}: no such folder; --images must name a folder of PNG images "
+        raise InputError(f"{folder}: no such folder; --images must name a folder of PNG images "
                          "or a KITTI sequence folder that holds image_0")
     paths = listed(images)
     if not paths:
         raise InputError(f"{images}: holds no PNG images")
-    if options.output.resolve() == images.resolve():
-        raise InputError(f"{options.output}: is the folder of the images; label maps have the same names, "
+    if output.resolve() == images.resolve():
+        raise InputError(f"{output}: is the folder of the images; label maps have the same names, "
                          "so name another folder")
-    models = [training.load_model(path) for path in options.model] or [prediction.load_shipped()]
-    model = models[0] if len(models) == 1 else backbones.ensemble(models)
-    prediction.write_label_maps(model, paths, options.output)
-    print(f"{options.output}: {len(paths)} label maps")
+    return paths
 
 
 MANY_MASKS = 10_000  # files; more of them must be asked for
@@ -176,9 +195,11 @@ def build_parser():
     sub.add_argument("--kitti-semantic", type=Path, metavar="ROOT", help="folder that holds train and trainannot")
 
     sub = command(predict)
-    sub.add_argument("--images", type=Path, required=True, metavar="DIR_OR_SEQUENCE",
-                     help="folder of PNG images, or a KITTI sequence folder")
+    sub.add_argument("--images", type=Path, nargs="+", required=True, metavar="DIR_OR_SEQUENCE",
+                     help="folder of PNG images, or a KITTI sequence folder; several get a folder each")
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the label maps")
+    sub.add_argument("--dask", metavar="ADDRESS",
+                     help="scheduler (tcp://host:8786) whose workers make the label maps, with the same bits")
     sub.add_argument("--model", type=Path, nargs="+", default=[], metavar="FILE",
                      help="a trained model (.keras, .hdf5), several for the mean of their probabilities; "
                           "without it the model in the package")

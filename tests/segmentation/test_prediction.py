@@ -9,7 +9,7 @@ import keras
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, cityscapes, files
+from thesis_repro import InputError, cityscapes, files, stages
 from thesis_repro.segmentation import backbones, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.study.flicker import flicker
@@ -103,6 +103,56 @@ def test_a_killed_prediction_goes_on_and_ends_with_the_same_bytes(model, frames,
 
     assert contents(output) == contents(tmp_path / "undisturbed")
     assert any((output / name).stat().st_mtime_ns == when for name, when in kept.items())
+
+
+def test_label_maps_spread_over_workers_are_those_of_one_and_are_not_made_again(model, frames, tmp_path, monkeypatch):
+    model.save(tmp_path / "model.keras")
+    prediction.load.cache_clear()
+    monkeypatch.setattr(prediction, "PART", 4)
+    loaded, read = [], training.load_model
+    monkeypatch.setattr(training, "load_model", lambda path: loaded.append(path) or read(path))
+    sequences = [(frames, tmp_path / "spread" / "00"), (frames[:5], tmp_path / "spread" / "01")]
+    made = []
+
+    def run(function, calls):  # the last first, as a cluster might
+        for index in reversed(range(len(calls))):
+            made.append(len(calls[index][-1]))
+            yield index, function(*calls[index])
+
+    prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences, batch_size=2)
+    assert len(made) == 5 and max(made) == 2 and len(loaded) == 1
+    for paths, folder in sequences:
+        prediction.write_label_maps(model, paths, tmp_path / "alone" / folder.name, batch_size=2)
+        assert contents(folder) == contents(tmp_path / "alone" / folder.name) and len(contents(folder)) == len(paths)
+    assert stages.record(sequences[0][1]) == stages.record(tmp_path / "alone" / "00")
+
+    removed = sequences[0][1] / frames[3].name
+    removed.unlink()
+    kept = {path: path.stat().st_mtime_ns for path in files.listed(sequences[0][1])}
+    made.clear()
+    prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences, batch_size=2)
+    again = [path.name for path, when in kept.items() if path.stat().st_mtime_ns != when]
+    assert made == [1] and removed.is_file() and again == [frames[2].name]  # the other one of its batch
+
+
+def test_a_worker_with_other_files_or_another_model_is_told_apart(model, frames, tmp_path):
+    def elsewhere(function, calls):
+        for index, (model_files, _, folder, record, batches) in enumerate(calls):
+            yield index, function(model_files, "another", folder, record, batches)
+
+    def not_shared(function, calls):
+        for index, (model_files, weights, _, record, batches) in enumerate(calls):
+            yield index, function(model_files, weights, tmp_path / "elsewhere", record, batches)
+
+    def lost(function, calls):
+        yield from ((index, "the worker died") for index in range(len(calls)))
+
+    model.save(tmp_path / "model.keras")
+    for run, says in ((elsewhere, "another model"), (not_shared, "same folders under the same paths"),
+                      (lost, "1 of 1 parts of the label maps failed; the first: the worker died")):
+        with pytest.raises(InputError, match=says):
+            prediction.spread_label_maps(run, [tmp_path / "model.keras"], [(frames[:3], tmp_path / "out")])
+        assert contents(tmp_path / "out") == {}
 
 
 def test_label_maps_of_another_model_are_replaced(model, frames, tmp_path):

@@ -55,38 +55,112 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     Raises InputError for an unreadable image, two images of one name, a batch that does not fit into memory, and a
     folder with files that this project did not make.
     """
-    memory.require(model, _call_size(min(batch_size, len(paths))))
-    paths, output_dir = [Path(path) for path in paths], Path(output_dir)
+    batches = _open(_weights(model), paths, output_dir, batch_size)
+    with files.progress(None, "label maps", len(paths), initial=len(paths) - sum(map(len, batches))) as bar:
+        _write_batches(model, batches, bar.update)
+
+
+def _open(weights, paths, output_dir, batch_size):
+    """Make the folder of label maps a stage; returns what is missing in it, batches of (image, label map) paths."""
+    paths, output_dir = [Path(path).absolute() for path in paths], Path(output_dir).absolute()
     targets = [output_dir / f"{path.stem}.png" for path in paths]
     if len(set(targets)) < len(targets):
         raise InputError(f"{paths[0].parent}: two images share a name, so their label maps would; rename one")
     # The batch size counts, because the network's arithmetic may round differently for another one.
-    stages.stage(output_dir, model=_weights(model), images=stages.listing(paths), batch_size=batch_size,
+    stages.stage(output_dir, model=weights, images=stages.listing(paths), batch_size=batch_size,
                  code=stages.code("segmentation/prediction"))
-    chunks = [range(start, min(start + batch_size, len(paths))) for start in range(0, len(paths), batch_size)]
-    chunks = [chunk for chunk in chunks if not all(targets[index].exists() for index in chunk)]
-    finished = len(paths) - sum(map(len, chunks))
+    pairs = list(zip(paths, targets))
+    batches = [pairs[start:start + batch_size] for start in range(0, len(pairs), batch_size)]
+    return [batch for batch in batches if not all(target.exists() for _, target in batch)]
+
+
+def _write_batches(model, batches, done):
+    """Predict and write batches of (image, label map) paths; done: called with the length of each that is written."""
+    memory.require(model, _call_size(max(map(len, batches), default=1)))
     run = _compiled(model)
-    with ThreadPoolExecutor(2) as pool, files.progress(None, "label maps", len(paths), initial=finished) as bar:
-        waiting = iter(chunks)
+    with ThreadPoolExecutor(2) as pool:
+        waiting = iter(batches)
         decoded, written = deque(), deque()
 
         def decode_next():
-            for chunk in waiting:
-                decoded.append((chunk, pool.submit(_decode, [paths[index] for index in chunk], model.input_shape)))
+            for batch in waiting:
+                decoded.append((batch, pool.submit(_decode, [path for path, _ in batch], model.input_shape)))
                 return
 
         decode_next()
         decode_next()
         while decoded:
-            chunk, images = decoded.popleft()
+            batch, images = decoded.popleft()
             labels = run(images.result())
             decode_next()
-            written.append((len(chunk), pool.submit(_write, labels, [targets[index] for index in chunk])))
+            written.append((len(batch), pool.submit(_write, labels, [target for _, target in batch])))
             while written and (len(written) > 2 or not decoded):
-                count, done = written.popleft()
-                done.result()
-                bar.update(count)
+                count, writing = written.popleft()
+                writing.result()
+                done(count)
+
+
+PART = 256  # images that a worker is given at once, in whole batches: minutes of the thesis's network on two cores
+
+
+def spread_label_maps(run, model_files, sequences, batch_size=16):
+    """Write the label maps of many sequences on many workers: the bits of `write_label_maps` for each, wherever they
+    are made on processors of one kind.
+
+    run: function of (function, argument tuples) that calls it with each on some worker and yields (index, what it
+    returned, or for a lost worker the reason), as a pool of `study.cluster` has it. model_files: of one model, or of
+    several for the mean of their probabilities (`backbones.ensemble`). sequences: (image paths, folder) for each.
+    Workers need this package and see all files under the same paths; each reads the model once. Finished batches are
+    not predicted again after a stop.
+
+    Raises InputError for what `write_label_maps` does, after whatever could be written has been.
+    """
+    model_files = tuple(str(Path(path).absolute()) for path in model_files)
+    weights = _weights(load(model_files))
+    calls, missing, total = [], 0, 0
+    for paths, folder in sequences:
+        batches = _open(weights, paths, folder, batch_size)
+        step = max(1, PART // batch_size)
+        record = stages.made_from(folder)
+        calls += [(model_files, weights, Path(folder).absolute(), record, batches[start:start + step])
+                  for start in range(0, len(batches), step)]
+        missing, total = missing + sum(map(len, batches)), total + len(paths)
+    failures = []
+    with files.progress(None, "label maps", total, initial=total - missing) as bar:
+        for index, failed in run(_write_part, calls):
+            if failed:
+                failures.append(failed)
+            else:
+                bar.update(sum(map(len, calls[index][-1])))
+    if failures:
+        raise InputError(f"{len(failures)} of {len(calls)} parts of the label maps failed; the first: {failures[0]}")
+
+
+@lru_cache(maxsize=1)
+def load(model_files):
+    """The model of one file, or the ensemble of several (a tuple of paths); kept, for the next call in this process."""
+    from thesis_repro.segmentation import backbones  # takes seconds
+
+    models = [training.load_model(path) for path in model_files]
+    return models[0] if len(models) == 1 else backbones.ensemble(models)
+
+
+def _write_part(model_files, weights, folder, record, batches):
+    """Write some batches of a sequence, here or on another machine; returns why that failed, None where it did not."""
+    try:
+        if stages.record(folder) is None or stages.made_from(folder) != record:
+            raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
+                             "folders under the same paths")
+        model = load(model_files)
+        if _weights(model) != weights:
+            raise InputError(f"{', '.join(model_files)}: holds another model for this worker than for the others, or "
+                             "has changed; start the workers again")
+        if stages.record(folder)["code"] != stages.code("segmentation/prediction"):
+            raise InputError("this worker has another version of thesis_repro; install the same on all")
+        _write_batches(model, batches, lambda count: None)
+    except Exception as error:  # whatever it is, the other parts go on and the reason is reported
+        return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return None
 
 
 def read_input(path, input_shape):
