@@ -38,6 +38,7 @@ class Street:
     """What `run` needs of a sequence."""
 
     name = "street"
+    has_truth = True
 
     def __init__(self, count=10, **options):
         self.images, self.intrinsics, self.poses = street(count, **options)

@@ -1,4 +1,5 @@
 import re
+import shutil
 
 import cv2
 import numpy as np
@@ -37,7 +38,24 @@ def test_wrong_camera_is_noticed(tiny_kitti):
     for index in range(4):
         cv2.imwrite(str(tiny_kitti / f"sequences/00/image_0/{index:06d}.png"), np.zeros((376, 1241), np.uint8))
     _, problems = check_kitti(tiny_kitti)
-    assert len(problems) == 1 and "calib.txt: P0 differs from the thesis's camera by" in problems[0]
+    assert len(problems) == 1 and "calib.txt: the camera differs from the thesis's by" in problems[0]
+
+
+def test_sequences_without_truth_are_described_and_missing_poses_named(tiny_kitti):
+    shutil.copytree(tiny_kitti / "sequences/00", tiny_kitti / "sequences/11")
+    (tiny_kitti / "sequences/11/times.txt").unlink()
+    (tiny_kitti / "sequences/11/image_0").rename(tiny_kitti / "sequences/11/image_2")
+    (tiny_kitti / "sequences/11/calib.txt").write_text("P2: 50 0 32 0 0 50 24 0 0 0 1 0\n")
+    facts, problems = check_kitti(tiny_kitti)
+    assert problems == [] and facts[1].startswith("sequence 11: 4 frames of 64x48; no true poses, so the study passes "
+                                                  "it over")
+    assert "image_2, read as gray; no times.txt, so 10 frames a second" in facts[1]
+    (tiny_kitti / "poses/00.txt").unlink()
+    _, problems = check_kitti(tiny_kitti)
+    assert len(problems) == 1 and "poses/00.txt: no such file" in problems[0]
+    shutil.rmtree(tiny_kitti / "sequences/00")
+    facts, problems = check_kitti(tiny_kitti)
+    assert len(facts) == 1 and len(problems) == 1 and "no sequence holds frames" in problems[0]
 
 
 def test_a_missing_folder_is_one_line(tmp_path, capsys):

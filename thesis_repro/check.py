@@ -10,16 +10,27 @@ from thesis_repro.files import progress, read_gray
 def check_kitti(root):
     """Check every sequence below an odometry root; returns (lines that describe, problems)."""
     facts, problems = [], []
-    for name in kitti.sequences(root):
+    names = without_truth = kitti.without_truth(root)
+    try:
+        names = sorted(kitti.sequences(root) + without_truth)
+    except InputError as error:  # there is nothing to compare with, but what there is can be looked at
+        problems.append(str(error))
+    for name in names:
         try:
             sequence = kitti.Sequence(root, name)
+            wrong = _wrong_times(sequence) + ([] if name in without_truth else _wrong_poses(sequence))
             height, width = sequence.size
         except InputError as error:
             problems.append(str(error))
             continue
-        problems += _failures(sequence.frame, range(len(sequence)), f"sequence {name}")
-        problems += _wrong_poses(sequence)
+        problems += _failures(sequence.frame, range(len(sequence)), f"sequence {name}") + wrong
         notes = []
+        if name in without_truth:
+            notes.append("no true poses, so the study passes it over and the odometry takes steps of --speed or 1 m")
+        if sequence.frame_paths[0].parent.name in kitti.IMAGE_FOLDERS[1:]:
+            notes.append(f"the frames of {sequence.frame_paths[0].parent.name}, read as gray")
+        if not sequence.has_times:
+            notes.append(f"no times.txt, so {1 / kitti.FRAME_TIME:g} frames a second")
         expected = kitti.FRAME_COUNTS.get(name)
         if expected and len(sequence) != expected:
             notes.append(f"an excerpt: the complete sequence has {expected}")
@@ -29,7 +40,7 @@ def check_kitti(root):
             difference = np.abs(np.array([matrix[0, 0] - camera.fx, matrix[1, 1] - camera.fy,
                                           matrix[0, 2] - camera.cx, matrix[1, 2] - camera.cy])).max()
             if difference > 1e-3:
-                problems.append(f"{sequence.folder / 'calib.txt'}: P0 differs from the thesis's camera by "
+                problems.append(f"{sequence.folder / 'calib.txt'}: the camera differs from the thesis's by "
                                 f"{difference:.4g} pixels; it must be the file of sequence {name}")
             else:
                 notes.append("the thesis's camera")
@@ -43,13 +54,13 @@ def check_kitti(root):
 def _wrong_poses(sequence):
     rotations = sequence.poses[:, :3, :3]
     error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    path = sequence.root / "poses" / f"{sequence.name}.txt"
-    problems = [f"{path}, line {index + 1}: is no rotation (off by {error[index]:.2g}); the file is damaged"
-                for index in np.flatnonzero(error > 1e-3)[:1]]
-    if len(sequence) > 1 and (np.diff(sequence.times) <= 0).any():
-        line = int(np.flatnonzero(np.diff(sequence.times) <= 0)[0]) + 2
-        problems.append(f"{sequence.folder / 'times.txt'}, line {line}: time does not increase; the file is damaged")
-    return problems
+    return [f"{sequence.poses_path}, line {index + 1}: is no rotation (off by {error[index]:.2g}); the file is damaged"
+            for index in np.flatnonzero(error > 1e-3)[:1]]
+
+
+def _wrong_times(sequence):
+    return [f"{sequence.folder / 'times.txt'}, line {index + 2}: time does not increase; the file is damaged"
+            for index in np.flatnonzero(np.diff(sequence.times) <= 0)[:1]]
 
 
 def check_cityscapes(root, splits=("train", "val")):

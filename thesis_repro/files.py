@@ -1,6 +1,7 @@
 """Reading images, writing files whole or not at all, and showing progress."""
 
 import os
+import re
 import struct
 import sys
 import zlib
@@ -15,12 +16,15 @@ from thesis_repro import InputError
 
 BAR_DELAY = 1  # seconds before a bar shows: what is over sooner needs none
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_START, JPEG_SCAN, JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
+IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 
 def read_gray(path):
-    """Read one image as 8-bit gray, shape (height, width).
+    """Read one image as 8-bit gray, shape (height, width); colours become their luminance.
 
-    Raises InputError when the file is missing, empty, truncated, corrupt or no image.
+    Raises InputError when the file is missing, empty, truncated, corrupt or no image. (What changed inside a JPEG
+    cannot be noticed: it has no checksums.)
     """
     return _read(path, cv2.IMREAD_GRAYSCALE)
 
@@ -38,7 +42,8 @@ def _read(path, flag):
         raise InputError(f"{path}: no such image; check the folder it should be in") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
-    if data.startswith(PNG_SIGNATURE) and not _png_is_whole(data):
+    if (data.startswith(PNG_SIGNATURE) and not _png_is_whole(data)
+            or data.startswith(JPEG_START) and not _jpeg_is_whole(data)):
         raise InputError(f"{path}: the image is truncated or corrupt; copy or download it again")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flag) if data else None
     if image is None:
@@ -63,9 +68,41 @@ def _png_is_whole(data):
     return False
 
 
+def _jpeg_is_whole(data):
+    # OpenCV fills the missing rows of a cut JPEG with gray. The end's marker cannot stand among the pixels' bytes, but
+    # may in a preview that a camera puts before them, so the segments before the first scan are stepped over.
+    position = len(JPEG_START)
+    while position + 4 <= len(data):
+        if data[position:position + 2] == JPEG_SCAN:
+            return JPEG_END in data[position:]
+        (length,) = struct.unpack(">H", data[position + 2:position + 4])
+        position += 2 + length
+    return False
+
+
 def listed(folder, pattern="*.png"):
     """Files of a folder that match, sorted; hidden ones are left out: a killed run may leave a half-written one."""
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
+
+
+def images(folder):
+    """The PNG or JPEG images of a folder, in the order of the numbers that their names end in, or else of the names.
+
+    Hidden ones are left out. Raises InputError where there are both kinds.
+    """
+    found = [path for path in listed(folder, "*") if path.suffix.lower() in IMAGES]
+    if len({IMAGES[path.suffix.lower()] for path in found}) > 1:
+        raise InputError(f"{folder}: holds PNG and JPEG images; one folder must hold one kind, so move the others away")
+    numbers = numbers_of(found)
+    return found if numbers is None else [path for _, path in sorted(zip(numbers, found))]
+
+
+def numbers_of(paths):
+    """The numbers that the names of files end in, as integers; None where they do not count one series of files."""
+    matches = [re.fullmatch(r"(.*?)(\d+)", path.stem) for path in paths]
+    if not all(matches) or len({match[1] for match in matches}) > 1:
+        return None
+    return [int(match[2]) for match in matches]
 
 
 @contextmanager

@@ -1,15 +1,18 @@
 """KITTI odometry: one sequence's frames, camera, times and true poses, and trajectory files."""
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
+from statistics import median_low
 
 import cv2
 import numpy as np
 
 from thesis_repro import InputError
-from thesis_repro.files import listed, read_gray, write_text
+from thesis_repro.files import images, numbers_of, read_gray, write_text
 
 
 @dataclass(frozen=True)
@@ -34,54 +37,137 @@ CAMERAS = {"00": _CAMERA_00, "01": _CAMERA_00, "02": _CAMERA_00, "03": _CAMERA_0
 FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201), strict=True))
 
 
-# The benchmark keeps the true poses of these to itself, and without them there is no scale.
-WITHOUT_TRUTH = frozenset(f"{number}" for number in range(11, 22))
+IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")  # left gray, left colour, then the right ones
+FRAME_TIME = 0.1  # seconds between KITTI's frames, and between those of a sequence that has no times
 
 
 def sequences(root: str | Path) -> list[str]:
-    """Names of the sequences under root/sequences that hold image_0, sorted, less those without published poses.
+    """Names of the sequences under root/sequences that hold frames, sorted, less those of `without_truth`.
 
     Raises InputError when there are none.
     """
+    names = [name for name in _with_frames(root) if _has_truth(root, name)]
+    if not names:
+        raise InputError(f"{Path(root) / 'sequences'}: no sequence holds frames (image_0 or image_2) and true poses; "
+                         "the images and the poses of the odometry benchmark are needed")
+    return names
+
+
+def without_truth(root: str | Path) -> list[str]:
+    """Names of the sequences that hold frames but have no true poses, sorted: the benchmark keeps those of 11 to 21 to
+    itself, and a sequence of one's own may have none.
+
+    The odometry runs over them, but there is nothing to compare it with. 00 to 10 without poses are not among them:
+    there a file is missing.
+    """
+    return [name for name in _with_frames(root) if not _has_truth(root, name)]
+
+
+def _with_frames(root):
     root = Path(root)
     if not (root / "sequences").is_dir():
         raise InputError(f"{root}: holds no folder 'sequences'; KITTI must name the folder that holds "
                          "sequences/NN/image_0 and poses/NN.txt")
-    names = sorted(folder.name for folder in (root / "sequences").iterdir() if (folder / "image_0").is_dir()
-                   and (folder.name not in WITHOUT_TRUTH or (root / "poses" / f"{folder.name}.txt").is_file()))
-    if not names:
-        raise InputError(f"{root / 'sequences'}: no sequence holds a folder image_0; "
-                         "the gray images of the odometry benchmark are needed")
-    return names
+    return sorted(folder.name for folder in (root / "sequences").iterdir()
+                  if folder.is_dir() and (images_of(folder).name in IMAGE_FOLDERS or images(folder)))
+
+
+def _has_truth(root, name):
+    return name in FRAME_COUNTS or (Path(root) / "poses" / f"{name}.txt").is_file()
+
+
+def images_of(folder: str | Path, camera: str | None = None) -> Path:
+    """Where the frames of a sequence's folder are: in the one of IMAGE_FOLDERS that `camera` names, or else in the
+    first of them that is there, or else in the folder itself.
+
+    Raises InputError for another camera.
+    """
+    if camera is not None and camera not in IMAGE_FOLDERS:
+        raise InputError(f"camera {camera!r}: unknown; choose one of {', '.join(sorted(IMAGE_FOLDERS))}")
+    candidates = [Path(folder) / name for name in ([camera] if camera else IMAGE_FOLDERS)]
+    return next((path for path in candidates if path.is_dir()), candidates[0] if camera else Path(folder))
 
 
 class Sequence:
     """One odometry sequence in the official layout: sequences/NN/image_0, calib.txt, times.txt and poses/NN.txt.
 
+    Frames are PNG or JPEG; without gray ones in image_0 the colour ones of image_2 are read, as gray. (The true poses
+    are those of image_0's camera, 6 cm beside the other's.) Where there is no times.txt, `times` has KITTI's ten
+    frames a second. Where there is no file of poses, `has_truth` is False.
     Everything but the frames is read and checked when the object is made; frames are read when asked for.
     Raises InputError, naming the file, for whatever is missing or malformed.
     """
 
-    def __init__(self, root: str | Path, name: str) -> None:
-        self.root = Path(root)
-        self.name = str(name)
-        self.folder = self.root / "sequences" / self.name
-        images = self.folder / "image_0"
-        if not images.is_dir():
-            raise InputError(f"{images}: no such folder; sequence {self.name} must hold its gray frames there")
-        self.frame_paths = listed(images)
+    def __init__(self, root: str | Path | None, name: str | Path, camera: str | None = None,
+                 speed: float | None = None) -> None:
+        """root: the folder that holds sequences and poses, and name: of the sequence, where "6" is as good as "06".
+        Or root None, and name a folder of one's own that holds calib.txt, the frames (in image_0 or itself) and
+        perhaps times.txt and poses.txt.
+
+        camera: one of IMAGE_FOLDERS; by default see `images_of`. speed: metres a second, for a sequence without true
+        poses; by default one metre a frame.
+        """
+        self.root, self.folder, self.poses_path = _places(root, name)
+        self.name = self.folder.name
+        self.speed = speed
+        if not self.folder.is_dir():
+            raise InputError(f"{self.folder / (camera or 'image_0')}: no such folder; sequence {self.name} must hold "
+                             "its frames there (gray in image_0 or colour in image_2)")
+        where = images_of(self.folder, camera)
+        if not where.is_dir():
+            raise InputError(f"{where}: no such folder; sequence {self.name} must hold its frames there")
+        self.frame_paths = images(where)
         if not self.frame_paths:
-            raise InputError(f"{images}: holds no PNG frames; sequence {self.name} is empty")
-        self.intrinsics = _read_intrinsics(self.folder / "calib.txt")
-        self.times = _read_numbers(self.folder / "times.txt", 1)[:, 0]
-        self._check_count(self.folder / "times.txt", len(self.times))
-        self.poses = read_poses(self.root / "poses" / f"{self.name}.txt")
-        self._check_count(self.root / "poses" / f"{self.name}.txt", len(self.poses))
+            raise InputError(f"{where}: holds no PNG or JPEG frames; sequence {self.name} is empty")
+        _check_numbering(self.frame_paths)
+        self.intrinsics = _read_intrinsics(self.folder / "calib.txt", where.name)
+        times = self.folder / "times.txt"
+        self.has_times = times.is_file()
+        self.times = _read_numbers(times, 1)[:, 0] if self.has_times else FRAME_TIME * np.arange(len(self))
+        self._check_count(times, len(self.times))
+        self.has_truth = self.poses_path.is_file()
+        if self.has_truth:
+            self._poses = read_poses(self.poses_path)
+            self._check_count(self.poses_path, len(self._poses))
+        if speed is not None:
+            self._check_speed(speed)
 
     def _check_count(self, path, count):
         if count != len(self):
             raise InputError(f"{path}: {count} lines for {len(self)} frames in {self.frame_paths[0].parent}; "
                              "one line a frame is needed")
+
+    def _check_speed(self, speed):
+        if self.has_truth:
+            raise InputError(f"speed: sequence {self.name} has true poses ({self.poses_path}), from which the length "
+                             "of each step is taken; give none")
+        if not np.isfinite(speed) or speed <= 0:
+            raise InputError(f"speed: {speed} is none; give metres a second, above 0")
+        times = self.folder / "times.txt"
+        if not self.has_times:
+            raise InputError(f"{times}: no such file; a speed needs the times of the frames, in seconds, one a line")
+        if (np.diff(self.times) <= 0).any():
+            raise InputError(f"{times}: time does not always increase; a speed needs times that do")
+
+    @property
+    def poses(self) -> np.ndarray:
+        """True camera-to-world poses, (n, 4, 4), metres. Raises InputError where there are none."""
+        if not self.has_truth:
+            raise InputError(f"{self.poses_path}: no such file; sequence {self.name} has no true poses, and this needs "
+                             "them")
+        return self._poses
+
+    @property
+    def assumed_steps(self) -> np.ndarray:
+        """Metres from the frame before, (n,), 0 for the first, where no truth says them: those of the speed, or 1."""
+        if self.speed is None:
+            return np.concatenate([[0.0], np.ones(len(self) - 1)])
+        return np.concatenate([[0.0], self.speed * np.diff(self.times)])
+
+    @property
+    def label_names(self) -> list[str]:
+        """What the label map or mask of each frame is called: as the frame, but always .png."""
+        return [f"{path.stem}.png" for path in self.frame_paths]
 
     def __len__(self) -> int:
         return len(self.frame_paths)
@@ -109,11 +195,50 @@ class Sequence:
 
     def subset(self, count: int | None) -> "Sequence":
         """The same sequence cut to its first `count` frames (all of them where it has fewer, or for None)."""
-        short = object.__new__(Sequence)
-        short.__dict__.update(root=self.root, name=self.name, folder=self.folder, intrinsics=self.intrinsics,
-                              frame_paths=self.frame_paths[:count], times=self.times[:count],
-                              poses=self.poses[:count])
+        short = copy(self)
+        short.frame_paths, short.times = self.frame_paths[:count], self.times[:count]
+        if self.has_truth:
+            short._poses = self._poses[:count]
         return short
+
+
+def _places(root, name):
+    """(root, folder, file of true poses) of a sequence, see Sequence."""
+    if root is None:
+        folder = Path(name).resolve()
+        if folder.parent.name != "sequences":
+            return folder.parent, folder, folder / "poses.txt"
+        root, name = folder.parent.parent, folder.name  # it is one of KITTI's after all
+    root, name = Path(root), str(name)
+    if name.isdigit() and not (root / "sequences" / name).is_dir():
+        name = name.zfill(2)
+    return root, root / "sequences" / name, root / "poses" / f"{name}.txt"
+
+
+def true_poses(root: str | Path | None, name: str | Path) -> np.ndarray:
+    """The true poses of a sequence, (n, 4, 4), whose frames need not be there; root and name as Sequence takes them.
+
+    Raises InputError where there are none.
+    """
+    path = _places(root, name)[2]
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; without true poses there is nothing to compare with")
+    return read_poses(path)
+
+
+def _check_numbering(paths):
+    """Raise InputError for frames that count by one with a gap. (Every fifth frame, say, or times are no count.)"""
+    numbers = numbers_of(paths) or [0]
+    steps = [after - before for before, after in pairwise(numbers)]
+    if len(steps) < 2 or median_low(steps) != 1 or max(steps) == 1:
+        return
+    before = next(index for index, step in enumerate(steps) if step > 1)
+    path, missing = paths[before], sum(step - 1 for step in steps)
+    digits = len(path.stem) - len(path.stem.rstrip("0123456789"))
+    first = f"{path.stem[:-digits]}{numbers[before] + 1:0{digits}d}{path.suffix}"
+    more = f" ({missing} are missing in all)" if missing > 1 else ""
+    raise InputError(f"{path.with_name(first)}: is missing between {path.name} and {paths[before + 1].name}{more}; "
+                     "copy it again, for the odometry needs every frame")
 
 
 def _size(shape):
@@ -147,20 +272,21 @@ def _read_numbers(path, columns):
     return np.array(rows, np.float64)
 
 
-def _read_intrinsics(path):
-    """The camera matrix of image_0 (Equation 2.4): the first 3x3 of P0."""
+def _read_intrinsics(path, camera):
+    """The camera matrix of image_0 (Equation 2.4), the first 3x3 of P0, or of another camera."""
+    key = f"P{camera[-1]}" if camera in IMAGE_FOLDERS else "P0"
     for line in _read_text(path).splitlines():
-        if line.startswith("P0:"):
+        if line.startswith(f"{key}:"):
             try:
                 values = np.array([float(word) for word in line[3:].split()], np.float64)
             except ValueError:
                 values = np.empty(0)
             matrix = values.reshape(3, 4)[:, :3] if values.shape == (12,) and np.isfinite(values).all() else None
             if matrix is None or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-                raise InputError(f"{path}: P0 must be 12 finite numbers with positive focal lengths, "
+                raise InputError(f"{path}: {key} must be 12 finite numbers with positive focal lengths, "
                                  f"found {line.strip()[:60]!r}")
             return matrix
-    raise InputError(f"{path}: has no line 'P0:' with the projection matrix of image_0")
+    raise InputError(f"{path}: has no line '{key}:' with the projection matrix of {camera}")
 
 
 def read_poses(path: str | Path) -> np.ndarray:

@@ -149,7 +149,8 @@ def coverage(mask: np.ndarray) -> float:
 class LabelMasks:
     """Masks of a sequence made from its label maps when they are asked for: masks[i] for frame i.
 
-    folder holds one label map a frame, of any size, named like the frame. settings: as in `keypoint_mask`.
+    folder holds one label map a frame, of any size, named like the frame (for JPEG frames too, as .png). settings: as
+    in `keypoint_mask`.
     Raises InputError when the folder or a frame's label map is missing.
     """
 
@@ -218,8 +219,8 @@ def _files_of_frames(folder, sequence, what):
         raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence "
                          f"{sequence.name}")
     present = {path.name for path in listed(folder)}
-    missing = [path.name for path in sequence.frame_paths if path.name not in present]
+    missing = [name for name in sequence.label_names if name not in present]
     if missing:
         raise InputError(f"{folder / missing[0]}: no such {what} ({len(missing)} of {len(sequence)} frames of sequence "
                          f"{sequence.name} have none); every frame needs one")
-    return [folder / path.name for path in sequence.frame_paths]
+    return [folder / name for name in sequence.label_names]

@@ -182,6 +182,8 @@ def test_vote_is_opencvs_to_the_last_bit(drive, kind):
 class Changed:
     """A sequence with some of its frames replaced."""
 
+    has_truth = True
+
     def __init__(self, sequence, replaced=None, poses=None, frames=None):
         self.name, self.intrinsics = sequence.name, sequence.intrinsics
         self.poses = (sequence.poses if poses is None else poses)[:frames]

@@ -52,12 +52,19 @@ def start_pose(sequence: Sequence) -> np.ndarray:
 
     The first pose of every complete KITTI sequence is the identity up to 1e-10, an excerpt's is not.
     """
+    if not sequence.has_truth:
+        return np.eye(4)
     first = sequence.poses[0]
     return np.eye(4) if np.abs(first - np.eye(4)).max() < 1e-6 else first
 
 
 def scales(sequence: Sequence) -> np.ndarray:
-    """Metres between the true positions of a frame and the one before; 0 for the first. (n,)"""
+    """Metres between the true positions of a frame and the one before; 0 for the first. (n,)
+
+    Without truth they are the sequence's `assumed_steps`.
+    """
+    if not sequence.has_truth:
+        return sequence.assumed_steps
     return np.concatenate([[0.0], [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]])
 
 
@@ -190,7 +197,8 @@ def _finish(estimates: Iterable[_Estimate]) -> None:
 
 def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
     """Everything that has to be the same for a checkpoint to go on from."""
-    numbers = hashlib.sha256(sequence.intrinsics.tobytes() + sequence.poses.tobytes()).hexdigest()
+    arrays = (sequence.intrinsics, start_pose(sequence), scales(sequence))
+    numbers = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     return {"sequence": sequence.name, "frames": len(sequence), "numbers": numbers, "opencv": cv2.__version__,
             "columns": NUMBERS, "runs": {name: asdict(one.odometry.settings) for name, one in members.items()}}
 

@@ -109,15 +109,18 @@ def _places(root: Path) -> list[tuple[kitti.Sequence, int]]:
 def _copy(sequence: kitti.Sequence, start: int, root: Path) -> None:
     """An excerpt as a sequence of its own."""
     folder, indices = root / "sequences" / NAME, range(start, start + FRAMES)
-    (folder / "image_0").mkdir(parents=True)
+    camera = sequence.frame_paths[0].parent.name
+    frames = folder / (camera if camera in kitti.IMAGE_FOLDERS else "image_0")
+    frames.mkdir(parents=True)
     labels = controls.true_labels(sequence.root, sequence.name)
     for index in indices:
         sequence.frame(index)  # says which file is unreadable, if it is
         path = sequence.frame_paths[index]
-        shutil.copy(path, folder / "image_0")
-        if (labels / path.name).is_file():
+        shutil.copy(path, frames)
+        label = labels / sequence.label_names[index]
+        if label.is_file():
             controls.true_labels(root, NAME).mkdir(exist_ok=True)
-            shutil.copy(labels / path.name, controls.true_labels(root, NAME))
+            shutil.copy(label, controls.true_labels(root, NAME))
     shutil.copy(sequence.folder / "calib.txt", folder)
     write_text(folder / "times.txt", "".join(f"{sequence.times[index]}\n" for index in indices))
     kitti.write_kitti_poses(root / "poses" / f"{NAME}.txt", sequence.poses[start:start + FRAMES])
@@ -286,6 +289,8 @@ def text(root: Path, plan: Plan, calibration: Calibration, repetitions: int, com
     total, everything = sum(plan.frames.values()), sum(kitti.FRAME_COUNTS.values())
     whose = "the complete benchmark" if complete else f"{root}"
     lines = [f"{whose}: {len(plan.frames)} sequences, {total:,} frames"]
+    if passed_over := kitti.without_truth(root):
+        lines.append(f"(passed over, for they have no true poses: {', '.join(passed_over)})")
     if not complete and any(plan.frames.get(name, 0) < count for name, count in kitti.FRAME_COUNTS.items()):
         lines.append(f"(the complete benchmark has {len(kitti.FRAME_COUNTS)} sequences, {everything:,} frames; "
                      "--complete plans for it)")

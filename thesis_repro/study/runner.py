@@ -93,9 +93,12 @@ def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
     """The jobs' sequences by name; what the folder holds of other data, code or boundaries is deleted."""
     sequences = {name: study.sequence(name) for name in sorted({job.sequence for job in jobs})}
     for name, sequence in sequences.items():
+        if not sequence.has_truth:
+            raise InputError(f"{sequence.poses_path}: no such file; without true poses sequence {name} has no "
+                             "errors to compare; leave it out (the odometry command runs it)")
         true_labels = controls.true_labels(study.kitti, name)
         stages.stage(study.folder / name, **_versions(), frames=stages.listing(sequence.frame_paths),
-                     poses=stages.content(sequence.root / "poses" / f"{name}.txt"),
+                     poses=stages.content(sequence.poses_path),
                      labels=stages.made_from(study.labels / name), boundaries=study.boundaries,
                      true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None)
     return sequences
