@@ -1,0 +1,157 @@
+"""The answer in a figure, a table and words: error against number of keypoints, by method (`study.answer`)."""
+
+import numpy as np
+import pandas as pd
+
+from thesis_repro.report.findings import ENOUGH, UNAIDED
+from thesis_repro.report.style import BASELINE, MASKED, PAGE_WIDTH, line_style, new_figure
+from thesis_repro.study import answer, results
+
+MARKERS = "oDs^v<>Pp*X"
+
+
+def _style(variant):
+    index = list(answer.METHODS).index(variant)
+    color = {"baseline": BASELINE, "masked": MASKED}.get(variant, line_style(index)["color"])
+    return {"color": color, "marker": MARKERS[index], "label": answer.METHODS[variant]}
+
+
+def figure_answer(summary):
+    """Ratio of each method's error to that of all keypoints against its number of keypoints; log scales.
+
+    One row of panels an estimator, one column a metric. Markers are geometric means over sequences at the tested width,
+    bars their bootstrap intervals; lines lead through the other widths and limits that were run.
+    """
+    poses = [pose for pose in results.POSES if len(results.of_variant(summary, "baseline", pose))]
+    figure, axes = new_figure(len(poses), len(answer.METRICS), height=1.0 + 2.5 * len(poses), squeeze=False)
+    for row, pose in zip(axes, poses, strict=True):
+        for panel, (metric, name) in zip(row, answer.METRICS.items(), strict=True):
+            for variant, line in _lines(summary, metric, pose).groupby("variant", sort=False):
+                panel.plot(line["keypoints"], line["ratio"], color=_style(variant)["color"], linewidth=0.9, alpha=0.6)
+            for one in answer.compared(summary, metric, pose).itertuples():
+                if np.isfinite(one.low):
+                    panel.plot([one.keypoints] * 2, [one.low, one.high], color=_style(one.variant)["color"],
+                               linewidth=1.6)
+                panel.plot(one.keypoints, one.ratio, linestyle="none", markersize=6, markeredgecolor="white",
+                           **_style(one.variant))
+            panel.axhline(1, color="black", linewidth=0.8)
+            panel.set(xscale="log", yscale="log", title=f"{name}, {results.POSES[pose]}")
+            panel.minorticks_off()
+            _plain_ticks(panel)
+        row[0].set_ylabel("times the error of all keypoints")
+    for panel in axes[-1]:
+        panel.set_xlabel("mean number of keypoints")
+    figure.legend(*axes[-1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def figure_by_sequence(summary, metric):
+    """The same errors themselves, one panel a sequence: bars from the lowest to the highest of the repetitions."""
+    lines = answer.lines(summary, metric)
+    names = list(dict.fromkeys(lines["sequence"]))
+    columns = min(4, len(names))
+    rows = -(-len(names) // columns)
+    figure, axes = new_figure(rows, columns, height=PAGE_WIDTH / columns * rows * 0.9 + 0.8, squeeze=False)
+    for panel in axes.flat[len(names):]:
+        panel.set_axis_off()
+    for panel, name in zip(axes.flat, names, strict=False):
+        for variant, line in lines[lines["sequence"] == name].groupby("variant", sort=False):
+            spread = [line["mean"] - line["lowest"], line["highest"] - line["mean"]]
+            panel.errorbar(line["keypoints"], line["mean"], yerr=np.maximum(spread, 0), linewidth=0.9, elinewidth=0.9,
+                           markersize=4, markeredgewidth=0, **_style(variant))
+        panel.set(xscale="log", yscale="log", title=name)
+        panel.minorticks_off()
+        _plain_ticks(panel)
+        panel.tick_params(labelsize=7)
+    for panel in axes[:, 0]:
+        panel.set_ylabel({"rmse": "RMSE (m)", "rotation": "rotation error (degrees)"}[metric])
+    figure.supxlabel("mean number of keypoints", fontsize=9)
+    handles = {}
+    for panel in axes.flat[:len(names)]:
+        handles |= dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def _lines(summary, metric, pose):
+    """Geometric means over sequences of the ratios to all keypoints, for methods run with several settings."""
+    every = answer.logs(results.of_variant(summary, "baseline", pose), metric)
+    found = answer.lines(summary, metric, pose)
+    found["setting"] = found.groupby(["sequence", "variant"]).cumcount()
+    counts = found.groupby("variant")["setting"].transform("max")
+    found = found[(counts > 0) & (found["variant"] != "baseline")]
+    found = found.assign(ratio=np.log(found["mean"]) - found["sequence"].map(every), keypoints=np.log(found["keypoints"]))
+    return np.exp(found.groupby(["variant", "setting"], sort=False)[["keypoints", "ratio"]].mean()).reset_index()
+
+
+def _plain_ticks(panel):
+    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+        steps = (1, 2, 5) if high / low < 100 else (1,)
+        ticks = [step * 10.0**power for power in range(-6, 6) for step in steps if low <= step * 10.0**power <= high]
+        if len(ticks) < 2:  # less than the way from 2 to 5
+            ticks = np.unique([float(f"{tick:.2g}") for tick in np.geomspace(low, high, 5)[1:-1]])
+        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+
+
+def table(summary):
+    """Every method under both estimators and metrics: keypoints, ratios to all keypoints and of masks to it."""
+    rows = []
+    for pose, estimator in results.POSES.items():
+        if not len(results.of_variant(summary, "baseline", pose)):
+            continue
+        for metric, name in answer.METRICS.items():
+            for one in answer.compared(summary, metric, pose).itertuples():
+                rows.append({"estimator": estimator, "error": name, "keypoints": answer.METHODS[one.variant],
+                             "mean number": round(one.keypoints), "sequences": one.sequences,
+                             "times all keypoints": _number(one.ratio), "interval": _between(one.low, one.high),
+                             "thesis's mean of percentages (%)": round(one.percent, 1),
+                             "masks are times this": _number(one.masks),
+                             "masks, interval": _between(one.masks_low, one.masks_high)})
+    return pd.DataFrame(rows)
+
+
+def _number(value):
+    return float(f"{value:.3g}")
+
+
+def _between(low, high):
+    return pd.NA if np.isnan(low) else f"{low:.3g} to {high:.3g}"
+
+
+def words(summary, data):
+    """The answer as one paragraph of Markdown, chosen by the numbers as `study.answer` has it."""
+    found = {metric: answer.compared(summary, metric).set_index("variant") for metric in answer.METRICS}
+    first = found["rmse"]
+    if "masked" not in first.index:
+        return ""
+    count = int(first.loc["masked", "sequences"])
+    parts = []
+    for metric, name in answer.METRICS.items():
+        one = found[metric].loc["masked"]
+        interval = "" if np.isnan(one["low"]) else f" [{one['low']:.2f}, {one['high']:.2f}]"
+        parts.append(f"the {name} is {one['ratio']:.2f}{interval} times that of all keypoints")
+    text = (f"**Do masks help?** Data: {data}. Refined estimator, width {results.tested_width(summary)}, "
+            f"{first.loc['masked', 'keypoints']:.0f} keypoints instead of {first.loc['baseline', 'keypoints']:.0f}, "
+            f"geometric means over {count} sequence{'s' * (count != 1)}: with masks {' and '.join(parts)}.")
+    beaten, better, same = [], [], []
+    for variant in UNAIDED:
+        signs = [_sign(found[metric].loc[variant, "masks_low"], found[metric].loc[variant, "masks_high"])
+                 for metric in answer.METRICS if variant in found[metric].index]
+        if signs:
+            (beaten if set(signs) == {-1} else better if set(signs) == {1} else same).append(answer.METHODS[variant])
+    for names, said in ((beaten, "worse than masks by both measures"), (better, "better than masks by both measures"),
+                        (same, "not told apart from masks by both measures")):
+        if names and count >= results.FEWEST:
+            text += f" Of what knows no class of the frame, {said}: {', '.join(names)}."
+    helps = {_sign(found[metric].loc["masked", "low"], found[metric].loc["masked", "high"]) for metric in found}
+    if count < ENOUGH:
+        return f"{text} **{count} sequences say nothing of sequences in general.**\n"
+    if helps == {-1}:
+        return text + (" **Masks help here, and the segmentation matters.**\n" if not better and not same
+                       else " **Masks help here, but not for what the segmentation knows.**\n")
+    return text + (" **Masks do harm here.**\n" if helps == {1} else " **Masks are not shown to help here.**\n")
+
+
+def _sign(low, high):
+    """-1 where an interval of ratios lies below 1, 1 where above, 0 where neither."""
+    return -1 if high < 1 else 1 if low > 1 else 0

@@ -1,0 +1,95 @@
+"""What the slips of the appendix's training code do, each alone: short trainings that differ in one thing (audit)."""
+
+import os
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
+
+import albumentations as A
+import keras
+import numpy as np
+import pandas as pd
+import segmentation_models as sm
+
+from thesis_repro import files
+from thesis_repro.cityscapes import CLASS_WEIGHTS, ID, N_CLASSES
+from thesis_repro.segmentation import augmentation, quality, training
+from thesis_repro.segmentation.unet import build_unet
+
+NOISE_OF_TODAY = (0.2, 0.44)  # standard deviation of A.GaussNoise's defaults, as shares of 255
+VARIANTS = ("thesis", "corrected blocks", "divided by 255", "person weight 1", "noise of today")
+
+
+def trials(images, labels, validation, *, steps, seeds, base_filters=8, batch_size=8, rate=3e-3):
+    """Train the thesis's network and each of VARIANTS for a few steps: a row for each variant and seed.
+
+    images (n, size, size, 1) and labels (n, size, size), uint8, and the same of `validation`. What can be seen after so
+    few steps is how a slip changes the beginning of a training, not where a whole one ends. Columns variant, seed,
+    steps, mean_iou and accuracy as Cityscapes measures them, person (IoU of that class, NaN where it is absent).
+    """
+    rows = []
+    for network in (False, True):
+        model = build_unet(images.shape[1:], N_CLASSES, base_filters, corrected_blocks=network)
+        for variant in ("corrected blocks",) if network else [one for one in VARIANTS if one != "corrected blocks"]:
+            for seed in files.progress(range(seeds), variant, unit="training"):
+                rows.append({"variant": variant, "seed": seed, "steps": steps}
+                            | _trial(model, images, labels, validation, variant, seed, steps, batch_size, rate))
+    return pd.DataFrame(rows)
+
+
+def _trial(model, images, labels, validation, variant, seed, steps, batch_size, rate):
+    keras.utils.set_random_seed(seed)
+    fresh = keras.models.clone_model(model)
+    augmented = augmentation.augment_set(images, labels, _augmenter(images.shape[1], variant), seed)
+    weights = CLASS_WEIGHTS.copy()
+    if variant == "person weight 1":
+        weights[ID["person"]] = 1
+    scale = 255 if variant == "divided by 255" else 1
+    fresh.compile(keras.optimizers.Adam(rate),
+                  sm.losses.DiceLoss(class_weights=weights) + sm.losses.CategoricalFocalLoss())
+    some, true = np.concatenate([images, augmented[0]]), np.concatenate([labels, augmented[1]])
+    chosen = np.random.default_rng(seed).integers(0, len(some), steps * batch_size)
+    fresh.fit(some[chosen].astype(np.float32) / scale, augmentation.one_hot(true[chosen], N_CLASSES),
+              batch_size=batch_size, epochs=1, shuffle=False, verbose=0)
+    predicted = fresh.predict(validation[0].astype(np.float32) / scale, verbose=0).argmax(axis=-1)
+    mean_iou, accuracy, classes = quality.cityscapes_scores(quality.confusion_matrix(validation[1], predicted))
+    return {"mean_iou": mean_iou, "accuracy": accuracy, "person": classes["iou"].get("person", np.nan)}
+
+
+def _augmenter(size, variant):
+    transforms = augmentation.transform_list(size)
+    if variant == "noise of today":
+        transforms = [A.GaussNoise(std_range=NOISE_OF_TODAY, p=one.p) if isinstance(one, A.GaussNoise) else one
+                      for one in transforms]
+    return augmentation.Augmenter(transforms)
+
+
+def validation_losses(model, images, labels, seeds):
+    """The validation loss of a model by what the set is augmented with: a table of seed, nothing, blur and all."""
+    model.compile(loss=training.total_loss())
+    size, rows = images.shape[1], []
+    for seed in range(seeds):
+        sets = {"nothing": (images, labels),
+                "blur": augmentation.augment_set(images, labels, augmentation.validation_augmenter(size), seed),
+                "all": augmentation.augment_set(images, labels, augmentation.validation_augmenter(size, full=True),
+                                                seed)}
+        rows.append({"seed": seed} | {name: float(model.evaluate(
+            one.astype(np.float32), augmentation.one_hot(maps, N_CLASSES), batch_size=4, verbose=0))
+            for name, (one, maps) in sets.items()})
+    return pd.DataFrame(rows)
+
+
+def invented(label_map, seed):
+    """Share of pixels, percent, whose id the label map does not hold, where it is transformed as an image or as a mask.
+
+    As an image (Figure 3.2 of the appendix): shifted, scaled and blurred with interpolation. Returns (image, mask).
+    """
+    transforms = [A.Affine(scale=(0.5, 1.5), translate_percent=(-0.1, 0.1), p=1), A.Blur(blur_limit=3, p=1)]
+    found = []
+    for kind in ("image", "mask"):
+        compose = A.Compose(transforms)
+        compose.set_random_seed(seed)
+        given = {"image": label_map} if kind == "image" else {"image": np.zeros_like(label_map), "mask": label_map}
+        changed = compose(**given)[kind]
+        found.append(100 * float((~np.isin(changed, [0, *np.unique(label_map)])).mean()))
+    return tuple(found)
