@@ -12,7 +12,9 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
 TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
-OWN_TABLES, OWN_FIGURES = ["budget", "controls", "widths"], ["budget", "controls"]
+OWN_TABLES = ["answer", "audit", "budget", "controls", "widths"]
+OWN_FIGURES = ["answer", "answer_sequences", "budget", "controls"]
+OWN_TEXTS = ["answer_in_words", "findings"]
 FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" for n in range(1, 7)),
            *(f"figure_4_{n:02d}" for n in range(1, 18)), "figure_a_01"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
@@ -42,8 +44,8 @@ def test_all_notebooks_run_and_leave_every_artefact(tmp_path):
     figures = tmp_path / "figures" / "embedded-smoke"
     assert sorted(names(figures, ".svg") + names(figures, ".webp")) == sorted(FIGURES + OWN_FIGURES)
     assert names(figures, ".csv") == sorted(TABLES + OWN_TABLES)
-    assert names(figures, ".md") == sorted(TABLES + OWN_TABLES + ["findings"])
-    texts = [f"{name}.md" for name in (*TABLES[2:], *OWN_TABLES, "findings")]
+    assert names(figures, ".md") == sorted(TABLES + OWN_TABLES + OWN_TEXTS)
+    texts = [f"{name}.md" for name in (*TABLES[2:], *OWN_TABLES, *OWN_TEXTS)]
     texts += [path.name for path in figures.iterdir() if path.suffix in (".svg", ".webp")
               and path.stem not in WITHOUT_DATA]
     assert [name for name in texts if b"embedded world" not in (figures / name).read_bytes()] == []

@@ -184,7 +184,7 @@ def of_runs(summary):
 
 
 def of_switches(runs):
-    """Rows 10, 12 to 15, 28 to 30, 34, 36, 37, 40, 42 and 48, from the first table of `effects.measure`."""
+    """Rows 10, 12 to 15, 28 to 30, 34, 36, 37, 40, 42, 48 and 50, from the first table of `effects.measure`."""
     def of(variant, pose=None):
         rows = runs[runs["variant"] == variant]
         return rows if pose is None else rows[rows["pose"] == pose]
@@ -195,8 +195,11 @@ def of_switches(runs):
             ("12", "dilated symmetrically over the thesis's way", "symmetric", "masks"),
             ("28", "drawn by lot over the strongest", "any", "strongest"),
             ("37", "without keypoints on movable classes over all keypoints", "no movable", "all"),
+            ("37", "with masks without movable classes over masks", "masks, no movable", "masks"),
             ("42", "keypoints outside dropped over detected inside", "filter", "masks"),
-            ("48", "with ORB over Shi-Tomasi", "orb", "all")):
+            ("48", "with ORB over Shi-Tomasi", "orb", "all"),
+            ("50", "with corrected masks over the thesis's", "corrected", "masks"),
+            ("50", "with corrected masks over all keypoints", "corrected", "all")):
         effects += _compare(row, what, of(variant), of(reference))
         effects.append(_keypoints(row, of(variant), of(reference)))
     for variant, what in (("all", "all keypoints"), ("masks", "masks")):
@@ -265,8 +268,9 @@ def of_chance(prefixes):
     whole = prefixes[prefixes["frames"] == prefixes.groupby("sequence")["frames"].transform("max")]
     as_low = chance.share_as_low(whole, reported.mean(), reported.median())
     effects.append(Effect("39", f"the thesis reports mean {reported.mean():+.1f} %, median {reported.median():+.1f} %; "
-                                f"with the spread of whole sequences {100 * as_low[0]:.0f} and {100 * as_low[1]:.0f} of "
-                                "100 studies of masks that do nothing would report as low a number"))
+                                f"with the spread of the longest stretch {100 * as_low[0]:.0f} and "
+                                f"{100 * as_low[1]:.0f} of 100 studies of masks that do nothing would report as low a "
+                                "number"))
     return effects
 
 
@@ -297,9 +301,9 @@ def of_tracks(measured):
         reference = means.loc["all keypoints"].reindex(one.index)
         found = {column: _ratio(one[column] / reference[column]) for column in ("residual", "cells", "heading")}
         if name != "all keypoints" and found["heading"]:
-            effects.append(Effect("32", f"{name}: tracks off by {found['residual'][0]} as much as all keypoints, in "
+            effects.append(Effect("32", f"{name}: tracks off by {found['residual'][0]} as much as with all, in "
                                         f"{found['cells'][0]} as many parts of the frame, heading known "
-                                        f"{found['heading'][0]} as badly as with all", found["heading"][1]))
+                                        f"{found['heading'][0]} as badly", found["heading"][1]))
     return effects
 
 

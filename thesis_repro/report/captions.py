@@ -129,6 +129,17 @@ ON_LABEL_MAPS = {*(f"figure_4_{number:02d}" for number in (3, 4, 5, *range(7, 18
 # What is not in the thesis: (kind, name of the file), title, caption.
 ADDED = {
     ("text", "findings"): ("What the runs show", ""),
+    ("text", "answer_in_words"): ("The answer, in words", ""),
+    ("figure", "answer"): ("Error against number of keypoints", "How many times the error of all keypoints each method "
+                           "has, at as many keypoints as it leaves: markers are geometric means over sequences at the "
+                           "tested width, bars their intervals, lines lead through other widths and limits. Above, the "
+                           "thesis's estimator, below, the refined one, by which the question is judged; both scales "
+                           "are logarithmic."),
+    ("figure", "answer_sequences"): ("Error against number of keypoints, each sequence", "RMSE under the refined "
+                                     "estimator; bars go from the lowest to the highest of the repetitions."),
+    ("table", "answer"): ("The answer, in numbers", "Geometric means over sequences of the ratios of errors within "
+                          "each sequence, with bootstrap intervals; one that holds 1 shows no difference. The mean of "
+                          "percentages, as the thesis takes it, stands beside them."),
     ("text", "claims"): ("Section 4.1's claims about label maps", ""),
     ("figure", "domain_gap"): ("The gap between domains", "IoU of each class (Cityscapes' measure, over the whole set) "
                                "of the run's model and of the model in the package: on validation images of the run's "
@@ -154,6 +165,10 @@ ADDED = {
                            "included, against the ten frames a second that KITTI's camera takes."),
     ("table", "budget"): ("Time of a frame, in numbers", "Milliseconds of each stage, and the frames a second that "
                           "they allow one after another and with the next frame segmented meanwhile."),
+    ("table", "audit"): ("Audit", "Where the thesis contradicts itself, its code or its libraries, and claims that no "
+                         "table of it shows: what would be right, the switch that makes it so, and what that switch "
+                         "alone does here. Ratios are geometric means over sequences, spreads their intervals, or the "
+                         "range where there are fewer than three."),
 }
 
 _FACTORS = [2000 / row["mean_keypoints"] for row in REPORTED["table_4_1"]]

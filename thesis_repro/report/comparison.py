@@ -16,17 +16,18 @@ def _style(variant):
     return {"color": color, "marker": MARKERS[index], "label": answer.METHODS[variant]}
 
 
-def figure_answer(summary):
+def figure_answer(summary, every=None):
     """Ratio of each method's error to that of all keypoints against its number of keypoints; log scales.
 
     One row of panels an estimator, one column a metric. Markers are geometric means over sequences at the tested width,
-    bars their bootstrap intervals; lines lead through the other widths and limits that were run.
+    bars their bootstrap intervals; lines lead through the other widths and limits of `every`, which holds `summary`.
     """
+    every = summary if every is None else every
     poses = [pose for pose in results.POSES if len(results.of_variant(summary, "baseline", pose))]
     figure, axes = new_figure(len(poses), len(answer.METRICS), height=1.0 + 2.5 * len(poses), squeeze=False)
     for row, pose in zip(axes, poses, strict=True):
         for panel, (metric, name) in zip(row, answer.METRICS.items(), strict=True):
-            for variant, line in _lines(summary, metric, pose).groupby("variant", sort=False):
+            for variant, line in _lines(every, metric, pose).groupby("variant", sort=False):
                 panel.plot(line["keypoints"], line["ratio"], color=_style(variant)["color"], linewidth=0.9, alpha=0.6)
             for one in answer.compared(summary, metric, pose).itertuples():
                 if np.isfinite(one.low):
@@ -80,7 +81,8 @@ def _lines(summary, metric, pose):
     found["setting"] = found.groupby(["sequence", "variant"]).cumcount()
     counts = found.groupby("variant")["setting"].transform("max")
     found = found[(counts > 0) & (found["variant"] != "baseline")]
-    found = found.assign(ratio=np.log(found["mean"]) - found["sequence"].map(every), keypoints=np.log(found["keypoints"]))
+    found = found.assign(ratio=np.log(found["mean"]) - found["sequence"].map(every),
+                         keypoints=np.log(found["keypoints"]))
     return np.exp(found.groupby(["variant", "setting"], sort=False)[["keypoints", "ratio"]].mean()).reset_index()
 
 

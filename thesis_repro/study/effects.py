@@ -18,14 +18,14 @@ from thesis_repro import masks, odometry, stages
 from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
+from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
 from thesis_repro.odometry.passes import Masks, poses_of
 from thesis_repro.study.jobs import CONTROL_WIDTH
 
 POSES = ("all", "inliers", "refined")
-MOVABLE = [ID[name] for name in ("person", "rider", "car", "truck", "bus", "caravan", "trailer", "train",
-                                 "motorcycle", "bicycle", "license plate", "dynamic", "ego vehicle")]
 FEW = (100, 200, 400)  # keypoints: a twentieth, a tenth and a fifth of the thesis's 2000
+CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)  # all corrections of masks together
 WRONG = 2.0  # degrees: a step of FAST metres or more whose rotation is further off has failed
 FAST = 0.25
 TURN, STRAIGHT = 1.0, 0.3  # degrees a frame: a turn is more than the first, a straight stretch less than the second
@@ -35,14 +35,14 @@ TURN, STRAIGHT = 1.0, 0.3  # degrees a frame: a turn is more than the first, a s
 
 
 class FromLabels:
-    """Masks made of each frame's label map by a function of (label map, size, frame): masks[i] for frame i."""
+    """Masks made of each frame's label map by a function of (label map, size): masks[i] for frame i."""
 
-    def __init__(self, folder: Path, sequence: Sequence, make: Callable[[np.ndarray, tuple, int], np.ndarray]) -> None:
+    def __init__(self, folder: Path, sequence: Sequence, make: Callable[[np.ndarray, tuple], np.ndarray]) -> None:
         self.paths = [Path(folder) / path.name for path in sequence.frame_paths]
         self.size, self.make = sequence.size, make
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self.make(read_label_map(self.paths[index]), self.size, index)
+        return self.make(read_label_map(self.paths[index]), self.size)
 
 
 def enlarged_nearest(label_map: np.ndarray, size: tuple[int, int], dilation_width: int) -> np.ndarray:
@@ -51,25 +51,9 @@ def enlarged_nearest(label_map: np.ndarray, size: tuple[int, int], dilation_widt
     return masks.dilate(cv2.Canny(enlarged, masks.CANNY_LOW, masks.CANNY_HIGH), dilation_width)
 
 
-def symmetric(label_map: np.ndarray, size: tuple[int, int], dilation_width: int, boundaries: str) -> np.ndarray:
-    """The thesis's mask, but as wide to the left and above as to the right and below (audit row 12).
-
-    An even kernel has no middle; the next larger odd one with half a pixel at each border is the mean of both sides.
-    Pixels that only one of the two anchors keeps are kept every other column or row, so that as many stay.
-    """
-    edge_image = masks.edges(label_map, size, boundaries)
-    if dilation_width % 2:
-        return masks.dilate(edge_image, dilation_width)
-    kernel, half = np.ones((dilation_width, dilation_width), np.uint8), dilation_width // 2
-    one, other = (cv2.dilate(edge_image, kernel, anchor=(anchor, anchor)) for anchor in (half, half - 1))
-    chosen = (np.add.outer(np.arange(size[0]), np.arange(size[1])) % 2).astype(bool)
-    return np.where(chosen, one, other)
-
-
 def without_movable(label_map: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """No boundaries: all of the frame but what can move (Section 5.2 wants keypoints on what does not)."""
-    enlarged = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.where(np.isin(enlarged, MOVABLE), np.uint8(0), np.uint8(255))
+    return np.where(masks.forbidden(label_map, size, MaskSettings(movable=0)), np.uint8(0), np.uint8(255))
 
 
 class AnyKeypoints:
@@ -151,10 +135,11 @@ def runs_of(sequence: Sequence, labels: Path, plan: Plan
         "all": (THESIS, None),
         "masks": (THESIS, own),
         "filter": (replace(THESIS, mask_mode="filter"), own),
-        "nearest": (THESIS, FromLabels(labels, sequence, lambda one, size, _: enlarged_nearest(one, size, width))),
-        "symmetric": (THESIS, FromLabels(labels, sequence, lambda one, size, _: symmetric(one, size, width,
-                                                                                         boundaries))),
-        "no movable": (THESIS, FromLabels(labels, sequence, lambda one, size, _: without_movable(one, size))),
+        "nearest": (THESIS, FromLabels(labels, sequence, lambda one, size: enlarged_nearest(one, size, width))),
+        "symmetric": (THESIS, masks.LabelMasks(labels, sequence, width, MaskSettings(boundaries, symmetric=True))),
+        "corrected": (THESIS, masks.LabelMasks(labels, sequence, width, CORRECTED)),
+        "masks, no movable": (THESIS, masks.LabelMasks(labels, sequence, width, MaskSettings(boundaries, movable=0))),
+        "no movable": (THESIS, FromLabels(labels, sequence, without_movable)),
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
         "any": (THESIS, AnyKeypoints(sequence, number)),
         **{f"{few} keypoints": (replace(THESIS, max_keypoints=few), None) for few in FEW},
