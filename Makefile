@@ -33,7 +33,7 @@ export TF_CPP_MIN_LOG_LEVEL := 3
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 
-.PHONY: help setup figures test lint lab bench weights clean check-data
+.PHONY: help setup figures evidence test lint lab bench weights clean check-data
 
 help:
 	@echo "make figures     every table and figure into figures/, on embedded data"
@@ -44,6 +44,7 @@ help:
 	@echo "make lint        style (Ruff) and types (mypy)"
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
+	@echo "make evidence    the answer and the audit on real frames, KITTI=/path, into figures/kitti_excerpts"
 	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
 	@echo "make weights     trains the model that ships from nothing, CAMVID=/path KITTI_SEMANTIC=/path"
 	@echo "make setup       only .venv with the pinned packages"
@@ -119,11 +120,16 @@ bench: setup
 	@$(BIN)/python -m thesis_repro.bench.odometry --kitti "$(or $(KITTI),build/world-demo/kitti)" --output build/bench.json
 	@$(BIN)/python -m thesis_repro.bench.segmentation
 
+evidence: setup
+	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
+	@$(BIN)/python -m thesis_repro.report.evidence "$(KITTI)" figures/kitti_excerpts $(if $(JOBS),--jobs $(JOBS))
+
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
 	@$(if $(KITTI_SEMANTIC),,echo "KITTI_SEMANTIC must name the folder of KITTI's street scenes (train, trainannot)" >&2; exit 1)
 	@$(BIN)/python -m thesis_repro.segmentation.shipped "$(CAMVID)" "$(KITTI_SEMANTIC)" build/shipped
 
 clean:
-	rm -rf .venv build figures/*/ *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -exec rm -rf {} +
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -26,6 +26,7 @@ from thesis_repro.report import captions, gap, style
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
+EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 HERE = Path(__file__).parent
 THESIS = [name for artefacts in captions.CHAPTERS.values() for name in artefacts]
 ENDINGS = {"figure": (".svg", ".webp"), "table": (".csv", ".md"), "text": (".md",)}  # the first there is shown
@@ -93,6 +94,7 @@ def build(settings):
     return TEMPLATES.get_template("template.html").render(
         title=f"Tables and figures, {settings.run}", style="", settings=settings, facts=_facts(settings),
         chapters=chapters, shown=shown, of=len(THESIS), notebooks=notebooks,
+        evidence=EVIDENCE if (settings.figures / EVIDENCE).is_file() else None,
         missing=[one for chapter in chapters for one in chapter["artefacts"] if not one["there"]],
         folder=os.path.relpath(settings.build / "notebooks", settings.figures))
 
