@@ -1,1 +1,1 @@
-"""What the odometry and the segmentation cost on this machine; for development."""
+"""What odometry and segmentation cost on this machine, and how reliable the refined pose is; for development."""
