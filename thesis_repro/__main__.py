@@ -114,7 +114,7 @@ def odometry(options):
     from thesis_repro.files import write_text
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings
-    from thesis_repro.odometry import metrics
+    from thesis_repro.odometry import boresight, metrics
     from thesis_repro.report import video
 
     if options.labels and options.dilation is None:
@@ -134,11 +134,17 @@ def odometry(options):
     elif options.labels:
         masks = LabelMasks(options.labels, sequence, options.dilation, _mask_settings(options))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
+    if options.boresight:
+        result = boresight.apply(result, options.boresight)
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
+    relative = metrics.relative_errors(result.poses, sequence.poses)
     summary = {
         "sequence": sequence.name, "frames": len(sequence),
         "rmse_m": metrics.rmse(result.poses, sequence.poses, settings.alignment),
         "mae_m": metrics.mae(result.poses, sequence.poses, settings.alignment),
+        "ate_se3_m": _number(metrics.ate(result.poses, sequence.poses, "se3")["rmse"]),
+        "relative_translation_percent": _number(relative["translation_percent"]),
+        "relative_rotation_deg_per_m": _number(relative["rotation_deg_per_m"]),
         "mean_keypoints": float(result.frames["detected"].mean()),
         "ms_per_frame": 1000 * float(seconds.mean()),
         "flagged": {flag: int(count) for flag, count in result.flagged.items()},
@@ -156,9 +162,69 @@ def odometry(options):
     else:
         print(f"sequence {sequence.name}, {len(sequence)} frames\n"
               f"RMSE            {summary['rmse_m']:.6f} m\nMAE             {summary['mae_m']:.6f} m\n"
+              f"ATE, aligned    {_text(summary['ate_se3_m'], '.6f')} m\nover {metrics.RELATIVE_LENGTH:g} m       "
+              f"{_text(summary['relative_translation_percent'], '.3f')} %, "
+              f"{_text(summary['relative_rotation_deg_per_m'], '.5f')} degrees a metre\n"
               f"mean keypoints  {summary['mean_keypoints']:.1f}\ntime a frame    {summary['ms_per_frame']:.1f} ms")
         for flag, count in summary["flagged"].items():
             print(f"{flag:16}{count} frame{'s' * (count > 1)}")
+
+
+def boresight(options):
+    """estimate the constant rotation between camera and ground truth (degrees; for odometry --boresight)"""
+    from thesis_repro import odometry
+    from thesis_repro.kitti import Sequence
+    from thesis_repro.odometry import boresight
+
+    paths = {}
+    for name in dict.fromkeys(options.sequences):
+        sequence = Sequence(options.kitti, name)
+        estimated = odometry.run(sequence, replace(odometry.THESIS, pose="refined"), description=f"sequence {name}")
+        paths[name] = estimated.poses, sequence.poses
+    found, table = boresight.estimate(list(paths.values())), boresight.explained(paths)
+    if options.json:
+        units = dict.fromkeys(("steps", "others"), "") | dict.fromkeys(
+            ("rmse", "rmse_own", "rmse_others", "rotations", "directions", "ate"), "_m")
+        sequences = {row.pop("sequence"): {f"{key}{units.get(key, '_deg')}": _number(value)
+                                           for key, value in row.items()} for row in table.to_dict("records")}
+        print(json.dumps(_angles(found) | {"steps": found.steps, "sequences": sequences}))
+        return
+    for index, angle in enumerate(boresight.ANGLES):
+        print(f"{angle:6}{_degrees(found.angles[index], found.low[index], found.high[index])}")
+    print(f"from {found.steps} steps of sequences {', '.join(paths)}\n")
+    print("RMSE in metres: as it is, with the sequence's own angles, with those of the others of its recording day; and "
+          "what is\nleft of it where rotations alone, or directions of motion alone, are the odometry's. ATE: aligned. "
+          "Degrees: how much\nthe sideways direction of motion sways on straight steps, to the camera and in the "
+          f"truth, and by how much the\nrotations of both part over the first {boresight.START} steps.")
+    for row in table.to_dict("records"):
+        angles = (f"{angle} {_degrees(row[angle], row[f'{angle}_low'], row[f'{angle}_high'])}"
+                  for angle in boresight.ANGLES)
+        print(f"\nsequence {row['sequence']}: {', '.join(angles)}")
+        others = f", of {row['others']} {row['rmse_others']:.3f}" if row["others"] else ""
+        print(f"  RMSE {row['rmse']:.3f}, own angles {row['rmse_own']:.3f}{others}; rotations alone "
+              f"{row['rotations']:.3f}, directions alone {row['directions']:.3f}; ATE "
+              f"{_text(_number(row['ate']), '.3f')}\n  sway: camera {_text(_number(row['camera_sway']), '.2f')}, truth "
+              f"{_text(_number(row['truth_sway']), '.2f')}; first steps {row['start']:.2f}")
+
+
+def _angles(found):
+    from thesis_repro.odometry.boresight import ANGLES
+
+    values = {f"{name}_deg": _number(float(angle)) for name, angle in zip(ANGLES, found.angles, strict=True)}
+    return values | {f"{name}_interval_deg": None if low != low else [float(low), float(high)]
+                     for name, low, high in zip(ANGLES, found.low, found.high, strict=True)}
+
+
+def _degrees(angle, low, high):
+    return "not determined" if angle != angle else f"{angle:+.3f} ({low:+.3f} to {high:+.3f})"
+
+
+def _number(value):
+    return None if value != value else value  # JSON knows no NaN
+
+
+def _text(value, form):
+    return "none (too short or straight)" if value is None else format(value, form)
 
 
 def plan(options):
@@ -244,10 +310,17 @@ def build_parser():
     sub.add_argument("--detector", metavar="shi-tomasi|orb", help="of keypoints; they are tracked all the same")
     sub.add_argument("--min-distance", type=float, metavar="PIXELS", help="between keypoints (3)")
     sub.add_argument("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")
+    sub.add_argument("--boresight", type=float, nargs=3, metavar=("PITCH", "YAW", "ROLL"),
+                     help="turn the path by the rotation between camera and truth, degrees; see the command boresight")
     sub.add_argument("--output", type=Path, metavar="POSES.txt", help="estimated poses in KITTI's form")
     sub.add_argument("--tum", type=Path, metavar="FILE", help="estimated poses in TUM's form")
     sub.add_argument("--video", type=Path, metavar="OUT.mp4", help="what the odometry sees and where it goes")
     sub.add_argument("--frames-csv", type=Path, metavar="FILE", help="one row a frame")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
+
+    sub = command(boresight)
+    sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
+    sub.add_argument("--sequences", nargs="+", required=True, metavar="NN", help="sequences, 00 to 10")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
 
     sub = command(plan)

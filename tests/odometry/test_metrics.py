@@ -12,6 +12,7 @@ from evo.tools import file_interface
 from thesis_repro import InputError
 from thesis_repro.kitti import write_kitti_poses, write_tum
 from thesis_repro.odometry import metrics
+from thesis_repro.odometry.boresight import turned
 
 
 def path(positions):
@@ -156,6 +157,29 @@ def test_a_path_too_short_for_kittis_segments_says_so():
     errors = metrics.kitti_errors(short, short)
     assert np.isnan(errors["translation_percent"]) and np.isnan(errors["rotation_deg_per_m"])
     assert errors["note"] == "too short: 99.0 m, the shortest segment is 100 m" and errors["segments"] == 0
+
+
+def test_relative_errors_do_not_know_a_constant_rotation_between_the_frames():
+    true = winding()
+    estimated = drifted(true)
+    angles = (2.0, -3.0, 1.0)
+    plain, moved = (metrics.relative_errors(some, true, 10) for some in (estimated, turned(estimated, angles)))
+    for key in ("translation_percent", "rotation_deg_per_m"):
+        assert plain[key] > 0 and moved[key] == pytest.approx(plain[key], rel=1e-3)
+    assert metrics.relative_errors(turned(true, angles), true, 10)["translation_percent"] < 0.01
+    assert metrics.rmse(turned(true, angles), true) > 0.1
+
+
+def test_relative_errors_by_hand():
+    true = path([[0, 0, z] for z in range(31)])
+    longer = path([[0, 0, 1.02 * z] for z in range(31)])
+    errors = metrics.relative_errors(longer, true)
+    assert errors["segments"] == 11 and errors["note"] == ""
+    assert errors["translation_percent"] == pytest.approx(2, rel=1e-3)
+    assert errors["rotation_deg_per_m"] == pytest.approx(0, abs=1e-9)
+    short = metrics.relative_errors(true[:15], true[:15])
+    assert np.isnan(short["translation_percent"]) and short["note"] == (
+        "too short: 14.0 m, stretches of 20 m are compared")
 
 
 def test_evo_opens_the_trajectories(tmp_path):

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import cv2
 import evo
 import numpy as np
 import pandas as pd
@@ -33,14 +34,15 @@ def _differences(estimated, true, alignment):
     alignment: "position" shifts the estimate so that frame 1 agrees, as PySLAM's 2021 version does; "pose" also turns
     it so that the rotation of frame 1 agrees, as later versions do.
     """
-    estimated, true = _check(estimated, true)
+    estimated, true = checked(estimated, true)
     positions = estimated[1:, :3, 3] - estimated[1, :3, 3]
     if alignment == "pose":
         positions = positions @ (true[1, :3, :3] @ estimated[1, :3, :3].T).T
     return positions - (true[1:, :3, 3] - true[1, :3, 3])
 
 
-def _check(estimated, true):
+def checked(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both paths as arrays. Raises InputError where they have not one pose a frame each, or fewer than two."""
     estimated, true = np.asarray(estimated), np.asarray(true)
     if estimated.shape != true.shape:
         raise InputError(f"the estimated path has {len(estimated)} poses and the true one {len(true)}; "
@@ -88,13 +90,55 @@ def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
 
 def _evo_paths(estimated, true):
-    _check(estimated, true)
+    checked(estimated, true)
     return tuple(PosePath3D(poses_se3=list(np.array(some, np.float64))) for some in (true, estimated))
 
 
 def _statistics(error):
     values = error.get_all_statistics()
     return {key: float(values[key]) for key in ("rmse", "mean", "median", "max")}
+
+
+RELATIVE_LENGTH = 20.0  # metres: several of them in every path at hand
+
+
+def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = RELATIVE_LENGTH) -> dict[str, Any]:
+    """Mean errors over stretches of one length that no constant rotation between both frames and no start can change:
+    {translation_percent, rotation_deg_per_m, segments, note}.
+
+    From every frame to the first one `length` metres of true path away; the motion M of the camera against that of the
+    truth, both as in `kitti_segments`, after the one rotation B that brings all stretches nearest (B M B^T; Kabsch's
+    solution for their translations and rotation vectors). KITTI's own measure contains that rotation.
+    NaN, with a note, where the path is shorter than `length`.
+    """
+    estimated, true = checked(estimated, true)
+    travelled = _travelled(true)
+    last = np.searchsorted(travelled, travelled + length)
+    first = np.flatnonzero(last < len(true))
+    if not len(first):
+        return {"translation_percent": np.nan, "rotation_deg_per_m": np.nan, "segments": 0,
+                "note": f"too short: {travelled[-1]:.1f} m, stretches of {length:g} m are compared"}
+    motion, given = (np.linalg.inv(some[first]) @ some[last[first]] for some in (estimated, true))
+    vectors, goals = (np.concatenate([some[:, :3, 3], length * np.array([_rotation_vector(one) for one in some])])
+                      for some in (motion, given))
+    moments = goals.T @ vectors
+    # a little of the identity: what a straight path leaves open stays as it is
+    left, _, right = np.linalg.svd(moments + 1e-6 * np.trace(goals.T @ goals) * np.eye(3))
+    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    offsets = np.linalg.norm(given[:, :3, 3] - motion[:, :3, 3] @ turn.T, axis=1)
+    angles = [np.linalg.norm(_rotation_vector(one[:3, :3].T @ turn @ other[:3, :3] @ turn.T))
+              for one, other in zip(given, motion, strict=True)]
+    return {"translation_percent": float(offsets.mean() / length * 100),
+            "rotation_deg_per_m": float(np.degrees(np.mean(angles)) / length), "segments": len(first), "note": ""}
+
+
+def _travelled(poses):
+    """Metres along a path (n, 4, 4) up to each of its poses, (n,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+
+
+def _rotation_vector(pose):
+    return cv2.Rodrigues(np.ascontiguousarray(pose[:3, :3]))[0].ravel()
 
 
 KITTI_LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)  # metres
@@ -107,9 +151,8 @@ def kitti_segments(estimated: np.ndarray, true: np.ndarray) -> pd.DataFrame:
     From every tenth frame, for each length, up to the first frame more than that many metres of true path away. The
     translation error is in metres a metre, the rotation error in degrees a metre.
     """
-    estimated, true = _check(estimated, true)
-    steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
-    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    estimated, true = checked(estimated, true)
+    travelled = _travelled(true)
     rows = []
     for first in range(0, len(true), KITTI_EVERY):
         for length in KITTI_LENGTHS:
