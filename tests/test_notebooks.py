@@ -12,8 +12,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
 TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
-OWN_TABLES = ["answer", "audit", "budget", "controls", "widths"]
-OWN_FIGURES = ["answer", "answer_sequences", "budget", "controls"]
+OWN_TABLES = ["answer", "audit", "budget", "controls", "masks", "widths"]
+OWN_FIGURES = ["answer", "answer_sequences", "budget", "controls", "masks"]
 OWN_TEXTS = ["answer_in_words", "findings"]
 FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" for n in range(1, 7)),
            *(f"figure_4_{n:02d}" for n in range(1, 18)), "figure_a_01"]

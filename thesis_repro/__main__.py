@@ -192,10 +192,10 @@ def boresight(options):
     for index, angle in enumerate(boresight.ANGLES):
         print(f"{angle:6}{_degrees(found.angles[index], found.low[index], found.high[index])}")
     print(f"from {found.steps} steps of sequences {', '.join(paths)}\n")
-    print("RMSE in metres: as it is, with the sequence's own angles, with those of the others of its recording day; and "
-          "what is\nleft of it where rotations alone, or directions of motion alone, are the odometry's. ATE: aligned. "
-          "Degrees: how much\nthe sideways direction of motion sways on straight steps, to the camera and in the "
-          f"truth, and by how much the\nrotations of both part over the first {boresight.START} steps.")
+    print("RMSE in metres: as it is, with the sequence's own angles, with those of the others of its recording day;\n"
+          "and what is left where rotations alone, or directions of motion alone, are the odometry's. ATE: aligned.\n"
+          "Degrees: how much the sideways direction of motion sways on straight steps, to the camera and in the\n"
+          f"truth, and by how much the rotations of both part over the first {boresight.START} steps.")
     for row in table.to_dict("records"):
         angles = (f"{angle} {_degrees(row[angle], row[f'{angle}_low'], row[f'{angle}_high'])}"
                   for angle in boresight.ANGLES)

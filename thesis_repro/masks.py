@@ -141,6 +141,15 @@ def _mask(parts, dilation_width, settings):
     return mask
 
 
+def boundaries_found(mask: np.ndarray, true_labels: np.ndarray) -> float:
+    """Share of the true boundary pixels that a mask keeps, 0 to 1; true_labels: (h, w) ids of the mask's frame.
+
+    True boundaries are marked on both sides (`edges`, exact and symmetric). NaN where there are none.
+    """
+    true = edges(true_labels, mask.shape, "exact", symmetric=True) > 0
+    return float((mask[true] > 0).mean()) if true.any() else np.nan
+
+
 def coverage(mask: np.ndarray) -> float:
     """Share of the frame that the mask keeps, 0 to 1."""
     return float(np.count_nonzero(mask)) / mask.size

@@ -155,6 +155,13 @@ ADDED = {
                           "and the width that the other sequences choose, as changes in percent from all keypoints; "
                           "and how far the best width is chance. The intervals of chosen widths are too narrow: the "
                           "choices share most of their data."),
+    ("figure", "masks"): ("Masks, corrected", "The thesis's mask of one frame beside masks with one correction each, "
+                          "and with all of them: what is kept is light, with the keypoints on it; true boundaries are "
+                          "orange where the data has true label maps."),
+    ("table", "masks"): ("Masks, in numbers", "For the thesis's masks and for each correction: the share of the true "
+                         "boundary pixels that the mask keeps, of the predicted label maps and of the true ones, the "
+                         "part of the frame that it covers, and the keypoints on it; means over frames of the "
+                         "sequence. Blank where the data has no true label maps."),
     ("figure", "controls"): ("Controls", "Masks from the segmentation against masks and limits that know nothing of "
                              "it, under the thesis's estimator and under the refined one. If a control does as well, "
                              "it is not the segmentation that helps. Where changes are large, the axis follows the "

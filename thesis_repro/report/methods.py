@@ -94,6 +94,23 @@ def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
     return figure
 
 
+def figure_masks(frame, masks, keypoints, true_edges=None):
+    """Masks of one frame side by side, {title: (h, w)}, with their keypoints, {title: (n, 2)}, and the true boundaries.
+
+    What a mask keeps is light. true_edges: (h, w), 255 on them, or None where they are not known.
+    """
+    figure, axes = frame_panels(frame, -(-len(masks) // 2), 2)
+    for panel, (title, mask) in zip(axes, masks.items(), strict=False):
+        picture = np.dstack([np.where(mask > 0, frame // 2 + 127, frame // 3)] * 3)
+        if true_edges is not None:
+            picture[true_edges > 0] = EDGE
+        show_image(panel, picture, title)
+        panel.scatter(*keypoints[title].T, **KEYPOINT)
+    for panel in axes[len(masks):]:
+        panel.set_axis_off()
+    return figure
+
+
 def figure_4_01(history):
     """Training and validation curves: F1 score, IoU score, loss; one point an epoch."""
     figure, axes = new_figure(1, 3, height=2.6)
