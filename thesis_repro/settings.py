@@ -60,7 +60,7 @@ PROFILES = {
                      timed_frames=5, widths=(1, 5, 10, 15), repetitions=2, world_sequences=2, world_frames=12,
                      world_training_images=12, world_validation_images=4),
     "demo": Profile(image_size=160, base_filters=8, batch_size=4, epochs=18, patience=5, training_images=200,
-                    frames=200, timed_frames=7, widths=ALL_WIDTHS, repetitions=5, world_sequences=11, world_frames=None,
+                    frames=200, timed_frames=7, widths=ALL_WIDTHS, repetitions=3, world_sequences=11, world_frames=None,
                     world_training_images=100, world_validation_images=20),
     "thesis": Profile(image_size=320, base_filters=64, batch_size=16, epochs=100, patience=5, training_images=None,
                       frames=None, timed_frames=200, widths=ALL_WIDTHS, repetitions=5,

@@ -95,7 +95,7 @@ def figure_2_03():
     """Sigmoid against ReLU, with their derivatives."""
     x = np.linspace(-6, 6, 241)
     sigmoid = 1 / (1 + np.exp(-x))
-    figure, axes = new_figure(2, 2, height=3.6, sharex=True, sharey="row")
+    figure, axes = new_figure(2, 2, height=3.6, sharex=True)
     step = (np.array([-6, 0]), np.zeros(2)), (np.array([0, 6]), np.ones(2))
     for column, (title, value, slopes) in enumerate((
             ("sigmoid, 1 / (1 + exp(-x))", sigmoid, [(x, sigmoid * (1 - sigmoid))]),
@@ -104,7 +104,7 @@ def figure_2_03():
         axes[0, column].set_title(title)
         for slope in slopes:
             axes[1, column].plot(*slope, color=RED)
-        axes[1, column].set_xlabel("x (no unit)")
+        axes[1, column].set(xlabel="x (no unit)", ylim=(-0.06, 1.06))
     axes[1, 1].plot(0, 0, "o", color=RED, markersize=4, markerfacecolor="white")  # at 0 it has none
     axes[1, 1].plot(0, 1, "o", color=RED, markersize=4, markerfacecolor="white")
     axes[0, 0].set_ylabel("activation (no unit)")
@@ -313,6 +313,7 @@ def figure_2_09(first, second, title):
         axes[0].plot((u, x), (v, y + lower), linewidth=0.8, color=scale.to_rgba(match.distance), marker="o",
                      markersize=2)
     figure.colorbar(scale, ax=axes[0], location="right", shrink=0.7, pad=0.01, label="bits of 256 that differ")
+    figure.set_figheight(0.92 * figure.get_figheight())  # the bar takes some of the width
     return figure
 
 

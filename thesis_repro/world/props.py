@@ -69,7 +69,8 @@ def vehicle(names, rng, kind):
         second = np.array((wa, -ya, za + z0))
         faces.add(second, (-2 * wa, 0, 0), np.array((wb, -yb, zb + z0)) - second, texture, label, triangle=1,
                   uv=(1, -1, 0, va, 0, vb - va))
-    faces.add((-half, -0.32, z0), (2 * half, 0, 0), (0, 0, length), "bin", label, lit=0, gain=0.3)  # underside
+    under = half - max(narrower)
+    faces.add((-under, -0.32, z0), (2 * under, 0, 0), (0, 0, length), "bin", label, lit=0, gain=0.3)
     return faces.matrix()
 
 
