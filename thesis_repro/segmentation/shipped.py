@@ -58,8 +58,8 @@ class Preset:
 
     base_filters: int = 16
     # Crops at full scale cost a quarter of whole images; whole images are what the network is used on.
-    phases: tuple = (Phase(160, 8, 100, (2e-3, 2e-2)), Phase(160, 8, 5500, (2e-2, 2e-2)))
-    last: Phase = Phase(320, 4, 450, (2e-2, 0))  # run twice: without the pairs held out, and with them
+    phases: tuple = (Phase(160, 8, 100, (2e-3, 2e-2)), Phase(160, 8, 10400, (2e-2, 2e-2)))
+    last: Phase = Phase(320, 4, 700, (2e-2, 0))  # run twice: without the pairs held out, and with them
     shares: tuple = (("camvid", 0.5), ("kitti", 0.4), ("world", 0.1))  # of a batch, on average
     kitti_look: tuple = (("camvid", 0.4), ("kitti", 0.85), ("world", 0.7))  # share seen as KITTI shows it, not CamVid
     world_images: int = 100
