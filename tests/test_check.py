@@ -34,6 +34,19 @@ def test_every_problem_is_listed_and_the_exit_code_says_so(tiny_kitti, tiny_city
         assert any(re.search(pattern, problem) for problem in problems), pattern
 
 
+def test_street_scenes_need_no_validation_split(tiny_cityscapes, capsys):
+    for split in ("val", "valannot"):
+        for path in (tiny_cityscapes / split).iterdir():
+            path.unlink()
+    assert main(["check-data", "--kitti-semantic", str(tiny_cityscapes)]) == 0
+    assert "split train: 4 images with label maps" in capsys.readouterr().out
+    assert main(["check-data", "--cityscapes", str(tiny_cityscapes)]) == 1
+    (tiny_cityscapes / "trainannot" / "street_0.png").unlink()
+    capsys.readouterr()
+    assert main(["check-data", "--kitti-semantic", str(tiny_cityscapes)]) == 1
+    assert "has no label map" in capsys.readouterr().err
+
+
 def test_wrong_camera_is_noticed(tiny_kitti):
     for index in range(4):
         cv2.imwrite(str(tiny_kitti / f"sequences/00/image_0/{index:06d}.png"), np.zeros((376, 1241), np.uint8))

@@ -29,10 +29,21 @@ def test_runs_of_other_data_and_profiles_never_meet(tmp_path):
     assert "model in the package" in runs[2].data_note and "embedded" not in runs[4].data_note
 
 
+def test_street_scenes_to_judge_by_are_a_run_of_their_own(tmp_path):
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
+    settings = read_settings({"THESIS_REPRO_KITTI_SEMANTIC": str(scenes)})
+    assert settings.kitti_semantic == scenes and str(scenes) in str(settings)
+    assert settings.run != "embedded-demo" and settings.figures.name == settings.run  # not what visitors see
+    assert settings.kitti_is_embedded and settings.world == read_settings({}).world
+    assert read_settings({}).kitti_semantic is None
+
+
 @pytest.mark.parametrize("environment, says", [
     ({"THESIS_REPRO_PROFILE": "huge"}, "PROFILE=huge: unknown profile; choose one of smoke, demo, thesis"),
     ({"THESIS_REPRO_PROFIL": "demo"}, "THESIS_REPRO_PROFIL: unknown setting"),
     ({"THESIS_REPRO_KITTI": "/no/such/folder"}, "KITTI=/no/such/folder: no such folder"),
+    ({"THESIS_REPRO_KITTI_SEMANTIC": "/no/such/folder"}, "KITTI_SEMANTIC=/no/such/folder: no such folder"),
     ({"THESIS_REPRO_JOBS": "0"}, "JOBS=0: must be"),
     ({"THESIS_REPRO_JOBS": "many"}, "JOBS=many: must be"),
 ])

@@ -33,3 +33,23 @@ def test_the_input_side_holds_bytes_not_floats():
                                      check=True).stdout.split()[-1])
     # two bytes a pixel, an image and its label map, and some batches
     assert 0.9 * 2 * 5950 * 64**2 / 1e9 < gigabytes < 4 * 2 * 5950 * 64**2 / 1e9
+
+
+def test_operations_are_those_of_the_convolutions_that_run():
+    model = build_unet((32, 32, 1), 35, 2)
+
+    def convolutions(side, inputs, filters):
+        return side**2 * 9 * inputs * filters
+
+    way_down = [convolutions(32, 1, 2), convolutions(16, 2, 4), convolutions(8, 4, 8), convolutions(4, 8, 16),
+                convolutions(2, 16, 32)]
+    up = [2 * 2 * 4 * 32 * 16, 4 * 4 * 4 * 16 * 8, 8 * 8 * 4 * 8 * 4, 16 * 16 * 4 * 4 * 2]
+    way_up = [convolutions(4, 32, 16), convolutions(8, 16, 8), convolutions(16, 8, 4), convolutions(32, 4, 2)]
+    assert bench_segmentation.operations(model) == 2 * (sum(way_down + up + way_up) + 32**2 * 2 * 35)
+
+
+def test_the_share_of_the_peak_follows_from_the_times():
+    found = bench_segmentation.arithmetic(build_unet((32, 32, 1), 35, 2), side=128, repeats=2)
+    assert found["share_of_peak"] == pytest.approx(found["network_gflops"] / found["peak_gflops"])
+    assert found["network_gflops"] == pytest.approx(found["gflop_an_image"] / found["ms_an_image"] * 1000)
+    assert 0 < found["share_of_peak"] < 1

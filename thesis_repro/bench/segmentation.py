@@ -1,13 +1,16 @@
 """Memory of the training input, and the speed of training input and prediction, measured on this machine.
 
-`python -m thesis_repro.bench_segmentation` prints all of it; each function returns its numbers as a dict.
+`python -m thesis_repro.bench.segmentation` prints all of it; each function returns its numbers as a dict.
 """
 
+import math
 import tempfile
 import time
 from pathlib import Path
 
+import keras
 import numpy as np
+import tensorflow as tf
 
 from thesis_repro import cityscapes, files
 from thesis_repro.segmentation import memory, prediction, training
@@ -68,6 +71,43 @@ def prediction_speed(model=None, frames=48, one_by_one=12, batch_size=16, frame_
             "sequence_frames_per_s": 1 / fast, "times_faster": slow / fast}
 
 
+def operations(model):
+    """Floating-point operations of one image: a multiplication and an addition for each weight of a convolution.
+
+    What else the network does (normalisation, activation, pooling, softmax) is some operations a value, not hundreds.
+    """
+    total = 0
+    for layer in model.layers:
+        if isinstance(layer, keras.layers.Conv2DTranspose):  # each value goes to its places through a kernel's weights
+            places, weights = layer.input.shape[1:3], layer.kernel.shape
+        elif isinstance(layer, keras.layers.Conv2D):
+            places, weights = layer.output.shape[1:3], layer.kernel.shape
+        else:
+            continue
+        total += 2 * math.prod(places) * math.prod(weights)
+    return total
+
+
+def arithmetic(model, images=prediction.CALL, side=2048, repeats=5):
+    """The share of the machine's peak that a network reaches, in memory, from uint8 images to label maps.
+
+    The peak is that of a large float32 matrix product by the same library on the same threads. Both are measured in
+    turns and the best of each is taken, so that what else the machine does counts little.
+    """
+    size = model.input_shape[1]
+    some = _noise(images, size, 0)[0]
+    matrix = tf.constant(np.random.default_rng(0).standard_normal((side, side), np.float32))
+    product = tf.function(lambda: tf.reduce_sum(tf.matmul(matrix, matrix)))
+    product(), prediction.predict(model, some)  # compiles
+    seconds = [(_seconds(lambda: product().numpy()), _seconds(lambda: prediction.predict(model, some)))
+               for _ in range(repeats)]
+    peak, network = (min(times) for times in zip(*seconds))
+    done = operations(model)
+    return {"size": size, "gflop_an_image": done / 1e9, "peak_gflops": 2 * side**3 / peak / 1e9,
+            "network_gflops": done * images / network / 1e9, "ms_an_image": 1000 * network / images,
+            "share_of_peak": (done * images / network) / (2 * side**3 / peak)}
+
+
 def _noise(count, size, seed):
     random = np.random.default_rng(seed)
     return (random.integers(0, 256, (count, size, size, 1), np.uint8),
@@ -100,6 +140,13 @@ def main():
         found = prediction_speed(model, frames, one_by_one)
         print(f"prediction, {name}: {found['sequence_frames_per_s']:.1f} frames/s, model.predict one by one "
               f"{found['one_by_one_frames_per_s']:.1f}: {found['times_faster']:.2f} times as fast")
+
+
+    for name, model, *_ in networks:
+        found = arithmetic(model)
+        print(f"arithmetic, {name}: {found['gflop_an_image']:.2f} GFLOP an image, {found['ms_an_image']:.0f} ms, "
+              f"{found['network_gflops']:.0f} of {found['peak_gflops']:.0f} GFLOP/s: "
+              f"{100 * found['share_of_peak']:.0f} % of the machine's peak")
 
 
 if __name__ == "__main__":
