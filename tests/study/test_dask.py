@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -157,3 +158,31 @@ def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, sm
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
     older = runner._run_pass(jobs, study, record, 1)
     assert "another version of thesis_repro or of OpenCV" in older[jobs[0]]
+
+
+def test_label_maps_of_workers_have_the_bits_of_one_process(workers, scheduler, small_world, tmp_path, monkeypatch):
+    from thesis_repro.__main__ import main
+    from thesis_repro.cityscapes import N_CLASSES
+    from thesis_repro.segmentation import prediction
+    from thesis_repro.segmentation.unet import build_unet
+
+    build_unet((64, 64, 1), N_CLASSES, 4).save(tmp_path / "model.keras")
+    monkeypatch.setattr(prediction, "PART", 4)
+    monkeypatch.setattr(prediction, "spread_label_maps", partial(prediction.spread_label_maps, batch_size=4))
+    monkeypatch.setattr(prediction, "write_label_maps", partial(prediction.write_label_maps, batch_size=4))
+    sequences = small_world / "kitti" / "sequences"
+    command = ["predict", "--images", sequences / "00", sequences / "01", "--model", tmp_path / "model.keras"]
+    assert main([*map(str, command), "--output", str(tmp_path / "alone")]) == 0
+    assert main([*map(str, command), "--output", str(tmp_path / "spread"), "--dask", scheduler]) == 0
+
+    def contents(folder):
+        return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*.*"))}
+
+    assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)
+    assert contents(tmp_path / "spread") == contents(tmp_path / "alone")
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "spread").rglob("*.png")}
+    first = next(iter(written))
+    first.unlink()
+    assert main([*map(str, command), "--output", str(tmp_path / "spread"), "--dask", scheduler]) == 0
+    assert contents(tmp_path / "spread") == contents(tmp_path / "alone")
+    assert sum(path.stat().st_mtime_ns == when for path, when in written.items()) == 2 * FRAMES - 4  # but one batch

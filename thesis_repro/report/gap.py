@@ -89,8 +89,14 @@ def _domains(some):
 
 
 def _sky(some):
+    there = some[some["sky_iou"].notna()]
+    if there.empty:
+        return ""
+    worse = there["domain"][there["sky_iou"] < there["mean_iou"]]
     return "Sky: " + ", ".join(f"IoU {row.sky_iou:.2f} with {100 * row.sky_recall:.0f} % of it found on {row.domain}"
-                               for row in some.itertuples() if not np.isnan(row.sky_iou)) + "."
+                               for row in there.itertuples()) + (
+        f"; below the mean of the classes on {', '.join(worse)}." if len(worse) else
+        "; above the mean of the classes everywhere.")
 
 
 def _shadows(some):
