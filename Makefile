@@ -10,7 +10,8 @@ PROFILE ?= demo
 BIN := .venv/bin
 
 # A misspelled setting must not pass for the default.
-KNOWN := KITTI CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON
+SIZES := IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
+KNOWN := KITTI CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON $(SIZES)
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
@@ -23,7 +24,7 @@ absolute = $(if $(filter /% ~%,$(firstword $(1))),$(1),$(CURDIR)/$(1))
 export THESIS_REPRO_PROFILE := $(PROFILE)
 $(foreach name,KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES,$(if $($(name)),\
   $(eval export THESIS_REPRO_$(name) := $(call absolute,$($(name))))))
-$(foreach name,JOBS DASK_SCHEDULER,$(if $($(name)),$(eval export THESIS_REPRO_$(name) := $($(name)))))
+$(foreach name,JOBS DASK_SCHEDULER $(SIZES),$(if $($(name)),$(eval export THESIS_REPRO_$(name) := $($(name)))))
 DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)") \
                 $(if $(KITTI_SEMANTIC),--kitti-semantic "$(KITTI_SEMANTIC)")
 # what the libraries would otherwise say or look up
@@ -33,13 +34,15 @@ export TF_CPP_MIN_LOG_LEVEL := 3
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 
-.PHONY: help setup figures evidence test lint lab bench weights clean check-data
+.PHONY: help setup figures evidence test lint lab bench weights clean check-data plan
 
 help:
 	@echo "make figures     every table and figure into figures/, on embedded data"
 	@echo "                 KITTI=/path CITYSCAPES=/path   on your own data"
 	@echo "                 KITTI_SEMANTIC=/path           label maps judged on KITTI's street scenes too"
-	@echo "                 PROFILE=smoke|demo|thesis      how large (demo)"
+	@echo "                 PROFILE=smoke|demo|thesis      how large (demo), or one by one: IMAGE_SIZE BASE_FILTERS"
+	@echo "                 BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS"
+	@echo "make plan        what that would take, KITTI=/path, with the same settings"
 	@echo "make test        unit tests, and every notebook on the smallest profile"
 	@echo "make lint        style (Ruff) and types (mypy)"
 	@echo "make lab         JupyterLab on the notebooks"
@@ -67,10 +70,16 @@ setup: .venv/ready
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 ifneq (,$(filter figures,$(MAKECMDGOALS)))
 # ($(shell) of this make does not see what is exported.)
-RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS,THESIS_REPRO_$(name)='$(THESIS_REPRO_$(name))') \
+RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS $(SIZES),THESIS_REPRO_$(name)='$(THESIS_REPRO_$(name))') \
          $(PYTHON) -m thesis_repro.settings)
 ifeq (,$(RUN))
 $(error the settings above are wrong)
+endif
+# With real frames and no Cityscapes the model in the package makes the label maps: nothing is rendered or trained.
+ifneq (,$(THESIS_REPRO_KITTI))
+ifeq (,$(THESIS_REPRO_CITYSCAPES))
+NOTEBOOKS := $(filter-out notebooks/01_% notebooks/02_% notebooks/04_%,$(NOTEBOOKS))
+endif
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
@@ -101,6 +110,9 @@ $(foreach notebook,$(notdir $(NOTEBOOKS)),\
   $(eval $(call execute,$(notebook),$(previous)))\
   $(eval previous := $(RUN)/notebooks/$(notebook)))
 endif
+
+plan: setup
+	@$(BIN)/python -m thesis_repro plan $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)")
 
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS)

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from dataclasses import fields, replace
 from importlib.metadata import version
@@ -227,16 +228,55 @@ def _text(value, form):
     return "none (too short or straight)" if value is None else format(value, form)
 
 
+def study(options):
+    """run the odometry with masks of your own beside all keypoints and controls, and leave tables, figures, a page"""
+    from thesis_repro import kitti
+    from thesis_repro.report import study
+    from thesis_repro.settings import ALL_WIDTHS, cores
+    from thesis_repro.study import jobs, plan, series
+
+    if not options.sources:
+        raise InputError("no masks: name a folder of label maps with --labels or of masks with --masks")
+    widths = options.widths
+    if not any(kind == "labels" for kind, _ in options.sources):
+        if widths or options.controls:
+            raise InputError(f"{'--widths' if widths else f'--controls {options.controls}'}: only masks from label "
+                             "maps (--labels) have a width")
+        widths = ()
+    elif widths is None:
+        widths = ALL_WIDTHS
+    planned = series.checked(series.Study(
+        options.kitti.absolute(), tuple(options.sequences or kitti.sequences(options.kitti)),
+        series.named(options.sources, options.name), tuple(sorted(set(widths))),
+        jobs.CONTROL_WIDTH if options.controls == 0 else options.controls, tuple(dict.fromkeys(options.pose)),
+        options.repetitions, options.frames))
+    if options.plan:
+        print(plan.of_study(planned))
+        return
+    if options.jobs is not None and options.jobs < 1:
+        raise InputError(f"--jobs {options.jobs}: must be 1 or more")
+    folder = options.output.absolute()
+    summary = planned.run(folder, options.jobs or cores(), options.dask)
+    print(f"{len(summary):,} runs; open {study.write(planned, summary, folder)} in a browser")
+
+
 def plan(options):
-    """say how long all runs over a KITTI folder would take here, and their memory and disk, from a short calibration"""
+    """say how long make figures would take here, training included, its memory and disk, from a short calibration"""
+    from thesis_repro import cityscapes, kitti
+    from thesis_repro.settings import read_settings
     from thesis_repro.study import plan
 
-    if options.repetitions < 1 or min(options.cores) < 1:
+    # the sizes of the thesis, but for what make's PROFILE, EPOCHS and so on say
+    sizes = read_settings({"THESIS_REPRO_PROFILE": "thesis"} | {
+        name: value for name, value in os.environ.items() if name.startswith("THESIS_REPRO_")}).sizes
+    repetitions = sizes.repetitions if options.repetitions is None else options.repetitions
+    if repetitions < 1 or min(options.cores) < 1:
         raise InputError("--repetitions and --cores: need whole numbers of 1 or more")
-    frames = plan.counts(options.kitti, options.complete)
-    calibration = plan.calibrate(options.kitti, options.repetitions)
-    planned = plan.make(options.kitti, frames, calibration, options.repetitions, options.cores)
-    print(plan.text(options.kitti, planned, calibration, options.repetitions, options.complete))
+    images = len(cityscapes.pairs(options.cityscapes, "train")) if options.cityscapes else 0
+    frames = plan.counts(options.kitti, options.complete, sizes.frames)
+    work = plan.Thesis(options.kitti, tuple(kitti.sequences(options.kitti)), sizes, repetitions=repetitions)
+    calibration = plan.calibrate(work)
+    print(plan.text(work, plan.make(work, frames, calibration, options.cores, images), calibration, options.complete))
 
 
 def build_parser():
@@ -323,11 +363,38 @@ def build_parser():
     sub.add_argument("--sequences", nargs="+", required=True, metavar="NN", help="sequences, 00 to 10")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
 
+
+    sub = command(study)
+    sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
+    sub.add_argument("--sequences", nargs="+", metavar="NN", help="those to run (all that ROOT holds)")
+    sub.add_argument("--labels", dest="sources", action="append", type=lambda text: ("labels", Path(text)),
+                     metavar="DIR", help="a folder of label maps (Cityscapes ids, any size, named like the frames) for "
+                                         "each sequence, DIR/NN; several times for several networks")
+    sub.add_argument("--masks", dest="sources", action="append", type=lambda text: ("masks", Path(text)),
+                     metavar="DIR", help="the same with masks of the frames' size, 255 keep, 0 ignore")
+    sub.add_argument("--name", action="append", default=[], metavar="NAME",
+                     help="of each --labels and --masks, in their order (the folder's)")
+    sub.add_argument("--widths", type=int, nargs="+", metavar="W",
+                     help="dilation widths in pixels of masks from label maps (1 to 15)")
+    sub.add_argument("--controls", type=int, nargs="?", const=0, metavar="W",
+                     help="masks and limits that know no segmentation, beside masks of width W (10)")
+    sub.add_argument("--repetitions", type=int, default=5, metavar="N",
+                     help="of every run, each with the correspondences in another order (5)")
+    sub.add_argument("--pose", nargs="+", choices=("all", "refined"), default=["all"],
+                     help="the estimator: the thesis's (all, default), the refined one, or both")
+    sub.add_argument("--frames", type=int, metavar="N", help="from the start of each sequence (all)")
+    place = sub.add_mutually_exclusive_group()
+    place.add_argument("--jobs", type=int, metavar="N", help="processes at once (as many as there are cores)")
+    place.add_argument("--dask", metavar="ADDRESS", help="a Dask scheduler that the runs are sent to, tcp://host:8786")
+    sub.add_argument("--plan", action="store_true", help="say what it would take, and run nothing")
+    sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for everything it writes")
+
     sub = command(plan)
     sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
+    sub.add_argument("--cityscapes", type=Path, metavar="ROOT", help="count the training of a network on these images")
     sub.add_argument("--complete", action="store_true",
                      help="plan for the complete benchmark, 23,201 frames, even where ROOT holds less")
-    sub.add_argument("--repetitions", type=int, default=5, metavar="N", help="of every run (5)")
+    sub.add_argument("--repetitions", type=int, metavar="N", help="of every run (5)")
     sub.add_argument("--cores", type=int, nargs="+", default=[1, 4, 8, 16, 64], metavar="N",
                      help="numbers of cores to plan for (1 4 8 16 64)")
     return parser

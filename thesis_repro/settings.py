@@ -6,7 +6,7 @@ Every variable starts with THESIS_REPRO_; `make figures KITTI=... CITYSCAPES=...
 import hashlib
 import os
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from thesis_repro import InputError
@@ -23,7 +23,18 @@ VARIABLES = {
     "JOBS": "processes that work at once; as many as there are cores when not set",
     "DASK_SCHEDULER": "address of a Dask scheduler (tcp://host:8786) that the odometry runs are sent to",
     "PROGRESS": "file or terminal that progress bars are written to",
+    # sizes of the profile, one by one
+    "IMAGE_SIZE": "pixels, both ways, of the network's input",
+    "BASE_FILTERS": "channels of the network's first block",
+    "BATCH_SIZE": "images in a batch",
+    "EPOCHS": "most epochs of the training",
+    "FRAMES": "frames from the start of each sequence, or all",
+    "WIDTHS": "dilation widths in pixels, such as 5,10 or 1-15",
+    "REPETITIONS": "runs of each kind, with the correspondences in another order each time",
 }
+# the least that each may be, and what it must be a multiple of
+LIMITS = {"IMAGE_SIZE": (32, 16), "BASE_FILTERS": (1, 1), "BATCH_SIZE": (1, 1), "EPOCHS": (1, 1), "FRAMES": (5, 1),
+          "WIDTHS": (1, 1), "REPETITIONS": (1, 1)}
 ALL_WIDTHS = tuple(range(1, 16))
 
 
@@ -89,27 +100,36 @@ class Settings:
     seed: int = SEED
 
     @property
+    def shipped(self):
+        """Whether the label maps come from the model in the package: with real frames and nothing to train on."""
+        return self.cityscapes_is_embedded and not self.kitti_is_embedded
+
+    @property
     def data_note(self):
         """One line for captions: which data the numbers come from."""
         odometry = "embedded world (rendered)" if self.kitti_is_embedded else "the user's KITTI folder"
         training = "embedded world (rendered)" if self.cityscapes_is_embedded else "the user's Cityscapes folder"
-        if self.cityscapes_is_embedded and not self.kitti_is_embedded:  # see notebook 5
+        if self.shipped:
             odometry += ", label maps by the model in the package"
-        return f"odometry: {odometry}; training: {training}; profile {self.profile}"
+        sizes = "".join(f", {name.replace('_', ' ')} {_short(value)}"
+                        for name, value in _changed(self.profile, self.sizes).items())
+        return f"odometry: {odometry}; training: {training}; profile {self.profile}{sizes}"
 
     def __str__(self):
         rows = {"run": self.run, "odometry data": self.kitti, "training data": self.cityscapes,
                 **({"KITTI semantic": self.kitti_semantic} if self.kitti_semantic else {}),
+                "label maps by": "the model in the package" if self.shipped else "the network of this run",
                 "results": self.build, "figures": self.figures, "processes": self.jobs, "seed": self.seed,
                 **{key.replace("_", " "): value for key, value in asdict(self.sizes).items()
                    if not key.startswith("world_") or self.kitti_is_embedded or self.cityscapes_is_embedded}}
-        return "\n".join(f"{key:24}{'all' if value is None else _short(value)}" for key, value in rows.items())
+        return "\n".join(f"{key:24}{_short(value)}" for key, value in rows.items())
 
 
 def read_settings(environment=None):
     """The settings from the environment's THESIS_REPRO_ variables.
 
-    Raises InputError for an unknown variable, an unknown profile, a missing data folder or a bad number.
+    Raises InputError for an unknown variable, an unknown profile, a missing data folder or a bad number. Sizes that are
+    not the profile's are part of the run's name.
     """
     environment = os.environ if environment is None else environment
     given = {name[len(PREFIX):]: value for name, value in environment.items() if name.startswith(PREFIX) and value}
@@ -118,7 +138,7 @@ def read_settings(environment=None):
     profile = given.get("PROFILE", "demo")
     if profile not in PROFILES:
         raise InputError(f"PROFILE={profile}: unknown profile; choose one of {', '.join(PROFILES)}")
-    jobs = given.get("JOBS", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()))
+    jobs = given.get("JOBS", str(cores()))
     if not jobs.isdigit() or int(jobs) < 1:
         raise InputError(f"JOBS={jobs}: must be a whole number of processes, 1 or more")
     build = Path(given.get("BUILD", ROOT / "build")).absolute()
@@ -127,15 +147,64 @@ def read_settings(environment=None):
     kitti, cityscapes, kitti_semantic = (_data_folder(name, given.get(name))
                                          for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC"))
     data = "_".join(_short_name(name, path) for name, path in (("kitti", kitti), ("cityscapes", cityscapes)) if path)
+    sizes = own_sizes(profile, given)
     judged = f"_{_short_name('semantic', kitti_semantic)}" if kitti_semantic else ""
-    run = f"{data or 'embedded'}{judged}-{profile}"
+    run = "-".join([f"{data or 'embedded'}{judged}", profile, *(f"{name.replace('_', '-')}-{_in_a_name(value)}"
+                                                                for name, value in _changed(profile, sizes).items())])
     return Settings(
-        profile=profile, sizes=PROFILES[profile], kitti=kitti or world / "kitti",
+        profile=profile, sizes=sizes, kitti=kitti or world / "kitti",
         cityscapes=cityscapes or world / "cityscapes", kitti_is_embedded=kitti is None,
         cityscapes_is_embedded=cityscapes is None, run=run, build=build / run,
         # the default run's figures are what visitors see; those of all others go into folders beside them
         figures=figures if run == "embedded-demo" else figures / run,
         world=world, jobs=int(jobs), scheduler=given.get("DASK_SCHEDULER"), kitti_semantic=kitti_semantic)
+
+
+def own_sizes(profile, given):
+    """The sizes of a profile with those that are given as text, {"EPOCHS": "3", "FRAMES": "all", "WIDTHS": "1-15"}.
+
+    Raises InputError, naming the first that it cannot be.
+    """
+    return replace(PROFILES[profile], **{name.lower(): _size(name, given[name]) for name in LIMITS if name in given})
+
+
+def _size(name, text):
+    if name == "FRAMES" and text == "all":
+        return None
+    least, step = LIMITS[name]
+    numbers = _numbers(text) if name == "WIDTHS" else [int(text)] if text.isdecimal() else []
+    if not numbers or any(number < least or number % step for number in numbers):
+        kind = "whole numbers, such as 5,10 or 1-15," if name == "WIDTHS" else "a whole number"
+        raise InputError(f"{name}={text}: must be {kind}{' or all,' * (name == 'FRAMES')} of {least} or more"
+                         f"{f' and a multiple of {step}' * (step > 1)}")
+    return tuple(numbers) if name == "WIDTHS" else numbers[0]
+
+
+def _numbers(text):
+    """The numbers of "1-3, 7", sorted; none where it is something else."""
+    found = set()
+    for word in text.replace(",", " ").split():
+        first, _, last = word.partition("-")
+        if not first.isdecimal() or ("-" in word and not last.isdecimal()):
+            return []
+        found |= set(range(int(first), int(last or first) + 1)) or {0}
+    return sorted(found)
+
+
+def _changed(profile, sizes):
+    """The sizes that are not the profile's, by name."""
+    own = {name.lower(): getattr(sizes, name.lower()) for name in LIMITS}
+    return {name: value for name, value in own.items() if value != getattr(PROFILES[profile], name)}
+
+
+def _in_a_name(value):
+    text = "_".join(map(str, value)) if isinstance(value, tuple) else "all" if value is None else str(value)
+    return text if len(text) <= 40 else hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def cores():
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 def _data_folder(name, value):
@@ -153,6 +222,8 @@ def _short_name(name, path):
 
 
 def _short(value):
+    if value is None:
+        return "all"
     if isinstance(value, Path):
         try:
             return value.relative_to(ROOT)

@@ -9,6 +9,7 @@ from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
 from thesis_repro.study import controls, results, runner
 from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, mask_control_jobs, reduced_jobs
+from thesis_repro.study.sources import Source
 
 WIDTH = 10
 
@@ -21,7 +22,7 @@ def sequence(small_world):
 @pytest.fixture(scope="module")
 def made(sequence, small_labels):
     """Every control's masks and the thesis's own."""
-    return {variant: controls.masks(variant, small_labels / "00", sequence, WIDTH) for variant in controls.MASKS} | {
+    return {variant: controls.masks(variant, Source(small_labels), sequence, WIDTH) for variant in controls.MASKS} | {
         "masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
 
 
@@ -94,7 +95,7 @@ def test_true_labels_are_those_of_the_world(sequence, small_world, made):
 
 def test_a_sequence_without_label_maps_has_no_controls(sequence, tmp_path):
     with pytest.raises(InputError, match="no such folder; it must hold one label map"):
-        controls.masks("mirrored", tmp_path / "none", sequence, WIDTH)
+        controls.masks("mirrored", Source(tmp_path / "none"), sequence, WIDTH)
 
 
 def test_keypoints_spread_out_are_as_many_as_asked_for(sequence):
@@ -147,7 +148,7 @@ def test_another_width_is_that_of_every_mask(small_world, small_labels, tmp_path
 
 def test_all_masks_have_the_boundaries_that_are_asked_for(sequence, small_labels, made):
     exact = masks.LabelMasks(small_labels / "00", sequence, WIDTH, "exact")
-    chosen = {variant: controls.masks(variant, small_labels / "00", sequence, WIDTH, "exact")
+    chosen = {variant: controls.masks(variant, Source(small_labels), sequence, WIDTH, "exact")
               for variant in controls.MASKS}
     assert not np.array_equal(exact[5], made["masked"][5])
     assert np.array_equal(chosen["other-frame"][5], exact[11])

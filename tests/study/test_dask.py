@@ -141,7 +141,7 @@ def test_a_scheduler_without_workers_says_so(scheduler):
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"])
 def test_a_scheduler_that_does_not_answer_is_one_clear_line(address, monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 1)
-    with pytest.raises(InputError, match=f"DASK_SCHEDULER={address}: no scheduler answers there") as error:
+    with pytest.raises(InputError, match=f"Dask scheduler {address}: none answers there") as error:
         with cluster.open_pool(1, address):
             pass
     assert "\n" not in str(error.value)
@@ -151,7 +151,7 @@ def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, sm
     jobs, kitti = first_jobs(["00"], ()), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
     record = runner.stages.made_from(tmp_path / "00")
-    study = runner._Study(kitti, small_labels, tmp_path, frames=None, boundaries="canny")
+    study = runner._Study(kitti, runner.by_name(small_labels), tmp_path, frames=None, boundaries="canny")
     elsewhere = runner._run_pass(jobs, replace(study, folder=tmp_path / "elsewhere"), record, 1)
     assert "same folders under the same paths" in elsewhere[jobs[0]]
     (tmp_path / "00" / "baseline-0.csv").unlink()

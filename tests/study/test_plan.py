@@ -10,6 +10,7 @@ from thesis_repro import InputError, kitti, stages
 from thesis_repro.__main__ import main
 from thesis_repro.study import plan, runner
 from thesis_repro.study.jobs import first_jobs, mask_control_jobs
+from thesis_repro.study.sources import Source
 
 pytestmark = pytest.mark.slow
 
@@ -17,15 +18,17 @@ SERIES = plan.FIRST_SERIES, plan.SECOND_SERIES
 EXCERPT = plan.Excerpt("00 from frame 2", jobs=dict(zip(SERIES, (168, 30))),
                        series=dict(zip(SERIES, (1.68 + 0.05, 0.3 + 0.05))), shared=0.05, row_bytes=500.0,
                        worker_bytes=200_000_000)
-CALIBRATION = plan.Calibration([EXCERPT], timing=0.5, networks=dict.fromkeys(plan.MODELS, 1.0),
-                               network_bytes=2_000_000_000, label_bytes=6000.0, seconds=30.0)
+MODELS = plan.SHIPPED, plan.OWN
+CALIBRATION = plan.Calibration([EXCERPT], timing=0.5, networks=dict.fromkeys(MODELS, 1.0), network_bytes=2_000_000_000,
+                               label_bytes=6000.0, seconds=30.0, training=3.0, training_bytes=9_000_000_000)
 
 
 def test_the_complete_benchmark_is_added_up(tmp_path):
-    made = plan.make(tmp_path, kitti.FRAME_COUNTS, CALIBRATION, 2, (1, 4, 64))
+    work = plan.Thesis(tmp_path, (), repetitions=2)
+    made = plan.make(work, kitti.FRAME_COUNTS, CALIBRATION, (1, 4, 64), training_images=2975)
     # 34 thesis runs without the 2 reduced, refined baseline and masks, 5 mask controls under both estimators
     assert made.jobs == dict(zip(SERIES, (11 * (32 + 4 + 20), 11 * (2 + 4 + 4))))
-    assert made.label_hours == dict.fromkeys(plan.MODELS, pytest.approx(23201 / 3600))
+    assert made.label_hours == dict.fromkeys(MODELS, pytest.approx(23201 / 3600))
     # one pass a sequence: what all share, and a hundredth of a second a job
     assert made.odometry_hours == pytest.approx(dict(zip(SERIES, (23201 * (0.05 + 0.56) / 3600,
                                                                   23201 * (0.05 + 0.1) / 3600))))
@@ -37,6 +40,12 @@ def test_the_complete_benchmark_is_added_up(tmp_path):
     # no faster than the longest sequence with what no cut can take from it
     assert hours[64] * 3600 > 2 * 4661 * 0.05
     assert made.memory_bytes[64] > made.memory_bytes[4] > made.worker_bytes[4] > 200_000_000
+    # the thesis's 4760 images for 100 epochs, and 1190 to validate with
+    assert made.training_images == 4760
+    assert made.training_hours == pytest.approx(100 * (4760 * 3 + 1190 * 1) / 3600)
+    text = plan.text(work, made, CALIBRATION, complete=True)
+    assert "its training, up to 100 epochs of 4,760 images" in text and "a training batch of 16 at least 9.0 GB" in text
+    assert f"{made.training_hours + sum(made.odometry_hours.values()) + made.timing_hours + 23201 / 3600:.2f}" in text
 
 
 def test_workers_take_what_comes_next():
@@ -46,7 +55,7 @@ def test_workers_take_what_comes_next():
 
 
 def test_the_excerpts_are_spread_over_all_frames(small_world):
-    places = [(sequence.name, start) for sequence, start in plan._places(small_world / "kitti")]
+    places = [(sequence.name, start) for sequence, start in plan._places(plan.Thesis(small_world / "kitti", ("00", "01")))]
     assert places == [("00", 4), ("01", 0), ("01", 6)]  # frames 4, 12 and 20 of 24; the last as far as it goes
 
 
@@ -64,7 +73,8 @@ def quick(monkeypatch):
     """The thesis's plan with one width and no network of 64 filters, so that it takes seconds."""
     monkeypatch.setattr(plan, "EXCERPTS", 1)
     monkeypatch.setattr(plan, "NETWORK_IMAGES", 1)
-    monkeypatch.setattr(plan, "_thesis_model", plan._shipped_model)
+    monkeypatch.setattr(plan, "_own_model", lambda sizes: plan._shipped_model())
+    monkeypatch.setattr(plan, "_training", lambda *_: (2.0, 1_000_000))
 
 
 def test_the_command_prints_a_table(small_world, quick, capsys):
@@ -88,8 +98,10 @@ def test_the_calibration_is_near_what_a_run_takes(small_world, tmp_path):
         cv2.imwrite(str(labels / path.name), label_map)
         cv2.imwrite(str(more / path.name), label_map)
     with plan.ProcessPoolExecutor(1, plan.get_context("spawn")) as pool:
-        excerpt = pool.submit(plan._measure, tmp_path / "excerpt", "00", 1).result()
-    jobs = first_jobs(["00"], plan.PROFILE.widths) + mask_control_jobs(sequence.root, ["00"])
+        work = plan.Thesis(tmp_path / "excerpt" / "kitti", (plan.NAME,), repetitions=1,
+                           sources=(Source(tmp_path / "excerpt" / "labels"),))
+        excerpt = pool.submit(plan._measure, tmp_path / "excerpt", "00", work).result()
+    jobs = first_jobs(["00"], plan.Thesis.sizes.widths) + mask_control_jobs(sequence.root, ["00"])
     started = time.process_time()
     runner.run(jobs, sequence.root, tmp_path / "labels", tmp_path / "results")
     seconds = time.process_time() - started
@@ -114,9 +126,9 @@ def test_a_damaged_frame_is_named_where_the_user_has_it(tiny_kitti, monkeypatch)
     path = tiny_kitti / "sequences/00/image_0/000002.png"
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(InputError, match="kitti/sequences/00/image_0/000002.png: the image is truncated"):
-        plan.calibrate(tiny_kitti, 1)
+        plan.calibrate(plan.Thesis(tiny_kitti, ("00",), repetitions=1))
 
 
 def test_too_short_a_sequence_is_one_clear_line(tiny_kitti):
     with pytest.raises(InputError, match="too short to plan from; one of 6 frames"):
-        plan.calibrate(tiny_kitti, 1)
+        plan.calibrate(plan.Thesis(tiny_kitti, ("00",), repetitions=1))

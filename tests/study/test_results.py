@@ -224,7 +224,7 @@ def test_runs_without_a_test_have_the_width_of_the_thesis_and_two_tests_have_non
     summary = summary_of(ELEVEN, narrow_is_good)
     assert results.tested_width(summary[summary["pose"] == "all"]) == 10
     both = pd.concat([summary, summary_of(ELEVEN, narrow_is_good, tested=5)])
-    with pytest.raises(InputError, match="masked runs of the widths 5, 10 under the refined estimator"):
+    with pytest.raises(InputError, match="controls of the widths 5, 10; masks are put to the test at one"):
         results.tested_width(both)
 
 

@@ -126,6 +126,12 @@ CHAPTERS = {
 ON_LABEL_MAPS = {*(f"figure_4_{number:02d}" for number in (3, 4, 5, *range(7, 18))), "table_4_1", "table_4_2",
                  "table_4_3", "widths", "controls"}
 
+
+# What shows a network being trained, or set against label maps: left out where the model in the package is used.
+OF_TRAINING = {"table_3_1", "table_3_2", "figure_4_01", "figure_4_02",
+               *(f"figure_3_{number:02d}" for number in range(1, 6))}
+CARD = "thesis_repro/segmentation/weights/README.md"  # of the model in the package
+
 # What is not in the thesis: (kind, name of the file), title, caption.
 ADDED = {
     ("text", "findings"): ("What the runs show", ""),
@@ -176,6 +182,25 @@ ADDED = {
                          "table of it shows: what would be right, the switch that makes it so, and what that switch "
                          "alone does here. Ratios are geometric means over sequences, spreads their intervals, or the "
                          "range where there are fewer than three."),
+}
+
+# What a study with masks of one's own shows: (kind, name of the file), title, caption. NAME is that of a source.
+STUDY = {
+    ("text", "findings"): ("What the runs show", ""),
+    ("table", "sources"): ("The masks side by side", "Mean changes in percent from all keypoints under the same "
+                           "estimator (Equation 4.1; negative is better), every source of masks and width."),
+    ("figure", "keypoints-all"): ("Error against keypoints, thesis's estimator", "Above, the mean change of RMSE over "
+                                  "the sequences and its interval against the part of the keypoints that the masks "
+                                  "leave, one line a source. Below, each sequence by itself; bars go from the lowest "
+                                  "to the highest repetition, the diamond is all keypoints."),
+    ("figure", "keypoints-refined"): ("Error against keypoints, refined estimator", "As before, where RANSAC's inliers "
+                                      "alone decide and the motion is fitted to them."),
+    ("figure", "controls-NAME"): ("Controls of NAME", "These masks against masks and limits that know nothing of the "
+                                  "segmentation. If a control does as well, it is not the segmentation that helps."),
+    ("table", "controls-NAME"): ("Controls of NAME, in numbers", ADDED["table", "controls"][1]),
+    ("table", "widths-NAME"): ("A fair choice of width for NAME", ADDED["table", "widths"][1]),
+    ("table", "errors"): ("Every sequence", "RMSE and MAE in metres, means over the repetitions and their range, and "
+                          "changes in percent from all keypoints."),
 }
 
 _FACTORS = [2000 / row["mean_keypoints"] for row in REPORTED["table_4_1"]]

@@ -4,6 +4,7 @@ A difference is only called one where its bootstrap interval over sequences excl
 sequences for that to mean something; everything else "cannot be told apart".
 """
 
+from itertools import combinations
 from math import comb
 
 import numpy as np
@@ -30,12 +31,23 @@ def verdict(differences):
     return -1 if high < 0 else 1 if low > 0 else 0
 
 
+def study_words(summary, data):
+    """The same on a summary with several sources of masks: each by itself, then one against the other."""
+    parts = [_about(summary, data), _chance(summary)]
+    for source in results.sources(summary):
+        own = results.of_source(summary, source)
+        parts += [f"### {source}", _again(own), _choice(own), *(_against_controls(own, pose) for pose in POSES)]
+    parts += [_against_each_other(summary, pose) for pose in POSES]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
 def words(summary, data, label_maps=None):
     """A Markdown text on what a summary of runs shows; data: one line that says where they come from.
 
     label_maps: one line on how good these are (`gap.line`).
     """
-    parts = [_about(summary, data), _label_maps(label_maps), _chance(summary), _choice(summary)]
+    parts = [_about(summary, data), _label_maps(label_maps), f"{_chance(summary)} {_again(summary)}".strip(),
+             _choice(summary)]
     parts += [_against_controls(summary, pose) for pose in POSES]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -69,38 +81,44 @@ def _chance(summary):
     errors = results.over_orders(baseline, "rmse")
     ratio = errors["highest"] / errors["lowest"]
     widest = f" and up to {ratio.max():.2g} times ({ratio.idxmax()})" if len(ratio) > 1 else ""
-    text = ("**How much is chance.** With all keypoints, the order of the correspondences alone makes the highest RMSE "
+    return ("**How much is chance.** With all keypoints, the order of the correspondences alone makes the highest RMSE "
             f"of a sequence {ratio.median():.2g} times its lowest (median over sequences){widest}.")
+
+
+def _again(summary):
+    """Whether the best width is so again where the order of the correspondences is another."""
     stability = results.stability(summary).dropna()
-    if len(stability):
-        number = results.of_variant(summary, "masked")["dilation_width"].nunique()
-        promised = results.widths(summary).loc[stability.index, "best_rmse"]
-        text += (" A sequence's best width in one repetition is the best in another "
-                 f"{stability['same_best'].mean():.0f} times in 100; lots drawn among {number} widths would agree "
-                 f"{100 / number:.0f} times. Chosen in one repetition and judged in the others, it changes RMSE by "
-                 f"{_signed(stability['elsewhere'].mean())} % on average; chosen and judged by the same runs, as in "
-                 f"the thesis, by {_signed(promised.mean())} %.")
-    return text
+    number = results.of_variant(summary, "masked")["dilation_width"].nunique()
+    if stability.empty or number < 2:
+        return ""
+    promised = results.widths(summary).loc[stability.index, "best_rmse"]
+    return ("A sequence's best width in one repetition is the best in another "
+            f"{stability['same_best'].mean():.0f} times in 100; lots drawn among {number} widths would agree "
+            f"{100 / number:.0f} times. Chosen in one repetition and judged in the others, it changes RMSE by "
+            f"{_signed(stability['elsewhere'].mean())} % on average; chosen and judged by the same runs, as in "
+            f"the thesis, by {_signed(promised.mean())} %.")
 
 
 def _choice(summary):
     table = results.widths(summary)
-    if table.empty:
+    if table.empty or results.of_variant(summary, "masked")["dilation_width"].nunique() < 2:
         return ""
-    text = ("**Masks against all keypoints, thesis's estimator.** With the width of the lowest RMSE on each sequence "
-            f"(the thesis says RMSE and/or MAE): {_changes(table, 'best')}. That choice favours masks even where they "
-            "do nothing, so it is no test.")
+    text = (f"**Masks against all keypoints, {POSES[results.main_pose(summary)]}.** With the width of the lowest RMSE "
+            f"on each sequence (the thesis says RMSE and/or MAE): {_changes(table, 'best')}. That choice favours masks "
+            "even where they do nothing, so it is no test.")
     if len(table) > 1:
         text += (f" With one width for all ({table['fixed'].iloc[0]}), chosen on the same sequences too: "
                  f"{_changes(table, 'fixed')}. With the width that the other sequences choose: "
                  f"{_changes(table, 'left_out')}; that is no longer favoured, but the choices hang together and an "
                  f"interval would be too narrow. {_tested(summary)}")
-    return text
+    return text.strip()
 
 
 def _tested(summary):
     """Where the width that is put to the test comes from."""
     width = results.tested_width(summary)
+    if "masked" not in results.control_changes(summary, "rmse"):
+        return ""
     if width != CONTROL_WIDTH:
         return (f"The test below is of the width {width}, set in place of Section 3.6's {CONTROL_WIDTH}; it is a fair "
                 "one if it was set before any run was seen.")
@@ -124,9 +142,10 @@ def _against_controls(summary, pose):
     changes = results.control_changes(summary, "rmse", pose)
     if "masked" not in changes:
         return ""
-    text = (f"**Masks of width {results.tested_width(summary)} and the controls, {POSES[pose]}.** With masks RMSE "
+    width, others = results.tested_width(summary), [variant for variant in changes if variant != "masked"]
+    masks = "These masks" if width is None else f"Masks of width {width}"
+    text = (f"**{masks}{' and the controls' if others else ''}, {POSES[pose]}.** With masks RMSE "
             f"{_judged(changes['masked'])}.")
-    others = [variant for variant in changes if variant != "masked"]
     signs = {variant: verdict(changes["masked"] - changes[variant]) for variant in others}
     for sign, said in ((-1, "is smaller than with"), (1, "is larger than with"), (0, f"{SAME} that with")):
         found = [f"{CONTROLS[variant]} ({_mean(changes['masked'] - changes[variant], ' points')})"
@@ -134,6 +153,23 @@ def _against_controls(summary, pose):
         if found:
             text += f" It {said} {', '.join(found)}."
     return text + _in_sequences(summary, others, pose) + _conclusion(changes["masked"], signs)
+
+
+def _against_each_other(summary, pose):
+    changes, called = {}, {}
+    for source in results.sources(summary):
+        own = results.of_source(summary, source)
+        found, width = results.control_changes(own, "rmse", pose), results.tested_width(own)
+        if "masked" in found:
+            changes[source] = found["masked"]
+            called[source] = source if width is None else f"{source} (width {width})"
+    said = {-1: "is smaller than with", 0: f"{SAME} that with", 1: "is larger than with"}
+    found = [f"with {called[one]} RMSE {said[verdict(changes[one] - changes[other])]} {called[other]} "
+             f"({_mean(changes[one] - changes[other], ' points')})" for one, other in combinations(changes, 2)]
+    if not found:
+        return ""
+    text = "; ".join(found)
+    return f"### One against the other, {POSES[pose]}\n\nChanges from all keypoints compared: {text}."
 
 
 def _in_sequences(summary, others, pose):

@@ -193,8 +193,9 @@ def figure_controls(summary):
     table = results.controls(summary)
     table = table[table["variant"] != "baseline"]
     variants = [variant for variant in results.CONTROLS if variant in set(table["variant"])]
-    figure, axes = new_figure(2, 2, height=1.6 + 0.5 * len(variants), sharex="col", sharey=True)
-    for column, (pose, text) in enumerate(results.POSES.items()):
+    poses = [pose for pose in results.POSES if (table["pose"] == pose).any()]
+    figure, axes = new_figure(2, len(poses), height=1.6 + 0.5 * len(variants), sharex="col", sharey=True, squeeze=False)
+    for column, pose in enumerate(poses):
         extreme = [0.0]
         for panel, metric in zip(axes[:, column], ("rmse", "mae")):
             changes = results.control_changes(summary, metric, pose)
@@ -209,7 +210,7 @@ def figure_controls(summary):
                 panel.plot(row[metric], y + 0.1, "D" if masked else "o", color=color, markersize=5.5,
                            markeredgecolor="white")
                 extreme += list(values)
-            panel.set_title(f"{metric.upper()}, {text}")
+            panel.set_title(f"{metric.upper()}, {results.POSES[pose]}")
             panel.grid(axis="y", visible=False)
         scaled = _percent_scale(axes[:, column], min(extreme), max(extreme))
         axes[1, column].set_xlabel("change from all keypoints (%)" + scaled * ",\non the scale of the errors' ratio")
@@ -238,6 +239,53 @@ def _percent_scale(panels, lowest, highest):
         panel.xaxis.set_minor_locator(NullLocator())
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.0f}" if value else "0"))
     return True
+
+
+def figure_keypoints(summary, pose):
+    """Error against number of keypoints, one line a source of masks: over all sequences, then each by itself.
+
+    pose: estimator. A line joins the widths of a source; bars go from the lowest to the highest repetition, above over
+    the interval of the mean.
+    """
+    table, means = (rows[rows["pose"] == pose] for rows in (results.errors(summary), results.side_by_side(summary)))
+    names, sources = sorted(table["sequence"].unique()), results.sources(summary)
+    columns = min(4, len(names))
+    rows = -(-len(names) // columns)
+    figure, _ = new_figure(height=3.4 + 1.6 * rows)
+    figure.clear()
+    above, below = figure.subfigures(2, 1, height_ratios=[2.9, 1.6 * rows + 0.5])
+    axes = above.subplots()
+    for index, source in enumerate(sources):
+        own = means[means["source"] == source].sort_values("kept")
+        change, line = own["rmse_change"], line_style(index)
+        spread = np.array([change - own["rmse_low"], own["rmse_high"] - change])
+        axes.errorbar(own["kept"], change, yerr=None if np.isnan(spread).all() else spread, marker="o", markersize=3,
+                      elinewidth=0.7, label=source, **line)
+    axes.plot(100, 0, "D", color="black", markersize=5, label="all keypoints")
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set(xlabel="keypoints kept (%)", ylabel="change of RMSE (%)",
+             title=f"Error against keypoints, mean over sequences, {results.POSES[pose]}")
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    panels = below.subplots(rows, columns, squeeze=False)
+    for panel, name in zip(panels.flat, names):
+        of_name = table[table["sequence"] == name]
+        for index, source in enumerate(["", *sources]):
+            own = of_name[of_name["source"] == source].sort_values("mean_keypoints")
+            line = line_style(index - 1) if source else {"color": "black", "linestyle": "none"}
+            panel.errorbar(own["mean_keypoints"], own["rmse"],
+                           yerr=[own["rmse"] - own["rmse_lowest"], own["rmse_highest"] - own["rmse"]],
+                           marker="o" if source else "D", markersize=2.5, linewidth=1, elinewidth=0.6, **line)
+        panel.set_title(name, fontsize=8, pad=3)
+        panel.set_ylim(0, None)
+        panel.tick_params(labelsize=7)
+        panel.xaxis.set_major_locator(MaxNLocator(4))
+    for panel in panels.flat[len(names):]:
+        panel.set_axis_off()
+    for panel in panels.flat[max(0, len(names) - columns):len(names)]:
+        panel.set_xlabel("keypoints", fontsize=8)
+    for panel in panels[:, 0]:
+        panel.set_ylabel("RMSE (m)", fontsize=8)
+    return figure
 
 
 def figure_4_17(seconds):

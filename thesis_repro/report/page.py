@@ -95,7 +95,9 @@ def build(settings):
         title=f"Tables and figures, {settings.run}", style="", settings=settings, facts=_facts(settings),
         chapters=chapters, shown=shown, of=len(THESIS), notebooks=notebooks,
         evidence=EVIDENCE if (settings.figures / EVIDENCE).is_file() else None,
-        missing=[one for chapter in chapters for one in chapter["artefacts"] if not one["there"]],
+        missing=[one for chapter in chapters for one in chapter["artefacts"] if not one["there"]
+                 and not one["left_out"]],
+        left_out=[one for chapter in chapters for one in chapter["artefacts"] if one["left_out"]], card=captions.CARD,
         folder=os.path.relpath(settings.build / "notebooks", settings.figures))
 
 
@@ -103,26 +105,32 @@ def _facts(settings):
     sizes = settings.sizes
     frames = "all frames" if sizes.frames is None else f"at most {sizes.frames} frames"
     images = "all images" if sizes.training_images is None else f"at most {sizes.training_images} images"
+    network = (f"network {sizes.image_size}x{sizes.image_size} with {sizes.base_filters} filters in the first block, "
+               f"up to {sizes.epochs} epochs on {images}; ")
     sequences = _read(settings.figures / "table_4_1.csv")
     return {
         "odometry data": "embedded world" if settings.kitti_is_embedded else f"KITTI folder “{settings.kitti.name}”",
         "sequences": ", ".join(f"{row['sequence']} ({row['frames']} frames)"
                                for row in sequences.to_dict("records") if row.get("frames")),
-        "training data": "embedded world" if settings.cityscapes_is_embedded
+        "label maps": f"by the model in the package; its card is {captions.CARD}" if settings.shipped else None,
+        "training data": None if settings.shipped else "embedded world" if settings.cityscapes_is_embedded
                          else f"Cityscapes folder “{settings.cityscapes.name}”",
         "KITTI's street scenes": settings.kitti_semantic and f"folder “{settings.kitti_semantic.name}”",
-        "label maps": (said := gap.line(settings.build)) and said.removeprefix("label maps "),
-        "profile": f"{settings.profile}: network {sizes.image_size}x{sizes.image_size} with {sizes.base_filters} "
-                   f"filters in the first block, up to {sizes.epochs} epochs on {images}; {frames} of each sequence, "
+        "quality of label maps": (said := gap.line(settings.build)) and said.removeprefix("label maps "),
+        "profile": f"{settings.profile}: {'' if settings.shipped else network}{frames} of each sequence, "
                    f"{len(sizes.widths)} dilation widths, {sizes.repetitions} repetitions",
         "seeds": f"{settings.seed} throughout; repetition 0 keeps the order of the correspondences, repetition n "
                  "shuffles it with seed n",
         "results of": _when(settings),
         "code": _commit(),
         "Python": f"{platform.python_version()} on {platform.system()} {platform.machine()}, {settings.jobs} processes",
-        "packages": ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
-                    + "; environment.txt has them all",
+        "packages": _packages(),
     }
+
+
+def _packages():
+    return (", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
+            + "; environment.txt has them all")
 
 
 def _when(settings):
@@ -146,23 +154,45 @@ def _commit():
 
 def _artefact(settings, kind, name, title, caption, makers):
     """What the template needs to show a table, a figure or a text, or to say that it is missing."""
-    files = [path for ending in ENDINGS[kind] if (path := settings.figures / f"{name}{ending}").is_file()]
-    shown = ENDINGS[kind] if kind == "figure" else ENDINGS[kind][:1]
-    path = next((path for path in files if path.suffix in shown), None)
-    number = None
+    number, shown = None, _shown(settings.figures, kind, name)
     if name in THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
         _, chapter, count = name.split("_")
         number = f"{kind.capitalize()} {chapter.upper()}.{int(count)}"
     return {
         "kind": kind, "id": name if number or kind == "text" else f"{kind}-{name}", "number": number,
         "title": f"{number}. {title}" if number else title, "caption": caption,
-        "there": path is not None, "files": [path.name for path in files],
         "makers": makers.get(name, []), "reported": _reported(settings, name), "here": None,
         "label_maps": gap.line(settings.build) if name in captions.ON_LABEL_MAPS else None,
+        **shown, "left_out": settings.shipped and name in captions.OF_TRAINING and not shown["there"],
+    }
+
+
+def _shown(folder, kind, name):
+    """What there is of a table, a figure or a text in a folder."""
+    files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
+    shown = ENDINGS[kind] if kind == "figure" else ENDINGS[kind][:1]
+    path = next((path for path in files if path.suffix in shown), None)
+    return {
+        "there": path is not None, "files": [path.name for path in files], "left_out": False,
         "size": _size(path) if path and kind == "figure" else None,
         "table": _table(path) if path and kind == "table" else None,
         "html": _markdown(path.read_text(encoding="utf-8")) if path and kind == "text" else None,
     }
+
+
+def build_study(folder, artefacts, facts, embedded):
+    """The page of a study as HTML, from the files in its folder.
+
+    artefacts: {(kind, name): (title, caption)}, as in captions. facts: what was run, {name: text}.
+    embedded: whether the frames are those of the embedded world.
+    """
+    shown = [{"kind": kind, "id": name if kind == "text" else f"{kind}-{name}", "number": None, "title": title,
+              "caption": caption, "makers": [], "reported": None, "here": None, **_shown(folder, kind, name)}
+             for (kind, name), (title, caption) in artefacts.items()]
+    return TEMPLATES.get_template("study.html").render(
+        title="A study of masks", style="", artefacts=shown, embedded=embedded, notebooks={}, facts=facts | {
+            "code": _commit(), "Python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
+            "packages": _packages()})
 
 
 def _makers():

@@ -124,6 +124,41 @@ def _between(table, low, high):
     return [pd.NA if np.isnan(one) else f"{one:+.1f} to {other:+.1f}" for one, other in zip(table[low], table[high])]
 
 
+def table_sources(summary):
+    """Every source of masks and width side by side: mean changes from all keypoints, with intervals."""
+    table = results.side_by_side(summary)
+    shown = _source_columns(table).assign(sequences=table["sequences"])
+    shown["mean keypoints"] = table["mean_keypoints"].round().astype(int)
+    shown["kept (%)"] = table["kept"].round(1)
+    for metric in ("rmse", "mae"):
+        label = metric.upper()
+        shown[f"{label} (%)"] = table[f"{metric}_change"].round(1)
+        shown[f"{label}, {results.LEVEL} % interval"] = _between(table, f"{metric}_low", f"{metric}_high")
+        shown[f"{label} improved"] = table[f"{metric}_improved"].astype("Int64")
+    return shown
+
+
+def table_errors(summary):
+    """Every sequence by itself: errors in metres, mean and range of the repetitions, and keypoints."""
+    table = results.errors(summary)
+    shown = pd.concat([table["sequence"], _source_columns(table)], axis=1).assign(frames=table["frames"])
+    shown["mean keypoints"] = table["mean_keypoints"].round().astype(int)
+    for metric in ("rmse", "mae"):
+        label = metric.upper()
+        spread = table[[f"{metric}_lowest", f"{metric}_highest"]].set_axis(["lowest", "highest"], axis=1)
+        shown[f"{label} (m)"] = table[metric].map(_significant)
+        shown[f"{label}, range"] = _ranges(spread)
+        shown[f"{label} (%)"] = table[f"{metric}_change"].where(table["source"] != "").round(1)
+    shown["flagged frames"] = table["flagged"].round(1)
+    return shown.sort_values("sequence", kind="stable", ignore_index=True)
+
+
+def _source_columns(table):
+    return pd.DataFrame({"estimator": table["pose"].map(results.POSES),
+                         "masks": table["source"].where(table["source"] != "", "all keypoints"),
+                         "width (pixels)": table["dilation_width"].astype("Int64")})
+
+
 def table_budget(measured, overlapped):
     """Milliseconds a frame of each stage, one column a variant, and the frames a second that they allow.
 

@@ -20,7 +20,7 @@ from thesis_repro import InputError, masks, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
-from thesis_repro.study.runner import masks_of
+from thesis_repro.study.runner import by_name, masks_of
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
 PLAIN = "all keypoints"  # the variant without network and mask; the other is "masked, width 10" or whatever width
@@ -74,7 +74,7 @@ def _boundaries(folder: Path) -> str:
 
 def _time_jobs(jobs: list[Job], sequence: Sequence, labels: Path, boundaries: str, path: Path) -> None:
     scales = odometry.scales(sequence)
-    sources, _ = masks_of(jobs, sequence, labels, boundaries)
+    sources, _ = masks_of(jobs, sequence, by_name(labels), boundaries)
     followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in sources}
     seconds = dict.fromkeys(sources, 0.0)
     with opencv_threads(1):  # one thread makes times comparable

@@ -37,12 +37,12 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
         client = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, ImportError) as error:
         reason = str(error).strip().splitlines()
-        raise InputError(f"DASK_SCHEDULER={scheduler}: no scheduler answers there "
+        raise InputError(f"Dask scheduler {scheduler}: none answers there "
                          f"({reason[0] if reason else type(error).__name__}); start one with 'dask scheduler' and give "
                          "the address that it prints, tcp://host:port") from None
     with client:
         if not client.nthreads():
-            raise InputError(f"DASK_SCHEDULER={scheduler}: the scheduler has no workers; start some with "
+            raise InputError(f"Dask scheduler {scheduler}: has no workers; start some with "
                              f"'dask worker {scheduler} --nthreads 1'")
         yield _Workers(client)
 
@@ -58,7 +58,7 @@ class _Processes:
             yield from work
         except TerminatedWorkerError:
             raise InputError("a process was killed, most likely because memory ran out; what was finished is kept, so "
-                             "start again, with fewer processes (JOBS)") from None
+                             "start again, with fewer processes (JOBS or --jobs)") from None
 
 
 def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:

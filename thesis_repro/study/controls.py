@@ -13,15 +13,17 @@ import cv2
 import numpy as np
 
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks, dilate
+from thesis_repro.masks import dilate
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import SharedKeypoints
+from thesis_repro.study.sources import FileMasks, Source
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
 CLOSE = 0.002  # of the frame: a difference of coverage that is none
 SAMPLE = 12  # frames on which a distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
 SEED = 0  # of the random lines
+LINE_WIDTH = 10  # pixels, of lines and edges beside masks that come ready made and have no width
 
 
 def true_labels(kitti: Path, name: str) -> Path:
@@ -32,9 +34,10 @@ def true_labels(kitti: Path, name: str) -> Path:
 class OtherFrame:
     """The mask of the frame half a sequence away: as many boundaries, of the same kind, in the wrong place."""
 
-    def __init__(self, labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> None:
-        self.masks = LabelMasks(labels, sequence, dilation_width, boundaries)
+    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> None:
+        self.masks = source.masks(sequence, dilation_width, boundaries)
         self.paths = self.masks.paths
+        self.line_width = dilation_width or LINE_WIDTH
 
     def __len__(self) -> int:
         return len(self.masks)
@@ -76,14 +79,14 @@ class RandomLines(OtherFrame):
         image = np.full(shape, number, np.uint16)
         for segment in range(number - 1, -1, -1):
             cv2.line(image, start[segment].astype(int).tolist(), end[segment].astype(int).tolist(), segment)
-        return cv2.erode(image, np.ones((self.masks.dilation_width,) * 2, np.uint8))  # the least number near a pixel
+        return cv2.erode(image, np.ones((self.line_width,) * 2, np.uint8))  # the least number near a pixel
 
 
 class ImageEdges(OtherFrame):
     """The strongest Canny edges of the frame itself, dilated, that cover what its mask covers: no network at all."""
 
-    def __init__(self, labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> None:
-        super().__init__(labels, sequence, dilation_width, boundaries)
+    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> None:
+        super().__init__(source, sequence, dilation_width, boundaries)
         self.sequence = sequence
 
     def __getitem__(self, index: int) -> np.ndarray:
@@ -96,7 +99,7 @@ class ImageEdges(OtherFrame):
             # interpolated, but never so near an end that the other one could stay for ever
             share = np.clip((covered_low - wanted) / (covered_low - covered_high), 0.1, 0.9)
             threshold = int(np.clip(low * (high / low) ** share, low + 1, high - 1))
-            mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), self.masks.dilation_width)
+            mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), self.line_width)
             covered = cv2.countNonZero(mask)
             if abs(covered - wanted) < miss:
                 best, miss = mask, abs(covered - wanted)
@@ -107,27 +110,28 @@ class ImageEdges(OtherFrame):
         return best
 
 
-def _exact_boundaries(labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> LabelMasks:
-    return LabelMasks(labels, sequence, dilation_width, "exact")
+def _exact_boundaries(source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> FileMasks:
+    return source.masks(sequence, dilation_width, "exact")
 
 
-def _true_labels(labels: Path, sequence: Sequence, dilation_width: int, boundaries: str) -> LabelMasks:
-    return LabelMasks(true_labels(sequence.root, sequence.name), sequence, dilation_width, boundaries)
+def _true_labels(source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> FileMasks:
+    return Source(true_labels(sequence.root, sequence.name)).masks(sequence, dilation_width, boundaries)
 
 
-ControlMasks: TypeAlias = LabelMasks | OtherFrame  # both know the `paths` of the label maps that they read
-MASKS: dict[str, Callable[[Path, Sequence, int, str], ControlMasks]] = {
+ControlMasks: TypeAlias = FileMasks | OtherFrame
+MASKS: dict[str, Callable[[Source, Sequence, int | None, str], ControlMasks]] = {
     "other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges,
     "exact-boundaries": _exact_boundaries, "true-labels": _true_labels}
+OF_LABEL_MAPS = ("exact-boundaries", "true-labels")  # ask what label maps are good for; other masks have none
 
 
-def masks(variant: str, labels: Path, sequence: Sequence, dilation_width: int,
+def masks(variant: str, source: Source, sequence: Sequence, dilation_width: int | None,
           boundaries: str = "canny") -> ControlMasks:
-    """The masks of one of MASKS for a sequence whose predicted label maps are in the folder `labels`.
+    """The masks of one of MASKS for a sequence, as control of the source's own.
 
-    boundaries: of the label maps, see `masks.edges`; "exact-boundaries" has its own.
+    dilation_width: pixels, and boundaries, see `masks.edges`, of label maps; "exact-boundaries" has its own.
     """
-    return MASKS[variant](labels, sequence, dilation_width, boundaries)
+    return MASKS[variant](source, sequence, dilation_width, boundaries)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:

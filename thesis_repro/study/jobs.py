@@ -11,14 +11,15 @@ from typing import Any
 import pandas as pd
 
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks
 from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.study import controls
+from thesis_repro.study.sources import Source
 
 # Pixels: the width of Section 3.6 and of Figures 3.6 and 4.5, at which masks are put to the test. It was fixed before
 # any run. (The code of appendix A.8 dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
 POSES = {"all": "thesis's estimator", "refined": "refined estimator"}  # the second spreads far less
+UNMASKED = ("baseline", "reduced", "fewer", "spread")
 PIECES = 4  # passes for each of several workers, at the least
 
 
@@ -27,7 +28,8 @@ class Job:
     """One run of the odometry over one sequence. What is None or left out is as in the thesis.
 
     variant: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
-    dilation_width: pixels, of masks. max_keypoints, min_distance: of the detector.
+    dilation_width: pixels, of masks from label maps. source: name of where the masks come from, or those that a limit
+    of keypoints was taken from; empty where there is only one. max_keypoints, min_distance: of the detector.
     pose: "all" or "refined", see OdometrySettings.
     repetition: 0 takes the correspondences in the order in which they come, which is the thesis's single run; any
     other number is the seed that shuffles them.
@@ -40,15 +42,17 @@ class Job:
     min_distance: float | None = None
     pose: str = "all"
     repetition: int = 0
+    source: str = ""
 
     @property
     def name(self) -> str:
-        """Unique in its sequence, and the stem of its file: masked-05-0, mirrored-10-refined-1, spread-7.5-0."""
+        """Unique in its sequence, and the stem of its file: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0."""
         width = None if self.dilation_width is None else f"{self.dilation_width:02d}"
         distance = None if self.min_distance is None else f"{self.min_distance:g}"
         pose = None if self.pose == "all" else self.pose
         parts = (self.variant, width, self.max_keypoints, distance, pose, self.repetition)
-        return "-".join(str(part) for part in parts if part is not None)
+        name = "-".join(str(part) for part in parts if part is not None)
+        return f"{self.source}/{name}" if self.source else name
 
     @property
     def settings(self) -> OdometrySettings:
@@ -57,16 +61,18 @@ class Job:
                                 "permute": self.repetition or None, "pose": self.pose}
         return replace(THESIS, **{name: value for name, value in said.items() if value is not None})
 
-    def masks(self, sequence: Sequence, labels: Path, boundaries: str = "canny") -> controls.ControlMasks | None:
+    def masks(self, sequence: Sequence, sources: Mapping[str, Source], boundaries: str = "canny"
+              ) -> controls.ControlMasks | None:
         """Its masks; None where the detector may look everywhere.
 
-        labels: a folder that holds one folder of label maps a sequence. boundaries: see `masks.edges`.
+        sources: by name. boundaries: see `masks.edges`.
         """
-        if self.dilation_width is None:
+        if self.variant in UNMASKED:
             return None
+        source = sources[self.source]
         if self.variant == "masked":
-            return LabelMasks(labels / self.sequence, sequence, self.dilation_width, boundaries)
-        return controls.masks(self.variant, labels / self.sequence, sequence, self.dilation_width, boundaries)
+            return source.masks(sequence, self.dilation_width, boundaries)
+        return controls.masks(self.variant, source, sequence, self.dilation_width, boundaries)
 
 
 def first_jobs(names: Iterable[str], widths: Iterable[int], repetitions: int = 1) -> list[Job]:
@@ -89,11 +95,41 @@ def mask_control_jobs(kitti: Path, names: Iterable[str], repetitions: int = 1,
         jobs += [Job(name, variant, its_width, pose="refined", repetition=repetition)
                  for variant, its_width in (("baseline", None), ("masked", width))
                  for repetition in range(repetitions)]
-        jobs += [Job(name, variant, width, pose=pose, repetition=repetition)
-                 for variant in controls.MASKS
-                 if variant != "true-labels" or controls.true_labels(kitti, name).is_dir()
-                 for pose in POSES for repetition in range(repetitions)]
+        jobs += _repeated(mask_controls(kitti, name, width), POSES, repetitions)
     return jobs
+
+
+def mask_controls(kitti: Path, name: str, width: int | None, source: str = "") -> list[Job]:
+    """A job of each control that is a mask, beside masks of a width; None: beside masks that come ready made."""
+    left_out = list(controls.OF_LABEL_MAPS) if width is None else []
+    if not controls.true_labels(kitti, name).is_dir():
+        left_out.append("true-labels")
+    return [Job(name, variant, width, source=source) for variant in controls.MASKS if variant not in left_out]
+
+
+def study_jobs(kitti: Path, names: Iterable[str], sources: Iterable[Source], widths: Iterable[int], *,
+               tested: int | None = None, poses: Iterable[str] = ("all",), repetitions: int = 1) -> list[Job]:
+    """The runs of several sources side by side that depend on no other: all keypoints once, and each source's masks.
+
+    widths: pixels, of masks from label maps. tested: that of the mask controls, None for none; where it is given, it
+    is one of the widths too.
+    """
+    jobs: list[Job] = []
+    widths, sources = sorted({*widths, *([tested] if tested else [])}), list(sources)
+    for name in names:
+        jobs.append(Job(name, "baseline"))
+        for source in sources:
+            ready = source.kind == "masks"
+            jobs += [Job(name, "masked", width, source=source.name) for width in ([None] if ready else widths)]
+            if tested:
+                jobs += mask_controls(kitti, name, None if ready else tested, source.name)
+    return _repeated(jobs, poses, repetitions)
+
+
+def _repeated(jobs: Iterable[Job], poses: Iterable[str], repetitions: int) -> list[Job]:
+    poses = list(poses)
+    return [replace(job, pose=pose, repetition=repetition) for job in jobs for pose in poses
+            for repetition in range(repetitions)]
 
 
 def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
@@ -106,7 +142,7 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
 
 
 def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: int | None = None,
-                          repetitions: int = 1) -> list[Job]:
+                          repetitions: int = 1, poses: Iterable[str] = tuple(POSES), source: str = "") -> list[Job]:
     """As many keypoints as masks leave, {sequence: number}, without a mask: the strongest, or spread out.
 
     "fewer" limits their number; "spread" keeps them farther apart.
@@ -114,15 +150,15 @@ def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: i
     jobs = []
     for name, number in keypoints.items():
         distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
-        jobs += keypoint_controls(name, number, distance, repetitions)
+        jobs += keypoint_controls(name, number, distance, repetitions, poses, source)
     return jobs
 
 
-def keypoint_controls(name: str, number: float, distance: float, repetitions: int) -> list[Job]:
+def keypoint_controls(name: str, number: float, distance: float, repetitions: int,
+                      poses: Iterable[str] = tuple(POSES), source: str = "") -> list[Job]:
     """`keypoint_control_jobs` of one sequence; distance: pixels, that leaves `number` keypoints."""
-    limits = [Job(name, "fewer", max_keypoints=_whole(number)), Job(name, "spread", min_distance=distance)]
-    return [replace(limit, pose=pose, repetition=repetition) for limit in limits for pose in POSES
-            for repetition in range(repetitions)]
+    return _repeated([Job(name, "fewer", max_keypoints=_whole(number), source=source),
+                      Job(name, "spread", min_distance=distance, source=source)], poses, repetitions)
 
 
 def _whole(number: float) -> int:

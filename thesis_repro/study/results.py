@@ -2,7 +2,8 @@
 
 `summary` is the table that `runner.run` returns: one row a run, with sequence, variant, dilation_width, pose,
 repetition, rmse and mae in metres, mean_keypoints. A change is always Equation 4.1, in percent, of means over the
-repetitions, from all keypoints under the same pose; negative is better.
+repetitions, from all keypoints under the same pose; negative is better. Where masks come from several sources, all but
+the last functions take the runs `of_source`.
 """
 
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from thesis_repro import InputError
 from thesis_repro.odometry.metrics import percent_change
+from thesis_repro.study.controls import MASKS
 from thesis_repro.study.jobs import CONTROL_WIDTH, POSES
 
 CONTROLS = {  # what the runs at one width are called, in the order in which they are shown
@@ -31,9 +33,14 @@ LEVEL = 95  # percent
 DRAWS = 10_000
 
 
-def of_variant(summary: pd.DataFrame, variant: str, pose: str = "all", width: int | None = None) -> pd.DataFrame:
-    """The rows of one variant under one pose, of one dilation width where it is given."""
-    rows = summary[(summary["variant"] == variant) & (summary["pose"] == pose)]
+def main_pose(summary: pd.DataFrame) -> str:
+    """The estimator that widths are judged under: the thesis's where it was run, else the refined one."""
+    return next((pose for pose in POSES if (summary["pose"] == pose).any()), next(iter(POSES)))
+
+
+def of_variant(summary: pd.DataFrame, variant: str, pose: str | None = None, width: int | None = None) -> pd.DataFrame:
+    """The rows of one variant under one pose (`main_pose` for None), of one dilation width where it is given."""
+    rows = summary[(summary["variant"] == variant) & (summary["pose"] == (pose or main_pose(summary)))]
     return rows if width is None else rows[rows["dilation_width"] == width]
 
 
@@ -86,7 +93,7 @@ def width_changes(summary: pd.DataFrame, metric: str) -> pd.DataFrame:
     return percent_change(masked.T, _baseline(summary, metric)).T.reindex(masked.index)
 
 
-def _baseline(summary: pd.DataFrame, metric: str, pose: str = "all") -> pd.Series:
+def _baseline(summary: pd.DataFrame, metric: str, pose: str | None = None) -> pd.Series:
     return of_variant(summary, "baseline", pose).groupby("sequence")[metric].mean()
 
 
@@ -153,35 +160,44 @@ def stability(summary: pd.DataFrame) -> pd.DataFrame:
 # The controls
 
 
-def tested_width(summary: pd.DataFrame) -> int:
-    """The width at which masks are put to the test: that of the masked runs under the refined estimator.
+def tested_width(summary: pd.DataFrame) -> int | None:
+    """The width at which masks are put to the test: that of the controls, or the only one that there is.
 
-    CONTROL_WIDTH where there are none. Raises InputError where they have several widths.
+    CONTROL_WIDTH where neither says it; None for masks that came ready made. Raises InputError where the controls have
+    several widths.
     """
-    found = of_variant(summary, "masked", "refined")["dilation_width"].unique()
+    masked = summary.loc[summary["variant"] == "masked", "dilation_width"]
+    if len(masked) and masked.isna().all():
+        return None
+    found = summary.loc[summary["variant"].isin(MASKS), "dilation_width"].unique()
     if len(found) > 1:
-        raise InputError(f"masked runs of the widths {', '.join(f'{width:g}' for width in sorted(found))} under the "
-                         "refined estimator; masks are put to the test at one width, so list the controls of one")
+        raise InputError(f"controls of the widths {', '.join(f'{width:g}' for width in sorted(found))}; masks are put "
+                         "to the test at one width, so list the controls of one")
+    if not len(found) and masked.nunique() == 1:
+        found = masked.unique()
     return int(found[0]) if len(found) else CONTROL_WIDTH
 
 
 def control_names(summary: pd.DataFrame) -> dict[str, str]:
     """CONTROLS, the masks with their width."""
-    return CONTROLS | {"masked": f"{CONTROLS['masked']}, width {tested_width(summary)}"}
+    width = tested_width(summary)
+    return CONTROLS if width is None else CONTROLS | {"masked": f"{CONTROLS['masked']}, width {width}"}
 
 
 def keypoints_left(summary: pd.DataFrame) -> pd.Series:
     """The mean number of keypoints that masks of the tested width leave, by sequence."""
-    rows = summary[(summary["variant"] == "masked") & (summary["dilation_width"] == tested_width(summary))]
+    width, rows = tested_width(summary), summary[summary["variant"] == "masked"]
+    if width is not None:
+        rows = rows[rows["dilation_width"] == width]
     return rows.groupby("sequence")["mean_keypoints"].mean()
 
 
-def of_control(summary: pd.DataFrame, variant: str, pose: str = "all") -> pd.DataFrame:
+def of_control(summary: pd.DataFrame, variant: str, pose: str | None = None) -> pd.DataFrame:
     """The rows of one variant of the comparison: masked runs of the tested width, all rows of any other."""
     return of_variant(summary, variant, pose, tested_width(summary) if variant == "masked" else None)
 
 
-def control_changes(summary: pd.DataFrame, metric: str, pose: str = "all") -> pd.DataFrame:
+def control_changes(summary: pd.DataFrame, metric: str, pose: str | None = None) -> pd.DataFrame:
     """Change of the metric (%) with masks of the tested width and with each control that was run.
 
     One row a sequence, one column a variant in the order of CONTROLS.
@@ -245,6 +261,62 @@ def apart(one: pd.DataFrame, other: pd.DataFrame) -> tuple[list[str], list[str]]
     lower = one.loc[names, "highest"] < other.loc[names, "lowest"]
     higher = one.loc[names, "lowest"] > other.loc[names, "highest"]
     return list(names[lower]), list(names[higher])
+
+
+# Several sources of masks
+
+
+def of_source(summary: pd.DataFrame, source: str) -> pd.DataFrame:
+    """The runs of one source, and those with all keypoints, which belong to every one."""
+    return summary[summary["source"].isin([source, ""])]
+
+
+def sources(summary: pd.DataFrame) -> list[str]:
+    """The names of the sources, in the order of their runs."""
+    return [name for name in summary["source"].unique() if name]
+
+
+def errors(summary: pd.DataFrame) -> pd.DataFrame:
+    """What the repetitions of each run amount to: one row for each pose, source, width and sequence.
+
+    Columns pose, source, dilation_width, sequence, frames, repetitions, mean_keypoints, kept (percent of all
+    keypoints); rmse, rmse_lowest, rmse_highest, rmse_change (percent), the same for mae; flagged (mean number of
+    frames). All keypoints come first, with the source "".
+    """
+    keys = ["pose", "source", "dilation_width", "sequence"]
+    runs = summary[summary["variant"].isin(["baseline", "masked"])].groupby(keys, dropna=False, sort=False)
+    table = pd.DataFrame({"frames": runs["frames"].first(), "repetitions": runs["repetition"].nunique(),
+                          "mean_keypoints": runs["mean_keypoints"].mean(), "flagged": runs["flagged"].mean(),
+                          **{f"{metric}{name}": getattr(runs[metric], how)() for metric in ("rmse", "mae")
+                             for name, how in (("", "mean"), ("_lowest", "min"), ("_highest", "max"))}}).reset_index()
+    every = table[table["source"] == ""].set_index(["pose", "sequence"])
+    own = every.reindex(pd.MultiIndex.from_frame(table[["pose", "sequence"]]))
+    table["kept"] = 100 * table["mean_keypoints"] / own["mean_keypoints"].to_numpy()
+    for metric in ("rmse", "mae"):
+        table[f"{metric}_change"] = percent_change(table[metric], own[metric].to_numpy())
+    order = {value: place for place, value in enumerate([*POSES, "", *sources(summary)])}
+    return table.sort_values(keys, key=lambda column: column.map(order) if column.name in ("pose", "source")
+                             else column, kind="stable", na_position="first", ignore_index=True)
+
+
+def side_by_side(summary: pd.DataFrame) -> pd.DataFrame:
+    """Means over sequences: one row for each pose, source and width, all keypoints first under each pose.
+
+    Columns pose, source, dilation_width, sequences, mean_keypoints, kept; rmse_change, rmse_low, rmse_high (mean and
+    interval), rmse_improved (number of sequences), the same for mae.
+    """
+    rows = []
+    for (pose, source, width), of_row in errors(summary).groupby(["pose", "source", "dilation_width"], dropna=False,
+                                                                 sort=False):
+        row = {"pose": pose, "source": source, "dilation_width": width, "sequences": len(of_row),
+               "mean_keypoints": of_row["mean_keypoints"].mean(), "kept": of_row["kept"].mean()}
+        for metric in ("rmse", "mae") if source else ():
+            changes = of_row[f"{metric}_change"]
+            row[f"{metric}_change"] = changes.mean()
+            row[f"{metric}_low"], row[f"{metric}_high"] = interval(changes)
+            row[f"{metric}_improved"] = int((changes < 0).sum())
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 # Time

@@ -15,13 +15,13 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro import InputError, masks, odometry, stages
-from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
 from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes, longest_first
+from thesis_repro.study.sources import Source
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class _Study:
     """What all jobs of one call have in common, and where each of them keeps its files."""
 
     kitti: Path
-    labels: Path
+    sources: dict[str, Source]
     folder: Path
     frames: int | None
     boundaries: str
@@ -47,12 +47,13 @@ class _Study:
         return self.folder / jobs[0].sequence / f"pass-{digest}.npz"
 
 
-def run(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, boundaries: str = "canny",
+def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *, boundaries: str = "canny",
         frames: int | None = None, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
     """Run the jobs that have no result yet; returns the summary of all that succeeded, one row a job.
 
-    kitti: the odometry root. labels: folder with one folder of label maps a sequence. folder: where results are kept;
-    those of other data, code or boundaries are deleted. boundaries: how all masks find them, see `masks.edges`.
+    kitti: the odometry root. labels: folder with one folder of label maps a sequence, or the sources that the jobs
+    name. folder: where results are kept; those of other data, code or boundaries are deleted.
+    boundaries: how all masks from label maps find them, see `masks.edges`.
     frames: how many of each sequence, None for all. processes: how many work at once on this machine.
     scheduler: address of a Dask scheduler ("tcp://host:8786"); its workers do the work then, with the same results.
     They need this package, and the three folders under the same paths. One thread a worker is best.
@@ -63,7 +64,7 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, boundar
     """
     if boundaries not in masks.BOUNDARIES:
         raise InputError(f"boundaries={boundaries!r}: unknown; choose one of {', '.join(masks.BOUNDARIES)}")
-    study = _Study(kitti, labels, folder, frames, boundaries)
+    study = _Study(kitti, by_name(labels), folder, frames, boundaries)
     jobs = list(dict.fromkeys(jobs))
     sequences = _open(jobs, study)
     failures: dict[Job, str] = {}
@@ -82,6 +83,11 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, boundar
     return pd.DataFrame([_summarize(job, sequences[job.sequence], study.result(job)) for job in done])
 
 
+def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
+    """The sources by name; a folder is the only one, and its name is empty."""
+    return {one.name: one for one in ([Source(labels)] if isinstance(labels, Path) else labels)}
+
+
 def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
     names: dict[tuple[str, str], list[str]] = {}
     for job, reason in failures.items():
@@ -90,17 +96,26 @@ def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
 
 
 def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
-    """The jobs' sequences by name; what the folder holds of other data, code or boundaries is deleted."""
+    """The jobs' sequences by name; what the folder holds of other data, code or boundaries is deleted.
+
+    Each source has a folder of its own in that of the sequence, so that what is made from one outlives another.
+    """
     sequences = {name: study.sequence(name) for name in sorted({job.sequence for job in jobs})}
     for name, sequence in sequences.items():
         if not sequence.has_truth:
             raise InputError(f"{sequence.poses_path}: no such file; without true poses sequence {name} has no "
                              "errors to compare; leave it out (the odometry command runs it)")
-        true_labels = controls.true_labels(study.kitti, name)
-        stages.stage(study.folder / name, **_versions(), frames=stages.listing(sequence.frame_paths),
-                     poses=stages.content(sequence.poses_path),
-                     labels=stages.made_from(study.labels / name), boundaries=study.boundaries,
-                     true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None)
+        true_labels, folder = controls.true_labels(study.kitti, name), study.folder / name
+        records = {source.name: source.record(name) for source in study.sources.values()}
+        stages.stage(folder, **_versions(), frames=stages.listing(sequence.frame_paths),
+                     poses=stages.content(sequence.poses_path), boundaries=study.boundaries,
+                     true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None,
+                     **records.pop("", {}))
+        for source, record in records.items():
+            if stages.record(folder / source) != record:  # so a state may have masks of other files
+                for state in folder.glob("pass-*.npz"):
+                    state.unlink()
+            stages.stage(folder / source, **record)
     return sequences
 
 
@@ -139,7 +154,7 @@ def _jobs_in(state: Path) -> list[str]:
     return list(kept[0]["job"]["runs"]) if kept else []
 
 
-def masks_of(jobs: Iterable[Job], sequence: Sequence, labels: Path, boundaries: str
+def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source], boundaries: str
              ) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
     """The masks of each job over a sequence, {job: masks}, and {job: reason} of those whose masks cannot be made.
 
@@ -149,32 +164,33 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, labels: Path, boundaries: 
     found: dict[Job, controls.ControlMasks | None] = {}
     failures: dict[Job, str] = {}
     for job in jobs:
-        source = (job.variant, job.dilation_width)
-        if source not in made:
-            made[source] = _checked_masks(job, sequence, labels, boundaries)
-        masks_or_error = made[source]
+        alike = (job.source, job.variant, job.dilation_width)
+        if alike not in made:
+            made[alike] = _checked_masks(job, sequence, sources, boundaries)
+        masks_or_error = made[alike]
         if isinstance(masks_or_error, InputError):
             failures[job] = str(masks_or_error)
         else:
             found[job] = masks_or_error
-    _check_label_map.cache_clear()
+    _check_file.cache_clear()
     return found, failures
 
 
-def _checked_masks(job: Job, sequence: Sequence, labels: Path, boundaries: str
+def _checked_masks(job: Job, sequence: Sequence, sources: Mapping[str, Source], boundaries: str
                    ) -> controls.ControlMasks | InputError | None:
     try:
-        its_masks = job.masks(sequence, labels, boundaries)
+        its_masks = job.masks(sequence, sources, boundaries)
         for path in () if its_masks is None else its_masks.paths:
-            _check_label_map(path)  # here, since in the middle of a pass it would stop all of it
+            # here, since in the middle of a pass it would stop all of it
+            _check_file(sources[job.source], path, sequence.size)
         return its_masks
     except InputError as error:
         return error
 
 
 @cache
-def _check_label_map(path: Path) -> None:
-    read_label_map(path)
+def _check_file(source: Source, path: Path, size: tuple[int, int]) -> None:
+    source.check_file(path, size)
 
 
 def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict[Job, str]:
@@ -187,7 +203,7 @@ def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict
         sequence = study.sequence(name)
         # all of them where there is a checkpoint to go on from, for it is one of all of them
         waiting = jobs if state.is_file() else [job for job in jobs if not study.result(job).is_file()]
-        found, failures = masks_of(waiting, sequence, study.labels, study.boundaries)
+        found, failures = masks_of(waiting, sequence, study.sources, study.boundaries)
         if not found:  # or Dask does again what it lost the answer of
             return failures
         results = odometry.run_many(sequence, {job.name: (job.settings, its_masks) for job, its_masks in found.items()},
@@ -215,9 +231,9 @@ def _summarize(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
     frames = pd.read_csv(result, keep_default_na=False, na_values={"detected": "", "tracked": ""})
     poses = poses_of(frames)
     return {
-        "sequence": job.sequence, "run": job.name, "variant": job.variant, "dilation_width": job.dilation_width,
-        "max_keypoints": job.max_keypoints, "min_distance": job.min_distance, "pose": job.pose,
-        "repetition": job.repetition, "frames": len(frames),
+        "sequence": job.sequence, "run": job.name, "source": job.source, "variant": job.variant,
+        "dilation_width": job.dilation_width, "max_keypoints": job.max_keypoints, "min_distance": job.min_distance,
+        "pose": job.pose, "repetition": job.repetition, "frames": len(frames),
         "rmse": metrics.rmse(poses, sequence.poses), "mae": metrics.mae(poses, sequence.poses),
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),

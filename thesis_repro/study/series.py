@@ -1,0 +1,112 @@
+"""A study with masks of one's own: what is run, whether the data is there, and the running of it."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from thesis_repro import InputError, kitti, stages
+from thesis_repro.study import jobs, results, runner, sources
+from thesis_repro.study.sources import Source
+
+
+@dataclass(frozen=True)
+class Study:
+    """Sources of masks side by side, against all keypoints.
+
+    sequences: names. widths: pixels, of masks from label maps. tested: width of the controls, None for none.
+    poses: estimators, of `jobs.POSES`. frames: of each sequence, None for all.
+    """
+
+    kitti: Path
+    sequences: tuple[str, ...]
+    sources: tuple[Source, ...]
+    widths: tuple[int, ...]
+    tested: int | None = None
+    poses: tuple[str, ...] = ("all",)
+    repetitions: int = 1
+    frames: int | None = None
+
+    def lengths(self) -> dict[str, int]:
+        """Frames by sequence."""
+        return {name: len(kitti.Sequence(self.kitti, name).subset(self.frames)) for name in self.sequences}
+
+    def first_jobs(self) -> list[jobs.Job]:
+        """The runs that need no result of others."""
+        return jobs.study_jobs(self.kitti, self.sequences, self.sources, self.widths, tested=self.tested,
+                               poses=self.poses, repetitions=self.repetitions)
+
+    def second_jobs(self, summary: pd.DataFrame | None) -> list[jobs.Job]:
+        """The controls that need the number of keypoints that masks leave; of unknown numbers without a summary."""
+        found = []
+        for source in self.sources if self.tested else ():
+            if summary is None:
+                found += [job for name in self.sequences for job in jobs.keypoint_controls(
+                    name, 1, 1, self.repetitions, self.poses, source.name)]
+            else:
+                found += jobs.keypoint_control_jobs(
+                    results.keypoints_left(results.of_source(summary, source.name)), self.kitti, self.frames,
+                    self.repetitions, self.poses, source.name)
+        return found
+
+    def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
+        """All runs, those that are kept in the folder left out; returns their summary, see `runner.run`.
+
+        Raises InputError for a folder with results of another number of frames.
+        """
+        stages.stage(folder, replace=False, frames=self.frames)
+        listed = self.first_jobs()
+
+        def run() -> pd.DataFrame:
+            return runner.run(listed, self.kitti, self.sources, folder / "runs", frames=self.frames,
+                              processes=processes, scheduler=scheduler)
+
+        summary = run()
+        second = self.second_jobs(summary)
+        if not second:
+            return summary
+        listed += second
+        return run()
+
+
+def named(folders: Iterable[tuple[str, Path]], names: Iterable[str]) -> tuple[Source, ...]:
+    """Sources from (kind, folder), the first with the first name; those without one are called as their folder.
+
+    Raises InputError for a name that cannot be a folder's, for two of the same, and for more names than folders.
+    """
+    folders, names = list(folders), list(names)
+    if len(names) > len(folders):
+        raise InputError(f"--name {names[len(folders)]}: {len(names)} names for {len(folders)} folders of masks; give "
+                         "one --name for each --labels or --masks, in their order")
+    for name in names:
+        if not re.fullmatch(r"[\w+-]+", name):
+            raise InputError(f"--name {name}: a name may have letters, digits, '_', '+' and '-'")
+    folders = [(kind, folder.absolute()) for kind, folder in folders]
+    names += [re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-") or "masks"
+              for _, folder in folders[len(names):]]
+    twice = [name for name, count in Counter(name.lower() for name in names).items() if count > 1]
+    if twice:
+        raise InputError(f"--name: two folders of masks would be called {twice[0]!r}; give each a --name of its own, "
+                         "in the order of --labels and --masks")
+    return tuple(Source(folder, kind, name) for (kind, folder), name in zip(folders, names, strict=True))
+
+
+def checked(study: Study) -> Study:
+    """The study, once everything is there that it needs. Raises InputError for the first thing that is not."""
+    for text, least, values in (("--repetitions", 1, [study.repetitions]), ("--widths", 1, study.widths),
+                                ("--controls", 1, [study.tested or 1]), ("--frames", 3, [study.frames or 3])):
+        for value in values:
+            if value < least:
+                raise InputError(f"{text} {value}: must be {least} or more")
+    twice = [name for name, count in Counter(study.sequences).items() if count > 1]
+    if twice:
+        raise InputError(f"--sequences: {twice[0]} is named twice")
+    whole = [kitti.Sequence(study.kitti, name) for name in study.sequences]
+    short = [sequence for sequence in whole if len(sequence) < 3]
+    if short:
+        raise InputError(f"{short[0].folder}: {len(short[0])} frames; a study needs 3 or more")
+    sources.check(study.sources, [sequence.subset(study.frames) for sequence in whole])
+    return study

@@ -1,0 +1,106 @@
+"""Where the masks of a study come from: the label maps of a network, or masks ready made; several side by side."""
+
+import struct
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from thesis_repro import InputError, stages
+from thesis_repro.cityscapes import read_label_map
+from thesis_repro.files import listed, read_gray
+from thesis_repro.kitti import Sequence
+from thesis_repro.masks import LabelMasks, MaskFolder
+
+KINDS = {"labels": "label maps", "masks": "masks"}
+FileMasks: TypeAlias = LabelMasks | MaskFolder  # both know the `paths` of the files that they read
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where masks come from.
+
+    folder: holds one folder a sequence; or, where one sequence is all there is, its files.
+    kind: "labels", label maps of any size whose boundaries are dilated; "masks", masks of the frames' size.
+    name: that its runs are called by; empty where there is only one source and nobody needs to ask.
+    """
+
+    folder: Path
+    kind: str = "labels"
+    name: str = ""
+
+    def of(self, sequence: str) -> Path:
+        """The folder with the files of one sequence."""
+        own = self.folder / sequence
+        return self.folder if not own.is_dir() and self.is_plain else own
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the folder itself holds files, as `thesis-repro predict` and `masks` write them."""
+        return any(self.folder.glob("[!.]*.png"))
+
+    def masks(self, sequence: Sequence, dilation_width: int | None, boundaries: str = "canny") -> FileMasks:
+        """The masks of a sequence. dilation_width: pixels, and boundaries, see `masks.edges`, of label maps.
+
+        Raises InputError where a frame has no file.
+        """
+        if self.kind == "masks":
+            return MaskFolder(self.of(sequence.name), sequence)
+        assert dilation_width is not None  # label maps have no masks without one
+        return LabelMasks(self.of(sequence.name), sequence, dilation_width, boundaries)
+
+    def check_file(self, path: Path, size: tuple[int, int]) -> None:
+        """Raise InputError where a file is no label map, or no mask of a (height, width)."""
+        if self.kind == "labels":
+            read_label_map(path)
+            return
+        mask = read_gray(path)
+        _check_size(path, mask.shape, size)
+        if len(np.unique(mask)) > 2:
+            raise InputError(f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps "
+                             "go with --labels)")
+
+    def record(self, sequence: str) -> dict[str, str | None]:
+        """What tells results of these files from those of others."""
+        folder = self.of(sequence)
+        made_from = stages.made_from(folder) if stages.record(folder) is not None else None
+        return {self.kind: stages.listing(listed(folder)), "made_from": made_from}
+
+
+def check(sources: Iterable[Source], sequences: Collection[Sequence]) -> None:
+    """Raise InputError, before anything runs, where a source does not have what every frame of the sequences needs.
+
+    Of masks the size of every file is looked at; of all sources the first file of each sequence is read. (The runner
+    reads all of them, and what it finds costs only the runs that need it.)
+    """
+    for source in sources:
+        what = KINDS[source.kind]
+        if not source.folder.is_dir():
+            raise InputError(f"{source.folder}: no such folder; it must hold a folder of {what} for each sequence")
+        for sequence in sequences:
+            if source.of(sequence.name) == source.folder and len(sequences) > 1:
+                raise InputError(f"{source.folder}: holds the {what} of one sequence, but {len(sequences)} are asked "
+                                 f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "
+                                 "name one with --sequences")
+            paths = source.masks(sequence, 1).paths
+            if source.kind == "masks":
+                for path in paths:
+                    _check_size(path, _png_size(path), sequence.size)
+            source.check_file(paths[0], sequence.size)
+
+
+def _check_size(path: Path, found: tuple[int, ...], size: tuple[int, int]) -> None:
+    if found != size:
+        raise InputError(f"{path}: {found[1]}x{found[0]} pixels, but the frames have {size[1]}x{size[0]}; masks must "
+                         "have the size of the frames")
+
+
+def _png_size(path: Path) -> tuple[int, ...]:
+    """(height, width) as the file's head has it, without decoding it."""
+    with open(path, "rb") as file:
+        head = file.read(24)
+    if len(head) < 24 or head[12:16] != b"IHDR":
+        return read_gray(path).shape  # or it says what is wrong
+    return struct.unpack(">II", head[16:])[::-1]
