@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-
 from street import Street, Stripes
+
 from thesis_repro import masks
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints

@@ -55,7 +55,8 @@ def test_workers_take_what_comes_next():
 
 
 def test_the_excerpts_are_spread_over_all_frames(small_world):
-    places = [(sequence.name, start) for sequence, start in plan._places(plan.Thesis(small_world / "kitti", ("00", "01")))]
+    work = plan.Thesis(small_world / "kitti", ("00", "01"))
+    places = [(sequence.name, start) for sequence, start in plan._places(work)]
     assert places == [("00", 4), ("01", 0), ("01", 6)]  # frames 4, 12 and 20 of 24; the last as far as it goes
 
 
