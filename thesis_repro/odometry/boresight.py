@@ -27,9 +27,10 @@ SHORTEST = 0.3  # metres: in a shorter step the direction of motion is lost in n
 WRONG = 20.0  # degrees between both directions of a step: it has failed, and says nothing about a constant angle
 HUBER = 1.345  # standard deviations beyond which a residual counts linearly
 ROUNDS = 10
+NEIGHBOURS = 9  # steps: long enough to average noise out, shorter than a turn
 BLOCK = 20  # steps at the least that are drawn together: neighbouring errors hang together
 BLOCKS = 8  # of a sequence at the most
-DRAWS = 400
+DRAWS = 200
 # 95 %: Student's t of 1, 2, ... degrees of freedom, and of more
 STUDENT = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.1)
 VAGUE = 1.0  # degrees: an angle whose interval reaches farther to either side is not determined
@@ -91,9 +92,13 @@ def estimate(paths: Sequence[Paths]) -> Boresight:
 
     Two kinds of vectors of a step must agree up to B: its direction of motion, and its rotation vector, whose axis
     shows in turns. For vectors s and B s exactly, B s - s = c x (B s + s) / 2 with the Gibbs vector c = 2 tan(angle/2)
-    axis of B: linear in c, and solved by least squares with Huber's weights, each kind measured by its own robust
-    standard deviation. Intervals: bootstrap over blocks of neighbouring steps, widened by Student's t where blocks are
-    few. They hold what varies within the sequences, not what is common to all of a drive.
+    axis of B: linear in c, and solved with Huber's weights, each kind measured by its own robust standard deviation.
+    The vectors' means over neighbouring steps serve as instruments: least squares would take each step's own noise,
+    which is at right angles to c x noise, for a proof that the angles are zero.
+
+    Intervals, 95 %: bootstrap over blocks of neighbouring steps, widened by Student's t where blocks are few. They hold
+    what varies within the sequences, not what is common to all of a drive. The vaguest angle is left out, one at a
+    time, until the others are determined.
     """
     vectors = [_vectors(*some) for some in paths]
     blocks = [block for some in vectors for block in _blocks(*some)]
@@ -101,15 +106,22 @@ def estimate(paths: Sequence[Paths]) -> Boresight:
     nothing = np.full(3, np.nan)
     if len(blocks) < 2:
         return Boresight(nothing, nothing, nothing, steps)
-    best = _fit(blocks)
-    random = np.random.default_rng(0)
-    drawn = np.array([_fit([blocks[index] for index in random.integers(0, len(blocks), len(blocks))])
-                      for _ in range(DRAWS)])
-    count = len(blocks)
-    reach = drawn.std(axis=0) * np.sqrt(count / (count - 1)) * STUDENT[min(count - 1, len(STUDENT)) - 1]
-    known = reach <= VAGUE
+    known = np.ones(3, bool)
+    best, reach = _with_reach(blocks, known)
+    while reach.max() > VAGUE:  # an angle that may be anything must not drag the others along
+        known[reach.argmax()] = False
+        best, reach = _with_reach(blocks, known)
     angles, low, high = (np.where(known, some, np.nan) for some in (best, best - reach, best + reach))
     return Boresight(angles, low, high, steps)
+
+
+def _with_reach(blocks, free):
+    """The best angles, those that are not free being 0, and how far their intervals reach to either side."""
+    random, count = np.random.default_rng(0), len(blocks)
+    drawn = np.array([_fit([blocks[index] for index in random.integers(0, count, count)], free)
+                      for _ in range(DRAWS)])
+    return _fit(blocks, free), (drawn.std(axis=0) * np.sqrt(count / (count - 1))
+                                * STUDENT[min(count - 1, len(STUDENT)) - 1])
 
 
 def _vectors(estimated, true):
@@ -129,25 +141,43 @@ def _motions(poses):
 
 
 def _blocks(seen, given):
-    """The linear equations of neighbouring steps, cut into blocks: [(matrix (n, 2, 3, 3), right side (n, 2, 3))]."""
-    x, y, z = np.moveaxis((seen + given) / 2, -1, 0)
+    """The linear equations of neighbouring steps, in blocks: [(matrix (n, 2, 3, 3), instrument, right side (n, 2, 3))].
+
+    The instrument is the matrix of the vectors' mean over neighbouring steps.
+    """
+    middle = (seen + given) / 2
+    pieces = max(min(BLOCKS, len(middle) // BLOCK), 1)
+    matrix, instrument = _crossing(middle), _crossing(_smooth(middle))
+    return [(matrix[chosen], instrument[chosen], (given - seen)[chosen])
+            for chosen in np.array_split(np.arange(len(middle)), pieces) if len(chosen)]
+
+
+def _crossing(vectors):
+    """(..., 3, 3): what times c is c x vector."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
     none = np.zeros_like(x)
-    crossed = np.stack([np.stack(row, axis=-1) for row in ((none, z, -y), (-z, none, x), (y, -x, none))], axis=-2)
-    pieces = max(min(BLOCKS, len(x) // BLOCK), 1)
-    return [(crossed[chosen], (given - seen)[chosen]) for chosen in np.array_split(np.arange(len(x)), pieces)
-            if len(chosen)]
+    return np.stack([np.stack(row, axis=-1) for row in ((none, z, -y), (-z, none, x), (y, -x, none))], axis=-2)
 
 
-def _fit(blocks):
-    """Pitch, yaw and roll, degrees, of the Gibbs vector that fits the equations best."""
-    matrix, right = (np.concatenate(some) for some in zip(*blocks, strict=True))
+def _smooth(vectors):
+    """Means over NEIGHBOURS of (n, 2, 3), fewer at the ends."""
+    total = np.concatenate([np.zeros((1, *vectors.shape[1:])), np.cumsum(vectors, axis=0)])
+    step = np.arange(len(vectors))
+    first, last = np.maximum(step - NEIGHBOURS // 2, 0), np.minimum(step + NEIGHBOURS // 2 + 1, len(vectors))
+    return (total[last] - total[first]) / (last - first)[:, None, None]
+
+
+def _fit(blocks, free):
+    """Pitch, yaw and roll, degrees, of the Gibbs vector that fits the equations best; 0 where it is not free (3,)."""
+    matrix, instrument, right = (np.concatenate(some) for some in zip(*blocks, strict=True))
     gibbs = np.zeros(3)
     for _ in range(ROUNDS):
         rest = np.linalg.norm(right - matrix @ gibbs, axis=-1)
         scale = np.maximum(np.median(rest, axis=0), 1e-9) / 1.538  # the median length of a normal vector in 3-space
         weight = np.minimum(1, HUBER * scale / np.maximum(rest, 1e-12)) / scale**2
-        normal = np.einsum("nk,nkij,nkil->jl", weight, matrix, matrix)
-        gibbs = np.linalg.lstsq(normal, np.einsum("nk,nkij,nki->j", weight, matrix, right), rcond=None)[0]
+        normal = np.einsum("nk,nkij,nkil->jl", weight, instrument, matrix)
+        moments = np.einsum("nk,nkij,nki->j", weight, instrument, right)
+        gibbs[free] = np.linalg.lstsq(normal[np.ix_(free, free)], moments[free], rcond=None)[0]
     length = np.linalg.norm(gibbs)
     return angles_of(cv2.Rodrigues(gibbs * (2 * np.arctan(length / 2) / max(length, 1e-12)))[0])
 
