@@ -19,7 +19,7 @@ def odometry(*options):
 
 def test_help_lists_the_commands():
     text = subprocess.run([sys.executable, "-m", "thesis_repro", "--help"], capture_output=True, text=True, check=True)
-    commands = ("synthesize", "check-data", "predict", "masks", "odometry", "plan")
+    commands = ("synthesize", "check-data", "predict", "masks", "odometry", "study", "plan")
     assert all(command in text.stdout for command in commands)
 
 

@@ -112,6 +112,22 @@ def test_only_what_changed_is_made_again(tmp_path):
 
 
 @pytest.mark.notebooks
+def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
+    """On the small world's frames, given as if they were real; one size is not the profile's."""
+    kitti = small_world / "kitti"
+    done = make_figures(tmp_path, f"KITTI={kitti}", "WIDTHS=5,10", "REPETITIONS=1")
+    assert done.returncode == 0, done.stdout + done.stderr
+    (build,) = (tmp_path / "build").iterdir()  # no world beside it
+    assert build.name.endswith("-smoke-widths-5_10-repetitions-1") and not (build / "model").exists()
+    assert [name[:2] for name in names(build / "notebooks", ".ipynb")] == ["03", "05", "06", "07", "08"]
+    figures = tmp_path / "figures" / build.name
+    left_out = {"figure_4_01", "figure_4_02", *(f"figure_3_{n:02d}" for n in range(1, 6))}
+    assert set(names(figures, ".svg") + names(figures, ".webp")) == {*FIGURES, *OWN_FIGURES} - left_out
+    page = (figures / "index.html").read_text()
+    assert "Nothing was trained" in page and "Missing" not in page and page.count("Left out: it shows") == 9
+
+
+@pytest.mark.notebooks
 def test_bad_data_stops_before_the_notebooks_with_one_line(tmp_path, tiny_kitti):
     (tiny_kitti / "poses" / "00.txt").unlink()
     failed = make_figures(tmp_path, f"KITTI={tiny_kitti}")

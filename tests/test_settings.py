@@ -39,7 +39,34 @@ def test_street_scenes_to_judge_by_are_a_run_of_their_own(tmp_path):
     assert read_settings({}).kitti_semantic is None
 
 
+def test_sizes_one_by_one_are_part_of_the_name_and_of_every_note():
+    given = {"EPOCHS": "3", "FRAMES": "all", "WIDTHS": "5,10", "IMAGE_SIZE": "64",
+             "REPETITIONS": str(PROFILES["demo"].repetitions)}
+    settings = read_settings({f"THESIS_REPRO_{name}": value for name, value in given.items()})
+    sizes = settings.sizes
+    assert (sizes.epochs, sizes.frames, sizes.widths, sizes.image_size) == (3, None, (5, 10), 64)
+    # what is the profile's anyway changes nothing, and all else is the profile's
+    assert settings.run == "embedded-demo-image-size-64-epochs-3-frames-all-widths-5_10"
+    assert settings.data_note.endswith("profile demo, image size 64, epochs 3, frames all, widths 5, 10")
+    assert sizes.batch_size == PROFILES["demo"].batch_size and settings.figures != read_settings({}).figures
+    assert read_settings({"THESIS_REPRO_FRAMES": "200", "THESIS_REPRO_WIDTHS": "1-15"}).run == "embedded-demo"
+    many = read_settings({"THESIS_REPRO_WIDTHS": "1-40"})
+    assert many.sizes.widths == tuple(range(1, 41)) and len(many.run) < 60
+
+
+def test_real_frames_alone_take_the_model_in_the_package(tmp_path):
+    assert read_settings({"THESIS_REPRO_KITTI": str(tmp_path)}).shipped
+    assert not read_settings({}).shipped
+    assert not read_settings({"THESIS_REPRO_KITTI": str(tmp_path), "THESIS_REPRO_CITYSCAPES": str(tmp_path)}).shipped
+
+
 @pytest.mark.parametrize("environment, says", [
+    ({"THESIS_REPRO_EPOCHS": "0"}, "EPOCHS=0: must be a whole number of 1 or more"),
+    ({"THESIS_REPRO_IMAGE_SIZE": "100"}, "IMAGE_SIZE=100: must be a whole number of 32 or more and a multiple of 16"),
+    ({"THESIS_REPRO_FRAMES": "some"}, "FRAMES=some: must be a whole number or all, of 5 or more"),
+    ({"THESIS_REPRO_WIDTHS": "5-1"}, "WIDTHS=5-1: must be whole numbers, such as 5,10 or 1-15, of 1 or more"),
+    ({"THESIS_REPRO_WIDTHS": "5,x"}, "WIDTHS=5,x: must be"),
+    ({"THESIS_REPRO_BATCH_SIZE": "-1"}, "BATCH_SIZE=-1: must be"),
     ({"THESIS_REPRO_PROFILE": "huge"}, "PROFILE=huge: unknown profile; choose one of smoke, demo, thesis"),
     ({"THESIS_REPRO_PROFIL": "demo"}, "THESIS_REPRO_PROFIL: unknown setting"),
     ({"THESIS_REPRO_KITTI": "/no/such/folder"}, "KITTI=/no/such/folder: no such folder"),

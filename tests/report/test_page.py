@@ -154,7 +154,7 @@ def test_the_executed_notebook_keeps_its_results_and_leads_back(run):
 @pytest.mark.parametrize("kitti, cityscapes, says", [
     (True, True, "All images and numbers here come from the embedded world"),
     (True, False, "The odometry's frames and numbers here come from the embedded world"),
-    (False, True, "drawn from the training data, comes from the embedded world"),
+    (False, True, "Nothing was trained: the label maps come from the model in the package"),
     (False, False, None),
 ])
 def test_the_embedded_world_is_named_at_the_top_where_it_was_used(run, tmp_path, kitti, cityscapes, says):
@@ -172,6 +172,10 @@ def test_the_embedded_world_is_named_at_the_top_where_it_was_used(run, tmp_path,
         assert shown.text.index(says) < shown.text.index("What was run")
     assert shown.text.count("Not comparable with the embedded world") == 2 * kitti + cityscapes  # 4.7, 4.17; 4.1
     assert "Thesis, complete KITTI sequences" in shown.text
+    # without training, what would show it is left out and not missed
+    missing = shown.text[shown.text.index("Missing:"):shown.text.index("What was run")]
+    assert ("Figure 4.1," in missing) == ("Left out" not in shown.text) == (kitti or not cityscapes)
+    assert "Figure 4.6," in missing and "Figure 2.2," in missing
 
 
 def test_what_was_run_is_told_from_the_run_itself(run):
