@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 from thesis_repro import stages
 from thesis_repro.files import write_text
 from thesis_repro.report import captions, findings, outcome, page, style, tables
-from thesis_repro.study import results
+from thesis_repro.study import controls, results
 from thesis_repro.study.sources import KINDS
 
 
@@ -57,13 +57,15 @@ def data_note(study):
 
 def _facts(study, summary):
     lengths = results.of_variant(summary, "baseline").groupby("sequence")["frames"].first()
+    of_labels = any(source.kind == "labels" for source in study.sources)
     return {
         "odometry data": "embedded world" if is_embedded(study.kitti) else f"KITTI folder “{study.kitti.name}”",
         "sequences": ", ".join(f"{name} ({count} frames)" for name, count in lengths.items()),
         **{f"masks “{source.name}”": f"{KINDS[source.kind]} in the folder “{source.folder.name}”"
            for source in study.sources},
-        "widths": ", ".join(map(str, study.widths)),
-        "controls": f"beside masks of width {study.tested}" if study.tested else "",
+        "widths": ", ".join(map(str, sorted({*study.widths, *([study.tested] if of_labels and study.tested else [])}))),
+        "controls": "" if not study.tested else f"beside masks of width {study.tested}" if of_labels
+                    else f"beside the masks; lines and edges are {controls.LINE_WIDTH} pixels wide",
         "estimators": ", ".join(results.POSES[pose] for pose in study.poses),
         "repetitions": f"{study.repetitions} of every run; repetition 0 keeps the order of the correspondences, "
                        "repetition n shuffles it with seed n",
