@@ -66,15 +66,16 @@ def predict(options):
 
 def _images(folder, output):
     """The images of a folder or of a KITTI sequence folder, whose label maps are to be written to another one."""
-    from thesis_repro.files import listed
+    from thesis_repro.files import images as images_in
+    from thesis_repro.kitti import images_of
 
-    images = folder / "image_0" if (folder / "image_0").is_dir() else folder
+    images = images_of(folder)
     if not images.is_dir():
-        raise InputError(f"{folder}: no such folder; --images must name a folder of PNG images "
-                         "or a KITTI sequence folder that holds image_0")
-    paths = listed(images)
+        raise InputError(f"{folder}: no such folder; --images must name a folder of PNG or JPEG images "
+                         "or a KITTI sequence folder that holds image_0 or image_2")
+    paths = images_in(images)
     if not paths:
-        raise InputError(f"{images}: holds no PNG images")
+        raise InputError(f"{images}: holds no PNG or JPEG images")
     if output.resolve() == images.resolve():
         raise InputError(f"{output}: is the folder of the images; label maps have the same names, "
                          "so name another folder")
@@ -96,7 +97,7 @@ def masks(options):
     from thesis_repro.kitti import Sequence
     from thesis_repro.masks import LabelMasks, write_masks
 
-    sequence, widths = Sequence(options.kitti, options.sequence), sorted(set(options.dilation))
+    sequence, widths = Sequence(options.kitti, options.sequence, options.camera), sorted(set(options.dilation))
     made = [LabelMasks(options.labels, sequence, width, _mask_settings(options)) for width in widths]
     count = len(made) * len(sequence)
     if count > MANY_MASKS and not options.many:
@@ -116,7 +117,7 @@ def odometry(options):
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings
     from thesis_repro.odometry import boresight, metrics
-    from thesis_repro.report import video
+    from thesis_repro.report import trajectories, video
 
     if options.labels and options.dilation is None:
         raise InputError("--labels: needs --dilation W, the width in pixels by which the boundaries are dilated")
@@ -128,7 +129,11 @@ def odometry(options):
         raise InputError("--boundaries, --symmetric, --classes, --without-movable, --margin: need --labels DIR, "
                          "the label maps that masks are made from")
     settings = replace(odometry.PRESETS[options.pyslam], **chosen)
-    sequence = Sequence(options.kitti, options.sequence)
+    if options.video:
+        video.check_name(options.video)
+    if options.plot:
+        trajectories.check_name(options.plot)
+    sequence = Sequence(options.kitti, options.sequence, options.camera, options.speed)
     masks = None
     if options.masks:
         masks = MaskFolder(options.masks, sequence)
@@ -138,14 +143,9 @@ def odometry(options):
     if options.boresight:
         result = boresight.apply(result, options.boresight)
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
-    relative = metrics.relative_errors(result.poses, sequence.poses)
     summary = {
         "sequence": sequence.name, "frames": len(sequence),
-        "rmse_m": metrics.rmse(result.poses, sequence.poses, settings.alignment),
-        "mae_m": metrics.mae(result.poses, sequence.poses, settings.alignment),
-        "ate_se3_m": _number(metrics.ate(result.poses, sequence.poses, "se3")["rmse"]),
-        "relative_translation_percent": _number(relative["translation_percent"]),
-        "relative_rotation_deg_per_m": _number(relative["rotation_deg_per_m"]),
+        **_errors(result.poses, sequence, settings.alignment),
         "mean_keypoints": float(result.frames["detected"].mean()),
         "ms_per_frame": 1000 * float(seconds.mean()),
         "flagged": {flag: int(count) for flag, count in result.flagged.items()},
@@ -156,19 +156,40 @@ def odometry(options):
         write_tum(options.tum, result.poses, sequence.times)
     if options.video:
         video.write_video(options.video, sequence, settings, masks, description="video")
+    if options.plot:
+        true = sequence.poses if sequence.has_truth else None
+        paths = {"estimate": result.poses if true is None else metrics.shifted(result.poses, true, settings.alignment)}
+        trajectories.write(options.plot, trajectories.figure(paths, true, f"sequence {sequence.name}"))
     if options.frames_csv:
         write_text(options.frames_csv, result.frames.to_csv(index=False))
     if options.json:
         print(json.dumps(summary))
     else:
-        print(f"sequence {sequence.name}, {len(sequence)} frames\n"
-              f"RMSE            {summary['rmse_m']:.6f} m\nMAE             {summary['mae_m']:.6f} m\n"
-              f"ATE, aligned    {_text(summary['ate_se3_m'], '.6f')} m\nover {metrics.RELATIVE_LENGTH:g} m       "
-              f"{_text(summary['relative_translation_percent'], '.3f')} %, "
-              f"{_text(summary['relative_rotation_deg_per_m'], '.5f')} degrees a metre\n"
+        steps = "1 m a frame" if options.speed is None else f"{options.speed:g} m/s"
+        errors = (f"RMSE            {summary['rmse_m']:.6f} m\nMAE             {summary['mae_m']:.6f} m\n"
+                  f"ATE, aligned    {_text(summary['ate_se3_m'], '.6f')} m\nover {metrics.RELATIVE_LENGTH:g} m       "
+                  f"{_text(summary['relative_translation_percent'], '.3f')} %, "
+                  f"{_text(summary['relative_rotation_deg_per_m'], '.5f')} degrees a metre"
+                  if sequence.has_truth else
+                  f"no truth to compare with ({sequence.poses_path} does not exist); steps of {steps} are assumed")
+        print(f"sequence {sequence.name}, {len(sequence)} frames\n{errors}\n"
               f"mean keypoints  {summary['mean_keypoints']:.1f}\ntime a frame    {summary['ms_per_frame']:.1f} ms")
         for flag, count in summary["flagged"].items():
             print(f"{flag:16}{count} frame{'s' * (count > 1)}")
+
+
+def _errors(poses, sequence, alignment):
+    """The errors of a run by name, all None where there are no true poses; None too where a path is too short."""
+    from thesis_repro.odometry import metrics
+
+    names = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_m")
+    if not sequence.has_truth:
+        return dict.fromkeys(names)
+    relative = metrics.relative_errors(poses, sequence.poses)
+    values = (metrics.rmse(poses, sequence.poses, alignment), metrics.mae(poses, sequence.poses, alignment),
+              metrics.ate(poses, sequence.poses, "se3")["rmse"], relative["translation_percent"],
+              relative["rotation_deg_per_m"])
+    return {name: _number(value) for name, value in zip(names, values, strict=True)}
 
 
 def boresight(options):
@@ -260,6 +281,22 @@ def study(options):
     print(f"{len(summary):,} runs; open {study.write(planned, summary, folder)} in a browser")
 
 
+def evaluate(options):
+    """compare trajectories with the true poses: the thesis's RMSE and MAE, ATE, RPE, KITTI's t_rel and r_rel"""
+    from thesis_repro.kitti import true_poses
+    from thesis_repro.report import trajectories
+
+    if options.plot:
+        trajectories.check_name(options.plot)
+    true = true_poses(options.kitti, options.sequence)
+    paths = trajectories.read(options.poses, true)
+    rows = trajectories.evaluate(paths, true, options.align)
+    if options.plot:
+        aligned = trajectories.aligned(paths, true, options.align)
+        trajectories.write(options.plot, trajectories.figure(aligned, true, f"sequence {options.sequence}"))
+    print(json.dumps(rows) if options.json else trajectories.text(rows, options.align))
+
+
 def plan(options):
     """say how long make figures would take here, training included, its memory and disk, from a short calibration"""
     from thesis_repro import cityscapes, kitti
@@ -302,13 +339,23 @@ def build_parser():
 
     sub = command(predict)
     sub.add_argument("--images", type=Path, nargs="+", required=True, metavar="DIR_OR_SEQUENCE",
-                     help="folder of PNG images, or a KITTI sequence folder; several get a folder each")
+                     help="folder of PNG or JPEG images, or a KITTI sequence folder; several get a folder each")
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the label maps")
     sub.add_argument("--dask", metavar="ADDRESS",
                      help="scheduler (tcp://host:8786) whose workers make the label maps, with the same bits")
     sub.add_argument("--model", type=Path, nargs="+", default=[], metavar="FILE",
                      help="a trained model (.keras, .hdf5), several for the mean of their probabilities; "
                           "without it the model in the package")
+
+    def add_sequence(sub):
+        sub.add_argument("--kitti", type=Path, metavar="ROOT", help="folder that holds sequences and poses")
+        sub.add_argument("--sequence", required=True, metavar="NN",
+                         help="sequence, 00 to 21 (6 for 06); without --kitti a folder of one's own: calib.txt with a "
+                              "line P0, the frames, and perhaps times.txt and poses.txt")
+
+    def add_camera(sub):
+        sub.add_argument("--camera", metavar="image_N",
+                         help="folder of the frames (image_0; image_2, read as gray, where there is none)")
 
     def add_mask_settings(sub):
         sub.add_argument("--boundaries", choices=("canny", "exact"), default="canny",
@@ -323,8 +370,8 @@ def build_parser():
 
     sub = command(masks)
     sub.add_argument("--labels", type=Path, required=True, metavar="DIR", help="one label map a frame")
-    sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
-    sub.add_argument("--sequence", required=True, metavar="NN", help="sequence, 00 to 10")
+    add_sequence(sub)
+    add_camera(sub)
     sub.add_argument("--dilation", type=int, nargs="+", required=True, metavar="W",
                      help="dilation width in pixels; several get a folder each")
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the masks")
@@ -332,8 +379,11 @@ def build_parser():
     add_mask_settings(sub)
 
     sub = command(odometry)
-    sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
-    sub.add_argument("--sequence", required=True, metavar="NN", help="sequence, 00 to 10")
+    add_sequence(sub)
+    add_camera(sub)
+    sub.add_argument("--speed", type=float, metavar="M_PER_S",
+                     help="metres a second where there are no true poses to take the length of steps from (without "
+                          "it, 1 m a frame)")
     source = sub.add_mutually_exclusive_group()
     source.add_argument("--masks", type=Path, metavar="DIR", help="one mask a frame, 255 keep, 0 ignore")
     source.add_argument("--labels", type=Path, metavar="DIR", help="one label map a frame, with --dilation")
@@ -354,6 +404,8 @@ def build_parser():
                      help="turn the path by the rotation between camera and truth, degrees; see the command boresight")
     sub.add_argument("--output", type=Path, metavar="POSES.txt", help="estimated poses in KITTI's form")
     sub.add_argument("--tum", type=Path, metavar="FILE", help="estimated poses in TUM's form")
+    sub.add_argument("--plot", type=Path, metavar="FILE",
+                     help="the path from above with the true one, and the error along the way (.png, .svg, .pdf, ...)")
     sub.add_argument("--video", type=Path, metavar="OUT.mp4", help="what the odometry sees and where it goes")
     sub.add_argument("--frames-csv", type=Path, metavar="FILE", help="one row a frame")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
@@ -362,7 +414,6 @@ def build_parser():
     sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
     sub.add_argument("--sequences", nargs="+", required=True, metavar="NN", help="sequences, 00 to 10")
     sub.add_argument("--json", action="store_true", help="print one JSON object")
-
 
     sub = command(study)
     sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
@@ -389,6 +440,15 @@ def build_parser():
     sub.add_argument("--plan", action="store_true", help="say what it would take, and run nothing")
     sub.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for everything it writes")
 
+    sub = command(evaluate)
+    add_sequence(sub)
+    sub.add_argument("poses", type=Path, nargs="+", metavar="POSES.txt", help="trajectories in KITTI's form")
+    sub.add_argument("--align", choices=("none", "se3", "sim3", "scale"), default="none",
+                     help="lay them over the truth for ATE, RPE, t_rel and r_rel (none)")
+    sub.add_argument("--plot", type=Path, metavar="FILE",
+                     help="all paths from above, and their errors along the way (.png, .svg, .pdf, ...)")
+    sub.add_argument("--json", action="store_true", help="print a JSON list, one object a trajectory")
+
     sub = command(plan)
     sub.add_argument("--kitti", type=Path, required=True, metavar="ROOT", help="folder that holds sequences and poses")
     sub.add_argument("--cityscapes", type=Path, metavar="ROOT", help="count the training of a network on these images")
@@ -401,7 +461,12 @@ def build_parser():
 
 
 def main(arguments=None):
-    options = build_parser().parse_args(arguments)
+    parser = build_parser()
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks what could come next
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    options = parser.parse_args(arguments)
     try:
         return options.function(options) or 0
     except InputError as error:

@@ -28,6 +28,16 @@ def percent_change(value: Any, benchmark: Any) -> Any:
     return (value - benchmark) / benchmark * 100
 
 
+def shifted(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> np.ndarray:
+    """The estimated path as `rmse` compares it: laid over the true one at frame 1. (n, 4, 4)"""
+    estimated, true = _check(estimated, true)
+    motion = np.eye(4)
+    if alignment == "pose":
+        motion[:3, :3] = true[1, :3, :3] @ estimated[1, :3, :3].T
+    motion[:3, 3] = true[1, :3, 3] - motion[:3, :3] @ estimated[1, :3, 3]
+    return motion @ estimated
+
+
 def _differences(estimated, true, alignment):
     """(n - 1, 3) position differences from frame 1 on.
 
@@ -54,27 +64,40 @@ def checked(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.nda
 
 # The field's measures
 
+ALIGNMENTS = ("none", "se3", "sim3", "scale")
+
 
 def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dict[str, Any]:
     """Absolute trajectory error, metres, over all frames: {rmse, mean, median, max, scale, note}.
 
-    estimated, true: (n, 4, 4) poses.
-    alignment: "none", "se3" (the rotation and shift that fit best) or "sim3" (and the scale, returned as `scale`).
+    estimated, true: (n, 4, 4) poses. alignment: see `align`; its scale is returned.
     Where no alignment is determined (a straight or standing path), the numbers are NaN and `note` says so.
     """
-    if alignment not in ("none", "se3", "sim3"):
-        raise InputError(f"alignment={alignment!r}: unknown; choose one of none, se3, sim3")
+    try:
+        estimated, scale = align(estimated, true, alignment)
+    except evo.EvoException:
+        return {**dict.fromkeys(("rmse", "mean", "median", "max", "scale"), np.nan),
+                "note": f"no {alignment} alignment: the path is straight or does not move"}
     reference, estimate = _evo_paths(estimated, true)
-    scale = 1.0
-    if alignment != "none":
-        try:
-            _, _, scale = estimate.align(reference, correct_scale=alignment == "sim3")
-        except evo.EvoException:
-            return {**dict.fromkeys(("rmse", "mean", "median", "max", "scale"), np.nan),
-                    "note": f"no {alignment} alignment: the path is straight or does not move"}
     error = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
     error.process_data((reference, estimate))
     return {**_statistics(error), "scale": float(scale), "note": ""}
+
+
+def align(estimated: np.ndarray, true: np.ndarray, alignment: str) -> tuple[np.ndarray, float]:
+    """The estimated path (n, 4, 4) laid over the true one, and the scale that this took.
+
+    alignment: "none", "se3" (the rotation and shift that fit best, by Umeyama's method), "sim3" (and the scale) or
+    "scale" (the scale of "sim3" alone). Raises InputError for another, and evo.EvoException where none is determined:
+    the path is straight or does not move.
+    """
+    if alignment not in ALIGNMENTS:
+        raise InputError(f"alignment={alignment!r}: unknown; choose one of {', '.join(ALIGNMENTS)}")
+    if alignment == "none":
+        return np.asarray(estimated), 1.0
+    reference, estimate = _evo_paths(estimated, true)
+    _, _, scale = estimate.align(reference, correct_scale=alignment == "sim3", correct_only_scale=alignment == "scale")
+    return np.array(estimate.poses_se3), float(scale)
 
 
 def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:

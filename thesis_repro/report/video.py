@@ -1,10 +1,14 @@
 """Pictures of the odometry at work: keypoints kept and discarded, tracks, the mask's outline, the path so far."""
 
+from fractions import Fraction
+from pathlib import Path
+
 import cv2
 import numpy as np
 
 from thesis_repro import InputError
 from thesis_repro.files import atomic, progress, write_png
+from thesis_repro.kitti import FRAME_TIME
 from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pose
 
 # blue, green, red, as OpenCV draws; blue and orange can be told apart by most people
@@ -12,6 +16,7 @@ KEPT, DISCARDED, OUTLINE = (255, 140, 30), (60, 60, 230), (0, 220, 255)
 INLIER, OUTLIER = (120, 220, 0), (0, 140, 255)
 TRUE, ESTIMATED, TEXT, PAPER = (90, 90, 90), (200, 80, 0), (40, 40, 40), (255, 255, 255)
 SHEET = 4  # pictures on a still
+QUALITY = 20  # x264's constant rate factor: less is better and larger; 18 to 23 look like the original
 MAP_SHARE = 0.75  # height of the map below the frame, in heights of the frame
 
 
@@ -44,12 +49,13 @@ def _dots(image, points, color):
 def draw_map(size, true, estimated, limits=None):
     """The path from above, x to the right and z upwards: an image of size (height, width).
 
-    true, estimated: (n, 4, 4) poses, metres; the true path is drawn whole, the estimated one as far as it goes.
+    true, estimated: (n, 4, 4) poses, metres; the true path is drawn whole (None: not known), the estimated one as far
+    as it goes.
     limits: ((x, z) least, (x, z) greatest) of what has to be seen; by default what the two paths cover.
     """
     height, width = size
     image = np.full((height, width, 3), PAPER, np.uint8)
-    low, high = _limits(true, estimated) if limits is None else limits
+    low, high = _limits(estimated if true is None else true, estimated) if limits is None else limits
     margin = 14
     metre = min((width - 2 * margin) / (high[0] - low[0]), (height - 2 * margin) / (high[1] - low[1]))
     centre = (low + high) / 2
@@ -58,14 +64,15 @@ def draw_map(size, true, estimated, limits=None):
         xz = (poses[:, [0, 2], 3] - centre) * metre
         return np.rint(np.stack([width / 2 + xz[:, 0], height / 2 - xz[:, 1]], axis=1)).astype(np.int32)
 
-    cv2.polylines(image, [pixels(true)], False, TRUE, 2, cv2.LINE_AA)
+    if true is not None:
+        cv2.polylines(image, [pixels(true)], False, TRUE, 2, cv2.LINE_AA)
     cv2.polylines(image, [pixels(estimated)], False, ESTIMATED, 2, cv2.LINE_AA)
     cv2.circle(image, pixels(estimated)[-1].tolist(), 4, ESTIMATED, -1, cv2.LINE_AA)
     bar = 10.0 ** np.floor(np.log10((width - 2 * margin) / metre / 2))
     left = (margin, height - margin)
     cv2.line(image, left, (round(margin + bar * metre), height - margin), TEXT, 2)
     _write(image, f"{bar:g} m", (left[0], left[1] - 6), TEXT)
-    _write(image, "ground truth", (margin, 18), TRUE)
+    _write(image, "no ground truth" if true is None else "ground truth", (margin, 18), TRUE)
     _write(image, "estimate", (margin, 36), ESTIMATED)
     return image
 
@@ -89,15 +96,17 @@ def pictures(sequence, settings=THESIS, masks=None, description=None):
     """
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence))
     # The true path starts at frame 1 for the errors; here both start where the odometry does.
-    true = sequence.poses.copy()
-    true[:, :3, 3] += odometry.pose[:3, 3] - true[0, :3, 3]
-    limits, metres, poses = _limits(true), scales(sequence), []
+    true = sequence.poses.copy() if sequence.has_truth else None
+    if true is not None:
+        true[:, :3, 3] += odometry.pose[:3, 3] - true[0, :3, 3]
+    seen = [odometry.pose[None]] if true is None else [true]
+    limits, metres, poses = _limits(*seen), scales(sequence), []
     indices = range(len(sequence))
     for index in indices if description is None else progress(indices, description):
         frame, mask = sequence.frame(index), None if masks is None else masks[index]
         step = odometry.step(frame, metres[index], mask)
         poses.append(step.pose)
-        low, high = _limits(true, np.array(poses))
+        low, high = _limits(*seen, np.array(poses))
         limits = np.minimum(limits[0], low), np.maximum(limits[1], high)
         upper = draw_frame(frame, step, settings, mask)
         height, width = frame.shape
@@ -109,8 +118,10 @@ def pictures(sequence, settings=THESIS, masks=None, description=None):
 
 def _describe(image, step, true, masked):
     row = step.row()
-    off = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
-    lines = [(f"frame {step.frame}", TEXT), (f"{off:.2f} m from the truth", TEXT)]
+    lines = [(f"frame {step.frame}", TEXT)]
+    if true is not None:
+        off = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
+        lines.append((f"{off:.2f} m from the truth", TEXT))
     if step.detected is not None:
         lines.append((f"{step.detected} keypoints" + " inside the mask" * masked, KEPT))
     if masked:
@@ -125,27 +136,29 @@ def _describe(image, step, true, masked):
         _write(image, text, (left, 20 + 20 * number), color)
 
 
-def write_video(path, sequence, settings=THESIS, masks=None, description=None):
-    """Write `pictures` as a video at the sequence's own pace (its times, seconds); the file's name ends in .mp4.
-
-    Raises InputError for another ending.
-    """
-    if not str(path).endswith(".mp4"):
+def check_name(path):
+    """Raise InputError where the name of a video does not end in .mp4."""
+    if Path(path).suffix != ".mp4":
         raise InputError(f"{path}: a video's name must end in .mp4")
-    pace = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 10.0
-    with atomic(path) as temporary:
-        writer = None
-        try:
-            for picture in pictures(sequence, settings, masks, description):
-                if writer is None:
-                    size = picture.shape[1], picture.shape[0]
-                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"mp4v"), float(pace), size)
-                    if not writer.isOpened():
-                        raise OSError(f"{path}: this OpenCV cannot write video")
-                writer.write(picture)
-        finally:
-            if writer is not None:
-                writer.release()
+
+
+def write_video(path, sequence, settings=THESIS, masks=None, description=None):
+    """Write `pictures` as a video (H.264, as browsers play it) at the sequence's own pace (its times, seconds).
+
+    Raises InputError where the file's name does not end in .mp4.
+    """
+    import av  # here, because loading FFmpeg's libraries is for those alone who want a video
+
+    check_name(path)
+    pace = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 1 / FRAME_TIME
+    with atomic(path) as temporary, av.open(str(temporary), "w", options={"movflags": "+faststart"}) as video:
+        stream = video.add_stream("libx264", rate=Fraction(pace).limit_denominator(1000), options={"crf": str(QUALITY)})
+        stream.pix_fmt = "yuv420p"  # the one that every browser knows
+        for picture in pictures(sequence, settings, masks, description):
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = picture.shape[:2]
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        video.mux(stream.encode())
 
 
 def write_sheet(path, sequence, masks=None, description=None):

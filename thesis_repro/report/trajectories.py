@@ -1,0 +1,133 @@
+"""Trajectories against the truth: one table of errors and one picture of several of them."""
+
+from collections import Counter
+from pathlib import Path
+
+import evo
+import numpy as np
+
+from thesis_repro import InputError
+from thesis_repro.files import atomic
+from thesis_repro.kitti import read_poses
+from thesis_repro.odometry import metrics
+from thesis_repro.report.style import TRUTH, line_style, new_figure, plt
+
+# what a table shows of a row of `evaluate`: heads of columns
+COLUMNS = {"rmse_m": "RMSE m", "mae_m": "MAE m", "ate_rmse_m": "ATE m", "ate_max_m": "largest m",
+           "rpe_translation_rmse_m": "RPE m", "rpe_rotation_rmse_deg": "RPE deg", "t_rel_percent": "t_rel %",
+           "r_rel_deg_per_100m": "r_rel deg/100m", "scale": "scale"}
+WHY = ("RMSE and MAE are the thesis's: both paths are laid over each other at frame 1 and frame 0 is left out; "
+       "ATE is evo's, over all frames as they are{aligned}")
+
+
+def read(files, true):
+    """Trajectories in KITTI's form by name, (n, 4, 4) each, n being that of the true poses.
+
+    The name is that of the file without its ending, or the path where two would have the same.
+    """
+    stems = Counter(Path(file).stem for file in files)
+    paths = {}
+    for file in files:
+        poses = read_poses(file)
+        if len(poses) != len(true):
+            raise InputError(f"{file}: {len(poses)} poses, but the sequence has {len(true)} true ones; one a frame is "
+                             "needed in both")
+        paths[Path(file).stem if stems[Path(file).stem] == 1 else str(file)] = poses
+    return paths
+
+
+def evaluate(paths, true, alignment="none"):
+    """The errors of each path, a list of dicts of numbers (None where one is not determined).
+
+    paths: {name: (n, 4, 4) poses}. RMSE and MAE are the thesis's whatever the alignment is; the others are of the path
+    as `metrics.align` leaves it.
+    """
+    return [_errors(name, poses, true, alignment) for name, poses in paths.items()]
+
+
+def _errors(name, poses, true, alignment):
+    row = {"trajectory": name, "poses": len(poses), "alignment": alignment,
+           "rmse_m": metrics.rmse(poses, true), "mae_m": metrics.mae(poses, true)}
+    ate = metrics.ate(poses, true, alignment)
+    notes = [ate["note"]]
+    row |= {f"ate_{key}_m": ate[key] for key in ("rmse", "mean", "median", "max")} | {"scale": ate["scale"]}
+    try:
+        poses, _ = metrics.align(poses, true, alignment)
+        rpe, segments = metrics.rpe(poses, true), metrics.kitti_errors(poses, true)
+        row |= {f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value for key, value in rpe.items()}
+        row |= {"t_rel_percent": segments["translation_percent"],
+                "r_rel_deg_per_100m": 100 * segments["rotation_deg_per_m"], "segments": segments["segments"]}
+        notes.append(segments["note"] and f"no t_rel and r_rel: {segments['note']}")
+    except evo.EvoException:  # of the alignment; ate's note says so
+        pass
+    row["note"] = "; ".join(filter(None, notes))
+    return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in row.items()}
+
+
+def aligned(paths, true, alignment):
+    """The paths as `metrics.align` leaves them; those that it cannot align are left out."""
+    found = {}
+    for name, poses in paths.items():
+        try:
+            found[name], _ = metrics.align(poses, true, alignment)
+        except evo.EvoException:
+            pass
+    return found
+
+
+def text(rows, alignment="none"):
+    """The rows of `evaluate` as a table for reading, with a word on what is in it."""
+    wide = max(len("trajectory"), *(len(row["trajectory"]) for row in rows))
+    heads = {key: head for key, head in COLUMNS.items() if key != "scale" or alignment in ("sim3", "scale")}
+    lines = ["  ".join([f"{'trajectory':{wide}}", *(f"{head:>{max(12, len(head))}}" for head in heads.values())])]
+    for row in rows:
+        values = (f"{'-' if row.get(key) is None else format(row[key], '.6f'):>{max(12, len(head))}}"
+                  for key, head in heads.items())
+        lines.append("  ".join([f"{row['trajectory']:{wide}}", *values]))
+    how = {"none": "", "se3": " after the best rotation and shift", "sim3": " after the best rotation, shift and scale",
+           "scale": " after the best scale"}[alignment]
+    lines += ["", WHY.format(aligned=how)]
+    notes = Counter(row["note"] for row in rows if row["note"])
+    for note, count in notes.items():
+        whose = ", ".join(row["trajectory"] for row in rows if row["note"] == note)
+        lines.append(note if count == len(rows) else f"{whose}: {note}")
+    return "\n".join(lines)
+
+
+def figure(paths, true, title):
+    """The paths from above and, where the truth is known, their distance from it along the way.
+
+    paths: {name: (n, 4, 4) poses} as they are to be compared. true: (n, 4, 4), or None.
+    """
+    drawing, panels = new_figure(1, 1 if true is None else 2, height=3.4, squeeze=False)
+    above = panels[0, 0]
+    if true is not None:
+        above.plot(true[:, 0, 3], true[:, 2, 3], color=TRUTH, linewidth=2.2, alpha=0.6, label="ground truth")
+        steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
+        travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    for index, (name, poses) in enumerate(paths.items()):
+        above.plot(poses[:, 0, 3], poses[:, 2, 3], label=name, **line_style(index))
+        if true is not None:
+            distance = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
+            panels[0, 1].plot(travelled, distance, label=name, **line_style(index))
+    above.set(xlabel="x (m)", ylabel="z (m)", title=f"{title} from above")
+    above.set_aspect("equal", adjustable="datalim")
+    if true is not None:
+        panels[0, 1].set(xlabel="travelled (m)", ylabel="distance from the truth (m)", title="error along the way")
+        panels[0, 1].set_ylim(bottom=0)
+    drawing.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return drawing
+
+
+def check_name(path):
+    """Raise InputError where the ending of a picture's name is none that can be written."""
+    known = sorted(plt.Figure().canvas.get_supported_filetypes())
+    if Path(path).suffix[1:].lower() not in known:
+        raise InputError(f"{path}: a picture's name must end in one of {', '.join(f'.{ending}' for ending in known)}")
+
+
+def write(path, drawing):
+    """Write a figure in the format that the file's ending names."""
+    with atomic(path) as temporary:
+        drawing.savefig(temporary, bbox_inches="tight", pad_inches=0.04)
+    plt.close(drawing)
