@@ -11,7 +11,7 @@ BIN := .venv/bin
 
 # A misspelled setting must not pass for the default.
 SIZES := IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
-KNOWN := KITTI CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON $(SIZES)
+KNOWN := KITTI CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON GPU $(SIZES)
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
@@ -50,10 +50,10 @@ help:
 	@echo "make evidence    the answer and the audit on real frames, KITTI=/path, into figures/kitti_excerpts"
 	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
 	@echo "make weights     trains the model that ships from nothing, CAMVID=/path KITTI_SEMANTIC=/path"
-	@echo "make setup       only .venv with the pinned packages"
+	@echo "make setup       only .venv with the pinned packages; GPU=1 adds CUDA for an NVIDIA GPU"
 	@echo "make clean       removes .venv, build and the figures of other data and profiles"
 
-setup: .venv/ready
+setup: .venv/ready $(if $(filter-out 0,$(GPU)),.venv/ready-gpu)
 
 .venv/ready: environment.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || { \
@@ -64,6 +64,12 @@ setup: .venv/ready
 	@$(PYTHON) -m venv .venv
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -r environment.txt 2> >(grep -v '^WARNING' >&2)
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . 2> >(grep -v '^WARNING' >&2)
+	@touch $@
+
+.venv/ready-gpu: environment-gpu.txt .venv/ready
+	@echo "installing CUDA for an NVIDIA GPU into .venv (about 2.5 GB to download)"
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -r environment-gpu.txt
+	@$(BIN)/python -c 'import tensorflow as tf; print("GPUs that TensorFlow sees:", len(tf.config.list_physical_devices("GPU")))'
 	@touch $@
 
 # The name of the run follows from the data and the profile; settings.py needs no package to say it.

@@ -5,6 +5,8 @@ A process that runs out of memory is killed without a word, so nobody would know
 
 import ctypes
 import math
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -59,6 +61,22 @@ def available():
     return max(0, min(rooms))
 
 
+def on_gpu():
+    """Bytes of memory of the smallest GPU, where TensorFlow uses one; None where it does not or nobody tells.
+
+    All of it, because what TensorFlow already holds serves the next batch again.
+    """
+    import tensorflow as tf
+
+    tool = shutil.which("nvidia-smi")
+    if tool is None or not tf.config.list_physical_devices("GPU"):
+        return None
+    told = subprocess.run([tool, "--query-gpu=memory.total", "--format=csv,noheader,nounits"], capture_output=True,
+                          text=True)
+    sizes = [int(word) for word in told.stdout.split() if word.isdigit()]
+    return min(sizes) * 2**20 if sizes else None
+
+
 def needed(model, batch_size, training):
     """Bytes that a batch takes at the least.
 
@@ -77,10 +95,12 @@ def _values(tensors):
 
 
 def require(model, batch_size, training=False):
-    """Raise InputError where a batch cannot fit into the memory that is left."""
-    room, need = available(), needed(model, batch_size, training)
+    """Raise InputError where a batch cannot fit into the memory that is left, or into that of the GPU."""
+    gpu, need = on_gpu(), needed(model, batch_size, training)
+    room = available() if gpu is None else gpu
     if room is not None and need > room:
         height, width = model.input_shape[1:3]
+        where = "left" if gpu is None else "on the GPU"
         raise InputError(f"batch_size={batch_size}: no memory for a batch of {batch_size} images of {height}x{width}, "
-                         f"which takes at least {need / 2**30:.1f} GiB of which {room / 2**30:.1f} GiB are left; "
+                         f"which takes at least {need / 2**30:.1f} GiB of which {room / 2**30:.1f} GiB are {where}; "
                          "lower the batch size")

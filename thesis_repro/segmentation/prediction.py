@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+os.environ.setdefault("TF_FORCE_GPU_ALLOW_GROWTH", "true")  # take of a GPU's memory what is needed, not all of it
 
 import cv2
 import numpy as np

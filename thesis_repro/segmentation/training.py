@@ -7,6 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+os.environ.setdefault("TF_FORCE_GPU_ALLOW_GROWTH", "true")  # take of a GPU's memory what is needed, not all of it
 os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
 
 import keras
