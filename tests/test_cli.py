@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 from importlib import metadata
@@ -19,7 +20,7 @@ def odometry(*options):
 
 def test_help_lists_the_commands():
     text = subprocess.run([sys.executable, "-m", "thesis_repro", "--help"], capture_output=True, text=True, check=True)
-    commands = ("synthesize", "check-data", "predict", "masks", "odometry", "study", "plan")
+    commands = ("synthesize", "check-data", "predict", "masks", "odometry", "boresight", "evaluate", "study", "plan")
     assert all(command in text.stdout for command in commands)
 
 
@@ -110,6 +111,42 @@ def test_a_damaged_frame_stops_the_run_before_anything_is_written(tiny_kitti, tm
     path.write_bytes(path.read_bytes()[:-20])
     assert odometry("--kitti", tiny_kitti, "--sequence", "00", "--frames-csv", tmp_path / "frames.csv") == 1
     assert "000003.png: the image is truncated" in capsys.readouterr().err and not (tmp_path / "frames.csv").exists()
+
+
+def test_jpeg_frames_without_truth_run_with_masks_named_png(tiny_kitti, tmp_path, capsys):
+    (tiny_kitti / "poses/00.txt").unlink()
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    for path in sorted((tiny_kitti / "sequences/00/image_0").glob("*.png")):
+        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path)))
+        cv2.imwrite(str(labels / path.name), np.repeat([[7], [23]], 24, axis=0).repeat(64, axis=1).astype(np.uint8))
+        path.unlink()
+    where = ["--kitti", tiny_kitti, "--sequence", "0"]
+    assert main(["masks", *map(str, where), "--labels", str(labels), "--dilation", "9", "--output",
+                 str(tmp_path / "masks")]) == 0
+    assert odometry(*where, "--masks", tmp_path / "masks", "--plot", tmp_path / "path.png", "--tum",
+                    tmp_path / "path.tum") == 0
+    told = capsys.readouterr().out
+    assert "no truth to compare with" in told and "steps of 1 m a frame are assumed" in told and "RMSE" not in told
+    assert cv2.imread(str(tmp_path / "path.png")) is not None
+    assert odometry(*where, "--speed", 7, "--json", "--frames-csv", tmp_path / "frames.csv") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["rmse_m"] is None and summary["mae_m"] is None
+    assert pd.read_csv(tmp_path / "frames.csv")["scale"].tolist() == pytest.approx([0, 0.7, 0.7, 0.7])
+
+
+def test_a_wrong_ending_stops_the_run_before_it_begins(tiny_kitti, tmp_path, capsys):
+    for option, says in (("--plot", "must end in one of"), ("--video", "must end in .mp4")):
+        assert odometry("--kitti", tiny_kitti, "--sequence", "00", option, tmp_path / "out.doc") == 1
+        assert says in capsys.readouterr().err
+
+
+def test_the_shell_is_told_what_could_come_next(tmp_path):
+    line = "thesis-repro evaluate --al"
+    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "told"), "COMP_LINE": line,
+             "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
+    subprocess.run([sys.executable, "-m", "thesis_repro"], env=os.environ | asked, check=True)
+    assert (tmp_path / "told").read_text().strip() == "--align"
 
 
 @pytest.mark.real

@@ -1,5 +1,6 @@
 """The video and the still sheet of the odometry."""
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -52,10 +53,21 @@ def test_the_video_has_every_frame_and_grows(tmp_path):
     frames = []
     while (read := capture.read())[0]:
         frames.append(read[1])
+    with av.open(str(tmp_path / "drive.mp4")) as file:  # what every browser plays
+        context = file.streams.video[0].codec_context
+        assert (context.name, context.pix_fmt) == ("h264", "yuv420p")
     assert len(frames) == 4 and capture.get(cv2.CAP_PROP_FPS) == pytest.approx(10, rel=0.01)
     assert frames[0].shape == (280, 480, 3)
     assert np.abs(frames[0].astype(int) - frames[3]).mean() > 5
     assert [file.name for file in tmp_path.iterdir()] == ["drive.mp4"]
+
+
+def test_without_truth_the_map_shows_the_estimate_alone():
+    drive = TimedStreet()
+    drive.has_truth, drive.assumed_steps = False, np.array([0.0, 1, 1, 1])
+    del drive.poses
+    last = list(video.pictures(drive))[-1][160:]
+    assert painted(last, video.ESTIMATED).sum() > 50 and not painted(last[60:, :-280], video.TRUE).any()
 
 
 def test_a_video_that_fails_leaves_nothing(tmp_path):
