@@ -98,7 +98,7 @@ def person(rng, kind):
             [(0.5, 0.5), (0.5 + hip, 0.5), (0.51 + stride + 0.06, 0.97), (0.51 + stride - 0.05, 0.97)]]
     arms = [[(0.5 - shoulder, 0.2), (0.5 - shoulder + 0.09, 0.22), (0.46 - shoulder, 0.52), (0.39 - shoulder, 0.5)],
             [(0.5 + shoulder, 0.2), (0.5 + shoulder - 0.09, 0.22), (0.54 + shoulder, 0.52), (0.61 + shoulder, 0.5)]]
-    head, neck = [(0.5, 0.092, 0.098, 0.06)], [(0.46, 0.14), (0.54, 0.14), (0.56, 0.2), (0.44, 0.2)]
+    head, neck = [(0.5, 0.093, 0.08, 0.06)], [(0.46, 0.14), (0.54, 0.14), (0.56, 0.2), (0.44, 0.2)]
     shoulders = [(0.5 - shoulder + 0.05, 0.215, 0.055, 0.03), (0.5 + shoulder - 0.05, 0.215, 0.055, 0.03)]
     alpha = _outline(shape, [torso, *legs, *arms, neck], [*head, *shoulders])
     coat, trousers = float(rng.uniform(40, 190)), float(rng.uniform(42, 100))
@@ -111,11 +111,11 @@ def person(rng, kind):
     if kind % 3 != 2:
         image[(np.abs(x - 64) < 1.5) & (y > 0.53 * 256)] *= 0.6  # between the legs
     image[(np.abs(x - 64) < 1) & (y > 0.2 * 256) & (y < 0.52 * 256)] *= 0.7  # a zip
-    image[_outline(shape, [neck]) > 127] = 112
-    image[_outline(shape, [], head) > 127] = 142
-    image[(_outline(shape, [], head) > 127) & (y < (0.085 if kind % 2 else 0.07) * 256)] = rng.uniform(30, 110)  # hair
+    image[_outline(shape, [neck]) > 127] = 96
+    image[_outline(shape, [], head) > 127] = 118
+    image[(_outline(shape, [], head) > 127) & (y < (0.1 if kind % 2 else 0.08) * 256)] = rng.uniform(28, 80)  # hair
     for side in (-1, 1):  # hands
-        cv2.circle(image, (int((0.5 + side * (shoulder + 0.075)) * 128), int(0.505 * 256)), 5, 138.0, -1)
+        cv2.circle(image, (int((0.5 + side * (shoulder + 0.075)) * 128), int(0.505 * 256)), 5, 112.0, -1)
     image[int(0.945 * 256):] = 34
     if kind % 2:  # a bag by the side, on its strap
         cv2.line(image, (50, 50), (80, 112), coat * 0.55, 3)

@@ -133,10 +133,12 @@ def _wall(plan, lot, setback, thickness, texture, label, height, lit=1):
     distance = plan.building_line(lot.road, lot.side) + setback
     for start in np.arange(lot.start, lot.stop - 4 - length / 2, length):
         x, z, heading = lot.road.track.at(start + length / 2, lot.side * distance)
+        ends_x, ends_z, _ = lot.road.track.at(start + np.array([0.0, length]), lot.side * distance)
+        half = np.hypot(np.diff(ends_x)[0], np.diff(ends_z)[0]) / 2 + 0.05  # longer outside a bend
         if not plan.free(x, z, 1.2):
             continue
         faces = Faces(plan.names)
-        faces.box((0, thickness), (-height, 0), (-length / 2 - 0.03, length / 2 + 0.03), texture, label, tile)
+        faces.box((0, thickness), (-height, 0), (-half, half), texture, label, tile)
         matrix = faces.matrix()
         matrix[:, LIT] = lit
         matrix[:, U] += start / tile  # neighbouring boxes show different parts of the texture
