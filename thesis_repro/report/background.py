@@ -223,12 +223,12 @@ def figure_2_07(model):
         width, height = 0.09 + 0.045 * np.log2(channels), 0.35 + 1.05 * side / largest
         y = -1.5 * np.log2(largest / side)
         axes.add_patch(Rectangle((x, y - height / 2), width, height, color=UNET_PARTS[kind][1], linewidth=0))
-        axes.text(x + width / 2, y + height / 2 + 0.06, channels, ha="center", va="bottom", fontsize=7)
+        axes.text(x + width / 2, y + height / 2 + 0.06, channels, ha="center", va="bottom", fontsize=6)
         places[name] = x, x + width, y
         bottom = min(bottom, y - height / 2)
         if kind in ("InputLayer", "MaxPooling2D", "Concatenate"):
             axes.text(x + width / 2, y - height / 2 - 0.08, f"{side}x{side}", ha="center", va="top", fontsize=7)
-        x += width + 0.26
+        x += width + 0.32
     for name, sources in skips.items():
         _, right, y = min(places[source] for source in sources)
         left, _, level = places[name]
