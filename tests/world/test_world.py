@@ -180,12 +180,14 @@ def test_nearer_surface_hides_the_farther_in_any_order():
 
 
 def test_cut_out_is_labelled_exactly_where_it_is_opaque():
-    # Four pixels a texel, so that the picture shows the texture's middle 20 by 30 texels.
-    _, labels = view(one_square(half=102.4, texture="tree0", label="traffic light"))
+    # Four pixels a texel of 0.4 m, so that the picture shows 20 by 30 texels: the trunk, 144 below the tree's middle.
+    square = one_square(half=102.4, texture="tree0", label="traffic light")
+    square[:, raster.CORNER + raster.Y] -= 144 * 0.4
+    _, labels = view(square)
     names, packed = textures.build(0)
     offset = packed.alpha[names["tree0"], 0, 0]
     opaque = packed.data[offset:offset + 512 * 512].reshape(512, 512) >= raster.OPAQUE
-    shown = opaque[246:266, 241:271].astype(np.uint8)
+    shown = opaque[390:410, 241:271].astype(np.uint8)
     sure = cv2.erode(shown, np.ones((3, 3))) == cv2.dilate(shown, np.ones((3, 3)))  # not between two texels
     sure[[0, -1]] = sure[:, [0, -1]] = False
     seen = labels.reshape(20, 4, 30, 4).transpose(0, 2, 1, 3) == ID["traffic light"]
