@@ -105,8 +105,7 @@ PART = 256  # images that a worker is given at once, in whole batches: minutes o
 
 
 def spread_label_maps(run, model_files, sequences, batch_size=16):
-    """Write the label maps of many sequences on many workers: the bits of `write_label_maps` for each, wherever they
-    are made on processors of one kind.
+    """Write the label maps of many sequences on many workers: on processors of one kind `write_label_maps`' bits.
 
     run: function of (function, argument tuples) that calls it with each on some worker and yields (index, what it
     returned, or for a lost worker the reason), as a pool of `study.cluster` has it. model_files: of one model, or of
