@@ -28,7 +28,7 @@ from thesis_repro.world import render, textures
 from thesis_repro.world.raster import GAIN, TEXTURE
 
 SIZES = PROFILES["demo"]
-IMAGES = 100  # for training, and a quarter of them for validation, at most
+IMAGES = 64  # for training, and a quarter of them for validation, at most
 BACKBONE = "resnet18"
 MEMBERS = 2  # of the ensemble; each has its part of the time
 SEEDS = (0, 1)
