@@ -18,6 +18,8 @@ from thesis_repro.odometry.refine import fit, near
 
 TURN, SWING = 1.5, 20.0  # degrees
 FIRST_TURN = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
+WITHIN = 4  # thresholds: where the fit from the expected motion looks first
+ALIKE = 0.97  # of the correspondences near the estimated motion: as good as that one
 SUPPORT = 0.6  # of the correspondences near the estimated motion: what explains fewer than that is refuted by them
 UNSURE_TURN, UNSURE_SWING = 0.5, 5.0  # degrees: standard deviations from which on a motion is not determined
 
@@ -47,8 +49,9 @@ def believe(motion: Motion, current: np.ndarray, previous: np.ndarray, scale: fl
 
     current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers. scale: metres.
 
-    A motion that its points determine and that goes on from the course, by no more than TURN and SWING, is believed.
-    Otherwise the best one is looked for among those that do go on. In a scene that stands still the true motion has
+    A motion that its points determine and that goes on from the course, by no more than TURN and SWING, is believed; so
+    that little of RANSAC's chance is left in it, it is fitted once more from the expected motion, where all orders of
+    the correspondences start alike. Otherwise the best motion is looked for among those that do go on. In a scene that stands still the true motion has
     nearly as many correspondences near it as any other, so that one is taken if it has at least SUPPORT times as many;
     if not, the camera has left its course, and the estimated motion is taken. Either way the step is AMBIGUOUS. Where
     neither is determined the step is NOT_DETERMINED: the camera goes on along its course.
@@ -61,7 +64,12 @@ def believe(motion: Motion, current: np.ndarray, previous: np.ndarray, scale: fl
                 and _degrees(translation @ one.translation) <= SWING)
 
     flag = ""
-    if not goes_on(motion):
+    if goes_on(motion):
+        first = near(rotation, translation, current, previous, WITHIN * threshold)
+        again = fit(rotation, translation, current, previous, first, threshold)
+        if goes_on(again) and again.support >= ALIKE * motion.support:
+            motion = replace(again, inliers=motion.inliers)
+    else:
         flag = AMBIGUOUS
         found = guided.find(current, previous, threshold, rotation, translation, turn, SWING)
         other = found and fit(*found, current, previous, near(*found, current, previous, threshold), threshold)
