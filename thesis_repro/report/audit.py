@@ -126,12 +126,13 @@ def _compare(row, what, runs, reference, metric="rmse"):
         if found:
             said.append((f"{found[0]} ({name})", found[1]))
     label = {"rmse": "RMSE"}.get(metric, metric)
-    return [Effect(row, f"{label} {what} {', '.join(text for text, _ in said)}",
+    return [Effect(row, f"{label} {what}: {', '.join(text for text, _ in said)}",
                    "; ".join(spread for _, spread in said))] if said else []
 
 
 def _keypoints(row, runs, reference):
-    return Effect(row, "keypoints {}".format(*_ratio(answer.ratios(runs, reference, "mean_keypoints"))))
+    times, spread = _ratio(answer.ratios(runs, reference, "mean_keypoints"))
+    return Effect(row, f"keypoints {times}", spread)
 
 
 def of_runs(summary):
@@ -234,8 +235,9 @@ def of_switches(runs):
                           "{:+.2f} to {:+.2f} and {:+.2f} to {:+.2f}, {} sequences".format(
                               *(end for name in angle for end in (angle[name].min(), angle[name].max())), len(angle))))
     for few in sorted(name for name in runs["variant"].unique() if name.endswith(" keypoints")):
-        for row in ("34", "40"):
-            effects += _compare(row, f"with {few} over all", of(few), of("all"))
+        effects += _compare("34", f"with {few} over all", of(few), of("all"))
+    effects += _compare("40", "with as few of the strongest as masks leave over all", of("strongest"), of("all"))
+    effects.append(_keypoints("40", of("strongest"), of("all")))
     few = of("100 keypoints", "refined")
     if len(few):
         effects.append(Effect("34", f"failed steps with 100 keypoints {few['failed'].mean():.1f} % (refined)"))
@@ -245,6 +247,8 @@ def of_switches(runs):
         if rotation[place]:
             effects.append(Effect("36", f"rotation error a step with masks over all keypoints {rotation[place][0]} "
                                         f"{words} (refined)", rotation[place][1]))
+        else:
+            effects.append(Effect("36", f"no step of these frames lies {words}"))
     return effects
 
 

@@ -4,16 +4,16 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.report.findings import ENOUGH, UNAIDED
-from thesis_repro.report.style import BASELINE, MASKED, PAGE_WIDTH, line_style, new_figure
+from thesis_repro.report.style import BASELINE, BLACK, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, SKY, new_figure
 from thesis_repro.study import answer, results
 
-MARKERS = "oDs^v<>Pp*X"
+MARKERS = "oDs^v<>PpXh"
+COLORS = (BASELINE, MASKED, GREEN, ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b", "#5d3a9b")  # in METHODS' order
 
 
 def _style(variant):
     index = list(answer.METHODS).index(variant)
-    color = {"baseline": BASELINE, "masked": MASKED}.get(variant, line_style(index)["color"])
-    return {"color": color, "marker": MARKERS[index], "label": answer.METHODS[variant]}
+    return {"color": COLORS[index], "marker": MARKERS[index], "label": answer.METHODS[variant]}
 
 
 def figure_answer(summary, every=None):
@@ -33,7 +33,8 @@ def figure_answer(summary, every=None):
                 if np.isfinite(one.low):
                     panel.plot([one.keypoints] * 2, [one.low, one.high], color=_style(one.variant)["color"],
                                linewidth=1.6)
-                panel.plot(one.keypoints, one.ratio, linestyle="none", markersize=6, markeredgecolor="white",
+                panel.plot(one.keypoints, one.ratio, linestyle="none", markersize=6.5, markeredgecolor="white", markeredgewidth=0.5,
+                          
                            **_style(one.variant))
             panel.axhline(1, color="black", linewidth=0.8)
             panel.set(xscale="log", yscale="log", title=f"{name}, {results.POSES[pose]}")
@@ -66,7 +67,8 @@ def figure_by_sequence(summary, metric):
         panel.tick_params(labelsize=7)
     for panel in axes[:, 0]:
         panel.set_ylabel({"rmse": "RMSE (m)", "rotation": "rotation error (degrees)"}[metric])
-    figure.supxlabel("mean number of keypoints", fontsize=9)
+    for panel in axes.flat[max(0, len(names) - columns):len(names)]:
+        panel.set_xlabel("mean number of keypoints", fontsize=8)
     handles = {}
     for panel in axes.flat[:len(names)]:
         handles |= dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True))
@@ -87,11 +89,14 @@ def _lines(summary, metric, pose):
 
 
 def _plain_ticks(panel):
+    """Few ticks at round numbers, however short or long a logarithmic axis is."""
     for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
-        steps = (1, 2, 5) if high / low < 100 else (1,)
-        ticks = [step * 10.0**power for power in range(-6, 6) for step in steps if low <= step * 10.0**power <= high]
-        if len(ticks) < 2:  # less than the way from 2 to 5
-            ticks = np.unique([float(f"{tick:.2g}") for tick in np.geomspace(low, high, 5)[1:-1]])
+        for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 7, 8, 9),
+                      np.arange(1, 10, 0.1), np.arange(1, 10, 0.02)):
+            ticks = [step * 10.0**power for power in range(-6, 6) for step in steps if low <= step * 10.0**power <= high]
+            if len(ticks) >= 3:
+                break
+        ticks = ticks[::-(-len(ticks) // 6) or 1]
         axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
 
 
