@@ -252,6 +252,19 @@ def of_switches(runs):
     return effects
 
 
+def of_boresight(explained):
+    """Row 30: the constant angle between camera and truth, and what taking it out does (`boresight.explained`)."""
+    effects = [Effect("30", ", ".join(f"{angle} {explained[angle].median():+.2f} degrees" for angle in ("pitch", "yaw")
+                                      if explained[angle].notna().any()) or "no angle is determined on these frames",
+                      "; ".join(f"{explained[angle].min():+.2f} to {explained[angle].max():+.2f}"
+                                for angle in ("pitch", "yaw") if explained[angle].notna().any()))]
+    for column, whose in (("rmse_own", "its own angle"), ("rmse_others", "the angle of others of the same day")):
+        found = _ratio(explained[column] / explained["rmse"])
+        if found:
+            effects.append(Effect("30", f"RMSE with {whose} taken out over raw: {found[0]} (refined)", found[1]))
+    return effects
+
+
 def _with(runs, reference, metric):
     """Ratios of those sequences that have the metric: not all of them turn."""
     keep = [some[some[metric] > 0] for some in (runs, reference)]

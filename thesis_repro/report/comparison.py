@@ -33,9 +33,8 @@ def figure_answer(summary, every=None):
                 if np.isfinite(one.low):
                     panel.plot([one.keypoints] * 2, [one.low, one.high], color=_style(one.variant)["color"],
                                linewidth=1.6)
-                panel.plot(one.keypoints, one.ratio, linestyle="none", markersize=6.5, markeredgecolor="white", markeredgewidth=0.5,
-                          
-                           **_style(one.variant))
+                panel.plot(one.keypoints, one.ratio, linestyle="none", markersize=6.5, markeredgecolor="white",
+                           markeredgewidth=0.5, **_style(one.variant))
             panel.axhline(1, color="black", linewidth=0.8)
             panel.set(xscale="log", yscale="log", title=f"{name}, {results.POSES[pose]}")
             panel.minorticks_off()
@@ -93,10 +92,11 @@ def _plain_ticks(panel):
     for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
         for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 7, 8, 9),
                       np.arange(1, 10, 0.1), np.arange(1, 10, 0.02)):
-            ticks = [step * 10.0**power for power in range(-6, 6) for step in steps if low <= step * 10.0**power <= high]
+            ticks = [step * 10.0**power for power in range(-6, 6) for step in steps]
+            ticks = [tick for tick in ticks if low <= tick <= high]
             if len(ticks) >= 3:
                 break
-        ticks = ticks[::-(-len(ticks) // 6) or 1]
+        ticks = ticks[::-(-len(ticks) // 6)]
         axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
 
 

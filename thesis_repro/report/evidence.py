@@ -21,6 +21,7 @@ import pandas as pd
 from thesis_repro import InputError, kitti, masks, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
+from thesis_repro.odometry import boresight
 from thesis_repro.report import audit, comparison, findings, outcome, style, tables
 from thesis_repro.study import answer, controls, effects, jobs, results, runner
 
@@ -47,6 +48,7 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     note = f"odometry: real KITTI frames, {length}; label maps by the model in the package"
     folder = Path(folder)
     found = [*audit.arithmetic(), *audit.of_switches(switches), *audit.of_chance(prefixes), *audit.of_runs(tested),
+             *audit.of_boresight(boresight.explained(answer.refined_paths(names, root, build / "odometry", frames))),
              *audit.of_boundaries(_boundaries(sequences, build / "labels")),
              *audit.of_tracks(_tracks(sequences, build / "labels"))]
     words = {"answer_in_words": comparison.words(tested, note), "findings": findings.words(tested, note)}

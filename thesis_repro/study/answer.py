@@ -14,6 +14,7 @@
   nothing is said of sequences in general, whatever the intervals are.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from thesis_repro.kitti import Sequence
 from thesis_repro.odometry.passes import poses_of
 from thesis_repro.study import results
 from thesis_repro.study.effects import relative_errors
+from thesis_repro.study.jobs import Job
 
 METRICS = {"rmse": "RMSE", "rotation": "rotation error a frame"}
 POSE = "refined"
@@ -41,6 +43,14 @@ def with_relative(summary: pd.DataFrame, kitti: Path, folder: Path, frames: int 
         found = pd.read_csv(folder / one.sequence / f"{one.run}.csv")
         rows.append(relative_errors(poses_of(found), true[one.sequence]))
     return summary.join(pd.DataFrame(rows, index=summary.index))
+
+
+def refined_paths(names: Iterable[str], kitti: Path, folder: Path, frames: int | None = None
+                  ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """{name: (estimated, true)} of all keypoints under the refined estimator, poses (n, 4, 4), for `boresight`."""
+    file = Job("", "baseline", pose=POSE).name
+    return {name: (poses_of(pd.read_csv(folder / name / f"{file}.csv")), Sequence(kitti, name).subset(frames).poses)
+            for name in names}
 
 
 def logs(rows: pd.DataFrame, metric: str) -> pd.Series:
