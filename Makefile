@@ -138,6 +138,7 @@ bench: setup
 	@$(BIN)/python -m thesis_repro.bench.odometry --kitti "$(or $(KITTI),build/world-demo/kitti)" --output build/bench.json
 	@$(BIN)/python -m thesis_repro.bench.segmentation
 
+.PHONY: evidence
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
 	@$(BIN)/python -m thesis_repro.report.evidence "$(KITTI)" figures/kitti_excerpts $(if $(JOBS),--jobs $(JOBS))

@@ -92,9 +92,9 @@ def build(settings):
         notebooks = {path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
                      for path in _executed(settings)}
     return TEMPLATES.get_template("template.html").render(
+        evidence=EVIDENCE if (settings.figures / EVIDENCE).is_file() else None,
         title=f"Tables and figures, {settings.run}", style="", settings=settings, facts=_facts(settings),
         chapters=chapters, shown=shown, of=len(THESIS), notebooks=notebooks,
-        evidence=EVIDENCE if (settings.figures / EVIDENCE).is_file() else None,
         missing=[one for chapter in chapters for one in chapter["artefacts"] if not one["there"]
                  and not one["left_out"]],
         left_out=[one for chapter in chapters for one in chapter["artefacts"] if one["left_out"]], card=captions.CARD,

@@ -17,41 +17,44 @@ from thesis_repro.segmentation import augmentation, quality, training
 from thesis_repro.segmentation.unet import build_unet
 
 NOISE_OF_TODAY = (0.2, 0.44)  # standard deviation of A.GaussNoise's defaults, as shares of 255
-VARIANTS = ("thesis", "corrected blocks", "divided by 255", "person weight 1", "noise of today")
 
 
 def trials(images, labels, validation, *, steps, seeds, base_filters=8, batch_size=8, rate=3e-3):
-    """Train the thesis's network and each of VARIANTS for a few steps: a row for each variant and seed.
+    """Train the thesis's network and four that differ in one slip for a few steps: a row for each variant and seed.
 
     images (n, size, size, 1) and labels (n, size, size), uint8, and the same of `validation`. What can be seen after so
     few steps is how a slip changes the beginning of a training, not where a whole one ends. Columns variant, seed,
     steps, mean_iou and accuracy as Cityscapes measures them, person (IoU of that class, NaN where it is absent).
     """
+    person = CLASS_WEIGHTS.copy()
+    person[ID["person"]] = 1
     rows = []
-    for network in (False, True):
-        model = build_unet(images.shape[1:], N_CLASSES, base_filters, corrected_blocks=network)
-        for variant in ("corrected blocks",) if network else [one for one in VARIANTS if one != "corrected blocks"]:
+    for corrected, weights, variants in ((False, CLASS_WEIGHTS, ("thesis", "divided by 255", "noise of today")),
+                                         (False, person, ("person weight 1",)),
+                                         (True, CLASS_WEIGHTS, ("corrected blocks",))):
+        model = build_unet(images.shape[1:], N_CLASSES, base_filters, corrected_blocks=corrected)
+        model.compile(keras.optimizers.Adam(rate),  # once for all of its trainings, for that takes longest
+                      sm.losses.DiceLoss(class_weights=weights) + sm.losses.CategoricalFocalLoss())
+        for variant in variants:
             for seed in files.progress(range(seeds), variant, unit="training"):
                 rows.append({"variant": variant, "seed": seed, "steps": steps}
-                            | _trial(model, images, labels, validation, variant, seed, steps, batch_size, rate))
+                            | _trial(model, images, labels, validation, variant, seed, steps, batch_size))
     return pd.DataFrame(rows)
 
 
-def _trial(model, images, labels, validation, variant, seed, steps, batch_size, rate):
+def _trial(model, images, labels, validation, variant, seed, steps, batch_size):
     keras.utils.set_random_seed(seed)
-    fresh = keras.models.clone_model(model)
+    model.set_weights(keras.models.clone_model(model).get_weights())  # drawn anew
+    for variable in model.optimizer.variables:
+        if variable is not model.optimizer.learning_rate:
+            variable.assign(np.zeros(variable.shape))
     augmented = augmentation.augment_set(images, labels, _augmenter(images.shape[1], variant), seed)
-    weights = CLASS_WEIGHTS.copy()
-    if variant == "person weight 1":
-        weights[ID["person"]] = 1
     scale = 255 if variant == "divided by 255" else 1
-    fresh.compile(keras.optimizers.Adam(rate),
-                  sm.losses.DiceLoss(class_weights=weights) + sm.losses.CategoricalFocalLoss())
     some, true = np.concatenate([images, augmented[0]]), np.concatenate([labels, augmented[1]])
     chosen = np.random.default_rng(seed).integers(0, len(some), steps * batch_size)
-    fresh.fit(some[chosen].astype(np.float32) / scale, augmentation.one_hot(true[chosen], N_CLASSES),
+    model.fit(some[chosen].astype(np.float32) / scale, augmentation.one_hot(true[chosen], N_CLASSES),
               batch_size=batch_size, epochs=1, shuffle=False, verbose=0)
-    predicted = fresh.predict(validation[0].astype(np.float32) / scale, verbose=0).argmax(axis=-1)
+    predicted = model.predict(validation[0].astype(np.float32) / scale, verbose=0).argmax(axis=-1)
     mean_iou, accuracy, classes = quality.cityscapes_scores(quality.confusion_matrix(validation[1], predicted))
     return {"mean_iou": mean_iou, "accuracy": accuracy, "person": classes["iou"].get("person", np.nan)}
 
