@@ -46,7 +46,7 @@ def _trial(model, images, labels, validation, variant, seed, steps, batch_size):
     keras.utils.set_random_seed(seed)
     model.set_weights(keras.models.clone_model(model).get_weights())  # drawn anew
     for variable in model.optimizer.variables:
-        if variable is not model.optimizer.learning_rate:
+        if variable.name != "learning_rate":
             variable.assign(np.zeros(variable.shape))
     augmented = augmentation.augment_set(images, labels, _augmenter(images.shape[1], variant), seed)
     scale = 255 if variant == "divided by 255" else 1
