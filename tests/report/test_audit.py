@@ -22,7 +22,7 @@ def summary(sequences, errors, repetitions=3):
                     rows.append({"sequence": name, "variant": variant, "pose": pose, "repetition": repetition,
                                  "dilation_width": 10 if variant not in ("baseline", "fewer", "spread") else np.nan,
                                  "max_keypoints": np.nan, "min_distance": np.nan, "mean_keypoints": 900 * factor,
-                                 "rmse": error, "mae": error, "rotation": error / 10, "frames": 30})
+                                 "rmse": error, "turned": error, "mae": error, "rotation": error / 10, "frames": 30})
     return pd.DataFrame(rows)
 
 
@@ -74,8 +74,8 @@ def test_the_answer_is_chosen_by_the_numbers(factors, says):
     runs = summary([f"{number:02d}" for number in range(8)], {"baseline": 1.0, **factors})
     if factors["masked"] == 1.0:  # an interval that holds 1
         odd = (runs["variant"] == "masked") & (runs["sequence"].astype(int) % 2 == 0)
-        runs.loc[odd, ["rmse", "rotation"]] *= 1.5
-        runs.loc[(runs["variant"] == "masked") & ~odd, ["rmse", "rotation"]] /= 1.5
+        runs.loc[odd, ["rmse", "turned", "rotation"]] *= 1.5
+        runs.loc[(runs["variant"] == "masked") & ~odd, ["rmse", "turned", "rotation"]] /= 1.5
     assert says in comparison.words(runs, "made up")
 
 
@@ -87,7 +87,7 @@ def test_few_sequences_say_nothing_in_general():
 def test_half_and_double_are_equally_far_from_one():
     runs = summary(["00", "01"], {"baseline": 1.0, "masked": 1.0})
     for name, factor in (("00", 0.5), ("01", 2.0)):
-        runs.loc[(runs["variant"] == "masked") & (runs["sequence"] == name), ["rmse", "rotation"]] *= factor
+        runs.loc[(runs["variant"] == "masked") & (runs["sequence"] == name), ["rmse", "turned", "rotation"]] *= factor
     row = answer.compared(runs, "rmse").set_index("variant").loc["masked"]
     assert row["ratio"] == pytest.approx(1, abs=0.03) and row["percent"] == pytest.approx(25, abs=4)
 
@@ -98,7 +98,7 @@ def test_the_figures_draw_every_method_and_the_table_has_a_row_for_each():
     assert len(figure.axes) == len(POSES) * len(answer.METRICS)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts == ["all keypoints", "segmentation mask", "keypoints spread out"]
-    assert len(comparison.table(runs)) == 3 * len(POSES) * len(answer.METRICS)
+    assert len(comparison.table(runs)) == 3 * len(POSES) * len(answer.SHOWN)
     panels = [axes for axes in comparison.figure_by_sequence(runs, "rmse").axes if axes.axison]
     assert [axes.get_title() for axes in panels] == ["00", "01", "02"]
 

@@ -142,7 +142,8 @@ ADDED = {
                            "thesis's estimator, below, the refined one, by which the question is judged; both scales "
                            "are logarithmic."),
     ("figure", "answer_sequences"): ("Error against number of keypoints, each sequence", "RMSE under the refined "
-                                     "estimator; bars go from the lowest to the highest of the repetitions."),
+                                     "estimator without the constant angle between camera and truth; bars go from the "
+                                     "lowest to the highest of the repetitions."),
     ("table", "answer"): ("The answer, in numbers", "Geometric means over sequences of the ratios of errors within "
                           "each sequence, with bootstrap intervals; one that holds 1 shows no difference. The mean of "
                           "percentages, as the thesis takes it, stands beside them."),

@@ -65,7 +65,7 @@ def figure_by_sequence(summary, metric):
         _plain_ticks(panel)
         panel.tick_params(labelsize=7)
     for panel in axes[:, 0]:
-        panel.set_ylabel({"rmse": "RMSE (m)", "rotation": "rotation error (degrees)"}[metric])
+        panel.set_ylabel({"rotation": "rotation error (degrees)"}.get(metric, "RMSE (m)"))
     for panel in axes.flat[max(0, len(names) - columns):len(names)]:
         panel.set_xlabel("mean number of keypoints", fontsize=8)
     handles = {}
@@ -106,7 +106,7 @@ def table(summary):
     for pose, estimator in results.POSES.items():
         if not len(results.of_variant(summary, "baseline", pose)):
             continue
-        for metric, name in answer.METRICS.items():
+        for metric, name in answer.SHOWN.items():
             for one in answer.compared(summary, metric, pose).itertuples():
                 rows.append({"estimator": estimator, "error": name, "keypoints": answer.METHODS[one.variant],
                              "mean number": round(one.keypoints), "sequences": one.sequences,
@@ -128,7 +128,7 @@ def _between(low, high):
 def words(summary, data):
     """The answer as one paragraph of Markdown, chosen by the numbers as `study.answer` has it."""
     found = {metric: answer.compared(summary, metric).set_index("variant") for metric in answer.METRICS}
-    first = found["rmse"]
+    first = found["turned"]
     if "masked" not in first.index:
         return ""
     count = int(first.loc["masked", "sequences"])

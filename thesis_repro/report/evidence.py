@@ -26,7 +26,8 @@ from thesis_repro.report import audit, comparison, findings, outcome, style, tab
 from thesis_repro.study import answer, controls, effects, jobs, results, runner
 
 LARGEST = 3_000_000  # bytes, of everything together
-OTHER_WIDTHS = (5, 15)  # pixels, beside the tested one, for the lines of error against number of keypoints
+WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
+OTHER_WIDTHS = (5, 15)  # beside the tested one, of all methods, for the lines of error against number of keypoints
 LINES = ("masked", "exact-boundaries", "mirrored", "random-lines", "image-edges")  # that have a width
 LOOKED_AT = 12  # frames of each sequence whose boundaries and keypoints are looked at one by one
 
@@ -53,13 +54,13 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
              *audit.of_tracks(_tracks(sequences, build / "labels"))]
     words = {"answer_in_words": comparison.words(tested, note), "findings": findings.words(tested, note)}
     for name, table in {"answer": comparison.table(tested), "audit": audit.table(found, note),
-                        "controls": tables.table_controls(tested), "runs": _short(every),
-                        "switches": _short(switches)}.items():
+                        "controls": tables.table_controls(tested), "widths": tables.table_widths(tested),
+                        "runs": _short(every), "switches": _short(switches)}.items():
         style.save_table(table, folder, name, note)
     for name in ("runs", "switches"):  # thousands of rows are for programs
         (folder / f"{name}.md").unlink()
     for name, figure in {"answer": comparison.figure_answer(tested, every),
-                         "answer_sequences": comparison.figure_by_sequence(every, "rmse"),
+                         "answer_sequences": comparison.figure_by_sequence(every, "turned"),
                          "answer_rotation": comparison.figure_by_sequence(every, "rotation"),
                          "controls": outcome.figure_controls(tested)}.items():
         style.save_figure(figure, folder, name, note)
@@ -86,13 +87,13 @@ def _runs(root, names, build, frames, repetitions, processes):
     def run(some):
         return runner.run(some, root, build / "labels", build / "odometry", frames=frames, processes=processes)
 
-    tested = jobs.first_jobs(names, (jobs.CONTROL_WIDTH,), repetitions)
-    tested += jobs.mask_control_jobs(root, names, repetitions)
+    tested = jobs.first_jobs(names, WIDTHS, repetitions) + jobs.mask_control_jobs(root, names, repetitions)
     other = [jobs.Job(name, variant, width, pose=pose, repetition=repetition) for name in names for variant in LINES
              for width in OTHER_WIDTHS for pose in jobs.POSES for repetition in range(repetitions)]
     summary = run([*tested, *other])
-    chosen = summary["run"].isin({job.name for job in tested})
-    tested += jobs.keypoint_control_jobs(results.keypoints_left(summary[chosen]), root, frames, repetitions)
+    first = summary[summary["run"].isin({job.name for job in tested})]
+    tested += jobs.reduced_jobs(results.best_widths(first), repetitions)
+    tested += jobs.keypoint_control_jobs(results.keypoints_left(first), root, frames, repetitions)
     for width in OTHER_WIDTHS:
         left = summary[(summary["variant"] == "masked") & (summary["dilation_width"] == width)]
         other += jobs.keypoint_control_jobs(left.groupby("sequence")["mean_keypoints"].mean(), root, frames,
@@ -138,12 +139,13 @@ def _page(note, words):
 
 ![RMSE of each sequence](answer_sequences.svg)
 
-*Each sequence, RMSE under the refined estimator; [the same of single rotations](answer_rotation.svg).*
+*Each sequence, refined estimator, RMSE without the constant angle; [single rotations](answer_rotation.svg).*
 
 ![Masks and controls](controls.svg)
 
 *Changes in percent, as the thesis has them: [in numbers](controls.md), [in words](findings.md).*
 
+- [widths.md](widths.md): the best width of each sequence, and how far it is chance
 - [audit.md](audit.md): where the thesis contradicts itself, its code or its libraries, and what each of that does here
 - [runs.csv](runs.csv), [switches.csv](switches.csv): every run
 """

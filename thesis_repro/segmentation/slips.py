@@ -1,6 +1,7 @@
 """What the slips of the appendix's training code do, each alone: short trainings that differ in one thing (audit)."""
 
 import os
+from functools import partial
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
@@ -32,19 +33,20 @@ def trials(images, labels, validation, *, steps, seeds, base_filters=8, batch_si
     for corrected, weights, variants in ((False, CLASS_WEIGHTS, ("thesis", "divided by 255", "noise of today")),
                                          (False, person, ("person weight 1",)),
                                          (True, CLASS_WEIGHTS, ("corrected blocks",))):
-        model = build_unet(images.shape[1:], N_CLASSES, base_filters, corrected_blocks=corrected)
+        fresh = partial(build_unet, images.shape[1:], N_CLASSES, base_filters, corrected_blocks=corrected)
+        model = fresh()
         model.compile(keras.optimizers.Adam(rate),  # once for all of its trainings, for that takes longest
                       sm.losses.DiceLoss(class_weights=weights) + sm.losses.CategoricalFocalLoss())
         for variant in variants:
             for seed in files.progress(range(seeds), variant, unit="training"):
                 rows.append({"variant": variant, "seed": seed, "steps": steps}
-                            | _trial(model, images, labels, validation, variant, seed, steps, batch_size))
+                            | _trial(model, fresh, images, labels, validation, variant, seed, steps, batch_size))
     return pd.DataFrame(rows)
 
 
-def _trial(model, images, labels, validation, variant, seed, steps, batch_size):
+def _trial(model, fresh, images, labels, validation, variant, seed, steps, batch_size):
     keras.utils.set_random_seed(seed)
-    model.set_weights(keras.models.clone_model(model).get_weights())  # drawn anew
+    model.set_weights(fresh().get_weights())
     for variable in model.optimizer.variables:
         if variable.name != "learning_rate":
             variable.assign(np.zeros(variable.shape))
