@@ -30,7 +30,7 @@ def percent_change(value: Any, benchmark: Any) -> Any:
 
 def shifted(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> np.ndarray:
     """The estimated path as `rmse` compares it: laid over the true one at frame 1. (n, 4, 4)"""
-    estimated, true = _check(estimated, true)
+    estimated, true = checked(estimated, true)
     motion = np.eye(4)
     if alignment == "pose":
         motion[:3, :3] = true[1, :3, :3] @ estimated[1, :3, :3].T
