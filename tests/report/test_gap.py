@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from thesis_repro.report import findings, gap, page, style
+from thesis_repro.report import gap, page, style
 from thesis_repro.settings import read_settings
 from thesis_repro.study.flicker import EXACT
 from thesis_repro.study.gap import Gap
@@ -56,7 +56,7 @@ def test_the_claims_are_told_with_their_numbers(found):
     assert "5.0 % with the model of this run, 3.0 % with the model in the package, 1.0 % with exact label maps" in text
 
 
-def test_the_quality_stands_in_findings_and_captions_of_the_run(found, tmp_path):
+def test_the_quality_stands_in_captions_of_the_run(found, tmp_path):
     settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "b"), "THESIS_REPRO_FIGURES": str(tmp_path / "f")})
     settings.figures.mkdir(parents=True)
     assert gap.line(settings.build) is None
@@ -68,4 +68,3 @@ def test_the_quality_stands_in_findings_and_captions_of_the_run(found, tmp_path)
     html = page.build(settings).replace("&#39;", "'")
     assert html.count("abel maps by the model in the package: mean IoU 0.50") == 1  # that one table alone is there
     assert "by the model in the package: mean IoU 0.50" in html[:html.index("How to read it")]
-    assert findings._label_maps(said).startswith("**How good the label maps are.** Label maps by")

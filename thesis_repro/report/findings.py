@@ -1,30 +1,31 @@
 """What the results show, in words that the numbers choose.
 
-A difference is only called one where its bootstrap interval over sequences excludes zero and there are enough
-sequences for that to mean something; everything else "cannot be told apart".
+Errors are compared as ratios within a sequence, on a logarithmic scale (`study.answer`), so that half and double weigh
+the same and no single sequence carries a mean. A difference is only called one where its bootstrap interval over
+sequences excludes a ratio of 1 and there are enough sequences for that to mean something; everything else "cannot be
+told apart".
 """
 
 from itertools import combinations
-from math import comb
 
 import numpy as np
 
-from thesis_repro.study import results
+from thesis_repro.study import answer, results
 from thesis_repro.study.jobs import CONTROL_WIDTH, POSES
 from thesis_repro.study.results import CONTROLS, LEVEL
 
 # Below this, changes of one sign in all sequences happen by chance more often than one time in twenty (2 / 2**n), and
 # an interval drawn from so few is too narrow.
 ENOUGH = 6
-FEWEST_REPETITIONS = 4  # that fall apart by chance in less than one sequence of twenty
 UNAIDED = ("other-frame", "mirrored", "random-lines", "image-edges", "fewer", "spread")  # know no class of the frame
-SAME = "cannot be told apart from"
 NAMES = {"baseline": "all keypoints", **CONTROLS}
+CHOICES = {"best": "the best of each sequence, on itself (as in the thesis)", "fixed": "one for all, on themselves",
+           "left_out": "by the other sequences"}
 
 
-def verdict(differences):
-    """-1 where the mean of one difference a sequence is shown to be below zero, 1 where above, 0 where neither."""
-    values = np.asarray(differences, float)
+def verdict(ratios):
+    """-1 where the mean of one ratio a sequence is shown to be below 1, 1 where above, 0 where neither."""
+    values = np.log(np.asarray(ratios, float))
     if np.count_nonzero(~np.isnan(values)) < ENOUGH:
         return 0
     low, high = results.interval(values)
@@ -32,11 +33,12 @@ def verdict(differences):
 
 
 def study_words(summary, data):
-    """The same on a summary with several sources of masks: each by itself, then one against the other."""
+    """A Markdown text on several sources of masks: each by itself, then one against the other."""
     parts = [_about(summary, data), _chance(summary)]
     for source in results.sources(summary):
         own = results.of_source(summary, source)
-        parts += [f"### {source}", _again(own), _choice(own), *(_against_controls(own, pose) for pose in POSES)]
+        parts += [f"### {source}", " ".join(said for pose in POSES if (said := _masks(own, pose))), _controls(own),
+                  _choice(own)]
     parts += [_against_each_other(summary, pose) for pose in POSES]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -46,189 +48,168 @@ def words(summary, data, label_maps=None):
 
     label_maps: one line on how good these are (`gap.line`).
     """
-    parts = [_about(summary, data), _label_maps(label_maps), f"{_chance(summary)} {_again(summary)}".strip(),
-             _choice(summary)]
-    parts += [_against_controls(summary, pose) for pose in POSES]
+    short = [_about(summary, data), label_maps and f"{label_maps[0].upper()}{label_maps[1:]}.", _chance(summary),
+             *(_masks(summary, pose, label_maps) for pose in POSES)]
+    if "embedded" in data.split(";")[0]:
+        short.append("These are rendered streets: nothing here is evidence about KITTI.")
+    parts = [" ".join(part for part in short if part), _controls(summary), _choice(summary)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _about(summary, data):
     baseline = results.of_variant(summary, "baseline")
     frames = baseline.groupby("sequence")["frames"].first()
-    text = (f"**What was run.** Data: {data}. {_number(len(frames), 'sequence')} ({', '.join(frames.index)}), "
-            f"{_from_to(frames)} frames each, {_number(baseline['repetition'].nunique(), 'repetition')} of every run "
-            "with the correspondences in another order. Changes are Equation 4.1, of means over the repetitions, "
-            "negative where the error is smaller.")
-    if len(frames) >= results.FEWEST:
-        text += f" Brackets hold the {LEVEL} % bootstrap interval of their mean over sequences."
-    if len(frames) < ENOUGH:
-        text += (f" With fewer than {ENOUGH} sequences even changes of one sign in all of them are no rare chance, so "
-                 "nothing here is said of sequences in general.")
-    else:
-        text += (" A difference is called one only where its interval excludes zero, which one comparison in twenty "
-                 "does by chance.")
-    return text
-
-
-def _label_maps(said):
-    return said and f"**How good the label maps are.** {said[0].upper()}{said[1:]}."
+    return (f"{_number(len(frames), 'sequence')} ({', '.join(frames.index)}; {frames.sum():,} frames), with all "
+            f"keypoints, with masks and with controls, {_number(baseline['repetition'].nunique(), 'repetition')} of "
+            f"every run with the correspondences in another order ({data}).")
 
 
 def _chance(summary):
     baseline = results.of_variant(summary, "baseline")
     if baseline["repetition"].nunique() < 2:
-        return "**How much is chance.** One repetition cannot say how much of any difference is chance."
+        return "One repetition cannot say how much of any difference is chance."
     errors = results.over_orders(baseline, "rmse")
     ratio = errors["highest"] / errors["lowest"]
-    widest = f" and up to {ratio.max():.2g} times ({ratio.idxmax()})" if len(ratio) > 1 else ""
-    return ("**How much is chance.** With all keypoints, the order of the correspondences alone makes the highest RMSE "
-            f"of a sequence {ratio.median():.2g} times its lowest (median over sequences){widest}.")
+    widest = f", up to {ratio.max():.2g} times ({ratio.idxmax()})" if len(ratio) > 1 else ""
+    return (f"The order of the correspondences alone makes the highest RMSE of a sequence {ratio.median():.2g} times "
+            f"its lowest with all keypoints (median over sequences{widest}).")
 
 
-def _again(summary):
-    """Whether the best width is so again where the order of the correspondences is another."""
-    stability = results.stability(summary).dropna()
-    number = results.of_variant(summary, "masked")["dilation_width"].nunique()
-    if stability.empty or number < 2:
+def _compared(summary, pose):
+    """The masks of the tested width over all keypoints, and over each control: {variant: ratio of each sequence}."""
+    masked = results.of_control(summary, "masked", pose)
+    every = results.of_variant(summary, "baseline", pose)
+    if not len(masked) or not len(every):
+        return {}
+    others = {variant: results.of_control(summary, variant, pose) for variant in CONTROLS if variant != "masked"}
+    return {"baseline": answer.ratios(masked, every, "rmse"),
+            **{variant: answer.ratios(masked, rows, "rmse") for variant, rows in others.items() if len(rows)}}
+
+
+def _masks(summary, pose, label_maps=None):
+    """What masks of the tested width do under one estimator, and whether it is the segmentation that does it."""
+    compared = _compared(summary, pose)
+    if not compared:
         return ""
-    promised = results.widths(summary).loc[stability.index, "best_rmse"]
-    return ("A sequence's best width in one repetition is the best in another "
-            f"{stability['same_best'].mean():.0f} times in 100; lots drawn among {number} widths would agree "
-            f"{100 / number:.0f} times. Chosen in one repetition and judged in the others, it changes RMSE by "
-            f"{_signed(stability['elsewhere'].mean())} % on average; chosen and judged by the same runs, as in "
-            f"the thesis, by {_signed(promised.mean())} %.")
+    change, width = compared["baseline"], results.tested_width(summary)
+    masks = "masks" if width is None else f"masks of width {width}"
+    with_maps = " from these label maps" if label_maps else ""
+    text = (f"Under the {POSES[pose].replace(' estimator', '')} estimator {masks} make RMSE {_times(change)} that of "
+            f"all keypoints ({_lower(change)}).")
+    count = int(change.notna().sum())
+    if count < ENOUGH:
+        return f"{text} {_number(count, 'sequence')} cannot tell whether masks help, nor whether the segmentation does."
+    helps = {-1: "help", 0: "are not shown to help", 1: "do worse than all keypoints"}[verdict(change)]
+    text += f" **Masks{with_maps} {helps} here"
+    signs = {variant: verdict(ratio) for variant, ratio in compared.items() if variant in UNAIDED}
+    if not signs:
+        return f"{text}.**"
+    beaten = [variant for variant, sign in signs.items() if sign < 0]
+    if len(beaten) == len(signs):
+        return f"{text}, and the segmentation matters: every control without it does worse.**"
+    if beaten:
+        rest = ", ".join(CONTROLS[variant] for variant in signs if variant not in beaten)
+        return f"{text}, and the segmentation is not shown to matter: not shown to do worse are {rest}.**"
+    return f"{text}, and the segmentation is not shown to matter: no control without it is shown to do worse.**"
+
+
+def _controls(summary):
+    """A Markdown table: every method as times all keypoints, and masks as times it, under each estimator."""
+    found = {pose: answer.compared(summary, "rmse", pose) for pose in POSES if _compared(summary, pose)}
+    if not found:
+        return ""
+    head = "| RMSE | keypoints | " + " | ".join(f"{POSES[pose]}: times all keypoints | masks are times this"
+                                                for pose in found) + " |"
+    lines = [head, "| :--- | ---: |" + " :--- | :--- |" * len(found)]
+    names = results.control_names(summary)
+    rows = {pose: table.set_index("variant") for pose, table in found.items()}
+    for variant in next(iter(rows.values())).index.drop("baseline"):
+        cells = []
+        for table in rows.values():
+            row = table.loc[variant] if variant in table.index else None
+            cells += ["", ""] if row is None else [
+                _ratio(row["ratio"], row["low"], row["high"]),
+                "" if variant == "masked" else _ratio(row["masks"], row["masks_low"], row["masks_high"])]
+        keypoints = next(table.loc[variant, "keypoints"] for table in rows.values() if variant in table.index)
+        lines.append(f"| {names[variant]} | {keypoints:.0f} | {' | '.join(cells)} |")
+    note = (f"Geometric means over sequences; in brackets their {LEVEL} % bootstrap interval, where there are "
+            f"{results.FEWEST} or more. A ratio whose interval holds 1 shows no difference; of those that exclude it, "
+            "one in twenty does so by chance.")
+    return "\n".join(["**Masks and controls, in numbers.** " + note, "", *lines])
 
 
 def _choice(summary):
-    table = results.widths(summary)
-    if table.empty or results.of_variant(summary, "masked")["dilation_width"].nunique() < 2:
+    """What the choice of width makes of the comparison: a Markdown table and what it is worth."""
+    table, number = results.widths(summary), results.of_variant(summary, "masked")["dilation_width"].nunique()
+    if table.empty or number < 2:
         return ""
-    text = (f"**Masks against all keypoints, {POSES[results.main_pose(summary)]}.** With the width of the lowest RMSE "
-            f"on each sequence (the thesis says RMSE and/or MAE): {_changes(table, 'best')}. That choice favours masks "
-            "even where they do nothing, so it is no test.")
-    if len(table) > 1:
-        text += (f" With one width for all ({table['fixed'].iloc[0]}), chosen on the same sequences too: "
-                 f"{_changes(table, 'fixed')}. With the width that the other sequences choose: "
-                 f"{_changes(table, 'left_out')}; that is no longer favoured, but the choices hang together and an "
-                 f"interval would be too narrow. {_tested(summary)}")
-    return text.strip()
+    lines = ["| width chosen | RMSE, times all keypoints | lower in | MAE, times all keypoints | lower in |",
+             "| :--- | :--- | :--- | :--- | :--- |"]
+    for choice, name in CHOICES.items():
+        changes = {metric: table[f"{choice}_{metric}"].dropna() for metric in ("rmse", "mae")}
+        if len(changes["rmse"]) and (choice == "best" or len(table) > 1):
+            cells = [cell for metric in ("rmse", "mae")
+                     for cell in (f"{np.exp(np.log1p(changes[metric] / 100).mean()):.2f}", _lower_of(changes[metric]))]
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+    text = (f"**The choice of width, {POSES[results.main_pose(summary)]}.** The best of {number} widths looks good even "
+            "where masks do nothing, so it is no test.")
+    return "\n".join([f"{text} {_again(summary, number)}{_tested(summary)}".strip(), "", *lines])
+
+
+def _again(summary, number):
+    """Whether the best width is so again where the order of the correspondences is another."""
+    stability = results.stability(summary).dropna()
+    if stability.empty:
+        return ""
+    return (f"A sequence's best width in one repetition is the best in another {stability['same_best'].mean():.0f} "
+            f"times in 100; lots drawn among {number} would agree {100 / number:.0f} times. ")
 
 
 def _tested(summary):
     """Where the width that is put to the test comes from."""
     width = results.tested_width(summary)
-    if "masked" not in results.control_changes(summary, "rmse"):
+    if not _compared(summary, results.main_pose(summary)):
         return ""
     if width != CONTROL_WIDTH:
-        return (f"The test below is of the width {width}, set in place of Section 3.6's {CONTROL_WIDTH}; it is a fair "
-                "one if it was set before any run was seen.")
-    text = f"The test below is of the width {width}, that of Section 3.6, fixed before any run"
+        return (f"The width put to the test is {width}, set in place of Section 3.6's {CONTROL_WIDTH}; the test is fair "
+                "if it was set before any run was seen.")
+    text = f"The width put to the test is {width}, that of Section 3.6, fixed before any run"
     return f"{text}." if width in set(results.best_widths(summary)["dilation_width"]) else (
         f"{text}; it is the best width of no sequence.")
 
 
-def _changes(table, choice):
-    return " and ".join(f"{metric.upper()} {_signed(changes.mean())} % ({_improved(changes)})"
-                        for metric in ("rmse", "mae") for changes in [table[f"{choice}_{metric}"]])
-
-
-def _judged(changes):
-    said = {-1: "is smaller than", 0: SAME, 1: "is larger than"}[verdict(changes)]
-    return (f"{said} that of all keypoints ({_mean(changes)}, median {_signed(changes.median())} %, "
-            f"{_improved(changes)})")
-
-
-def _against_controls(summary, pose):
-    changes = results.control_changes(summary, "rmse", pose)
-    if "masked" not in changes:
-        return ""
-    width, others = results.tested_width(summary), [variant for variant in changes if variant != "masked"]
-    masks = "These masks" if width is None else f"Masks of width {width}"
-    text = (f"**{masks}{' and the controls' if others else ''}, {POSES[pose]}.** With masks RMSE "
-            f"{_judged(changes['masked'])}.")
-    signs = {variant: verdict(changes["masked"] - changes[variant]) for variant in others}
-    for sign, said in ((-1, "is smaller than with"), (1, "is larger than with"), (0, f"{SAME} that with")):
-        found = [f"{CONTROLS[variant]} ({_mean(changes['masked'] - changes[variant], ' points')})"
-                 for variant in others if signs[variant] == sign]
-        if found:
-            text += f" It {said} {', '.join(found)}."
-    return text + _in_sequences(summary, others, pose) + _conclusion(changes["masked"], signs)
-
-
 def _against_each_other(summary, pose):
-    changes, called = {}, {}
+    masked, called = {}, {}
     for source in results.sources(summary):
         own = results.of_source(summary, source)
-        found, width = results.control_changes(own, "rmse", pose), results.tested_width(own)
-        if "masked" in found:
-            changes[source] = found["masked"]
+        rows, width = results.of_control(own, "masked", pose), results.tested_width(own)
+        if len(rows):
+            masked[source] = rows
             called[source] = source if width is None else f"{source} (width {width})"
-    said = {-1: "is smaller than with", 0: f"{SAME} that with", 1: "is larger than with"}
-    found = [f"with {called[one]} RMSE {said[verdict(changes[one] - changes[other])]} {called[other]} "
-             f"({_mean(changes[one] - changes[other], ' points')})" for one, other in combinations(changes, 2)]
+    said = {-1: "is smaller than with", 0: "cannot be told apart from that with", 1: "is larger than with"}
+    found = []
+    for one, other in combinations(masked, 2):
+        ratio = answer.ratios(masked[one], masked[other], "rmse")
+        found.append(f"with {called[one]} RMSE {said[verdict(ratio)]} {called[other]} ({_times(ratio)})")
     if not found:
         return ""
-    text = "; ".join(found)
-    return f"### One against the other, {POSES[pose]}\n\nChanges from all keypoints compared: {text}."
+    return f"### One against the other, {POSES[pose]}\n\n{'; '.join(found)}."
 
 
-def _in_sequences(summary, others, pose):
-    """In which sequences the repetitions with masks do not overlap those of another variant."""
-    masked = results.of_control(summary, "masked", pose)
-    repetitions = masked["repetition"].nunique()
-    if repetitions < FEWEST_REPETITIONS:
-        return ""
-    found, count = [], 0
-    for variant in ("baseline", *others):
-        rows = results.of_control(summary, variant, pose)
-        count += rows["sequence"].isin(masked["sequence"]).groupby(rows["sequence"]).any().sum()
-        said = [f"{word} in {', '.join(names) if len(names) <= 3 else f'{len(names)} sequences'}"
-                for word, names in zip(("better", "worse"), results.apart(masked, rows)) if names]
-        if said:
-            found.append(f"{NAMES[variant]} ({'; '.join(said)})")
-    expected = 2 / comb(2 * repetitions, repetitions) * count
-    if not found:
-        return " In no single sequence do all repetitions with masks lie on one side of all those of another variant."
-    return (f" In single sequences, every repetition with masks is better or worse than every one with "
-            f"{', '.join(found)}; of {count} such comparisons chance alone would give {expected:.1g}.")
+def _times(ratios):
+    return f"{_ratio(*answer.mean_ratio(ratios))} times"
 
 
-def _conclusion(change, signs):
-    signs = {variant: sign for variant, sign in signs.items() if variant in UNAIDED}
-    if not signs:
-        return ""
-    count = int(change.notna().sum())
-    if count < ENOUGH:
-        return (f" **{_number(count, 'sequence')} cannot tell whether masks help, nor whether it is the segmentation "
-                "that does.**")
-    helps = {-1: "Masks help here", 0: "Masks are not shown to help here", 1: "Masks do harm here"}[verdict(change)]
-    beaten = [variant for variant, sign in signs.items() if sign < 0]
-    if len(beaten) == len(signs):
-        why = "the segmentation matters: every control without it does worse"
-    elif beaten:
-        rest = [CONTROLS[variant] for variant in signs if variant not in beaten]
-        why = f"the segmentation is not shown to matter, as these are not shown to do worse: {', '.join(rest)}"
-    else:
-        why = "the segmentation is not shown to matter: no control without it is shown to do worse"
-    return f" **{helps}, and {why}.**" if verdict(change) or len(beaten) < len(signs) else f" **{helps}, but {why}.**"
+def _ratio(mean, low, high):
+    return f"{mean:.2f}" if np.isnan(low) else f"{mean:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _mean(values, unit=" %"):
-    low, high = results.interval(values)
-    bracket = "" if np.isnan(low) else f" [{_signed(low)}, {_signed(high)}]"
-    return f"{_signed(np.nanmean(values))}{unit}{bracket}"
+def _lower(ratios):
+    return f"lower in {(ratios < 1).sum()} of {ratios.notna().sum()} sequences"
 
 
-def _improved(changes):
-    return f"better in {(changes < 0).sum()} of {changes.notna().sum()}"
-
-
-def _signed(value):
-    return f"{value:+.0f}" if abs(value) >= 9.95 else f"{value:+.1f}"
-
-
-def _from_to(values):
-    return f"{min(values)}" if min(values) == max(values) else f"{min(values)} to {max(values)}"
+def _lower_of(changes):
+    return f"{(changes < 0).sum()} of {len(changes)}"
 
 
 def _number(count, noun):

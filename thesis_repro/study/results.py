@@ -251,18 +251,6 @@ def _row(runs: pd.DataFrame, metric: str, changes: pd.DataFrame, variant: str, b
     return row
 
 
-def apart(one: pd.DataFrame, other: pd.DataFrame) -> tuple[list[str], list[str]]:
-    """Sequences in which every repetition of one variant has a lower RMSE than every one of the other.
-
-    one, other: rows of two variants. Returns (names where one is lower, names where it is higher).
-    """
-    one, other = over_orders(one, "rmse"), over_orders(other, "rmse")
-    names = one.index.intersection(other.index)
-    lower = one.loc[names, "highest"] < other.loc[names, "lowest"]
-    higher = one.loc[names, "lowest"] > other.loc[names, "highest"]
-    return list(names[lower]), list(names[higher])
-
-
 # Several sources of masks
 
 
