@@ -1,3 +1,4 @@
+import os
 import signal
 import subprocess
 import sys
@@ -181,6 +182,7 @@ def test_two_images_of_one_name(model, frames, tmp_path):
 
 def test_no_memory_for_the_batch(model, monkeypatch):
     labels = IMAGES[..., 0] // 8
+    monkeypatch.setattr(memory, "on_gpu", lambda: None)
     monkeypatch.setattr(memory, "available", lambda: memory.needed(model, 3, training=False) - 1)
     with pytest.raises(InputError, match="batch_size=3: no memory for a batch of 3 images of 64x64"):
         prediction.predict(model, IMAGES, batch_size=3)
@@ -189,6 +191,19 @@ def test_no_memory_for_the_batch(model, monkeypatch):
     with pytest.raises(InputError, match="batch_size=3: no memory"):  # which takes far more
         memory.require(model, 3, training=True)
     assert prediction.predict(model, IMAGES, batch_size=2).shape == (7, SIZE, SIZE)
+
+
+def test_a_gpus_memory_counts_where_there_is_one(model, monkeypatch, tmp_path):
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\nprintf '8192\\n2\\n'\n")  # MiB, of two
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: [])
+    assert memory.on_gpu() is None
+    monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: ["one", "other"])
+    assert memory.on_gpu() == 2 * 2**20
+    with pytest.raises(InputError, match="batch_size=64: no memory .* are on the GPU; lower"):
+        memory.require(model, 64, training=True)
 
 
 def test_memory_available_follows_the_limit_of_the_process():
