@@ -60,7 +60,7 @@ setup: .venv/ready $(if $(filter-out 0,$(GPU)),.venv/ready-gpu)
 	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1 | head -1): Python 3.11, 3.12 or 3.13 is needed; name one with PYTHON=/path" >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { \
 	  echo "$(PYTHON) has no venv module: install it (Debian and Ubuntu: apt-get install python3-venv)" >&2; exit 1; }
-	@echo "installing the pinned packages into .venv (2.3 GB, some minutes)"
+	@echo "installing the pinned packages into .venv (2.4 GB, some minutes)"
 	@$(PYTHON) -m venv .venv
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -r environment.txt 2> >(grep -v '^WARNING' >&2)
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . 2> >(grep -v '^WARNING' >&2)
