@@ -51,10 +51,11 @@ def believe(motion: Motion, current: np.ndarray, previous: np.ndarray, scale: fl
 
     A motion that its points determine and that goes on from the course, by no more than TURN and SWING, is believed; so
     that little of RANSAC's chance is left in it, it is fitted once more from the expected motion, where all orders of
-    the correspondences start alike. Otherwise the best motion is looked for among those that do go on. In a scene that stands still the true motion has
-    nearly as many correspondences near it as any other, so that one is taken if it has at least SUPPORT times as many;
-    if not, the camera has left its course, and the estimated motion is taken. Either way the step is AMBIGUOUS. Where
-    neither is determined the step is NOT_DETERMINED: the camera goes on along its course.
+    the correspondences start alike. Otherwise the best motion is looked for among those that do go on. In a scene that
+    stands still the true motion has nearly as many correspondences near it as any other, so that one is taken if it has
+    at least SUPPORT times as many; if not, the camera has left its course, and the estimated motion is taken. Either
+    way the step is AMBIGUOUS. Where neither is determined the step is NOT_DETERMINED: the camera goes on along its
+    course.
     """
     rotation, translation = course.after(scale), course.translation
     turn = TURN if course.scale else FIRST_TURN
