@@ -77,6 +77,7 @@ def believe(motion: Motion, current: np.ndarray, previous: np.ndarray, scale: fl
         if other and goes_on(other) and (other.support >= SUPPORT * motion.support or not _determined(motion)):
             motion = other
     if _determined(motion):
+        assert motion.rotation is not None and motion.translation is not None  # a fitted motion has both
         return motion, Course(motion.rotation, motion.translation, scale), flag
     return replace(motion, rotation=rotation, translation=translation), course, NOT_DETERMINED
 

@@ -98,7 +98,8 @@ def _masks(summary, pose, label_maps=None):
             f"all keypoints ({_lower(change)}).")
     count = int(change.notna().sum())
     if count < ENOUGH:
-        return f"{text} {_number(count, 'sequence')} cannot tell whether masks help, nor whether the segmentation does."
+        return (f"{text} {_number(count, 'sequence')} cannot tell whether masks help, nor whether the segmentation "
+                "does.")
     helps = {-1: "help", 0: "are not shown to help", 1: "do worse than all keypoints"}[verdict(change)]
     text += f" **Masks{with_maps} {helps} here"
     signs = {variant: verdict(ratio) for variant, ratio in compared.items() if variant in UNAIDED}
@@ -151,8 +152,8 @@ def _choice(summary):
             cells = [cell for metric in ("rmse", "mae")
                      for cell in (f"{np.exp(np.log1p(changes[metric] / 100).mean()):.2f}", _lower_of(changes[metric]))]
             lines.append(f"| {name} | {' | '.join(cells)} |")
-    text = (f"**The choice of width, {POSES[results.main_pose(summary)]}.** The best of {number} widths looks good even "
-            "where masks do nothing, so it is no test.")
+    text = (f"**The choice of width, {POSES[results.main_pose(summary)]}.** The best of {number} widths looks good "
+            "even where masks do nothing, so it is no test.")
     return "\n".join([f"{text} {_again(summary, number)}{_tested(summary)}".strip(), "", *lines])
 
 
@@ -171,8 +172,8 @@ def _tested(summary):
     if not _compared(summary, results.main_pose(summary)):
         return ""
     if width != CONTROL_WIDTH:
-        return (f"The width put to the test is {width}, set in place of Section 3.6's {CONTROL_WIDTH}; the test is fair "
-                "if it was set before any run was seen.")
+        return (f"The width put to the test is {width}, set in place of Section 3.6's {CONTROL_WIDTH}; the test is "
+                "fair if it was set before any run was seen.")
     text = f"The width put to the test is {width}, that of Section 3.6, fixed before any run"
     return f"{text}." if width in set(results.best_widths(summary)["dilation_width"]) else (
         f"{text}; it is the best width of no sequence.")
