@@ -46,6 +46,7 @@ class Profile:
     base_filters: int  # channels of the U-Net's first block
     batch_size: int
     learning_rate: float  # of Adam
+    threads: int  # inside an operation of the training: part of its bits, so that no number of cores changes them
     epochs: int
     patience: int  # epochs without a lower validation loss before training stops
     training_images: int | None  # images taken from the training split
@@ -68,15 +69,15 @@ class Profile:
 
 
 PROFILES = {
-    "smoke": Profile(image_size=64, base_filters=4, batch_size=4, learning_rate=0.001, epochs=2, patience=5,
-                     training_images=16, frames=12, timed_frames=5, widths=(1, 5, 10, 15), repetitions=2,
+    "smoke": Profile(image_size=64, base_filters=4, batch_size=4, learning_rate=0.001, threads=1, epochs=2,
+                     patience=5, training_images=16, frames=12, timed_frames=5, widths=(1, 5, 10, 15), repetitions=2,
                      world_sequences=2, world_frames=12, world_training_images=12, world_validation_images=4),
     # The thesis's loss wants many steps: small batches and a higher rate come further in the same minutes.
-    "demo": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, epochs=18, patience=5,
-                    training_images=200, frames=200, timed_frames=7, widths=ALL_WIDTHS, repetitions=3,
+    "demo": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, threads=1, epochs=24,
+                    patience=5, training_images=200, frames=200, timed_frames=7, widths=ALL_WIDTHS, repetitions=3,
                     world_sequences=11, world_frames=None, world_training_images=100, world_validation_images=20),
-    "thesis": Profile(image_size=320, base_filters=64, batch_size=16, learning_rate=0.001, epochs=100, patience=5,
-                      training_images=None, frames=None, timed_frames=200, widths=ALL_WIDTHS, repetitions=5,
+    "thesis": Profile(image_size=320, base_filters=64, batch_size=16, learning_rate=0.001, threads=8, epochs=100,
+                      patience=5, training_images=None, frames=None, timed_frames=200, widths=ALL_WIDTHS, repetitions=5,
                       world_sequences=11, world_frames=300, world_training_images=2975, world_validation_images=500),
 }
 SEED = 0

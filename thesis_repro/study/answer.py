@@ -1,4 +1,4 @@
-"""Do masks from a segmentation help? The comparison, which was decided before any run of it was seen.
+"""Do masks from a segmentation help? The comparison, which was decided before any run on real frames was seen.
 
 - **Estimator**: the refined one (pose="refined"). The thesis's spreads so far between orders of the correspondences
   that it sees no effect of the size in question; it stands beside.
