@@ -83,9 +83,6 @@ def render_image(split, index, scale=0.5, seed=0):
     picture = _expose(rng, image, rng.uniform(88, 122), rng.uniform(1.2, 3.0))
     if rng.random() < 0.6:
         _bonnet(rng, picture, labels)
-    edge = max(1, round(width / 400))  # Cityscapes leaves the outermost pixels out of its region of interest
-    for part in (np.s_[:edge], np.s_[-edge:], np.s_[:, :edge], np.s_[:, -edge:]):
-        labels[part] = ID["out of roi"]
     return picture, labels
 
 
