@@ -181,7 +181,7 @@ def test_the_embedded_world_is_named_at_the_top_where_it_was_used(run, tmp_path,
 def test_what_was_run_is_told_from_the_run_itself(run):
     text = read(run).text
     assert "29 February 2024" in text and f"{platform.python_version()} on" in text
-    assert "tensorflow 2." in text and "network 160x160 with 8 filters" in text
+    assert "tensorflow 2." in text and "network 128x128 with 8 filters" in text
 
 
 def test_tables_are_tables_with_numbers_to_the_right(run):

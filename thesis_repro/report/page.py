@@ -187,7 +187,8 @@ def build_study(folder, artefacts, facts, embedded):
     embedded: whether the frames are those of the embedded world.
     """
     shown = [{"kind": kind, "id": name if kind == "text" else f"{kind}-{name}", "number": None, "title": title,
-              "caption": caption, "makers": [], "reported": None, "here": None, **_shown(folder, kind, name)}
+              "caption": caption, "makers": [], "reported": None, "here": None, "label_maps": None,
+              **_shown(folder, kind, name)}
              for (kind, name), (title, caption) in artefacts.items()]
     return TEMPLATES.get_template("study.html").render(
         title="A study of masks", style="", artefacts=shown, embedded=embedded, notebooks={}, facts=facts | {

@@ -374,7 +374,7 @@ def text(work: Work, plan: Plan, calibration: Calibration, complete: bool = Fals
     sizes = work.sizes if isinstance(work, Thesis) else None
     whose = "the complete benchmark" if complete else f"{work.kitti}"
     lines = [f"{whose}: {len(plan.frames)} sequence{'s' * (len(plan.frames) > 1)}, {total:,} frames"]
-    if sizes and (passed_over := kitti.without_truth(work.kitti)):
+    if sizes and not complete and (passed_over := kitti.without_truth(work.kitti)):
         lines.append(f"(passed over, for they have no true poses: {', '.join(passed_over)})")
     if not complete and sizes and any(plan.frames.get(name, 0) < count for name, count in kitti.FRAME_COUNTS.items()):
         lines.append(f"(the complete benchmark has {len(kitti.FRAME_COUNTS)} sequences, {everything:,} frames; "
