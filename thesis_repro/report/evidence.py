@@ -27,7 +27,8 @@ from thesis_repro.study import answer, controls, effects, jobs, results, runner
 
 LARGEST = 3_000_000  # bytes, of everything together
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
-OTHER_WIDTHS = (5, 15)  # beside the tested one, of all methods, for the lines of error against number of keypoints
+# Beside the tested width, for the lines of error against number of keypoints: under the estimator that judges alone.
+OTHER_WIDTHS, OTHER_REPETITIONS = (5, 15), 3
 LINES = ("masked", "exact-boundaries", "mirrored", "random-lines", "image-edges")  # that have a width
 LOOKED_AT = 12  # frames of each sequence whose boundaries and keypoints are looked at one by one
 
@@ -88,16 +89,17 @@ def _runs(root, names, build, frames, repetitions, processes):
         return runner.run(some, root, build / "labels", build / "odometry", frames=frames, processes=processes)
 
     tested = jobs.first_jobs(names, WIDTHS, repetitions) + jobs.mask_control_jobs(root, names, repetitions)
-    other = [jobs.Job(name, variant, width, pose=pose, repetition=repetition) for name in names for variant in LINES
-             for width in OTHER_WIDTHS for pose in jobs.POSES for repetition in range(repetitions)]
+    fewer = min(repetitions, OTHER_REPETITIONS)
+    other = [jobs.Job(name, variant, width, pose=answer.POSE, repetition=repetition) for name in names
+             for variant in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
     summary = run([*tested, *other])
     first = summary[summary["run"].isin({job.name for job in tested})]
     tested += jobs.reduced_jobs(results.best_widths(first), repetitions)
     tested += jobs.keypoint_control_jobs(results.keypoints_left(first), root, frames, repetitions)
     for width in OTHER_WIDTHS:
         left = summary[(summary["variant"] == "masked") & (summary["dilation_width"] == width)]
-        other += jobs.keypoint_control_jobs(left.groupby("sequence")["mean_keypoints"].mean(), root, frames,
-                                            repetitions)
+        limited = jobs.keypoint_control_jobs(left.groupby("sequence")["mean_keypoints"].mean(), root, frames, fewer)
+        other += [job for job in limited if job.pose == answer.POSE]
     keys = {(job.sequence, job.name) for job in tested}
     every = answer.with_relative(run([*tested, *other]), root, build / "odometry", frames)
     chosen = [key in keys for key in zip(every["sequence"], every["run"], strict=True)]
