@@ -39,8 +39,8 @@ CHAPTERS = {
         "figure_2_09": ("ORB matches", "Keypoints found by ORB in two frames of one sequence and matched by their "
                         "descriptors; the closest matches are drawn, in the colour of their distance."),
         "figure_2_10": ("Drift", "An estimated path leaves the true one, and the distance between them along the "
-                        "way: each step adds its own error to all later positions. Drift too small to be "
-                        "seen is drawn a second time, enlarged."),
+                        "way: each step adds its own error to all later positions. Few keypoints make it "
+                        "large enough to be seen."),
         "figure_2_11": ("Keypoints change with the viewpoint", "The same scene from two places: keypoints that are "
                         "found again, and those that are lost or new."),
         "figure_2_12": ("Keypoints on a frame and on its label map", "Shi-Tomasi on a frame covers every texture; on "
