@@ -238,3 +238,11 @@ def test_thesis_numbers_stand_beside_those_of_the_run(run):
     assert "Here: 2 epochs, the best was 1; train loss 0.90, F1 0.10, IoU 0.10; validation loss 0.80, F1 0.21" in text
     assert "5 to 10 % of the time saved." in text and "Here: −10 to 20 %, by width." in text
     assert "15,337,571 parameters" in text
+
+
+def test_the_page_opens_with_what_the_runs_show(run):
+    (run.settings.figures / "findings.md").write_text("Eleven **short** sentences.\n\n| a | b |\n| - | - |\n| 1 | 2 |\n")
+    html = page.build(run.settings)
+    assert html.index("Eleven <strong>short</strong>") < html.index('id="contents"') < html.index('id="what-was-run"')
+    (run.settings.figures / "findings.md").unlink()
+    assert "In short" not in page.build(run.settings)

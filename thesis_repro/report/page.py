@@ -91,7 +91,9 @@ def build(settings):
     if settings.figures != ROOT / "figures":  # that page is in git, where there is no build folder to link to
         notebooks = {path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
                      for path in _executed(settings)}
+    words = settings.figures / "findings.md"
     return TEMPLATES.get_template("template.html").render(
+        short=_markdown(words.read_text(encoding="utf-8").split("\n\n")[0]) if words.is_file() else None,
         evidence=EVIDENCE if (settings.figures / EVIDENCE).is_file() else None,
         title=f"Tables and figures, {settings.run}", style="", settings=settings, facts=_facts(settings),
         chapters=chapters, shown=shown, of=len(THESIS), notebooks=notebooks,
