@@ -67,7 +67,7 @@ def test_several_effects_of_a_row_stand_together_with_their_spreads():
 @pytest.mark.parametrize(("factors", "says"), [
     ({"masked": 0.5, "mirrored": 1.0, "fewer": 1.1}, "the segmentation matters"),
     ({"masked": 0.5, "mirrored": 0.4, "fewer": 1.1}, "not for what the segmentation knows"),
-    ({"masked": 2.0, "mirrored": 1.0, "fewer": 1.1}, "Masks do harm here"),
+    ({"masked": 2.0, "mirrored": 1.0, "fewer": 1.1}, "Masks do worse than all keypoints here"),
     ({"masked": 1.0, "mirrored": 1.0, "fewer": 1.1}, "not shown to help"),
 ])
 def test_the_answer_is_chosen_by_the_numbers(factors, says):

@@ -125,8 +125,11 @@ def _between(low, high):
     return pd.NA if np.isnan(low) else f"{low:.3g} to {high:.3g}"
 
 
-def words(summary, data):
-    """The answer as one paragraph of Markdown, chosen by the numbers as `study.answer` has it."""
+def words(summary, data, quality=None):
+    """The answer as one paragraph of Markdown, chosen by the numbers as `study.answer` has it.
+
+    quality: of the label maps, for the verdict (`gap.quality`).
+    """
     found = {metric: answer.compared(summary, metric).set_index("variant") for metric in answer.METRICS}
     first = found["turned"]
     if "masked" not in first.index:
@@ -153,10 +156,11 @@ def words(summary, data):
     helps = {_sign(found[metric].loc["masked", "low"], found[metric].loc["masked", "high"]) for metric in found}
     if count < ENOUGH:
         return f"{text} **{count} sequences say nothing of sequences in general.**\n"
+    masks = f"Masks{f' from label maps of {quality}' if quality else ''}"
     if helps == {-1}:
-        return text + (" **Masks help here, and the segmentation matters.**\n" if not better and not same
-                       else " **Masks help here, but not for what the segmentation knows.**\n")
-    return text + (" **Masks do harm here.**\n" if helps == {1} else " **Masks are not shown to help here.**\n")
+        return f"{text} **{masks} help here, " + ("and the segmentation matters.**\n" if not better and not same
+                                                 else "but not for what the segmentation knows.**\n")
+    return f"{text} **{masks} {'do worse than all keypoints' if helps == {1} else 'are not shown to help'} here.**\n"
 
 
 def _sign(low, high):

@@ -43,13 +43,13 @@ def study_words(summary, data):
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def words(summary, data, label_maps=None):
+def words(summary, data, label_maps=None, quality=None):
     """A Markdown text on what a summary of runs shows; data: one line that says where they come from.
 
-    label_maps: one line on how good these are (`gap.line`).
+    label_maps: one line on how good these are (`gap.line`). quality: the same in short, for verdicts (`gap.quality`).
     """
     short = [_about(summary, data), label_maps and f"{label_maps[0].upper()}{label_maps[1:]}.", _chance(summary),
-             *(_masks(summary, pose, label_maps) for pose in POSES)]
+             *(_masks(summary, pose, quality) for pose in POSES)]
     if "embedded" in data.split(";")[0]:
         short.append("These are rendered streets: nothing here is evidence about KITTI.")
     parts = [" ".join(part for part in short if part), _controls(summary), _choice(summary)]
@@ -86,14 +86,14 @@ def _compared(summary, pose):
             **{variant: answer.ratios(masked, rows, "rmse") for variant, rows in others.items() if len(rows)}}
 
 
-def _masks(summary, pose, label_maps=None):
+def _masks(summary, pose, quality=None):
     """What masks of the tested width do under one estimator, and whether it is the segmentation that does it."""
     compared = _compared(summary, pose)
     if not compared:
         return ""
     change, width = compared["baseline"], results.tested_width(summary)
     masks = "masks" if width is None else f"masks of width {width}"
-    with_maps = " from these label maps" if label_maps else ""
+    of_quality = f" from label maps of {quality}" if quality else ""
     text = (f"Under the {POSES[pose].replace(' estimator', '')} estimator {masks} make RMSE {_times(change)} that of "
             f"all keypoints ({_lower(change)}).")
     count = int(change.notna().sum())
@@ -101,7 +101,7 @@ def _masks(summary, pose, label_maps=None):
         return (f"{text} {_number(count, 'sequence')} cannot tell whether masks help, nor whether the segmentation "
                 "does.")
     helps = {-1: "help", 0: "are not shown to help", 1: "do worse than all keypoints"}[verdict(change)]
-    text += f" **Masks{with_maps} {helps} here"
+    text += f" **Masks{of_quality} {helps} here"
     signs = {variant: verdict(ratio) for variant, ratio in compared.items() if variant in UNAIDED}
     if not signs:
         return f"{text}.**"

@@ -10,6 +10,7 @@ from thesis_repro.report.style import BLUE, GREEN, ORANGE, new_figure
 from thesis_repro.segmentation import errors
 from thesis_repro.study.flicker import EXACT
 
+FRAMES = "the odometry's frames"  # the domain that masks are made on
 RECORD = "quality"  # a table in the build folder: the scores, and which model's label maps the odometry uses
 COLOURS = ((BLUE, ""), (ORANGE, "//"), (GREEN, ".."))  # of the domains
 MEASURES = {
@@ -130,3 +131,13 @@ def line(build):
     return f"label maps by {scores['model'].iloc[0]}: mean IoU " + ", ".join(
         f"{row.mean_iou:.2f} on {row.domain} ({row.images}; pixel accuracy {row.accuracy:.2f})"
         for row in scores.itertuples())
+
+
+def quality(build):
+    """How good the label maps of a run are, in short, for verdicts; on the odometry's frames where that is known."""
+    path = build / f"{RECORD}.csv"
+    if not path.is_file():
+        return None
+    scores = pd.read_csv(path)
+    scores = scores[scores["used"]].set_index("domain")["mean_iou"]
+    return f"mean IoU {scores.get(FRAMES, scores.iloc[0]):.2f}"
