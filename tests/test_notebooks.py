@@ -119,7 +119,7 @@ def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
     assert done.returncode == 0, done.stdout + done.stderr
     (build,) = (tmp_path / "build").iterdir()  # no world beside it
     assert build.name.endswith("-smoke-widths-5_10-repetitions-1") and not (build / "model").exists()
-    assert [name[:2] for name in names(build / "notebooks", ".ipynb")] == ["03", "05", "06", "07", "08"]
+    assert [name[:2] for name in names(build / "notebooks", ".ipynb")] == ["03", "05", "06", "07", "08", "09"]
     figures = tmp_path / "figures" / build.name
     left_out = {"figure_4_01", "figure_4_02", *(f"figure_3_{n:02d}" for n in range(1, 6))}
     assert set(names(figures, ".svg") + names(figures, ".webp")) == {*FIGURES, *OWN_FIGURES} - left_out

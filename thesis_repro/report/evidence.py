@@ -24,6 +24,7 @@ from thesis_repro.files import write_text
 from thesis_repro.odometry import boresight
 from thesis_repro.report import audit, comparison, findings, outcome, style, tables
 from thesis_repro.study import answer, controls, effects, jobs, results, runner
+from thesis_repro.study.sources import Source
 
 LARGEST = 3_000_000  # bytes, of everything together
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
@@ -118,7 +119,7 @@ def _tracks(sequences, labels):
         own, width = labels / sequence.name, jobs.CONTROL_WIDTH
         kinds = {"all keypoints": None, "masks": masks.LabelMasks(own, sequence, width),
                  "exact boundaries": masks.LabelMasks(own, sequence, width, "exact"),
-                 "random lines": controls.masks("random-lines", own, sequence, width)}
+                 "random lines": controls.masks("random-lines", Source(labels), sequence, width)}
         rows.append(effects.tracks(sequence, kinds, LOOKED_AT))
     return pd.concat(rows, ignore_index=True)
 
