@@ -130,7 +130,7 @@ def _vectors(estimated, true):
     motions = _motions(estimated), _motions(true)
     lengths = [np.linalg.norm(some[:, :3, 3], axis=1) for some in motions]
     seen, given = (np.stack([some[:, :3, 3] / np.maximum(length, 1e-9)[:, None],
-                             [cv2.Rodrigues(np.ascontiguousarray(one[:3, :3]))[0].ravel() for one in some]], axis=1)
+                             [metrics.rotation_vector(one) for one in some]], axis=1)
                    for some, length in zip(motions, lengths, strict=True))
     usable = (np.minimum(*lengths) > SHORTEST) & ((seen[:, 0] * given[:, 0]).sum(axis=1) > np.cos(np.radians(WRONG)))
     return seen[usable], given[usable]
@@ -207,7 +207,7 @@ def explained(paths: Mapping[str, Paths]) -> pd.DataFrame:
     rows = []
     for name, (estimated, true) in paths.items():
         own = estimate([paths[name]])
-        day = [other for other in paths if other != name and name in DAYS and DAYS.get(other) == DAYS[name]]
+        day = same_day(name, paths)
         row = {"sequence": name, "steps": own.steps}
         for index, angle in enumerate(ANGLES):
             row |= {angle: own.angles[index], f"{angle}_low": own.low[index], f"{angle}_high": own.high[index]}
@@ -227,6 +227,11 @@ def explained(paths: Mapping[str, Paths]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def same_day(name: str, names: Iterable[str]) -> list[str]:
+    """Those of `names` that were recorded on the day of sequence `name`, itself left out."""
+    return [other for other in names if other != name and name in DAYS and DAYS.get(other) == DAYS[name]]
+
+
 def _composed(motions, start):
     poses = [start]
     for motion in motions:
@@ -236,8 +241,7 @@ def _composed(motions, start):
 
 def _sway(motion, given):
     length = np.linalg.norm(given[:, :3, 3], axis=1)
-    turn = np.degrees(np.arccos(np.clip((np.trace(given[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    straight = (length > SHORTEST) & (turn < STRAIGHT)
+    straight = (length > SHORTEST) & (metrics.angles(given) < STRAIGHT)
     sideways = [np.degrees(some[straight, 0, 3] / length[straight]) for some in (motion, given)]
     return {f"{name}_sway": float(1.4826 * np.median(np.abs(some - np.median(some)))) if straight.any() else np.nan
             for name, some in zip(("camera", "truth"), sideways, strict=True)}
@@ -245,4 +249,4 @@ def _sway(motion, given):
 
 def _parted(motion, given):
     one, other = (_composed(some, np.eye(4))[-1][:3, :3] for some in (motion, given))
-    return float(np.degrees(np.arccos(np.clip((np.trace(one.T @ other) - 1) / 2, -1, 1))))
+    return float(metrics.angles(one.T @ other))

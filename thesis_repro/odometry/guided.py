@@ -35,10 +35,7 @@ def _best(columns, limit, rotation, translation, cos_turn, cos_swing, state):
     r, t = np.empty((3, 3)), np.empty(3)
     most, best_r, best_t = 0, np.empty((3, 3)), np.empty(3)
     for _ in range(MAX_SAMPLES):
-        state = draw(state, count, chosen)
-        for k in range(SAMPLE):
-            for j in range(4):
-                five[k, j] = columns[j, chosen[k]]
+        state = draw(state, columns, chosen, five)
         sure, solutions, _ = solve(five)
         if not sure:
             continue

@@ -135,33 +135,40 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
     NaN, with a note, where the path is shorter than `length`.
     """
     estimated, true = checked(estimated, true)
-    travelled = _travelled(true)
-    last = np.searchsorted(travelled, travelled + length)
+    along = travelled(true)
+    last = np.searchsorted(along, along + length)
     first = np.flatnonzero(last < len(true))
     if not len(first):
         return {"translation_percent": np.nan, "rotation_deg_per_m": np.nan, "segments": 0,
-                "note": f"too short: {travelled[-1]:.1f} m, stretches of {length:g} m are compared"}
+                "note": f"too short: {along[-1]:.1f} m, stretches of {length:g} m are compared"}
     motion, given = (np.linalg.inv(some[first]) @ some[last[first]] for some in (estimated, true))
-    vectors, goals = (np.concatenate([some[:, :3, 3], length * np.array([_rotation_vector(one) for one in some])])
+    vectors, goals = (np.concatenate([some[:, :3, 3], length * np.array([rotation_vector(one) for one in some])])
                       for some in (motion, given))
     moments = goals.T @ vectors
     # a little of the identity: what a straight path leaves open stays as it is
     left, _, right = np.linalg.svd(moments + 1e-6 * np.trace(goals.T @ goals) * np.eye(3))
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     offsets = np.linalg.norm(given[:, :3, 3] - motion[:, :3, 3] @ turn.T, axis=1)
-    angles = [np.linalg.norm(_rotation_vector(one[:3, :3].T @ turn @ other[:3, :3] @ turn.T))
-              for one, other in zip(given, motion, strict=True)]
+    off = [np.linalg.norm(rotation_vector(one[:3, :3].T @ turn @ other[:3, :3] @ turn.T))
+           for one, other in zip(given, motion, strict=True)]
     return {"translation_percent": float(offsets.mean() / length * 100),
-            "rotation_deg_per_m": float(np.degrees(np.mean(angles)) / length), "segments": len(first), "note": ""}
+            "rotation_deg_per_m": float(np.degrees(np.mean(off)) / length), "segments": len(first), "note": ""}
 
 
-def _travelled(poses):
+def travelled(poses: np.ndarray) -> np.ndarray:
     """Metres along a path (n, 4, 4) up to each of its poses, (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
 
-def _rotation_vector(pose):
+def rotation_vector(pose: np.ndarray) -> np.ndarray:
+    """Axis times angle in radians of a pose's rotation, (3,); pose: 3x3 or larger."""
     return cv2.Rodrigues(np.ascontiguousarray(pose[:3, :3]))[0].ravel()
+
+
+def angles(rotations: np.ndarray) -> np.ndarray:
+    """Degrees by which rotations (..., 3, 3) turn; of poses (..., 4, 4) the first three rows and columns count."""
+    trace = np.trace(rotations[..., :3, :3], axis1=-2, axis2=-1)
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
 
 
 KITTI_LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)  # metres
@@ -175,18 +182,17 @@ def kitti_segments(estimated: np.ndarray, true: np.ndarray) -> pd.DataFrame:
     translation error is in metres a metre, the rotation error in degrees a metre.
     """
     estimated, true = checked(estimated, true)
-    travelled = _travelled(true)
+    along = travelled(true)
     rows = []
     for first in range(0, len(true), KITTI_EVERY):
         for length in KITTI_LENGTHS:
-            last = int(np.searchsorted(travelled, travelled[first] + length, side="right"))
+            last = int(np.searchsorted(along, along[first] + length, side="right"))
             if last == len(true):
                 continue
             true_motion = np.linalg.inv(true[first]) @ true[last]
             motion = np.linalg.inv(estimated[first]) @ estimated[last]
             error = np.linalg.inv(motion) @ true_motion
-            angle = np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))
-            rows.append((first, last, length, np.linalg.norm(error[:3, 3]) / length, np.degrees(angle) / length))
+            rows.append((first, last, length, np.linalg.norm(error[:3, 3]) / length, angles(error) / length))
     return pd.DataFrame(rows, columns=["first", "last", "length", "translation", "rotation"])
 
 

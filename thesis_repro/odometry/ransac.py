@@ -105,9 +105,9 @@ def _agree(e, x, y, u, v, limit):
 
 
 @fast
-def draw(state, count, chosen):
-    """Write the indices of SAMPLE of `count` correspondences, drawn as OpenCV does; returns the generator's state."""
-    taken = 0
+def draw(state, columns, chosen, five):
+    """Write SAMPLE correspondences, drawn as OpenCV does: indices and rows; returns the generator's state."""
+    count, taken = columns.shape[1], 0
     while taken < SAMPLE:
         state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
         index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
@@ -116,6 +116,8 @@ def draw(state, count, chosen):
             new = new and chosen[k] != index
         if new:
             chosen[taken] = index
+            for j in range(4):
+                five[taken, j] = columns[j, index]
             taken += 1
     return state
 
@@ -132,10 +134,7 @@ def _next_better(columns, limit, state, sample, samples, best):
     five = np.empty((SAMPLE, 4))
     while sample < samples:
         sample += 1
-        state = draw(state, count, chosen)
-        for k in range(SAMPLE):
-            for j in range(4):
-                five[k, j] = columns[j, chosen[k]]
+        state = draw(state, columns, chosen, five)
         sure, solutions, margins = solve(five)
         if not sure:
             return state, sample, chosen, 0, count

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon, Rectangle
 
+from thesis_repro.odometry import metrics
 from thesis_repro.report.style import (
     BASELINE,
     BLUE,
@@ -276,7 +277,7 @@ def figure_2_08(poses, title):
         axes.annotate("", lay(end), lay(start), arrowprops={
             "arrowstyle": "-|>", "color": RED, "lw": 1.1, "shrinkA": 3, "shrinkB": 3,
             "connectionstyle": "arc3,rad=-0.35"})
-        angle = np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1)))
+        angle = metrics.angles(motion)
         side = to_the_left(start, end)
         horizontal = "left" if side[0] > 0.3 else "right" if side[0] < -0.3 else "center"
         axes.annotate(f"$T_{{{index},{index - 1}}}$\n{np.linalg.norm(motion[:3, 3]):.1f} m, {angle:.1f}°",

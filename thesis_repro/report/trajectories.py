@@ -103,8 +103,7 @@ def figure(paths, true, title):
     above = panels[0, 0]
     if true is not None:
         above.plot(true[:, 0, 3], true[:, 2, 3], color=TRUTH, linewidth=2.2, alpha=0.6, label="ground truth")
-        steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
-        travelled = np.concatenate([[0.0], np.cumsum(steps)])
+        travelled = metrics.travelled(true)
     for index, (name, poses) in enumerate(paths.items()):
         above.plot(poses[:, 0, 3], poses[:, 2, 3], label=name, **line_style(index))
         if true is not None:

@@ -27,7 +27,7 @@ from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import boresight, metrics
 from thesis_repro.odometry.passes import poses_of
 from thesis_repro.study import results
-from thesis_repro.study.effects import relative_errors
+from thesis_repro.study.effects import step_errors
 from thesis_repro.study.jobs import Job
 
 METRICS = {"turned": "RMSE without the angle", "rotation": "rotation error a frame"}  # that judge
@@ -37,7 +37,7 @@ METHODS = {"baseline": "all keypoints", **results.CONTROLS}
 
 
 def with_relative(summary: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None) -> pd.DataFrame:
-    """The summary of `runner.run` with the columns of `effects.relative_errors`, from the runs' own files, and
+    """The summary of `runner.run` with the columns of `effects.step_errors`, from the runs' own files, and
     `turned`, the RMSE in metres with the angle of `angles` taken out.
 
     folder: where `runner.run` keeps them. frames: of each sequence, as there.
@@ -47,7 +47,7 @@ def with_relative(summary: pd.DataFrame, kitti: Path, folder: Path, frames: int 
     for one in summary.itertuples():
         poses = poses_of(pd.read_csv(folder / one.sequence / f"{one.run}.csv"))
         true = paths[one.sequence][1]
-        rows.append(relative_errors(poses, true)
+        rows.append(step_errors(poses, true)
                     | {"turned": metrics.rmse(boresight.turned(poses, angle[one.sequence]), true)})
     return summary.join(pd.DataFrame(rows, index=summary.index))
 
@@ -65,8 +65,7 @@ def angles(paths: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, np.n
     0 where there are none, or where they do not determine an angle. paths: of `refined_paths`."""
     found = {}
     for name in paths:
-        day = boresight.DAYS.get(name)
-        others = [paths[other] for other in paths if other != name and day and boresight.DAYS.get(other) == day]
+        others = [paths[other] for other in boresight.same_day(name, paths)]
         found[name] = boresight.estimate(others).usable if others else np.zeros(3)
     return found
 

@@ -92,7 +92,7 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, plan:
     each sequence are kept; a stopped series goes on where it was.
 
     runs has a row for each sequence, variant, pose and repetition: errors in metres (rmse, mae, se3, sim3), relative
-    ones (`relative_errors`), mean_keypoints and flagged frames. prefixes has the RMSE of all keypoints over the first
+    ones (`step_errors`), mean_keypoints and flagged frames. prefixes has the RMSE of all keypoints over the first
     `frames` frames and `metres` of each sequence, a row an order, under the thesis's estimator.
     """
     calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, plan) for name in names]
@@ -158,11 +158,11 @@ def _row(result: odometry.Result, sequence: Sequence) -> dict[str, Any]:
     poses, true = poses_of(result.frames), sequence.poses
     return {"frames": len(true), "rmse": metrics.rmse(poses, true), "mae": metrics.mae(poses, true),
             **{kind: metrics.ate(poses, true, kind)["rmse"] for kind in ("se3", "sim3")},
-            "mean_keypoints": result.frames["detected"].mean(), **relative_errors(poses, true),
+            "mean_keypoints": result.frames["detected"].mean(), **step_errors(poses, true),
             "flagged": int(result.flagged.drop("stationary", errors="ignore").sum())}
 
 
-def relative_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
+def step_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """How far single steps are off, whatever came before them; (n, 4, 4) camera-to-world paths.
 
     rotation: mean angle, degrees a frame; in_turns and on_straights: of steps that turn by more than TURN and by less
@@ -171,7 +171,7 @@ def relative_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
     that turn WRONG by WRONG degrees or go backwards.
     """
     steps, true_steps = (np.linalg.inv(some[:-1]) @ some[1:] for some in (poses, true))
-    off, turn = (_angles(some) for some in (np.linalg.inv(true_steps) @ steps, true_steps))
+    off, turn = metrics.angles(np.linalg.inv(true_steps) @ steps), metrics.angles(true_steps)
     length = np.linalg.norm(true_steps[:, :3, 3], axis=1)
     fast = length >= FAST
     way, true_way = (some[fast, :3, 3] / np.maximum(np.linalg.norm(some[fast, :3, 3], axis=1, keepdims=True), 1e-12)
@@ -184,17 +184,13 @@ def relative_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
             "failed": 100 * _mean((off[fast] > WRONG) | (along < 0)), "steps": int(fast.sum())}
 
 
-def _angles(motions: np.ndarray) -> np.ndarray:
-    return np.degrees(np.arccos(np.clip((np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
-
-
 def _mean(values: np.ndarray) -> float:
     return float(values.mean()) if len(values) else np.nan
 
 
 def _prefixes(poses: np.ndarray, true: np.ndarray, order: int) -> list[dict[str, Any]]:
     """The RMSE over the first tenth, two tenths, ... of a path."""
-    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))])
+    travelled = metrics.travelled(true)
     return [{"repetition": order, "frames": count, "metres": travelled[count - 1],
              "rmse": metrics.rmse(poses[:count], true[:count])}
             for count in np.unique(np.linspace(0, len(true), 11).round().astype(int)) if count >= 5]
