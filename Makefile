@@ -34,7 +34,7 @@ export TF_CPP_MIN_LOG_LEVEL := 3
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 
-.PHONY: help setup figures evidence test lint lab bench weights clean check-data plan
+.PHONY: help setup figures evidence test torture lint lab bench weights clean check-data plan
 
 help:
 	@echo "make figures     every table and figure into figures/, on embedded data"
@@ -44,6 +44,7 @@ help:
 	@echo "                 BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS"
 	@echo "make plan        what that would take, KITTI=/path, with the same settings"
 	@echo "make test        unit tests, and every notebook on the smallest profile"
+	@echo "make torture     faults and bad input tried on purpose, some minutes: what is clear, unclear, lost"
 	@echo "make lint        style (Ruff) and types (mypy)"
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
@@ -125,6 +126,9 @@ check-data: setup
 
 test: setup
 	@$(BIN)/python -m pytest -q
+
+torture: setup
+	@$(BIN)/python -m pytest -q --torture tests/torture
 
 lint: setup
 	@$(BIN)/ruff check .
