@@ -3,15 +3,21 @@ import os
 from thesis_repro import compiled
 
 
-def test_what_was_compiled_before_a_neighbour_changed_is_forgotten(tmp_path):
-    cache = tmp_path / "__pycache__"
+def test_what_was_compiled_before_a_neighbour_changed_is_forgotten_whatever_the_dates_are(tmp_path):
+    cache, inner = tmp_path / "__pycache__", tmp_path / "inner.py"
+    (tmp_path / "outer.py").touch()
+    inner.write_text("1")
+
+    def kept():
+        (cache / "old.nbi").touch()
+        compiled.forget_stale(tmp_path)
+        return [path.name for path in cache.glob("*.nbi")]
+
     cache.mkdir()
-    for name, time in (("outer.py", 100), ("inner.py", 300)):
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (time, time))
-    for name, time in (("old.nbi", 200), ("new.nbi", 400)):
-        (cache / name).touch()
-        os.utime(cache / name, (time, time))
-    compiled.forget_stale(tmp_path)
-    assert [path.name for path in cache.iterdir()] == ["new.nbi"]
+    assert kept() == [] and kept() == ["old.nbi"]
+    inner.write_text("2")
+    os.utime(inner, (100, 100))  # older than all that was compiled
+    assert kept() == [] and kept() == ["old.nbi"]
+    os.utime(inner)
+    assert kept() == ["old.nbi"]
     compiled.forget_stale(tmp_path / "nothing")

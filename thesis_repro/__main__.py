@@ -3,12 +3,13 @@
 import argparse
 import json
 import os
+import shlex
 import sys
 from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
 
-from thesis_repro import InputError
+from thesis_repro import InputError, longrun
 
 DESCRIPTION = "Keypoint masks from semantic segmentation for monocular visual odometry: a thesis, reproduced."
 
@@ -18,8 +19,14 @@ def synthesize(options):
     from thesis_repro import world
     from thesis_repro.settings import PROFILES, SEED
 
-    world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
-    print(f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}")
+    with longrun.logged(options.out, options.words) as run:
+        made, every = world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
+        run.end(f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
+                f"{every:,} pictures with their label maps{_kept(every - made)}")
+
+
+def _kept(count):
+    return f", {count:,} of them from before" * (count > 0)
 
 
 def check_data(options):
@@ -53,15 +60,16 @@ def predict(options):
     outputs = [options.output] if len(names) == 1 else [options.output / name for name in names]
     sequences = [(_images(folder, output), output) for folder, output in zip(options.images, outputs)]
     model_files = options.model or [prediction.SHIPPED]
-    if options.dask:
-        with cluster.open_pool(1, options.dask) as pool:
-            prediction.spread_label_maps(pool.run, model_files, sequences)
-    else:
-        model = prediction.load(tuple(model_files)) if options.model else prediction.load_shipped()
-        for paths, output in sequences:
-            prediction.write_label_maps(model, paths, output)
-    for paths, output in sequences:
-        print(f"{output}: {len(paths)} label maps")
+    with longrun.logged(options.output, options.words) as run:
+        if options.dask:
+            with cluster.open_pool(1, options.dask) as pool:
+                made = prediction.spread_label_maps(pool.run, model_files, sequences)
+        else:
+            model = prediction.load(tuple(model_files)) if options.model else prediction.load_shipped()
+            made = sum(prediction.write_label_maps(model, paths, output) for paths, output in sequences)
+        every = sum(len(paths) for paths, _ in sequences)
+        run.end("\n".join(f"{output}: {len(paths)} label maps" for paths, output in sequences)
+                + _kept(every - made))
 
 
 def _images(folder, output):
@@ -277,8 +285,12 @@ def study(options):
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: must be 1 or more")
     folder = options.output.absolute()
-    summary = planned.run(folder, options.jobs or cores(), options.dask)
-    print(f"{len(summary):,} runs; open {study.write(planned, summary, folder)} in a browser")
+    with longrun.logged(folder, options.words) as run, longrun.claimed(folder):
+        summary = planned.run(folder, options.jobs or cores(), options.dask)
+        counts, page = summary.attrs, study.write(planned, summary, folder)
+        failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
+        run.end(f"{len(summary):,} runs{_kept(counts['kept'])}{failed}; open {page} in a browser")
+    return 1 if failed else 0
 
 
 def evaluate(options):
@@ -467,11 +479,11 @@ def main(arguments=None):
 
         argcomplete.autocomplete(parser)
     options = parser.parse_args(arguments)
+    options.words = shlex.join(["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)])  # for a log
     try:
         return options.function(options) or 0
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    except Exception as error:
+        return longrun.told(error)
     except KeyboardInterrupt:
         print("stopped; the same command goes on where it can", file=sys.stderr)
         return 130

@@ -1,22 +1,33 @@
 """One way to compile the inner loops."""
 
+import hashlib
+import os
 from pathlib import Path
 
 import numba
 
+MADE_FROM = "compiled-from"  # beside what Numba keeps
+
 
 def forget_stale(folder):
-    """Delete what Numba keeps of a folder's modules where one of them is newer.
+    """Delete what Numba keeps of a folder's modules where one of them has changed since, by its bytes.
 
-    Numba itself notices a change of a function's own file alone, not of a function that it calls from another one.
+    Numba itself notices a change of a function's own file alone, and that by its date and size; not of a function that
+    it calls from another one. A clock can jump, so dates say nothing here.
     """
-    newest = max((path.stat().st_mtime for path in folder.glob("*.py")), default=0)
-    for index in folder.glob("__pycache__/*.nbi"):
-        try:
-            if index.stat().st_mtime < newest:
-                index.unlink()
-        except OSError:  # another process was faster, or may not write here, so that nothing can be stale
-            pass
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))).hexdigest()
+    record = folder / "__pycache__" / MADE_FROM
+    try:
+        if record.is_file() and record.read_text() == digest:
+            return
+        for index in folder.glob("__pycache__/*.nbi"):
+            index.unlink(missing_ok=True)
+        record.parent.mkdir(exist_ok=True)
+        temporary = record.with_name(f"{MADE_FROM}.{os.getpid()}")
+        temporary.write_text(digest)
+        os.replace(temporary, record)
+    except OSError:  # nothing may be written here, so that nothing can be stale
+        pass
 
 
 for _folder in (path.parent for path in Path(__file__).parent.glob("*/__init__.py")):

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from thesis_repro import InputError
+from thesis_repro import InputError, longrun
 
 BAR_DELAY = 1  # seconds before a bar shows: what is over sooner needs none
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -110,10 +110,14 @@ def atomic(path):
     """Yield a temporary path beside `path`; rename it when the block ends well, delete it when it does not."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = longrun.temporary(path)
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:  # a full disk has no name, and the user does not know the temporary one
+        if error.filename in (None, str(temporary), temporary):
+            error.filename, error.filename2 = str(path), None
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -125,9 +129,9 @@ def write_text(path, text):
 
 def write_png(path, image):
     """Write one 8-bit image, (height, width) or (height, width, 3) as BGR."""
+    data = cv2.imencode(".png", image)[1]  # cv2.imwrite does not notice where a disk is full
     with atomic(path) as temporary:
-        if not cv2.imwrite(str(temporary), image):
-            raise OSError(f"{path}: cannot be written")
+        temporary.write_bytes(data)
 
 
 def write_array(path, array):
@@ -160,7 +164,7 @@ def progress(iterable=None, description="", total=None, unit="frame", initial=0)
     live = stream.isatty()
     return tqdm(iterable, desc=description, total=total, unit=unit, initial=initial, dynamic_ncols=live,
                 file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live,
-                delay=BAR_DELAY)
+                delay=BAR_DELAY, smoothing=0)  # all of the time so far tells more than the last few
 
 
 class _Lines:

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, longrun, stages
 from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence
@@ -194,11 +194,12 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 
     The folder is a stage (see stages): a stopped run goes on, masks of other label maps or widths in it are deleted.
     """
-    folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, **asdict(masks.settings),
-                          dilation_width=masks.dilation_width, code=stages.code("masks"))
-    for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
-        if not (folder / path.name).is_file():
-            write_png(folder / path.name, masks[index])
+    with longrun.claimed(folder):
+        folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, **asdict(masks.settings),
+                              dilation_width=masks.dilation_width, code=stages.code("masks"))
+        for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
+            if not (folder / path.name).is_file():
+                write_png(folder / path.name, masks[index])
 
 
 class MaskFolder:

@@ -7,43 +7,59 @@ job needs to go on, written whole or not at all (`store`, `resume`). Digests say
 import ast
 import hashlib
 import json
-import shutil
+import re
 import zipfile
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from thesis_repro import InputError
+from thesis_repro import InputError, longrun
 from thesis_repro.files import atomic, write_text
+from thesis_repro.longrun import LOG, RECORD
 
 _PACKAGE = Path(__file__).parent
-RECORD = "made-from.json"
 
 
 def stage(folder, *, replace=True, **inputs):
     """The folder of one stage, holding only results that were made from `inputs` (JSON values).
 
     What an earlier run with the same inputs finished is kept; results of other inputs are deleted, or with `replace`
-    False refused. Raises InputError for those, and for a file or a folder that this project did not make.
+    False refused; what a killed run left half written is deleted. Raises InputError for those that are refused, for a
+    file or a folder that this project did not make, and for one that another run holds (`longrun.claimed`).
     """
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; name a folder for the results")
-    wanted = json.loads(json.dumps(inputs, default=str))
-    found = record(folder)
-    if found is None and folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
-    if found is not None and found != wanted:
-        if not replace:
-            key = next(key for key in {**wanted, **found} if wanted.get(key) != found.get(key))
-            raise InputError(f"{folder}: holds results of other settings ({key} {found.get(key)!r}, not "
-                             f"{wanted.get(key)!r}); remove the folder or choose another")
-        shutil.rmtree(folder)
-    if found != wanted:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / RECORD, json.dumps(wanted, indent=1, sort_keys=True))
+    with longrun.claimed(folder):
+        wanted = json.loads(json.dumps(inputs, default=str))
+        found = record(folder)
+        if found is None and not all(_own(path) for path in folder.iterdir()):
+            raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
+        if found is not None and found != wanted:
+            if not replace:
+                key = next(key for key in {**wanted, **found} if wanted.get(key) != found.get(key))
+                raise InputError(f"{folder}: holds results of other settings ({key} {found.get(key)!r}, not "
+                                 f"{wanted.get(key)!r}); remove the folder or choose another")
+            _empty(folder)
+        longrun.sweep(folder)
+        if found != wanted:
+            write_text(folder / RECORD, json.dumps(wanted, indent=1, sort_keys=True))
     return folder
+
+
+def _own(path):
+    """Whether a file may lie in a folder that is going to be a stage: the log, or a record that was half written."""
+    record = Path(RECORD)
+    return path.name == LOG or re.fullmatch(rf"\.{record.stem}\.\d+{record.suffix}", path.name) is not None
+
+
+def _empty(folder):
+    """Delete all but the log, records last: what is left when this is killed is known to be ours."""
+    for path in sorted(folder.iterdir(), key=lambda path: path.name == RECORD):
+        if path.is_dir() and not path.is_symlink():
+            _empty(path)
+            path.rmdir()
+        elif path.name != LOG:
+            path.unlink()
 
 
 def record(folder):

@@ -64,8 +64,9 @@ def test_a_failure_is_one_line_a_report_and_no_notebook(start, tmp_path):
         "one failed: InputError: 00.txt: no such file; check KITTI",
         "the whole report: out/one.log; the same command goes on from here"]
     log = (tmp_path / "out" / "one.log").read_text()
+    assert "ERROR   one failed: InputError: 00.txt: no such file" in (tmp_path / "out" / "log.txt").read_text()
     assert "raise InputError" in log and "more of it" in log and "\x1b" not in log
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["one.log"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"one.log", "log.txt"}
 
 
 def test_a_kernel_that_dies_is_said_to_have_died(start, tmp_path):
@@ -89,7 +90,7 @@ def test_an_interrupted_notebook_leaves_no_kernel_running(start, tmp_path, sent)
     assert process.returncode == 130
     assert stderr.splitlines() == ["one was interrupted; the same command goes on from here"]
     assert (tmp_path / "tidied").is_file() and not is_alive((tmp_path / "pid").read_text())
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["one.log"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"one.log", "log.txt"}
 
 
 def test_progress_goes_to_a_terminal_by_its_name(monkeypatch):

@@ -202,7 +202,7 @@ def test_text_of_the_findings_cannot_become_markup(run):
     assert "<strong>What</strong> &lt;b&gt;it&lt;/b&gt; shows" in text
 
 
-def test_page_and_notebooks_are_made_again_only_where_something_is_newer(run):
+def test_page_and_notebooks_are_made_again_only_where_something_has_changed(run):
     html = run.executed.with_suffix(".html")
     assert page.update(run.settings)
     first = html.stat().st_mtime_ns

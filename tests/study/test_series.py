@@ -73,7 +73,7 @@ def test_a_study_leaves_tables_figures_words_and_a_page_that_shows_them(done):
     links = [link for link in Links(page).found if not link.startswith("#")]
     assert all((done / link).is_file() for link in links)
     assert {path.name for path in done.iterdir() if path.is_file()} - {
-        "index.html", "made-from.json", "runs.csv", "runs.md", "findings.md"} <= {*links}
+        "index.html", "made-from.json", "log.txt", "runs.csv", "runs.md", "findings.md"} <= {*links}
     assert {"keypoints-all.svg", "controls-net.svg", "controls-by-hand.svg", "errors.csv",
             "sources.md"} <= {*links}
     assert "embedded world" in page and "script" not in page

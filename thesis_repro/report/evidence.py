@@ -18,7 +18,7 @@ matplotlib.use("Agg")
 
 import pandas as pd
 
-from thesis_repro import InputError, kitti, masks, stages
+from thesis_repro import InputError, kitti, longrun, masks, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry import boresight
@@ -50,6 +50,7 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     length = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {length}; label maps by the model in the package"
     folder = Path(folder)
+    longrun.sweep(folder)
     found = [*audit.arithmetic(), *audit.of_switches(switches), *audit.of_chance(prefixes), *audit.of_runs(tested),
              *audit.of_boresight(boresight.explained(answer.refined_paths(names, root, build / "odometry", frames))),
              *audit.of_boundaries(_boundaries(sequences, build / "labels")),
@@ -164,12 +165,12 @@ def main(arguments=None):
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once")
     options = parser.parse_args(arguments)
     try:
-        files = write(options.kitti, options.folder, options.build, frames=options.frames,
-                      repetitions=options.repetitions, processes=options.jobs)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print(f"{options.folder}: {len(files)} files, {sum(path.stat().st_size for path in files):,} bytes")
+        with longrun.claimed(options.build), longrun.logged(options.build, "tables, plots and findings") as run:
+            files = write(options.kitti, options.folder, options.build, frames=options.frames,
+                          repetitions=options.repetitions, processes=options.jobs)
+            run.end(f"{options.folder}: {len(files)} files, {sum(path.stat().st_size for path in files):,} bytes")
+    except Exception as error:
+        return longrun.told(error)
     return 0
 
 

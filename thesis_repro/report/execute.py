@@ -20,6 +20,7 @@ from nbclient.util import run_sync
 from nbconvert.preprocessors import ExecutePreprocessor
 from traitlets import Unicode
 
+from thesis_repro import longrun
 from thesis_repro.settings import PREFIX
 
 # Whole lines that libraries log: segmentation-models on import, absl and TensorFlow with the place in their sources.
@@ -42,24 +43,31 @@ class Execution(ExecutePreprocessor):
 
     def preprocess(self, nb, resources=None, km=None):
         name, started = resources["metadata"]["name"], time.monotonic()
-        print(name, flush=True)
+        sys.excepthook = _in_one_line  # where the executed notebook itself cannot be written
+        folder = Path(self.log_file).parent  # of all executed notebooks of a run
+        with longrun.claimed(folder), longrun.logged(folder, f"make figures, {name}", ours=True):
+            longrun.say(name)
+            done = self._executed(name, nb, resources, km)
+            longrun.say(f"  done in {time.monotonic() - started:.0f} s")
+        return done
+
+    def _executed(self, name, nb, resources, km):
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
         with open(self.log_file, "w", encoding="utf-8") as self._log:
             try:
-                done = super().preprocess(nb, resources, km)
+                return super().preprocess(nb, resources, km)
             except KeyboardInterrupt:
                 print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
                 sys.exit(130)
             except Exception as error:
                 why, report = _explained(error)
                 self._log.write(report)
+                longrun.note(f"{name} failed: {why}")
                 print(f"{name} failed: {why}\nthe whole report: {_short(self.log_file)}; the same command goes on from "
                       "here", file=sys.stderr)
                 sys.exit(1)
             finally:
                 signal.signal(signal.SIGTERM, before)
-        print(f"  done in {time.monotonic() - started:.0f} s", flush=True)
-        return done
 
     @contextmanager
     def setup_kernel(self, **options):
@@ -125,13 +133,21 @@ def _terminal():
 def _explained(error):
     """(why a notebook failed in one line, the whole report)."""
     if isinstance(error, CellExecutionError):
-        why, report = f"{error.ename}: {error.evalue}", str(error)
+        why, report = f"{error.ename}: {error.evalue}".strip(), str(error)
+        why = why.partition("\n")[0] + longrun.remedy(why)
     elif isinstance(error, DeadKernelError):
         why = "the kernel died, as it does where there is not enough memory"
         report = traceback.format_exc()
     else:
         why, report = f"{type(error).__name__}: {error}", traceback.format_exc()
     return COLORS.sub("", why).strip().partition("\n")[0], COLORS.sub("", report)
+
+
+def _in_one_line(kind, error, trace):
+    if longrun.explained(error) is None:
+        sys.__excepthook__(kind, error, trace)
+    else:
+        longrun.told(error)
 
 
 def _short(path):

@@ -1,10 +1,11 @@
 """One page with every table and figure of a run: index.html beside them, to be opened from disk.
 
-`python -m thesis_repro.report.page` turns the executed notebooks into HTML where they are newer, and writes the page
-when anything it shows is newer. Neither needs a network, a server or scripts to be read. This module says what is
+`python -m thesis_repro.report.page` turns the executed notebooks into HTML where they have changed, and writes the page
+where anything it shows has. Neither needs a network, a server or scripts to be read. This module says what is
 shown; template.html says how.
 """
 
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -20,7 +21,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
-from thesis_repro import InputError
+from thesis_repro import longrun, stages
 from thesis_repro.files import write_text
 from thesis_repro.report import captions, gap, style
 from thesis_repro.settings import ROOT, read_settings
@@ -40,20 +41,37 @@ WHOLE = re.compile(r"[+-]?\d+(\.0+)?")
 
 
 def update(settings):
-    """Write the notebooks' HTML and the page where they are older than what they show; True if the page was."""
-    settings.figures.mkdir(parents=True, exist_ok=True)
-    page, executed = settings.figures / PAGE, _executed(settings)
-    own = [path for path in HERE.iterdir() if path.is_file()]
-    write_notebooks([path for path in executed if _newer([path, *own], path.with_suffix(".html"))], page)
-    if not _newer([*executed, *own, settings.figures, *settings.figures.glob("*.*")], page):
-        return False
-    write_text(page, build(settings))
-    os.utime(page)  # renaming made the folder newer than the file
+    """Write the notebooks' HTML and the page where what they show has changed; True if the page was written.
+
+    What killed runs left half written in the run's folders is deleted. Raises InputError where another run is at work.
+    """
+    with longrun.claimed(settings.build / "notebooks"):
+        longrun.sweep(settings.build)
+        if settings.figures.is_dir():
+            longrun.sweep(settings.figures)
+        page, executed = settings.figures / PAGE, _executed(settings)
+        write_notebooks(executed, page)
+        made = _made_from([*executed, *(path for path in settings.figures.glob("*.*") if path != page)])
+        if _ends_with(page, made):
+            return False
+        write_text(page, build(settings) + made)
     return True
 
 
-def _newer(paths, made):
-    return not made.is_file() or max(path.stat().st_mtime_ns for path in paths) > made.stat().st_mtime_ns
+def _made_from(paths):
+    """A comment at the end of a page that says which files it shows, and what they and this module hold.
+
+    Dates would not do: the clock of a machine can jump.
+    """
+    digest = hashlib.sha256()
+    for path in sorted([*paths, *HERE.iterdir()]):
+        if path.is_file():
+            digest.update(f"{path.name} {stages.content(path)}\n".encode())
+    return f"<!-- made from {digest.hexdigest()[:12]} -->\n"
+
+
+def _ends_with(path, text):
+    return path.is_file() and path.read_bytes().endswith(text.encode())
 
 
 def _executed(settings):
@@ -62,7 +80,9 @@ def _executed(settings):
 
 
 def write_notebooks(paths, page):
-    """Write each executed notebook as HTML beside it, with a link back to the page."""
+    """Write each executed notebook as HTML beside it, with a link back to the page, where that is not done yet."""
+    made_from = {path: _made_from([path]) for path in paths}
+    paths = [path for path in paths if not _ends_with(path.with_suffix(".html"), made_from[path])]
     if not paths:
         return
     from nbconvert import HTMLExporter  # slow to import, and seldom needed
@@ -74,7 +94,7 @@ def write_notebooks(paths, page):
         content, resources = exporter.from_filename(str(path))
         write_text(path.with_suffix(".html"), TEMPLATES.get_template("notebook.html").render(
             title=path.stem, style="\n".join(resources["inlining"]["css"]), content=content,
-            page=os.path.relpath(page, path.parent)))
+            page=os.path.relpath(page, path.parent)) + made_from[path])
 
 
 def build(settings):
@@ -305,9 +325,8 @@ def _markdown(text):
 def main():
     try:
         update(read_settings())
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    except Exception as error:
+        return longrun.told(error)
     return 0
 
 

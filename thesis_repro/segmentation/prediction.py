@@ -4,6 +4,7 @@ import hashlib
 import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import tensorflow as tf
 
-from thesis_repro import InputError, files, stages
+from thesis_repro import InputError, files, longrun, stages
 from thesis_repro.cityscapes import read_image
 from thesis_repro.segmentation import memory, training
 
@@ -53,12 +54,16 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     files are all there are skipped, any other is predicted in full, so that every run gives the same bytes.
     The folder is a stage (see stages): label maps of another model or of other images in it are deleted.
 
+    Returns how many images were predicted.
     Raises InputError for an unreadable image, two images of one name, a batch that does not fit into memory, and a
-    folder with files that this project did not make.
+    folder with files that this project did not make, or that another run is at work in.
     """
-    batches = _open(_weights(model), paths, output_dir, batch_size)
-    with files.progress(None, "label maps", len(paths), initial=len(paths) - sum(map(len, batches))) as bar:
-        _write_batches(model, batches, bar.update)
+    with longrun.claimed(output_dir):
+        batches = _open(_weights(model), paths, output_dir, batch_size)
+        missing = sum(map(len, batches))
+        with files.progress(None, "label maps", len(paths), initial=len(paths) - missing) as bar:
+            _write_batches(model, batches, bar.update)
+    return missing
 
 
 def _open(weights, paths, output_dir, batch_size):
@@ -113,8 +118,16 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
     Workers need this package and see all files under the same paths; each reads the model once. Finished batches are
     not predicted again after a stop.
 
+    Returns how many images were predicted.
     Raises InputError for what `write_label_maps` does, after whatever could be written has been.
     """
+    with ExitStack() as held:
+        for _, folder in sequences:
+            held.enter_context(longrun.claimed(folder))
+        return _spread(run, model_files, sequences, batch_size)
+
+
+def _spread(run, model_files, sequences, batch_size):
     model_files = tuple(str(Path(path).absolute()) for path in model_files)
     weights = _weights(load(model_files))
     calls, missing, total = [], 0, 0
@@ -134,6 +147,7 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
                 bar.update(sum(map(len, calls[index][-1])))
     if failures:
         raise InputError(f"{len(failures)} of {len(calls)} parts of the label maps failed; the first: {failures[0]}")
+    return missing
 
 
 @lru_cache(maxsize=1)
@@ -159,7 +173,7 @@ def _write_part(model_files, weights, folder, record, batches):
             raise InputError("this worker has another version of thesis_repro; install the same on all")
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # whatever it is, the other parts go on and the reason is reported
-        return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        return longrun.explained(error) or f"{type(error).__name__}: {error}"
     return None
 
 

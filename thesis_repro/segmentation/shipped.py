@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from thesis_repro import InputError, cityscapes, files, stages
+from thesis_repro import InputError, cityscapes, files, longrun, stages
 from thesis_repro.segmentation import memory, prediction, quality
 from thesis_repro.segmentation.card import CURVES, card, draw_curves
 from thesis_repro.segmentation.unet import DEPTH, build_unet
@@ -418,10 +418,14 @@ def main(arguments=None):
     parser.add_argument("--output", type=Path, default=FOLDER, help="folder for the model and its card")
     options = parser.parse_args(arguments)
     try:
-        write_shipped(options.camvid, options.kitti_semantic, options.build, options.output)
-    except InputError as error:
-        sys.exit(str(error))
+        with longrun.claimed(options.build), longrun.logged(options.build, "the model that ships", ours=True) as run:
+            longrun.sweep(options.build)
+            write_shipped(options.camvid, options.kitti_semantic, options.build, options.output)
+            run.end(f"{options.output}: the model that ships, and its card")
+    except Exception as error:
+        return longrun.told(error)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

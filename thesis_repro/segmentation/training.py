@@ -3,6 +3,7 @@
 import json
 import os
 import zlib
+from contextlib import ExitStack
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import pandas as pd
 import segmentation_models as sm
 import tensorflow as tf
 
-from thesis_repro import InputError, files, stages
+from thesis_repro import InputError, files, longrun, stages
 from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.segmentation import augmentation
 
@@ -147,7 +148,7 @@ class GoingOn(keras.callbacks.Callback):
         """
         super().__init__()
         self.folder, self.batches, self.others = Path(folder), batches, others
-        self.rows, self._counters, self._bar = [], [], None
+        self.rows, self._counters, self._bar, self._claim = [], [], None, ExitStack()
         self._variables = model.variables + model.optimizer.variables
         kept = stages.resume(self.folder / STATE)
         if kept is None:
@@ -171,6 +172,7 @@ class GoingOn(keras.callbacks.Callback):
         return epochs if stopped else min(len(self.rows), epochs)
 
     def on_train_begin(self, logs=None):
+        self._claim.enter_context(longrun.claimed(self.folder))
         for other, counters in zip(self.others, self._counters):
             vars(other).update(counters)
         total = self.params["epochs"] * len(self.batches)
@@ -194,6 +196,7 @@ class GoingOn(keras.callbacks.Callback):
 
     def on_train_end(self, logs=None):
         self._bar.close()
+        self._claim.close()
 
 
 def load_model(path):

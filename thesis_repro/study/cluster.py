@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from thesis_repro import InputError
+from thesis_repro import InputError, longrun
 
 TIMEOUT = 8  # seconds for a scheduler to answer
 
@@ -57,8 +57,7 @@ class _Processes:
         try:
             yield from work
         except TerminatedWorkerError:
-            raise InputError("a process was killed, most likely because memory ran out; what was finished is kept, so "
-                             "start again, with fewer processes (JOBS or --jobs)") from None
+            raise InputError(longrun.WORKER_KILLED) from None
 
 
 def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry, stages
+from thesis_repro import InputError, longrun, masks, odometry, stages
 from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
@@ -61,26 +61,49 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
     Jobs over one sequence go over it together (`odometry.run_many`: the bits of separate runs at a fraction of the
     cost), in as many passes as it takes to keep everyone busy. A job that fails is printed with its reason and does
     not stop the others. What was running when everything stopped goes on from its checkpoint.
+    The summary's `attrs` say how many jobs were "made" now, "kept" from before, and "failed".
+    Raises InputError where another run is at work in the folder, where all jobs fail, or where the machine lacks
+    something, such as space or memory; what is finished is kept.
     """
     if boundaries not in masks.BOUNDARIES:
         raise InputError(f"boundaries={boundaries!r}: unknown; choose one of {', '.join(masks.BOUNDARIES)}")
     study = _Study(kitti, by_name(labels), folder, frames, boundaries)
     jobs = list(dict.fromkeys(jobs))
+    with longrun.claimed(folder):
+        return _run(jobs, study, processes, scheduler)
+
+
+def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) -> pd.DataFrame:
     sequences = _open(jobs, study)
+    kept = sum(study.result(job).is_file() for job in jobs)
     failures: dict[Job, str] = {}
     with cluster.open_pool(processes, scheduler) as pool:
-        passes = _passes(jobs, {name: len(sequence) for name, sequence in sequences.items()}, study, pool.size)
+        lengths = {name: len(sequence) for name, sequence in sequences.items()}
+        passes = _passes(jobs, lengths, study, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
-        calls = [(one, study, stages.made_from(folder / one[0].sequence), threads) for one in passes]
-        for one, failed in progress(pool.run(_run_pass, calls), "odometry", total=len(passes), unit="pass"):
-            failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[one], failed)
+        calls = [(one, study, stages.made_from(study.folder / one[0].sequence), threads) for one in passes]
+        # a frame of each run: passes are of very different length, and some have done a part of their frames before
+        work = [len(one) * (lengths[one[0].sequence] - _frames_done(study.state(one))) for one in passes]
+        with progress(None, "odometry", total=sum(work), unit="frame") as bar:
+            for one, failed in pool.run(_run_pass, calls):
+                failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[one], failed)
+                bar.update(work[one])
     for (name, reason), names in _by_reason(failures).items():
         more = f" and {len(names) - 3} more" * (len(names) > 3)
-        print(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}")
+        longrun.say(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}", warning=True)
+    lacking = [reason for reason in failures.values() if isinstance(reason, _Lacking)]
+    if lacking:  # no answer can be trusted that is left out for want of space
+        raise InputError(lacking[0])
     done = [job for job in jobs if study.result(job).is_file()]
     if not done:
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
-    return pd.DataFrame([_summarize(job, sequences[job.sequence], study.result(job)) for job in done])
+    summary = pd.DataFrame([_summarize(job, sequences[job.sequence], study.result(job)) for job in done])
+    summary.attrs = {"made": len(done) - kept, "kept": kept, "failed": len(jobs) - len(done)}
+    return summary
+
+
+class _Lacking(str):
+    """Why a pass failed that the machine is at fault for."""
 
 
 def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
@@ -154,6 +177,15 @@ def _jobs_in(state: Path) -> list[str]:
     return list(kept[0]["job"]["runs"]) if kept else []
 
 
+def _frames_done(state: Path) -> int:
+    """How many frames of its sequence a checkpoint has behind it, 0 where there is none."""
+    try:
+        kept = stages.resume(state, arrays=False)
+    except InputError:
+        return 0
+    return int(kept[0]["done"]) if kept else 0
+
+
 def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source], boundaries: str
              ) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
     """The masks of each job over a sequence, {job: masks}, and {job: reason} of those whose masks cannot be made.
@@ -213,7 +245,11 @@ def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict
                 write_text(study.result(job), results.pop(job.name).frames.to_csv(index=False))
         state.unlink(missing_ok=True)
     except Exception as error:  # whatever it is, the others go on and the reason is reported
-        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        reason = longrun.explained(error)
+        if reason is None:
+            reason = f"{type(error).__name__}: {error}"
+        elif not isinstance(error, InputError):
+            reason = _Lacking(reason)
         failures = dict.fromkeys((job for job in jobs if not study.result(job).is_file()), reason) | failures
     return failures
 

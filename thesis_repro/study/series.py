@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro import InputError, kitti, stages
+from thesis_repro import InputError, kitti, longrun, stages
 from thesis_repro.study import jobs, results, runner, sources
 from thesis_repro.study.sources import Source
 
@@ -57,6 +57,10 @@ class Study:
 
         Raises InputError for a folder with results of another number of frames.
         """
+        with longrun.claimed(folder):
+            return self._run(folder, processes, scheduler)
+
+    def _run(self, folder: Path, processes: int, scheduler: str | None) -> pd.DataFrame:
         stages.stage(folder, replace=False, frames=self.frames)
         listed = self.first_jobs()
 
@@ -69,7 +73,11 @@ class Study:
         if not second:
             return summary
         listed += second
-        return run()
+        made = summary.attrs["made"]
+        summary = run()
+        for what, more in (("made", made), ("kept", -made)):  # what the first call made the second one kept
+            summary.attrs[what] += more
+        return summary
 
 
 def named(folders: Iterable[tuple[str, Path]], names: Iterable[str]) -> tuple[Source, ...]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
 
-from thesis_repro import InputError, kitti, stages
+from thesis_repro import InputError, kitti, longrun, stages
 from thesis_repro.cityscapes import ID
 from thesis_repro.files import progress, write_png, write_text
 from thesis_repro.world import drives, layout, textures
@@ -124,26 +124,28 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
     of KITTI's image size (and of 1024x512 for the training images); jobs: processes, -1 for one a core. A complete
     world of the same parameters is left as it is.
     replace: delete an embedded world of other parameters first; nothing else is ever deleted.
-    Raises InputError for a folder that holds something else, a world of other parameters, or a bad parameter.
+    Returns how many pictures were rendered, and how many there are.
+    Raises InputError for a folder that holds something else or that another run is at work in, a world of other
+    parameters, or a bad parameter.
     """
     out = Path(out)
     parameters = _parameters(sequences, frames, scale, train_images, validation_images, seed)
-    stages.stage(out, replace=replace, code=stages.code("world"), **parameters)
-    for stale in out.glob("**/.*.png"):  # left by a killed run
-        stale.unlink()
-    missing = [picture for picture in _pictures(out, **parameters)
-               if not all(path.is_file() for path in picture[1:])]
-    workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
-    if workers > 1:
-        compile_for_all()
-    with progress(description="rendering the embedded world", total=len(missing), unit="picture") as bar:
-        # Ten at a time: pictures of one sequence share its street.
-        work = (delayed(_write_some)(missing[k:k + 10]) for k in range(0, len(missing), 10))
-        for count in Parallel(n_jobs=workers, return_as="generator_unordered")(work):
-            bar.update(count)
-    for name in parameters["sequences"]:
-        if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # the last of them
-            _write_sequence_texts(out, name, parameters["frames"] or drives.DRIVES[name].frames, scale, seed)
+    with longrun.claimed(out):
+        stages.stage(out, replace=replace, code=stages.code("world"), **parameters)
+        pictures = list(_pictures(out, **parameters))
+        missing = [picture for picture in pictures if not all(path.is_file() for path in picture[1:])]
+        workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
+        if workers > 1:
+            compile_for_all()
+        with progress(description="rendering the embedded world", total=len(missing), unit="picture") as bar:
+            # Ten at a time: pictures of one sequence share its street.
+            work = (delayed(_write_some)(missing[k:k + 10]) for k in range(0, len(missing), 10))
+            for count in Parallel(n_jobs=workers, return_as="generator_unordered")(work):
+                bar.update(count)
+        for name in parameters["sequences"]:
+            if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # the last of them
+                _write_sequence_texts(out, name, parameters["frames"] or drives.DRIVES[name].frames, scale, seed)
+    return len(missing), len(pictures)
 
 
 def _parameters(sequences, frames, scale, train_images, validation_images, seed):

@@ -1,0 +1,223 @@
+"""What a long run owes its user: a folder of its own, a log, a word at its end, one line where the machine fails it.
+
+Nothing here needs another package, so that it works where the memory for one is lacking.
+"""
+
+import errno
+import fcntl
+import logging
+import os
+import re
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+from thesis_repro import InputError
+
+LOG = "log.txt"
+RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
+TEMPORARY = re.compile(r"\..+\.\d+(\.\w+)?")  # the names that `temporary` gives
+GOES_ON = "the same command then goes on"
+OTHER_FOLDER = "check who may read and write there, or name another folder"
+# what a user can do about an error of the system, by its number
+REMEDIES = {
+    errno.ENOSPC: f"make room on its disk, or name a folder on another; {GOES_ON}",
+    errno.EDQUOT: f"make room, or name a folder on another disk; {GOES_ON}",
+    errno.EFBIG: f"allow larger files (ulimit -f); {GOES_ON}",
+    errno.EROFS: "name a folder on a disk that may be written to",
+    errno.EACCES: OTHER_FOLDER,
+    errno.EPERM: OTHER_FOLDER,
+    errno.EMFILE: f"allow more open files (ulimit -n); {GOES_ON}",
+    errno.EIO: f"check its disk, or the connection to it; {GOES_ON}",
+}
+NO_MEMORY = f"memory ran out; free some, or work with fewer processes (--jobs, JOBS); {GOES_ON}"
+WORKER_KILLED = ("a process was killed, most likely because memory ran out; what was finished is kept, so start again, "
+                 "with fewer processes (JOBS or --jobs)")
+# how libraries say so in errors of their own
+SAYS_NO_MEMORY = ("nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc", "ut of memory",
+                  "failed to map segment", "can't start new thread")
+
+_log = logging.getLogger("thesis_repro")
+_log.addHandler(logging.NullHandler())
+_log.setLevel(logging.INFO)
+_log.propagate = False
+
+
+def explained(error):
+    """One line for bad input, or for what the machine lacks: space, permission, memory; None for any other error.
+
+    It names the file, where there is one, and says what to do. What an error was raised for counts too.
+    """
+    if isinstance(error, InputError):
+        return str(error)
+    while error is not None:
+        number, text = getattr(error, "errno", None), str(error)
+        if (isinstance(error, MemoryError) or number == errno.ENOMEM or type(error).__name__ == "ResourceExhaustedError"
+                or any(words in text for words in SAYS_NO_MEMORY)):
+            return NO_MEMORY
+        if type(error).__name__ == "TerminatedWorkerError":  # of joblib
+            return WORKER_KILLED
+        if number is None:  # HDF5 has the system's words in its own
+            number = next((one for one in (errno.ENOSPC, errno.EFBIG) if os.strerror(one) in text), None)
+        name = getattr(error, "filename", None)
+        if number in REMEDIES:
+            return f"{name or 'a file'}: {os.strerror(number)}; {REMEDIES[number]}"
+        if isinstance(error, OSError) and name is not None and number is not None:
+            return f"{name}: {os.strerror(number)}; check the path"
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def remedy(text):
+    """What to do about an error of which only the words are known, to be put behind them; nothing for most."""
+    if "MemoryError" in text or any(words in text for words in SAYS_NO_MEMORY):
+        return f"; {NO_MEMORY}"
+    return next((f"; {what}" for number, what in REMEDIES.items() if os.strerror(number) in text), "")
+
+
+def told(error):
+    """Say on standard error in one line why a command ends, and return its exit status; raises what is `explained` by
+    nothing."""
+    line = explained(error)
+    if line is None:
+        raise error
+    print(f"error: {line}", file=sys.stderr)
+    return 1
+
+
+def temporary(path):
+    """The path beside `path` under which this process writes it."""
+    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+
+
+def sweep(folder):
+    """Delete what killed runs left half written below a folder of results that no other run is at work in."""
+    for where, _, names in os.walk(folder):
+        for name in names:
+            if TEMPORARY.fullmatch(name):
+                Path(where, name).unlink(missing_ok=True)
+
+
+_held: dict[tuple, int] = {}  # how often this process holds each folder, by device and number
+
+
+@contextmanager
+def claimed(folder):
+    """Hold a folder, made where there is none, for this process until the block ends, in whatever way it ends.
+
+    Raises InputError where another process holds it. Where the file system knows no locks, everybody may go on.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; name a folder for the results")
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)  # a lock on it ends with the process, so that none can be left behind
+    about = os.fstat(descriptor)
+    key = about.st_dev, about.st_ino
+    try:
+        if key not in _held:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(f"{folder}: another run is at work there; wait until it has ended, or name another "
+                                 "folder") from None
+            except OSError:
+                pass
+        _held[key] = _held.get(key, 0) + 1
+        try:
+            yield
+        finally:
+            _held[key] -= 1
+            if not _held[key]:
+                del _held[key]
+    finally:
+        os.close(descriptor)
+        for path in new:  # where nothing came of it, nothing is left
+            try:
+                path.rmdir()
+            except OSError:
+                break
+
+
+# The log and the word at the end
+
+
+class _File(logging.FileHandler):
+    """Begins its file once the folder is one of results: where a run is refused, nothing is left."""
+
+    def __init__(self, folder, ours):
+        super().__init__(folder / LOG, delay=True, encoding="utf-8")
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+        self.folder, self.ours, self.waiting, self.warnings = folder, ours, [], 0
+
+    def emit(self, record):
+        self.warnings += record.levelno == logging.WARNING
+        self.waiting.append(record)
+        self.ours = self.ours or any(self.folder.glob(RECORD)) or any(self.folder.glob(f"*/{RECORD}"))
+        while self.ours and self.waiting:
+            super().emit(self.waiting.pop(0))
+
+    def handleError(self, record):
+        pass  # a full disk is told of by what needs it more than a log
+
+
+class Run:
+    """A long run with its log: how long it takes, and what it has to say."""
+
+    def __init__(self, handler):
+        self._handler, self._started = handler, time.monotonic()
+
+    def end(self, text):
+        """Say what came of the run, how long it took, and where to read about it."""
+        count = self._handler.warnings
+        say(f"{text}\n{duration(time.monotonic() - self._started)}; {count or 'no'} warning{'s' * (count != 1)}; "
+            f"log: {self._handler.folder / LOG}")
+
+
+@contextmanager
+def logged(folder, what, ours=False):
+    """Append all that is said, every warning, and the error that ends the block to the log of a folder; yields a `Run`.
+
+    what: the first line. ours: that the folder is one of results; otherwise the log begins with its record.
+    """
+    handler = _File(Path(folder), ours)
+    loggers = _log, logging.getLogger("py.warnings")
+    for logger in loggers:
+        logger.addHandler(handler)
+    logging.captureWarnings(True)
+    _log.info(what)
+    try:
+        yield Run(handler)
+    except Exception as error:
+        reason = explained(error)
+        _log.error(reason or type(error).__name__, exc_info=reason is None)
+        raise
+    except BaseException as error:
+        _log.error("stopped: %s", type(error).__name__)
+        raise
+    finally:
+        logging.captureWarnings(False)
+        for logger in loggers:
+            logger.removeHandler(handler)
+        handler.close()
+
+
+def say(text, warning=False):
+    """Print a text, and put it into the log."""
+    print(text, flush=True)
+    note(text, logging.WARNING if warning else logging.INFO)
+
+
+def note(text, level=logging.ERROR):
+    """Put a text into the log alone."""
+    for line in text.splitlines():
+        _log.log(level, line)
+
+
+def duration(seconds):
+    """A time in words of two units: "3 h 12 min"."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
