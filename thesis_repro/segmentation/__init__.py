@@ -1,8 +1,32 @@
 """The segmentation (appendix A.3 to A.7): augmentation, the U-Net, its training, label maps and their quality."""
 
 import os
+import sys
+from contextlib import contextmanager
 
 # TensorFlow splits an operation among its threads, and sums of pieces round differently for another number of pieces.
 # With a number of its own instead of the machine's, any number of cores gives the same bits. It is read once, when the
 # first operation runs. More threads than cores cost little; fewer would leave cores of large machines idle.
 os.environ.setdefault("TF_NUM_INTRAOP_THREADS", "8")
+
+
+@contextmanager
+def quietly():
+    """Loads TensorFlow and what needs it without their greetings, which no setting silences: they come from C++.
+
+    What goes wrong is raised as ever.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = os.dup(1), os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
+        yield
+    finally:
+        sys.stdout.flush()
+        for stream, own in enumerate(kept, 1):
+            os.dup2(own, stream)
+        for descriptor in (*kept, nowhere):
+            os.close(descriptor)

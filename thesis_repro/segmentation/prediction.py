@@ -156,6 +156,10 @@ def load(model_files):
     from thesis_repro.segmentation import backbones  # takes seconds
 
     models = [training.load_model(path) for path in model_files]
+    for path, model in zip(model_files, models):
+        if model.input_shape != models[0].input_shape:
+            raise InputError(f"{path}: takes images of {model.input_shape[1:]}, {model_files[0]} of "
+                             f"{models[0].input_shape[1:]}; the models of an ensemble need one size")
     return models[0] if len(models) == 1 else backbones.ensemble(models)
 
 

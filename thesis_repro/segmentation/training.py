@@ -19,7 +19,7 @@ import tensorflow as tf
 
 from thesis_repro import InputError, files, longrun, stages
 from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
-from thesis_repro.segmentation import augmentation
+from thesis_repro.segmentation import archive, augmentation
 
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
 
@@ -202,25 +202,28 @@ class GoingOn(keras.callbacks.Callback):
 def load_model(path):
     """Read a model saved by Keras, `.keras` or HDF5, for prediction: without loss and metrics.
 
-    Raises InputError where the file is missing, truncated or no model, or where it is no network from square images
-    to the 35 classes.
+    Nothing that the file carries is executed: `archive.check` refuses code before, and Keras reads in its safe mode.
+    Raises InputError for that, where the file is missing, truncated or no model, where it is no network from square
+    images to the 35 classes, and where its weights are not finite.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such model; train one or name another file")
+    archive.check(path)
     try:
-        model = keras.models.load_model(path, compile=False)
+        model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile each raise their own
-        reason = str(error).strip().split("\n")[0][:200]
+        reason = (str(error).strip() or type(error).__name__).split("\n")[0][:200]
         raise InputError(f"{path}: not a model that Keras can read, or a truncated one ({reason}); "
                          "copy it again or train anew") from None
     check_shape(model, path)
+    if not all(np.isfinite(weights).all() for weights in model.get_weights()):
+        raise InputError(f"{path}: holds weights that are not finite, of a training that failed; train anew")
     return model
 
 
 def check_shape(model, name):
-    """Raise InputError unless a model takes square images and gives 35 probabilities for each of their pixels."""
-    taken, given = model.input_shape, model.output_shape
-    if len(taken) != 4 or taken[1] is None or taken[1] != taken[2] or given != (*taken[:3], N_CLASSES):
-        raise InputError(f"{name}: a model from {taken} to {given}; expected (None, size, size, channels) to "
-                         f"(None, size, size, {N_CLASSES})")
+    """Raise InputError unless a model takes square images, gray or in colour, and gives 35 probabilities a pixel."""
+    taken, given = getattr(model, "input_shape", ()), getattr(model, "output_shape", ())
+    square = len(taken) == 4 and taken[1] is not None and taken[1] == taken[2] and taken[3] in (1, 3)
+    if not square or given != (*taken[:3], N_CLASSES):
+        raise InputError(f"{name}: a model from {taken} to {given}; expected (None, size, size, 1 or 3) to "
+                         f"(None, size, size, {N_CLASSES}), so name another model")

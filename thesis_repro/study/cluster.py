@@ -13,6 +13,7 @@ import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from thesis_repro import InputError, longrun
+from thesis_repro.settings import scheduler_address
 
 TIMEOUT = 8  # seconds for a scheduler to answer
 
@@ -26,7 +27,7 @@ class Pool(Protocol):
 @contextmanager
 def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """The pool of a Dask scheduler ("tcp://host:8786"), or `processes` processes of this machine where it is None."""
-    if scheduler is None:
+    if scheduler_address(scheduler) is None:
         yield _Processes(processes)
         return
     from dask.distributed import Client  # takes a second

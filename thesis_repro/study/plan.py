@@ -190,7 +190,10 @@ def _excerpt(work: Work, sequence: kitti.Sequence, start: int, where: Path) -> W
 
 
 def _shipped_model() -> Any:
-    from thesis_repro.segmentation import prediction  # here and below: TensorFlow takes seconds to load
+    from thesis_repro.segmentation import quietly
+
+    with quietly():
+        from thesis_repro.segmentation import prediction  # here and below: TensorFlow takes seconds to load
 
     return prediction.load_shipped()
 
