@@ -9,12 +9,17 @@ from thesis_repro.check import check_cityscapes, check_kitti
 
 
 def test_sound_data_has_no_problems(tiny_kitti, tiny_cityscapes):
-    facts, problems = check_kitti(tiny_kitti)
-    assert problems == [] and facts == ["sequence 00: 4 frames of 64x48; an excerpt: the complete sequence has 4541; "
-                                        "not the thesis's size of 1241x376"]
-    facts, problems = check_cityscapes(tiny_cityscapes)
-    assert problems == [] and facts[0] == ("split train: 4 images with label maps; "
-                                           "labels: road 7, building 11, sky 23")
+    for deep, frames, labels in ((False, "4 frames of 64x48", "labels in the first and last"),
+                                 (True, "4 frames of 64x48, all decoded", "labels")):
+        facts, problems = check_kitti(tiny_kitti, deep)
+        assert problems == [] and facts == [
+            f"sequence 00: {frames}; an excerpt: the complete sequence has 4541; not the thesis's size of 1241x376",
+            "can be run: odometry, predict and masks with 00",
+            f"can be run: evaluate, boresight, study and plan with 00; make figures KITTI={tiny_kitti}"]
+        facts, problems = check_cityscapes(tiny_cityscapes, deep)
+        assert problems == [] and facts[::2] == [
+            f"split train: 4 images with label maps; {labels}: road 7, building 11, sky 23",
+            f"can be run: make figures CITYSCAPES={tiny_cityscapes}"]
 
 
 def test_every_problem_is_listed_and_the_exit_code_says_so(tiny_kitti, tiny_cityscapes, capsys):
@@ -62,13 +67,17 @@ def test_sequences_without_truth_are_described_and_missing_poses_named(tiny_kitt
     facts, problems = check_kitti(tiny_kitti)
     assert problems == [] and facts[1].startswith("sequence 11: 4 frames of 64x48; no true poses, so the study passes "
                                                   "it over")
-    assert "image_2, read as gray; no times.txt, so 10 frames a second" in facts[1]
+    assert "1 m; no times.txt, so 10 frames a second; the frames of image_2, read as gray" in facts[1]
+    assert facts[2] == "can be run: odometry, predict and masks with 00, 11"
     (tiny_kitti / "poses/00.txt").unlink()
-    _, problems = check_kitti(tiny_kitti)
+    facts, problems = check_kitti(tiny_kitti)
     assert len(problems) == 1 and "poses/00.txt: no such file" in problems[0]
+    assert facts[-2:] == ["can be run: odometry, predict and masks with 11",
+                          "cannot be run: evaluate, boresight, study and plan; make figures needs all sequences "
+                          "without fault, so mend or move away the others"]
     shutil.rmtree(tiny_kitti / "sequences/00")
     facts, problems = check_kitti(tiny_kitti)
-    assert len(facts) == 1 and len(problems) == 1 and "no sequence holds frames" in problems[0]
+    assert len(facts) == 3 and len(problems) == 1 and "no sequence holds frames" in problems[0]
 
 
 def test_a_missing_folder_is_one_line(tmp_path, capsys):

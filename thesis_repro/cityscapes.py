@@ -8,7 +8,7 @@ import numpy as np
 from sklearn.model_selection import train_test_split
 
 from thesis_repro import InputError
-from thesis_repro.files import listed, progress, read_color, read_gray
+from thesis_repro.files import listed, progress, read_color, read_gray, read_ids
 
 # Tables 3.1 and 3.2; colours as the Cityscapes scripts draw them. "background" exists in the tables only:
 # the network has 35 outputs, and no label map holds 35 (audit: the tables list one category too many).
@@ -67,6 +67,7 @@ CLASS_WEIGHTS = np.array([label.weight for label in LABELS[:N_CLASSES]], np.floa
 COLORS = np.array([label.color for label in LABELS], np.uint8)
 ID = {label.name: label.id for label in LABELS}
 
+OFFICIAL = {"train": 2975, "val": 500}  # images of the complete splits
 VALIDATION_FRACTION = 0.2
 SPLIT_RANDOM_STATE = 0
 
@@ -95,11 +96,7 @@ def pairs(root, split, limit=None):
 
     Raises InputError for a missing folder, an empty split or an image without its label map.
     """
-    root = Path(root)
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder; CITYSCAPES must name the folder that holds leftImg8bit and gtFine, "
-                         "or train, trainannot, val and valannot")
-    images, labels, where = _listing(root, split)
+    images, labels, where = listing(root, split)
     if not images:
         raise InputError(f"{where}: no PNG images; the {split} split must hold at least one")
     lonely = sorted(images.keys() ^ labels.keys())
@@ -114,7 +111,12 @@ def pairs(root, split, limit=None):
     return [Pair(name, images[name], labels[name]) for name in names]
 
 
-def _listing(root, split):
+def listing(root, split):
+    """The images and the label maps of a split by name, {name: path} each, and the folder of the images."""
+    root = Path(root)
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; CITYSCAPES must name the folder that holds leftImg8bit and gtFine, "
+                         "or train, trainannot, val and valannot")
     if (root / "leftImg8bit").is_dir():
         where = root / "leftImg8bit" / split
         image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
@@ -139,8 +141,8 @@ def read_image(path, height, width, channels=1):
 
 
 def read_label_map(path):
-    """One label map of Cityscapes ids, uint8. Raises InputError where an id is 35 or more."""
-    label_map = read_gray(path)
+    """One label map of Cityscapes ids, uint8. Raises InputError where an id is 35 or more, and what `read_ids` does."""
+    label_map = read_ids(path)
     if label_map.max() >= N_CLASSES:
         raise InputError(f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; label maps must hold "
                          "Cityscapes label ids (the files that end in labelIds.png), not train ids or colours")
