@@ -20,8 +20,8 @@ def test_reads_back_what_was_written(tmp_path):
     (lambda data: data[:-1], "truncated or corrupt"),
     (lambda data: data[:len(data) // 2], "truncated or corrupt"),
     (lambda data: data[:200] + b"????" + data[204:], "truncated or corrupt"),
-    (lambda data: b"", "not an image"),
-    (lambda data: b"hello", "not an image"),
+    (lambda data: b"", "is empty"),
+    (lambda data: b"hello", "not a PNG or JPEG image"),
 ])
 def test_damaged_image_is_named(tmp_path, damage, says):
     path = tmp_path / "a.png"

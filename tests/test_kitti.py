@@ -32,6 +32,7 @@ def test_subset_is_the_start_and_never_longer(tiny_kitti):
 def test_poses_are_written_to_the_last_bit(tmp_path):
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3] = np.random.default_rng(0).normal(size=(3, 3, 4)) / 3
+    poses[:, :3, :3] = [cv2.Rodrigues(pose[:3, 3])[0] for pose in poses]
     write_kitti_poses(tmp_path / "poses.txt", poses)
     assert np.array_equal(read_poses(tmp_path / "poses.txt"), poses)
 

@@ -12,8 +12,17 @@ _HOMES = {"Sequence": "kitti", "keypoint_mask": "masks", "Odometry": "odometry",
 __all__ = ["InputError", *_HOMES]
 
 
+def one_line(text):
+    """A message as one line that a terminal shows as it is: line ends and control characters are spelled out."""
+    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape", "surrogatepass").decode()
+                   for letter in str(text))
+
+
 class InputError(ValueError):
     """Bad input: one line that says what, which file or setting, and what to do about it."""
+
+    def __str__(self):
+        return one_line(super().__str__())  # the names of files may hold anything
 
     def _render_traceback_(self):
         """What IPython shows of it: the line alone."""

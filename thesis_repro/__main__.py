@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import os
 import shlex
 import sys
@@ -9,9 +10,39 @@ from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
 
-from thesis_repro import InputError, longrun
+from thesis_repro import InputError, longrun, one_line
 
 DESCRIPTION = "Keypoint masks from semantic segmentation for monocular visual odometry: a thesis, reproduced."
+
+
+def _apart(option, output, *inputs):
+    """Raise InputError where a folder for results holds something that is read, which could be replaced."""
+    for path in inputs:
+        if path is not None and path.resolve().is_relative_to(output.resolve()):
+            raise InputError(f"{option} {output}: {'is' if path.resolve() == output.resolve() else 'holds'} the input "
+                             f"{path}; name another folder")
+
+
+def _new_files(outputs, read, folders):
+    """Raise InputError, before anything runs, for a file to write that cannot be, or that would harm an input.
+
+    outputs: {option: path or None}. read: files that are inputs. folders: that must stay as they are.
+    """
+    from thesis_repro.files import check_output
+
+    seen = {}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        check_output(path)
+        where = path.resolve()
+        if where in {file.resolve() for file in read}:
+            raise InputError(f"{option} {path}: is an input, which would be lost; name another file")
+        if where.parent in {folder.resolve() for folder in folders if folder}:
+            raise InputError(f"{option} {path}: would stand among the inputs in {path.parent}; name another folder")
+        if where in seen:
+            raise InputError(f"{option} {path}: is the file of {seen[where]} too; give each its own")
+        seen[where] = option
 
 
 def synthesize(options):
@@ -30,7 +61,7 @@ def _kept(count):
 
 
 def check_data(options):
-    """say what is there, what is missing or wrong in folders of KITTI, Cityscapes and KITTI's street scenes"""
+    """say what is there, missing or wrong in folders of KITTI, Cityscapes, KITTI's street scenes, and what can run"""
     from thesis_repro import check
 
     if not options.kitti and not options.cityscapes and not options.kitti_semantic:
@@ -40,17 +71,18 @@ def check_data(options):
     for root, look in ((options.kitti, check.check_kitti), (options.cityscapes, check.check_cityscapes),
                        (options.kitti_semantic, check.check_kitti_semantic)):
         if root:
-            facts, wrong = look(root)
+            facts, wrong = look(root, options.deep)
             print("\n".join([str(root), *(f"  {fact}" for fact in facts)]))
             problems += wrong
     for problem in problems:
-        print(f"wrong: {problem}", file=sys.stderr)
+        print(f"wrong: {one_line(problem)}", file=sys.stderr)
     return 1 if problems else 0
 
 
 def predict(options):
     """write label maps (8-bit ids, 320x320 PNG, named like the frames) for folders of images or sequences"""
-    from thesis_repro.segmentation import prediction
+    from thesis_repro.segmentation import archive, quietly
+    from thesis_repro.settings import scheduler_address
     from thesis_repro.study import cluster
 
     names = [folder.resolve().name for folder in options.images]
@@ -58,7 +90,14 @@ def predict(options):
         raise InputError("--images: two folders have one name, so their label maps would share a folder; give them to "
                          "two commands")
     outputs = [options.output] if len(names) == 1 else [options.output / name for name in names]
-    sequences = [(_images(folder, output), output) for folder, output in zip(options.images, outputs)]
+    sequences = [(_images(folder), output) for folder, output in zip(options.images, outputs)]
+    for output in outputs:
+        _apart("--output", output, *options.images, *(paths[0].parent for paths, _ in sequences), *options.model)
+    for path in options.model:
+        archive.check(path)
+    scheduler_address(options.dask)
+    with quietly():  # takes seconds, so that what is wrong with the files is said before
+        from thesis_repro.segmentation import prediction
     model_files = options.model or [prediction.SHIPPED]
     with longrun.logged(options.output, options.words) as run:
         if options.dask:
@@ -72,10 +111,10 @@ def predict(options):
                 + _kept(every - made))
 
 
-def _images(folder, output):
-    """The images of a folder or of a KITTI sequence folder, whose label maps are to be written to another one."""
+def _images(folder):
+    """The images of a folder, or of a KITTI sequence folder, which must be complete."""
     from thesis_repro.files import images as images_in
-    from thesis_repro.kitti import images_of
+    from thesis_repro.kitti import check_numbering, images_of
 
     images = images_of(folder)
     if not images.is_dir():
@@ -84,9 +123,8 @@ def _images(folder, output):
     paths = images_in(images)
     if not paths:
         raise InputError(f"{images}: holds no PNG or JPEG images")
-    if output.resolve() == images.resolve():
-        raise InputError(f"{output}: is the folder of the images; label maps have the same names, "
-                         "so name another folder")
+    if images != folder:
+        check_numbering(paths)
     return paths
 
 
@@ -107,6 +145,7 @@ def masks(options):
 
     sequence, widths = Sequence(options.kitti, options.sequence, options.camera), sorted(set(options.dilation))
     made = [LabelMasks(options.labels, sequence, width, _mask_settings(options)) for width in widths]
+    _apart("--output", options.output, options.labels, sequence.folder)
     count = len(made) * len(sequence)
     if count > MANY_MASKS and not options.many:
         raise InputError(f"--dilation: {len(made)} widths of {len(sequence)} frames would be {count:,} files. The "
@@ -142,6 +181,10 @@ def odometry(options):
     if options.plot:
         trajectories.check_name(options.plot)
     sequence = Sequence(options.kitti, options.sequence, options.camera, options.speed)
+    _new_files({"--output": options.output, "--tum": options.tum, "--plot": options.plot, "--video": options.video,
+                "--frames-csv": options.frames_csv},
+               [sequence.poses_path, sequence.folder / "calib.txt", sequence.folder / "times.txt"],
+               [sequence.frame_paths[0].parent, options.masks, options.labels])
     masks = None
     if options.masks:
         masks = MaskFolder(options.masks, sequence)
@@ -261,30 +304,32 @@ def study(options):
     """run the odometry with masks of your own beside all keypoints and controls, and leave tables, figures, a page"""
     from thesis_repro import kitti
     from thesis_repro.report import study
-    from thesis_repro.settings import ALL_WIDTHS, cores
+    from thesis_repro.settings import ALL_WIDTHS, MOST_JOBS, cores, scheduler_address
     from thesis_repro.study import jobs, plan, series
 
     if not options.sources:
         raise InputError("no masks: name a folder of label maps with --labels or of masks with --masks")
     widths = options.widths
     if not any(kind == "labels" for kind, _ in options.sources):
-        if widths or options.controls:
+        if widths or not (options.controls is None or options.controls is True):
             raise InputError(f"{'--widths' if widths else f'--controls {options.controls}'}: only masks from label "
                              "maps (--labels) have a width")
         widths = ()
     elif widths is None:
         widths = ALL_WIDTHS
+    scheduler_address(options.dask)
     planned = series.checked(series.Study(
         options.kitti.absolute(), tuple(options.sequences or kitti.sequences(options.kitti)),
         series.named(options.sources, options.name), tuple(sorted(set(widths))),
-        jobs.CONTROL_WIDTH if options.controls == 0 else options.controls, tuple(dict.fromkeys(options.pose)),
+        jobs.CONTROL_WIDTH if options.controls is True else options.controls, tuple(dict.fromkeys(options.pose)),
         options.repetitions, options.frames))
     if options.plan:
         print(plan.of_study(planned))
         return
-    if options.jobs is not None and options.jobs < 1:
-        raise InputError(f"--jobs {options.jobs}: must be 1 or more")
+    if options.jobs is not None and not 1 <= options.jobs <= MOST_JOBS:
+        raise InputError(f"--jobs {options.jobs}: must be 1 to {MOST_JOBS}")
     folder = options.output.absolute()
+    _apart("--output", folder, options.kitti, *(source.folder for source in planned.sources))
     with longrun.logged(folder, options.words) as run, longrun.claimed(folder):
         summary = planned.run(folder, options.jobs or cores(), options.dask)
         counts, page = summary.attrs, study.write(planned, summary, folder)
@@ -301,6 +346,7 @@ def evaluate(options):
     if options.plot:
         trajectories.check_name(options.plot)
     true = true_poses(options.kitti, options.sequence)
+    _new_files({"--plot": options.plot}, options.poses, ())
     paths = trajectories.read(options.poses, true)
     rows = trajectories.evaluate(paths, true, options.align)
     if options.plot:
@@ -312,15 +358,17 @@ def evaluate(options):
 def plan(options):
     """say how long make figures would take here, training included, its memory and disk, from a short calibration"""
     from thesis_repro import cityscapes, kitti
-    from thesis_repro.settings import read_settings
+    from thesis_repro.settings import MOST_REPETITIONS, read_settings
     from thesis_repro.study import plan
 
     # the sizes of the thesis, but for what make's PROFILE, EPOCHS and so on say
     sizes = read_settings({"THESIS_REPRO_PROFILE": "thesis"} | {
         name: value for name, value in os.environ.items() if name.startswith("THESIS_REPRO_")}).sizes
     repetitions = sizes.repetitions if options.repetitions is None else options.repetitions
-    if repetitions < 1 or min(options.cores) < 1:
-        raise InputError("--repetitions and --cores: need whole numbers of 1 or more")
+    for option, values, most in (("--repetitions", [repetitions], MOST_REPETITIONS), ("--cores", options.cores, 10**6)):
+        for value in values:
+            if not 1 <= value <= most:
+                raise InputError(f"{option} {value}: must be 1 to {most:,}")
     images = len(cityscapes.pairs(options.cityscapes, "train")) if options.cityscapes else 0
     frames = plan.counts(options.kitti, options.complete, sizes.frames)
     work = plan.Thesis(options.kitti, tuple(kitti.sequences(options.kitti)), sizes, repetitions=repetitions)
@@ -328,8 +376,60 @@ def plan(options):
     print(plan.text(work, plan.make(work, frames, calibration, options.cores, images), calibration, options.complete))
 
 
+class _Once(argparse.Action):
+    """Stores what an option is given, and refuses it a second time: the first would count for nothing."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        given = vars(namespace).setdefault("given", set())
+        if option_string and self.dest in given:
+            several = ", with all its values behind it" if self.nargs == "+" else ""
+            raise argparse.ArgumentError(self, f"is given twice; give it once{several}")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse with errors of one line, without empty paths, and with finite numbers alone."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.register("action", None, _Once)
+        self.register("type", Path, _path)
+        self.register("type", float, _finite)
+        self.register("type", int, _whole)
+
+    def error(self, message):
+        self.exit(2, f"error: {one_line(message)}; see {self.prog} --help\n")
+
+
+def _path(text):
+    if not text.strip():
+        raise argparse.ArgumentTypeError("is empty; name a file or a folder")
+    return Path(text)
+
+
+def _finite(text):
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text[:60]!r} is no finite number")
+    return value
+
+
+def _whole(text):
+    try:
+        value = int(text)
+    except ValueError:
+        value = None
+    if value is None or abs(value) >= 2**63:
+        raise argparse.ArgumentTypeError(f"{text[:60]!r} is no whole number that could be meant")
+    return value
+
+
 def build_parser():
-    parser = argparse.ArgumentParser(prog="thesis-repro", description=DESCRIPTION)
+    parser = _Parser(prog="thesis-repro", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"thesis-repro {version('thesis-repro')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
@@ -348,6 +448,8 @@ def build_parser():
     sub.add_argument("--cityscapes", type=Path, metavar="ROOT",
                      help="folder that holds leftImg8bit and gtFine, or train, trainannot, val and valannot")
     sub.add_argument("--kitti-semantic", type=Path, metavar="ROOT", help="folder that holds train and trainannot")
+    sub.add_argument("--deep", action="store_true", help="decode every file, on all cores; otherwise names, both ends "
+                                                         "of each file, and the first and last frame")
 
     sub = command(predict)
     sub.add_argument("--images", type=Path, nargs="+", required=True, metavar="DIR_OR_SEQUENCE",
@@ -439,7 +541,7 @@ def build_parser():
                      help="of each --labels and --masks, in their order (the folder's)")
     sub.add_argument("--widths", type=int, nargs="+", metavar="W",
                      help="dilation widths in pixels of masks from label maps (1 to 15)")
-    sub.add_argument("--controls", type=int, nargs="?", const=0, metavar="W",
+    sub.add_argument("--controls", type=int, nargs="?", const=True, metavar="W",
                      help="masks and limits that know no segmentation, beside masks of width W (10)")
     sub.add_argument("--repetitions", type=int, default=5, metavar="N",
                      help="of every run, each with the correspondences in another order (5)")

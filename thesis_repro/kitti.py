@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from statistics import median_low
 
@@ -38,6 +38,11 @@ FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 
 
 
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")  # left gray, left colour, then the right ones
+LEAST = 16  # pixels a side of a frame: on less no keypoint can be tracked
+MANY_MISSING = 10_000  # frames; more are not listed
+FASTEST = 10_000  # metres a second
+FAR = 1e9  # metres; no position is as far away
+RIGID = 1e-3  # what R R^T may differ from the identity: the digits of a file are few
 FRAME_TIME = 0.1  # seconds between KITTI's frames, and between those of a sequence that has no times
 
 
@@ -119,35 +124,28 @@ class Sequence:
         self.frame_paths = images(where)
         if not self.frame_paths:
             raise InputError(f"{where}: holds no PNG or JPEG frames; sequence {self.name} is empty")
-        _check_numbering(self.frame_paths)
-        self.intrinsics = _read_intrinsics(self.folder / "calib.txt", where.name)
+        check_numbering(self.frame_paths)
+        self.intrinsics = read_intrinsics(self.folder / "calib.txt", where.name)
         times = self.folder / "times.txt"
         self.has_times = times.is_file()
-        self.times = _read_numbers(times, 1)[:, 0] if self.has_times else FRAME_TIME * np.arange(len(self))
-        self._check_count(times, len(self.times))
+        self.times = read_times(times) if self.has_times else FRAME_TIME * np.arange(len(self))
+        check_count(times, len(self.times), self.frame_paths)
         self.has_truth = self.poses_path.is_file()
         if self.has_truth:
             self._poses = read_poses(self.poses_path)
-            self._check_count(self.poses_path, len(self._poses))
+            check_count(self.poses_path, len(self._poses), self.frame_paths)
         if speed is not None:
             self._check_speed(speed)
-
-    def _check_count(self, path, count):
-        if count != len(self):
-            raise InputError(f"{path}: {count} lines for {len(self)} frames in {self.frame_paths[0].parent}; "
-                             "one line a frame is needed")
 
     def _check_speed(self, speed):
         if self.has_truth:
             raise InputError(f"speed: sequence {self.name} has true poses ({self.poses_path}), from which the length "
                              "of each step is taken; give none")
-        if not np.isfinite(speed) or speed <= 0:
-            raise InputError(f"speed: {speed} is none; give metres a second, above 0")
-        times = self.folder / "times.txt"
+        if not 0 < speed <= FASTEST:
+            raise InputError(f"speed: {speed} is none; give metres a second, above 0 and at most {FASTEST:,}")
         if not self.has_times:
-            raise InputError(f"{times}: no such file; a speed needs the times of the frames, in seconds, one a line")
-        if (np.diff(self.times) <= 0).any():
-            raise InputError(f"{times}: time does not always increase; a speed needs times that do")
+            raise InputError(f"{self.folder / 'times.txt'}: no such file; a speed needs the times of the frames, in "
+                             "seconds, one a line")
 
     @property
     def poses(self) -> np.ndarray:
@@ -177,8 +175,13 @@ class Sequence:
 
     @cached_property
     def size(self) -> tuple[int, int]:
-        """(height, width) of the first frame; every frame must have it."""
-        return read_gray(self.frame_paths[0]).shape
+        """(height, width) of the first frame; every frame must have it.
+
+        Raises InputError where it is less than LEAST, and where the camera cannot be that of such frames.
+        """
+        height, width = read_gray(self.frame_paths[0]).shape
+        check_camera(self.folder / "calib.txt", self.intrinsics, self.frame_paths[0], (height, width))
+        return height, width
 
     def frame(self, index: int) -> np.ndarray:
         """Frame `index` as 8-bit gray, (height, width). Raises InputError when unreadable or of another size."""
@@ -210,6 +213,8 @@ def _places(root, name):
             return folder.parent, folder, folder / "poses.txt"
         root, name = folder.parent.parent, folder.name  # it is one of KITTI's after all
     root, name = Path(root), str(name)
+    if name in ("", ".", "..") or "/" in name:
+        raise InputError(f"sequence {name!r}: is no name of a folder in {root / 'sequences'}; give one, such as 00")
     if name.isdigit() and not (root / "sequences" / name).is_dir():
         name = name.zfill(2)
     return root, root / "sequences" / name, root / "poses" / f"{name}.txt"
@@ -226,19 +231,58 @@ def true_poses(root: str | Path | None, name: str | Path) -> np.ndarray:
     return read_poses(path)
 
 
-def _check_numbering(paths):
-    """Raise InputError for frames that count by one with a gap. (Every fifth frame, say, or times are no count.)"""
+def check_numbering(paths: list[Path]) -> None:
+    """Raise InputError for frames that count by one with a gap, and for two of one number.
+
+    (Every fifth frame, say, or times are no count.)
+    """
     numbers = numbers_of(paths) or [0]
-    steps = [after - before for before, after in pairwise(numbers)]
-    if len(steps) < 2 or median_low(steps) != 1 or max(steps) == 1:
+    twice = next((index for index, (before, after) in enumerate(pairwise(numbers)) if before == after), None)
+    if twice is not None:
+        raise InputError(f"{paths[twice + 1]}: has the number of {paths[twice].name}; take one of them away")
+    missing = missing_frames(paths)
+    if missing:
+        before = max(index for index, path in enumerate(paths) if numbers[index] < _number(missing[0]))
+        count = f"{len(missing)}{' or more' * (len(missing) == MANY_MISSING)}"
+        more = f" ({count} are missing in all)" if len(missing) > 1 else ""
+        raise InputError(f"{missing[0]}: is missing between {paths[before].name} and {paths[before + 1].name}{more}; "
+                         "copy it again, for the odometry needs every frame")
+
+
+def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
+    """The files that are not there of frames that count by one.
+
+    count: of all frames, which then begin with 0 (KITTI's) or with 1, or else where the first of `paths` does: those
+    before the first and after the last are found too. No more than MANY_MISSING are named.
+    """
+    numbers = numbers_of(paths)
+    steps = [after - before for before, after in pairwise(numbers or [])]
+    if not numbers or steps and median_low(steps) != 1 or count is None and len(steps) < 2:
+        return []
+    first, last = numbers[0], numbers[-1]
+    if count is not None:
+        first = next((start for start in (0, 1) if start <= first and last < start + count), first)
+        last = max(last, first + count - 1)
+    stem = paths[0].stem.rstrip("0123456789")
+    digits = min(len(path.stem) for path in paths) - len(stem)
+    there = set(numbers)
+    names = (paths[0].with_name(f"{stem}{number:0{digits}d}{paths[0].suffix}") for number in range(first, last + 1)
+             if number not in there)
+    return list(islice(names, MANY_MISSING))
+
+
+def _number(path):
+    return int(path.stem[len(path.stem.rstrip("0123456789")):])
+
+
+def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
+    """Raise InputError, naming the first missing frame where there is a count, unless a file has a line a frame."""
+    if count == len(frame_paths):
         return
-    before = next(index for index, step in enumerate(steps) if step > 1)
-    path, missing = paths[before], sum(step - 1 for step in steps)
-    digits = len(path.stem) - len(path.stem.rstrip("0123456789"))
-    first = f"{path.stem[:-digits]}{numbers[before] + 1:0{digits}d}{path.suffix}"
-    more = f" ({missing} are missing in all)" if missing > 1 else ""
-    raise InputError(f"{path.with_name(first)}: is missing between {path.name} and {paths[before + 1].name}{more}; "
-                     "copy it again, for the odometry needs every frame")
+    missing = missing_frames(frame_paths, count) if count > len(frame_paths) else []
+    about = f" (the first without one: {missing[0].name})" if missing else ""
+    raise InputError(f"{path}: {count} lines for {len(frame_paths)} frames in {frame_paths[0].parent}{about}; "
+                     "one line a frame is needed")
 
 
 def _size(shape):
@@ -249,9 +293,10 @@ def _read_text(path):
     try:
         return Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; it is part of the official KITTI odometry layout") from None
+        raise InputError(f"{path}: no such file; check its name, or copy it from the data set again") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from None
+        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are none"
+        raise InputError(f"{path}: cannot be read as text ({reason}); check the file and its permissions") from None
 
 
 def _read_numbers(path, columns):
@@ -265,15 +310,18 @@ def _read_numbers(path, columns):
             row = []
         if len(row) != columns or not np.isfinite(row).all():
             raise InputError(f"{path}, line {number}: expected {columns} finite number{'s' * (columns > 1)}, "
-                             f"found {line.strip()[:60]!r}")
+                             f"found {line.strip()[:60]!r}; copy the file again")
         rows.append(row)
     if not rows:
         raise InputError(f"{path}: is empty; one line a frame is needed")
     return np.array(rows, np.float64)
 
 
-def _read_intrinsics(path, camera):
-    """The camera matrix of image_0 (Equation 2.4), the first 3x3 of P0, or of another camera."""
+def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
+    """The camera matrix of image_0 (Equation 2.4), the first 3x3 of P0, or of another camera: (3, 3), pixels.
+
+    Raises InputError for a file without it, and for numbers that are no camera's without distortion and skew.
+    """
     key = f"P{camera[-1]}" if camera in IMAGE_FOLDERS else "P0"
     for line in _read_text(path).splitlines():
         if line.startswith(f"{key}:"):
@@ -284,16 +332,53 @@ def _read_intrinsics(path, camera):
             matrix = values.reshape(3, 4)[:, :3] if values.shape == (12,) and np.isfinite(values).all() else None
             if matrix is None or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
                 raise InputError(f"{path}: {key} must be 12 finite numbers with positive focal lengths, "
-                                 f"found {line.strip()[:60]!r}")
+                                 f"found {line.strip()[:60]!r}; copy the file again")
+            if matrix[0, 1] or matrix[1, 0] or not np.array_equal(matrix[2], [0, 0, 1]):
+                raise InputError(f"{path}: {key} must be f 0 u 0, 0 f v 0, 0 0 1 0 of a camera without distortion and "
+                                 f"skew, found {line.strip()[:60]!r}; copy the file again")
             return matrix
-    raise InputError(f"{path}: has no line '{key}:' with the projection matrix of {camera}")
+    raise InputError(f"{path}: has no line '{key}:' with the projection matrix of {camera}; copy the file again")
+
+
+def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[int, int]) -> None:
+    """Raise InputError where a camera matrix cannot be that of frames of (height, width), or these are too small."""
+    height, width = size
+    if min(size) < LEAST:
+        raise InputError(f"{frame}: {_size(size)} pixels are too few for an odometry; a side needs {LEAST} or more")
+    (fx, _, u), (_, fy, v), _ = intrinsics
+    if not (0 <= u <= width and 0 <= v <= height and all(width / 100 < focal < width * 100 for focal in (fx, fy))):
+        raise InputError(f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} are not those of a camera with "
+                         f"frames of {_size(size)} pixels; take the file of these frames")
+
+
+def read_times(path: str | Path) -> np.ndarray:
+    """The times of frames, (n,), seconds: one number a line. Raises InputError unless they increase."""
+    times = _read_numbers(path, 1)[:, 0]
+    late = np.flatnonzero(np.diff(times) <= 0)
+    if len(late):
+        raise InputError(f"{path}, line {late[0] + 2}: time does not increase; the file is damaged, so copy it again")
+    return times
 
 
 def read_poses(path: str | Path) -> np.ndarray:
-    """Camera-to-world poses, (n, 4, 4), metres: one line of 12 numbers, the first three rows, a frame."""
+    """Camera-to-world poses, (n, 4, 4), metres: one line of 12 numbers, the first three rows, a frame.
+
+    Raises InputError for what is no rotation (mirrored ones among it) and no position.
+    """
     rows = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
+    rotations = poses[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    for index in np.flatnonzero(~(error <= RIGID))[:1]:
+        raise InputError(f"{path}, line {index + 1}: is no rotation (off by {error[index]:.2g}); the file is damaged "
+                         "or in another form than KITTI's")
+    for index in np.flatnonzero(np.linalg.det(rotations) < 0)[:1]:
+        raise InputError(f"{path}, line {index + 1}: is a mirrored rotation, of axes that are left-handed; KITTI's x "
+                         "points to the right, y down and z ahead")
+    for index in np.flatnonzero(np.abs(poses[:, :3, 3]).max(axis=1) > FAR)[:1]:
+        raise InputError(f"{path}, line {index + 1}: is no position in metres; the file is damaged")
     return poses
 
 

@@ -13,7 +13,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from thesis_repro import InputError
+from thesis_repro import InputError, one_line
 
 LOG = "log.txt"
 RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
@@ -82,7 +82,7 @@ def told(error):
     line = explained(error)
     if line is None:
         raise error
-    print(f"error: {line}", file=sys.stderr)
+    print(f"error: {one_line(line)}", file=sys.stderr)
     return 1
 
 

@@ -99,10 +99,17 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
     symmetric: an even square is made one pixel smaller. Around exact boundaries, which are then marked on both sides,
     the mask is as wide as an even width says.
     """
-    if dilation_width < 1:
-        raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels")
+    check_width(dilation_width, edge_image.shape)
     side = dilation_width - (dilation_width % 2 == 0) if symmetric else dilation_width
     return cv2.dilate(edge_image, np.ones((side, side), np.uint8))
+
+
+def check_width(dilation_width: int, size: tuple[int, int]) -> None:
+    """Raise InputError for a dilation width that frames of (height, width) cannot have."""
+    most = 2 * max(size)  # a square of that side reaches from one end of the frame to the other
+    if not 1 <= dilation_width <= most:
+        raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels, and at most {most} for frames of "
+                         f"{size[1]}x{size[0]}")
 
 
 def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> np.ndarray:
@@ -169,8 +176,12 @@ class LabelMasks:
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = MaskSettings.of(settings)
-        if dilation_width < 1:
-            raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels")
+        check_width(dilation_width, self.size)
+        for name, pixels, most in (("margin", self.settings.margin, (min(self.size) - 1) // 2),
+                                   ("movable", self.settings.movable or 0, max(self.size) - 1)):
+            if pixels > most:
+                raise InputError(f"{name}={pixels}: leaves nothing of frames of {self.size[1]}x{self.size[0]}; give at "
+                                 f"most {most} pixels")
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -205,7 +216,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 class MaskFolder:
     """Masks of a sequence read from a folder of images named like the frames: masks[i] for frame i.
 
-    Raises InputError when the folder or a frame's mask is missing, or a mask has another size than the frame.
+    Raises InputError when the folder or a frame's mask is missing, and for what `read_mask` refuses.
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence) -> None:
@@ -216,11 +227,27 @@ class MaskFolder:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        mask = read_gray(self.paths[index])
-        if mask.shape != self.size:
-            raise InputError(f"{self.paths[index]}: {mask.shape[1]}x{mask.shape[0]} pixels, but the frames have "
-                             f"{self.size[1]}x{self.size[0]}; masks must have the size of the frames")
-        return mask
+        return read_mask(self.paths[index], self.size)
+
+
+def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
+    """One mask of frames of (height, width), uint8 of two values: 0, and another where keypoints may lie.
+
+    Raises InputError for another size and for more values, as label maps have them.
+    """
+    mask = read_gray(path)
+    check_mask_size(path, mask.shape, size)
+    if ((mask != 0) & (mask != mask.max())).any():
+        raise InputError(f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps go "
+                         "with --labels)")
+    return mask
+
+
+def check_mask_size(path: str | Path, found: tuple[int, ...], size: tuple[int, int]) -> None:
+    """Raise InputError where a mask's (height, width) is not that of the frames."""
+    if found != size:
+        raise InputError(f"{path}: {found[1]}x{found[0]} pixels, but the frames have {size[1]}x{size[0]}; masks must "
+                         "have the size of the frames")
 
 
 def _files_of_frames(folder, sequence, what):

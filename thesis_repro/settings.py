@@ -5,6 +5,7 @@ Every variable starts with THESIS_REPRO_; `make figures KITTI=... CITYSCAPES=...
 
 import hashlib
 import os
+import re
 import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -32,9 +33,11 @@ VARIABLES = {
     "WIDTHS": "dilation widths in pixels, such as 5,10 or 1-15",
     "REPETITIONS": "runs of each kind, with the correspondences in another order each time",
 }
-# the least that each may be, and what it must be a multiple of
-LIMITS = {"IMAGE_SIZE": (32, 16), "BASE_FILTERS": (1, 1), "BATCH_SIZE": (1, 1), "EPOCHS": (1, 1), "FRAMES": (5, 1),
-          "WIDTHS": (1, 1), "REPETITIONS": (1, 1)}
+MOST_JOBS, MOST_REPETITIONS = 1024, 1000
+# the least and the most that each may be, and what it must be a multiple of
+LIMITS = {"IMAGE_SIZE": (32, 4096, 16), "BASE_FILTERS": (1, 1024, 1), "BATCH_SIZE": (1, 4096, 1),
+          "EPOCHS": (1, 100_000, 1), "FRAMES": (5, 10**7, 1), "WIDTHS": (1, 1000, 1),
+          "REPETITIONS": (1, MOST_REPETITIONS, 1)}
 ALL_WIDTHS = tuple(range(1, 16))
 
 
@@ -142,8 +145,8 @@ def read_settings(environment=None):
     if profile not in PROFILES:
         raise InputError(f"PROFILE={profile}: unknown profile; choose one of {', '.join(PROFILES)}")
     jobs = given.get("JOBS", str(cores()))
-    if not jobs.isdigit() or int(jobs) < 1:
-        raise InputError(f"JOBS={jobs}: must be a whole number of processes, 1 or more")
+    if not 1 <= (_whole(jobs) or 0) <= MOST_JOBS:
+        raise InputError(f"JOBS={jobs}: must be a whole number of processes, 1 or more, and at most {MOST_JOBS}")
     build = Path(given.get("BUILD", ROOT / "build")).absolute()
     figures = Path(given.get("FIGURES", ROOT / "figures")).absolute()
     world = build / f"world-{profile}"
@@ -160,7 +163,8 @@ def read_settings(environment=None):
         cityscapes_is_embedded=cityscapes is None, run=run, build=build / run,
         # the default run's figures are what visitors see; those of all others go into folders beside them
         figures=figures if run == "embedded-demo" else figures / run,
-        world=world, jobs=int(jobs), scheduler=given.get("DASK_SCHEDULER"), kitti_semantic=kitti_semantic)
+        world=world, jobs=int(jobs), scheduler=scheduler_address(given.get("DASK_SCHEDULER")),
+        kitti_semantic=kitti_semantic)
 
 
 def own_sizes(profile, given):
@@ -174,23 +178,29 @@ def own_sizes(profile, given):
 def _size(name, text):
     if name == "FRAMES" and text == "all":
         return None
-    least, step = LIMITS[name]
-    numbers = _numbers(text) if name == "WIDTHS" else [int(text)] if text.isdecimal() else []
-    if not numbers or any(number < least or number % step for number in numbers):
+    least, most, step = LIMITS[name]
+    numbers = _numbers(text, most) if name == "WIDTHS" else [_whole(text)]
+    if not numbers or any(number is None or not least <= number <= most or number % step for number in numbers):
         kind = "whole numbers, such as 5,10 or 1-15," if name == "WIDTHS" else "a whole number"
-        raise InputError(f"{name}={text}: must be {kind}{' or all,' * (name == 'FRAMES')} of {least} or more"
-                         f"{f' and a multiple of {step}' * (step > 1)}")
+        raise InputError(f"{name}={text[:60]}: must be {kind}{' or all,' * (name == 'FRAMES')} of {least} or more"
+                         f"{f' and a multiple of {step}' * (step > 1)}, and at most {most}")
     return tuple(numbers) if name == "WIDTHS" else numbers[0]
 
 
-def _numbers(text):
-    """The numbers of "1-3, 7", sorted; none where it is something else."""
+def _whole(text):
+    """The whole number that a text is, 0 or more; None where it is something else."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else None
+
+
+def _numbers(text, most):
+    """The numbers of "1-3, 7", sorted; none where it is something else, or holds one above `most`."""
     found = set()
     for word in text.replace(",", " ").split():
-        first, _, last = word.partition("-")
-        if not first.isdecimal() or ("-" in word and not last.isdecimal()):
+        first, dash, last = word.partition("-")
+        begin, end = _whole(first), _whole(last if dash else first)
+        if begin is None or end is None or not begin <= end <= most:
             return []
-        found |= set(range(int(first), int(last or first) + 1)) or {0}
+        found |= set(range(begin, end + 1))
     return sorted(found)
 
 
@@ -203,6 +213,15 @@ def _changed(profile, sizes):
 def _in_a_name(value):
     text = "_".join(map(str, value)) if isinstance(value, tuple) else "all" if value is None else str(value)
     return text if len(text) <= 40 else hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def scheduler_address(text):
+    """The address of a Dask scheduler, or None for none; InputError where it is no address, for which Dask would start
+    a cluster of its own or read a file."""
+    if text is not None and not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d{1,5}", text):
+        raise InputError(f"Dask scheduler {text}: is no address; start one with 'dask scheduler' and give the address "
+                         "that it prints, tcp://host:port")
+    return text
 
 
 def cores():
@@ -221,7 +240,8 @@ def _data_folder(name, value):
 
 def _short_name(name, path):
     # two folders of the same name must not share results
-    return f"{name}-{path.name}-{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:6]}"
+    letters = re.sub(r"[^\w.+-]+", "-", path.name)  # make and shells have their own ideas of others
+    return f"{name}-{letters}-{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:6]}"
 
 
 def _short(value):
@@ -242,7 +262,7 @@ if __name__ == "__main__":
     try:
         _settings = read_settings()
     except InputError as error:
-        sys.exit(str(error))
+        sys.exit(f"error: {error}")
     if sys.argv[1:] == ["figures"]:
         print(f"tables and figures: open {_short(_settings.figures / 'index.html')} in a browser; "
               f"executed notebooks: {_short(_settings.build / 'notebooks')}")

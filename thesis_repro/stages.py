@@ -25,8 +25,9 @@ def stage(folder, *, replace=True, **inputs):
     """The folder of one stage, holding only results that were made from `inputs` (JSON values).
 
     What an earlier run with the same inputs finished is kept; results of other inputs are deleted, or with `replace`
-    False refused; what a killed run left half written is deleted. Raises InputError for those that are refused, for a
-    file or a folder that this project did not make, and for one that another run holds (`longrun.claimed`).
+    False refused; what a killed run left half written is deleted. Raises InputError for those that are refused, for
+    results of another kind (most of whose inputs have other names), for a file or a folder that this project did not
+    make, and for one that another run holds (`longrun.claimed`).
     """
     folder = Path(folder)
     with longrun.claimed(folder):
@@ -39,6 +40,9 @@ def stage(folder, *, replace=True, **inputs):
                 key = next(key for key in {**wanted, **found} if wanted.get(key) != found.get(key))
                 raise InputError(f"{folder}: holds results of other settings ({key} {found.get(key)!r}, not "
                                  f"{wanted.get(key)!r}); remove the folder or choose another")
+            if 2 * len(found.keys() & wanted.keys()) <= len(found.keys() | wanted.keys()):
+                raise InputError(f"{folder}: holds results of another kind (made from {', '.join(sorted(found))}), "
+                                 "which would be lost; choose another folder")
             _empty(folder)
         longrun.sweep(folder)
         if found != wanted:

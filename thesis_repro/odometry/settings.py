@@ -1,5 +1,6 @@
 """What the odometry is asked to do: the thesis's way, PySLAM's later one, and choices beside them."""
 
+import math
 from dataclasses import dataclass
 
 from thesis_repro import InputError
@@ -47,12 +48,13 @@ class OdometrySettings:
             if getattr(self, name) not in known:
                 raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
                                  f"choose one of {', '.join(known)}")
-        for name, least in (("max_keypoints", 0), ("min_distance", 0), ("redetect_below", 0), ("permute", 0),
-                            ("scale_gate", 0), ("shift_gate", 0)):
+        for name, most in (("max_keypoints", 2**31 - 1), ("min_distance", 10_000), ("redetect_below", 2**31 - 1),
+                           ("permute", 2**32 - 1), ("scale_gate", math.inf), ("shift_gate", math.inf)):
             value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"odometry setting {name}: {value} is below {least}; give {least} or more")
-        if not self.threshold > 0:
+            if value is not None and not 0 <= value <= most:
+                wrong = f"is above {most}; give less" if value > most else "is below 0; give 0 or more"
+                raise InputError(f"odometry setting {name}: {value} {wrong}")
+        if not 0 < self.threshold < math.inf:
             raise InputError(f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003")
 
 

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro import InputError, kitti, longrun, stages
+from thesis_repro import InputError, kitti, longrun, masks, stages
+from thesis_repro.settings import LIMITS, MOST_REPETITIONS
 from thesis_repro.study import jobs, results, runner, sources
 from thesis_repro.study.sources import Source
+
+MOST_WIDTH = LIMITS["WIDTHS"][1]
 
 
 @dataclass(frozen=True)
@@ -104,11 +107,14 @@ def named(folders: Iterable[tuple[str, Path]], names: Iterable[str]) -> tuple[So
 
 def checked(study: Study) -> Study:
     """The study, once everything is there that it needs. Raises InputError for the first thing that is not."""
-    for text, least, values in (("--repetitions", 1, [study.repetitions]), ("--widths", 1, study.widths),
-                                ("--controls", 1, [study.tested or 1]), ("--frames", 3, [study.frames or 3])):
+    if study.frames is not None and study.frames < 3:
+        raise InputError(f"--frames {study.frames}: must be 3 or more")
+    for text, most, values in (("--repetitions", MOST_REPETITIONS, [study.repetitions]),
+                               ("--widths", MOST_WIDTH, study.widths),
+                               ("--controls", MOST_WIDTH, [1 if study.tested is None else study.tested])):
         for value in values:
-            if value < least:
-                raise InputError(f"{text} {value}: must be {least} or more")
+            if not 1 <= value <= most:
+                raise InputError(f"{text} {value}: must be 1 or more, and at most {most}")
     twice = [name for name, count in Counter(study.sequences).items() if count > 1]
     if twice:
         raise InputError(f"--sequences: {twice[0]} is named twice")
@@ -116,5 +122,8 @@ def checked(study: Study) -> Study:
     short = [sequence for sequence in whole if len(sequence) < 3]
     if short:
         raise InputError(f"{short[0].folder}: {len(short[0])} frames; a study needs 3 or more")
+    for sequence in whole if any(source.kind == "labels" for source in study.sources) else ():
+        for width in (*study.widths, study.tested or 1):
+            masks.check_width(width, sequence.size)
     sources.check(study.sources, [sequence.subset(study.frames) for sequence in whole])
     return study

@@ -1,18 +1,15 @@
 """Where the masks of a study come from: the label maps of a network, or masks ready made; several side by side."""
 
-import struct
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-import numpy as np
-
 from thesis_repro import InputError, stages
 from thesis_repro.cityscapes import read_label_map
-from thesis_repro.files import listed, read_gray
+from thesis_repro.files import glance, listed
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks, MaskFolder
+from thesis_repro.masks import LabelMasks, MaskFolder, check_mask_size, read_mask
 
 KINDS = {"labels": "label maps", "masks": "masks"}
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both know the `paths` of the files that they read
@@ -56,11 +53,7 @@ class Source:
         if self.kind == "labels":
             read_label_map(path)
             return
-        mask = read_gray(path)
-        _check_size(path, mask.shape, size)
-        if len(np.unique(mask)) > 2:
-            raise InputError(f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps "
-                             "go with --labels)")
+        read_mask(path, size)
 
     def record(self, sequence: str) -> dict[str, str | None]:
         """What tells results of these files from those of others."""
@@ -87,20 +80,5 @@ def check(sources: Iterable[Source], sequences: Collection[Sequence]) -> None:
             paths = source.masks(sequence, 1).paths
             if source.kind == "masks":
                 for path in paths:
-                    _check_size(path, _png_size(path), sequence.size)
+                    check_mask_size(path, glance(path)[0], sequence.size)
             source.check_file(paths[0], sequence.size)
-
-
-def _check_size(path: Path, found: tuple[int, ...], size: tuple[int, int]) -> None:
-    if found != size:
-        raise InputError(f"{path}: {found[1]}x{found[0]} pixels, but the frames have {size[1]}x{size[0]}; masks must "
-                         "have the size of the frames")
-
-
-def _png_size(path: Path) -> tuple[int, ...]:
-    """(height, width) as the file's head has it, without decoding it."""
-    with open(path, "rb") as file:
-        head = file.read(24)
-    if len(head) < 24 or head[12:16] != b"IHDR":
-        return read_gray(path).shape  # or it says what is wrong
-    return struct.unpack(">II", head[16:])[::-1]
