@@ -9,12 +9,14 @@ from contextlib import contextmanager
 # first operation runs. More threads than cores cost little; fewer would leave cores of large machines idle.
 os.environ.setdefault("TF_NUM_INTRAOP_THREADS", "8")
 
+GPUS = "/dev/nvidiactl", "/dev/dxg"  # with NVIDIA's driver, and with that of WSL 2
+
 
 @contextmanager
 def quietly():
     """Loads TensorFlow and what needs it without their greetings, which no setting silences: they come from C++.
 
-    What goes wrong is raised as ever.
+    So does the complaint that there is no GPU, where there is none. What goes wrong is raised as ever.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -24,6 +26,8 @@ def quietly():
         for stream in (1, 2):
             os.dup2(nowhere, stream)
         yield
+        if not any(map(os.path.exists, GPUS)):
+            sys.modules["tensorflow"].config.list_physical_devices()
     finally:
         sys.stdout.flush()
         for stream, own in enumerate(kept, 1):
