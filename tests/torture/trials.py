@@ -90,9 +90,13 @@ def start(*words, where, before=None, **changes):
 
     where: the folder it is started in. before: called in the new process just before, to take something from it.
     """
-    return subprocess.Popen([sys.executable, "-m", "thesis_repro", *map(str, words)], cwd=where,
-                            env=environment(**changes), preexec_fn=before, start_new_session=True, text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return spawn([sys.executable, "-m", "thesis_repro", *words], where, before, **changes)
+
+
+def spawn(command, where, before=None, **changes):
+    """Start any command as `start` does."""
+    return subprocess.Popen(list(map(str, command)), cwd=where, env=environment(**changes), preexec_fn=before,
+                            start_new_session=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def finish(process, where=None, seen=None, timeout=TIMEOUT):

@@ -1,0 +1,217 @@
+"""SIGKILL at moments nobody chose, then the same command again: the bytes of an undisturbed run, and nothing stray."""
+
+import io
+import json
+import random
+import shlex
+import shutil
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import cv2
+import nbformat
+import numpy as np
+import pandas as pd
+import pytest
+from trials import ROOT, TIMEOUT, finish, kill, lost_unless, snapshot, spawn
+
+from thesis_repro import longrun
+from thesis_repro.settings import read_settings
+
+HERE = Path(__file__).parent
+COMMAND = [sys.executable, "-m", "thesis_repro"]
+DRAWING = """
+import numpy as np
+from thesis_repro.report import style
+from thesis_repro.settings import read_settings
+folder = read_settings().figures
+for number in range(6):
+    figure, axes = style.new_figure()
+    axes.plot(np.random.default_rng(number).random((400, 5)))
+    style.save_figure(figure, folder, f"figure_{number}", "made up")
+    figure, axes = style.new_figure()
+    axes.imshow(np.random.default_rng(number).random((200, 300)))
+    style.save_figure(figure, folder, f"picture_{number}", "made up")
+"""
+
+
+def contents(folder):
+    """Everything below a folder by path, without what no two runs share: times, dates and the log."""
+    return {str(path.relative_to(folder)): _content(path) for path in sorted(Path(folder).rglob("*"))
+            if path.is_file() and path.name != longrun.LOG and path.suffix != ".log"}
+
+
+def _content(path):
+    if path.suffix == ".csv" and "runs" in path.parts:
+        table = pd.read_csv(path, dtype=str)
+        return table[[name for name in table if not name.endswith("_seconds")]].to_csv()
+    if path.suffix == ".keras":
+        with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as file:
+            return {name: file.read(name) for name in file.namelist() if name != "metadata.json"}
+    if path.suffix == ".ipynb":
+        return [cell.get("outputs") for cell in json.loads(path.read_text())["cells"]]
+    return path.read_bytes()
+
+
+def look(folder):
+    """The files below a folder with their versions, the log left out."""
+    return {path: about for path, about in snapshot(folder).items() if path.name != longrun.LOG}
+
+
+def to_the_end(command, where, **environment):
+    result = finish(spawn(command, where, **environment), timeout=2 * TIMEOUT)
+    lost_unless(result.returncode == 0, f"does not go on: {result.stdout}\n{result.stderr}")
+
+
+def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: None, **environment):
+    """Kill a command `kills` times, each time a while after it has begun to write; then let it end.
+
+    command: what is run in the folder `where`; results: the folder below it that is compared, made anew by `prepare`
+    for the undisturbed run and for the killed one. The moments are spread over the time that the undisturbed run takes
+    from its first file on; a run that ends before its moment is compared too, and the next one begins anew.
+    """
+    results = where / results
+
+    def anew():
+        shutil.rmtree(results, ignore_errors=True)
+        prepare()
+
+    def begun(process):
+        """Wait until a file has changed; False where the process ended first."""
+        before = look(where)
+        while process.poll() is None:
+            if look(where) != before:
+                return True
+            time.sleep(0.005)
+        return False
+
+    anew()
+    process = spawn(command, where, **environment)
+    assert begun(process), f"writes nothing: {process.communicate()}"
+    started = time.monotonic()
+    assert finish(process).returncode == 0
+    seconds, wanted = time.monotonic() - started, contents(results)
+    moments = [(number + random.Random(f"{what} {seed} {number}").random()) / kills * seconds
+               for number in range(kills)]
+    random.Random(seed).shuffle(moments)
+    anew()
+    with ledger("kills", what, times=kills):
+        tries = 0
+        while moments:
+            tries += 1
+            process = spawn(command, where, **environment)
+            if begun(process):
+                time.sleep(moments[0] if tries < 3 * kills else 0)
+            if process.poll() is None:
+                kill(process)
+                moments.pop(0)
+                continue
+            result = finish(process)
+            lost_unless(result.returncode == 0, f"does not go on: {result.stdout}\n{result.stderr}")
+            same(contents(results), wanted)
+            moments[0] /= 2  # a resumed run is shorter
+            anew()
+        to_the_end(command, where, **environment)
+        same(contents(results), wanted)
+        stray = [path for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)]
+        lost_unless(not stray, f"left half written: {stray}")
+
+
+def same(found, wanted):
+    other = sorted(path for path in found.keys() | wanted.keys() if found.get(path) != wanted.get(path))
+    lost_unless(not other, f"not what an undisturbed run leaves: {', '.join(other)}")
+
+
+def test_the_embedded_world(ledger, tmp_path):
+    torture(ledger, "synthesize", [*COMMAND, "synthesize", "world", "--profile", "smoke"], tmp_path, "world", 3, 0)
+
+
+def test_a_small_embedded_world(ledger, tmp_path):
+    write = "from thesis_repro import world; world.write('world', sequences=['00'], frames=20, scale=0.2, " \
+            "train_images=20, validation_images=10, jobs=1)"
+    torture(ledger, "synthesize, small", [sys.executable, "-c", write], tmp_path, "world", 7, 1)
+
+
+def test_training(ledger, tmp_path):
+    torture(ledger, "training", [sys.executable, HERE / "small_training.py", "model", 8], tmp_path, "model", 7, 2)
+
+
+def test_label_maps(ledger, tmp_path):
+    from thesis_repro.cityscapes import N_CLASSES
+    from thesis_repro.segmentation.unet import build_unet
+
+    build_unet((64, 64, 1), N_CLASSES, 4).save(tmp_path / "model.keras")
+    (tmp_path / "images").mkdir()
+    for index, image in enumerate(np.random.default_rng(0).integers(0, 256, (400, 64, 96), np.uint8)):
+        cv2.imwrite(str(tmp_path / "images" / f"{index:06d}.png"), image)
+    torture(ledger, "predict", [*COMMAND, "predict", "--images", "images", "--model", "model.keras", "--output",
+                                "labels"], tmp_path, "labels", 7, 3)
+
+
+def study(small_world, small_labels):
+    return [*COMMAND, "study", "--kitti", small_world / "kitti", "--labels", small_labels, "--widths", 5, 10,
+            "--controls", 10, "--repetitions", 2, "--pose", "all", "refined", "--output", "study"]
+
+
+def test_a_study(ledger, tmp_path, small_world, small_labels):
+    torture(ledger, "study", study(small_world, small_labels), tmp_path, "study", 9, 4)
+
+
+def test_the_drawing_of_a_study(ledger, tmp_path, small_world, small_labels):
+    command = study(small_world, small_labels)
+    to_the_end(command, tmp_path)
+    shutil.copytree(tmp_path / "study", tmp_path / "runs")
+
+    def prepare():
+        """All runs are there, no table and no figure."""
+        shutil.copytree(tmp_path / "runs", tmp_path / "study")
+        for path in (tmp_path / "study").iterdir():
+            if path.is_file() and path.name != longrun.RECORD:
+                path.unlink()
+
+    torture(ledger, "the drawing of figures and a study's page", command, tmp_path, "study", 6, 5, prepare)
+
+
+def test_the_figures_of_a_notebook(ledger, tmp_path):
+    """As `make figures` executes one, and makes the page after the last."""
+    changes, settings = own_folders(tmp_path)
+    done = settings.build / "notebooks"
+
+    def prepare():
+        done.mkdir(parents=True)
+        nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(DRAWING)]), tmp_path / "one.ipynb")
+
+    execute = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--log-level=CRITICAL",
+               "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
+               f"--Execution.log_file={done}/one.log", f"--output-dir={done}", "--output=one.ipynb", "one.ipynb"]
+    command = ["bash", "-c", f"{shlex.join(execute)} && {shlex.join(PAGE)}"]
+    torture(ledger, "a notebook that draws", command, tmp_path, ".", 5, 6, prepare, **changes)
+
+
+PAGE = [sys.executable, "-m", "thesis_repro.report.page"]
+
+
+def own_folders(folder):
+    """Environment and settings of a run that keeps everything in a folder."""
+    changes = {"THESIS_REPRO_BUILD": str(folder / "build"), "THESIS_REPRO_FIGURES": str(folder / "figures")}
+    return changes, read_settings(changes)
+
+
+@pytest.mark.short
+def test_the_page(ledger, tmp_path):
+    changes, settings = own_folders(tmp_path)
+
+    def prepare():
+        executed = settings.build / "notebooks"
+        executed.mkdir(parents=True)
+        (tmp_path / "figures").mkdir(exist_ok=True)
+        for number in range(12):
+            cell = nbformat.v4.new_code_cell("1", outputs=[nbformat.v4.new_output("stream", text=f"{number}\n" * 2000)])
+            nbformat.write(nbformat.v4.new_notebook(cells=[cell], metadata={"language_info": {"name": "python"}}),
+                           executed / f"{number:02d}_some.ipynb")
+        for path in (ROOT / "figures").glob("*.csv"):
+            shutil.copy(path, settings.figures)
+
+    torture(ledger, "the page", PAGE, tmp_path, ".", 5, 7, prepare, **changes)
