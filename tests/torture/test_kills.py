@@ -1,21 +1,17 @@
 """SIGKILL at moments nobody chose, then the same command again: the bytes of an undisturbed run, and nothing stray."""
 
-import io
-import json
 import random
 import shlex
 import shutil
 import sys
 import time
-import zipfile
 from pathlib import Path
 
 import cv2
 import nbformat
 import numpy as np
-import pandas as pd
 import pytest
-from trials import ROOT, TIMEOUT, finish, kill, lost_unless, snapshot, spawn
+from trials import ROOT, TIMEOUT, contents, finish, kill, lost_unless, nothing_stray, same, snapshot, spawn
 
 from thesis_repro import longrun
 from thesis_repro.settings import read_settings
@@ -35,24 +31,6 @@ for number in range(6):
     axes.imshow(np.random.default_rng(number).random((200, 300)))
     style.save_figure(figure, folder, f"picture_{number}", "made up")
 """
-
-
-def contents(folder):
-    """Everything below a folder by path, without what no two runs share: times, dates and the log."""
-    return {str(path.relative_to(folder)): _content(path) for path in sorted(Path(folder).rglob("*"))
-            if path.is_file() and path.name != longrun.LOG and path.suffix != ".log"}
-
-
-def _content(path):
-    if path.suffix == ".csv" and "runs" in path.parts:
-        table = pd.read_csv(path, dtype=str)
-        return table[[name for name in table if not name.endswith("_seconds")]].to_csv()
-    if path.suffix == ".keras":
-        with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as file:
-            return {name: file.read(name) for name in file.namelist() if name != "metadata.json"}
-    if path.suffix == ".ipynb":
-        return [cell.get("outputs") for cell in json.loads(path.read_text())["cells"]]
-    return path.read_bytes()
 
 
 def look(folder):
@@ -115,13 +93,7 @@ def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: 
             anew()
         to_the_end(command, where, **environment)
         same(contents(results), wanted)
-        stray = [path for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)]
-        lost_unless(not stray, f"left half written: {stray}")
-
-
-def same(found, wanted):
-    other = sorted(path for path in found.keys() | wanted.keys() if found.get(path) != wanted.get(path))
-    lost_unless(not other, f"not what an undisturbed run leaves: {', '.join(other)}")
+        nothing_stray(where)
 
 
 def test_the_embedded_world(ledger, tmp_path):
@@ -181,7 +153,8 @@ def test_the_figures_of_a_notebook(ledger, tmp_path):
 
     def prepare():
         done.mkdir(parents=True)
-        nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(DRAWING)]), tmp_path / "one.ipynb")
+        cell = nbformat.v4.new_code_cell(DRAWING, id="drawing")
+        nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "one.ipynb")
 
     execute = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--log-level=CRITICAL",
                "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
@@ -208,7 +181,8 @@ def test_the_page(ledger, tmp_path):
         executed.mkdir(parents=True)
         (tmp_path / "figures").mkdir(exist_ok=True)
         for number in range(12):
-            cell = nbformat.v4.new_code_cell("1", outputs=[nbformat.v4.new_output("stream", text=f"{number}\n" * 2000)])
+            output = nbformat.v4.new_output("stream", text=f"{number}\n" * 2000)
+            cell = nbformat.v4.new_code_cell("1", id="one", outputs=[output])
             nbformat.write(nbformat.v4.new_notebook(cells=[cell], metadata={"language_info": {"name": "python"}}),
                            executed / f"{number:02d}_some.ipynb")
         for path in (ROOT / "figures").glob("*.csv"):

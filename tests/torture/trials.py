@@ -1,16 +1,22 @@
 """Trials by the real command line: start a command as a process, and demand that it fails in one clear line."""
 
 import fnmatch
+import io
+import json
 import os
 import signal
 import subprocess
 import sys
+import zipfile
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pandas as pd
 import pytest
+
+from thesis_repro import longrun
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 120  # seconds; a command that takes longer hangs
@@ -153,3 +159,33 @@ def clear(result, *says, left=()):
         assert str(text) in lines[0], f"{text!r} is not named: {told}"
     more = [path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)]
     assert not more, f"left behind: {', '.join(more)}\n{told}"
+
+
+def contents(folder):
+    """Everything below a folder by path, without what no two runs share: times, dates and the log."""
+    return {str(path.relative_to(folder)): _content(path) for path in sorted(Path(folder).rglob("*"))
+            if path.is_file() and path.name != longrun.LOG and path.suffix != ".log"}
+
+
+def _content(path):
+    if path.suffix == ".csv" and "runs" in path.parts:
+        table = pd.read_csv(path, dtype=str)
+        return table[[name for name in table if not name.endswith("_seconds")]].to_csv()
+    if path.suffix == ".keras":
+        with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as file:
+            return {name: file.read(name) for name in file.namelist() if name != "metadata.json"}
+    if path.suffix == ".ipynb":
+        return [cell.get("outputs") for cell in json.loads(path.read_text())["cells"]]
+    if path.suffix == ".html":  # the executed notebooks that it was made from hold times
+        return path.read_text().partition("<!-- made from")[0]
+    return path.read_bytes()
+
+
+def same(found, wanted):
+    other = sorted(path for path in found.keys() | wanted.keys() if found.get(path) != wanted.get(path))
+    lost_unless(not other, f"not what an undisturbed run leaves: {', '.join(other)}")
+
+
+def nothing_stray(where):
+    stray = [path for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)]
+    lost_unless(not stray, f"left half written: {', '.join(map(str, stray))}")
