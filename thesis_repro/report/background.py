@@ -272,7 +272,7 @@ def figure_2_08(poses, title):
         wedge = [position, position + size * (ahead + 0.6 * aside), position + size * (ahead - 0.6 * aside)]
         axes.add_patch(Polygon(lay(np.array(wedge)), facecolor=SKY, edgecolor=BLUE, alpha=0.8, linewidth=1))
         axes.annotate(f"$C_{{{index}}}$", lay(position), -17 * to_the_left(position, position + ahead),
-                      textcoords="offset points", ha="center", va="center", fontsize=11)
+                      textcoords="offset points", ha="center", va="center", fontsize=11, parse_math=True)
     for index, (start, end, motion) in enumerate(zip(positions, positions[1:], relative), 1):
         axes.annotate("", lay(end), lay(start), arrowprops={
             "arrowstyle": "-|>", "color": RED, "lw": 1.1, "shrinkA": 3, "shrinkB": 3,
@@ -282,7 +282,8 @@ def figure_2_08(poses, title):
         horizontal = "left" if side[0] > 0.3 else "right" if side[0] < -0.3 else "center"
         axes.annotate(f"$T_{{{index},{index - 1}}}$\n{np.linalg.norm(motion[:3, 3]):.1f} m, {angle:.1f}°",
                       lay((start + end) / 2), (18 + 6 * abs(side[1])) * side, textcoords="offset points", ha=horizontal,
-                      va="bottom" if side[1] > 0.3 else "top" if side[1] < -0.3 else "center", fontsize=8, color=RED)
+                      va="bottom" if side[1] > 0.3 else "top" if side[1] < -0.3 else "center", fontsize=8, color=RED,
+                      parse_math=True)
     axes.plot(*lay(positions).T, linestyle="none", marker="o", markersize=3.5, color="black")
     names = ["x, to the right of the first camera (m)", "z, ahead of the first camera (m)"]
     axes.set(xlabel=names[1] if upright else names[0], ylabel=names[0] if upright else names[1], title=title)

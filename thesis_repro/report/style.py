@@ -31,6 +31,7 @@ STYLE = {
     "lines.linewidth": 1.4,
     "image.interpolation": "nearest",
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names of files and sequences may hold dollars
     "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
     "savefig.dpi": 160,
 }

@@ -1,0 +1,175 @@
+"""Odd input that must work: names of every kind, a home that may not be written to; and what a run must not touch."""
+
+import ctypes
+import hashlib
+import os
+import shutil
+import xml.etree.ElementTree as ElementTree
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+import trials
+
+ODD = "it's \"50%\" <script>&$x$_ é漢\n{b} #[1]*"
+SEQUENCE = "<b>&\"'$_$ %s é"
+CLONE_NEWNET = 0x40000000  # Linux's word for a network of one's own
+
+
+def sequence(root, name, count=8):
+    """A sequence of noise that moves, its label maps and masks in folders with names as odd as its own."""
+    images = root / "kitti" / "sequences" / name / "image_0"
+    noise = np.random.default_rng(0).integers(0, 256, (48, 80), np.uint8)
+    labels = np.repeat([[7], [23]], 16, axis=0).repeat(40, axis=1).astype(np.uint8)
+    mask = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
+    for folder in (images, root / "labels <i>&", root / "masks", root / "kitti/poses"):
+        folder.mkdir(parents=True)
+    for index in range(count):
+        cv2.imwrite(str(images / f"{index:06d}.png"), noise[:, index:index + 64])
+        cv2.imwrite(str(root / "labels <i>&" / f"{index:06d}.png"), labels)
+        cv2.imwrite(str(root / "masks" / f"{index:06d}.png"), mask)
+    (images.parent / "calib.txt").write_text("P0: 50 0 32 0 0 50 24 0 0 0 1 0\n")
+    (images.parent / "times.txt").write_text("".join(f"{index / 10}\n" for index in range(count)))
+    (root / f"kitti/poses/{name}.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {index}\n" for index in range(count)))
+
+
+def digests(*folders):
+    """What is in every file below some folders, and what every link points to."""
+    return {path: path.readlink() if path.is_symlink() else hashlib.sha256(path.read_bytes()).hexdigest()
+            for folder in folders for path in folder.rglob("*") if path.is_symlink() or path.is_file()}
+
+
+class Tags(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.found = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.add(tag)
+        assert not any(name.startswith("on") for name, _ in attrs)
+
+
+def commands(root, name):
+    """Every command that reads data, over one sequence and into root/out."""
+    where, out, labels = ["--kitti", root / "kitti", "--sequence", name], root / 'out %d "x"', root / "labels <i>&"
+    return [
+        ["odometry", *where, "--labels", labels, "--dilation", 3, "--output", out / "p'$_$.txt", "--tum",
+         out / "%s.tum", "--plot", out / "%d.svg", "--video", out / "%03d é.mp4", "--frames-csv", out / "f\n.csv"],
+        ["masks", *where, "--labels", labels, "--dilation", 3, "--output", out / "masks\n&"],
+        ["odometry", *where, "--masks", out / "masks\n&", "--output", out / "q<script>.txt", "--plot", out / "$_$.png"],
+        ["evaluate", *where, out / "p'$_$.txt", out / "q<script>.txt", "--plot", out / "both.svg"],
+        ["boresight", "--kitti", root / "kitti", "--sequences", name],
+        ["check-data", "--kitti", root / "kitti", "--deep"],
+        ["study", "--kitti", root / "kitti", "--labels", labels, "--masks", root / "masks", "--repetitions", 1,
+         "--widths", 2, 3, "--jobs", 1, "--controls", 3, "--output", out / "study"],
+    ]
+
+
+def test_names_of_every_kind_work_and_data_is_only_read(tmp_path, command, ledger):
+    root = tmp_path / ODD
+    sequence(root, SEQUENCE)
+    data = root / "kitti", root / "labels <i>&", root / "masks"
+    before = digests(*data)
+    for words in commands(root, SEQUENCE):
+        with ledger("bad inputs", f"odd names: {words[0]}"):
+            result = command(*words)
+            assert result.returncode == 0 and "Traceback" not in result.stderr, result
+            trials.lost_unless(digests(*data) == before, f"{words[0]} has changed its data")
+    out = root / 'out %d "x"'
+    assert {path.name for path in out.iterdir()} == {
+        "p'$_$.txt", "%s.tum", "%d.svg", "%03d é.mp4", "f\n.csv", "masks\n&", "q<script>.txt", "$_$.png", "both.svg",
+        "study"}
+    for path in out.rglob("*.svg"):
+        assert not any("script" in str(part.tag) or part.tag == "b" for part in ElementTree.parse(path).iter()
+                       if "description" not in str(part.tag)), path
+    page = (out / "study" / "index.html").read_text()
+    assert "&lt;b&gt;&amp;" in page and "&lt;i&gt;&amp;" in page
+    assert not Tags(page).found & {"script", "b", "i"}
+
+
+@pytest.mark.short
+def test_a_page_says_what_is_in_a_name_as_text(tmp_path):
+    from thesis_repro.report import page
+
+    found = page._markdown("the folder “<script>alert(1)</script>” and [a link](javascript:alert(1)) & \"more\"")
+    assert not Tags(found).found & {"script"} and "javascript:" not in found and "&lt;script&gt;" in found
+
+
+@pytest.mark.parametrize("words", [
+    ["odometry", "--kitti", "kitti", "--sequence", "00", "--plot", "path.png", "--video", "path.mp4"],
+    ["predict", "--images", "kitti/sequences/00", "--output", "out"]], ids=lambda words: words[0])
+def test_a_home_that_may_not_be_written_to_works(tmp_path, tiny_kitti, command, ledger, words):
+    nobody = {"HOME": "/proc/nobody", "XDG_CACHE_HOME": None, "XDG_CONFIG_HOME": None, "MPLCONFIGDIR": None,
+              "NUMBA_CACHE_DIR": None, "KERAS_HOME": None}
+    with ledger("faults", f"no home: {words[0]}"):
+        result = command(*words, **nobody)
+        assert result.returncode == 0 and "Traceback" not in result.stderr, result
+    assert not any(path.startswith(("home", ".")) for path in result.left)
+
+
+def test_a_user_who_may_write_to_no_cache(tmp_path, tiny_kitti, command, ledger):
+    package = tmp_path / "package" / "thesis_repro"
+    shutil.copytree(trials.ROOT / "thesis_repro", package, ignore=shutil.ignore_patterns("__pycache__", "weights"))
+    (tmp_path / "home").mkdir()
+    for folder in (tmp_path / "home", *(path for path in [package, *package.rglob("*")] if path.is_dir())):
+        folder.chmod(0o555)
+    with ledger("faults", "a package and a home without permission to cache"):
+        result = command("odometry", "--kitti", "kitti", "--sequence", "00", "--plot", "path.png",
+                         before=without_roots_rights, timeout=300, PYTHONPATH=package.parent, HOME=tmp_path / "home",
+                         XDG_CACHE_HOME=None, XDG_CONFIG_HOME=None, MPLCONFIGDIR=None, NUMBA_CACHE_DIR=None)
+        assert result.returncode == 0 and (tmp_path / "path.png").is_file(), result
+        trials.lost_unless(result.left == ["path.png"], result.left)
+    for folder in [tmp_path / "home", package, *package.rglob("*")]:
+        folder.chmod(folder.stat().st_mode | 0o200)
+
+
+def without_roots_rights():
+    """Takes from root what lets it read and write everywhere, so that permissions hold for it as for everybody."""
+    if os.geteuid() == 0:
+        for capability in (1, 2, 3):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAP_FOWNER
+            ctypes.CDLL(None).prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
+
+
+WATCH = """
+import os, socket
+LOCAL = {"127.0.0.1", "::1", "localhost", "0.0.0.0", None, ""}
+
+def watched(function, place):
+    def call(*arguments, **options):
+        address = arguments[place] if len(arguments) > place else None
+        host = address[0] if isinstance(address, tuple) else address
+        if not (isinstance(host, (str, type(None))) and (host in LOCAL or str(host).startswith("/"))):
+            with open(os.environ["REACHED"], "a") as file:
+                file.write(f"{function.__name__} {address}\\n")
+            raise OSError("no network")
+        return function(*arguments, **options)
+    return call
+
+for name in ("connect", "connect_ex", "sendto"):
+    setattr(socket.socket, name, watched(getattr(socket.socket, name), 1 if name != "sendto" else -1))
+socket.getaddrinfo = watched(socket.getaddrinfo, 0)
+"""
+
+
+def test_nothing_is_fetched(tmp_path, command, ledger):
+    sequence(tmp_path, "00")
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site/sitecustomize.py").write_text(WATCH)
+    reached = tmp_path / "reached.txt"
+    watched = {"PYTHONPATH": f"{tmp_path / 'site'}{os.pathsep}{trials.ROOT}", "REACHED": reached}
+    cut_off = None
+    if os.geteuid() == 0 and shutil.which("unshare"):
+        def cut_off():  # as far as this machine allows it
+            ctypes.CDLL(None).unshare(CLONE_NEWNET)
+    for words in [*commands(tmp_path, "00"), ["predict", "--images", "kitti/sequences/00", "--output", "labels2"],
+                  ["synthesize", "world", "--profile", "smoke"]]:
+        with ledger("faults", f"no network: {words[0]}"):
+            result = command(*words, before=cut_off, **watched)
+            assert result.returncode == 0, result
+            trials.lost_unless(not reached.exists(), f"{words[0]} reaches out")
+    # the watch does see what reaches out
+    result = command("predict", "--images", "kitti/sequences/00", "--output", "labels3", "--dask",
+                     "tcp://192.0.2.1:8786", before=cut_off, **watched)
+    assert result.returncode == 1 and "192.0.2.1" in reached.read_text()
