@@ -23,10 +23,12 @@ absolute = $(if $(filter /% ~%,$(firstword $(1))),$(1),$(CURDIR)/$(1))
 
 export THESIS_REPRO_PROFILE := $(PROFILE)
 $(foreach name,KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES,$(if $($(name)),\
-  $(eval export THESIS_REPRO_$(name) := $(call absolute,$($(name))))))
+  $(eval export THESIS_REPRO_$(name) = $$(call absolute,$$($(name))))))
 $(foreach name,JOBS DASK_SCHEDULER $(SIZES),$(if $($(name)),$(eval export THESIS_REPRO_$(name) := $($(name)))))
-DATA_OPTIONS := $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)") \
-                $(if $(KITTI_SEMANTIC),--kitti-semantic "$(KITTI_SEMANTIC)")
+# (the shell takes them from the environment, so that they may hold quotes)
+DATA_OPTIONS := $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI") \
+                $(if $(CITYSCAPES),--cityscapes "$$THESIS_REPRO_CITYSCAPES") \
+                $(if $(KITTI_SEMANTIC),--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC")
 # what the libraries would otherwise say or look up
 export SM_FRAMEWORK := tf.keras
 export NO_ALBUMENTATIONS_UPDATE := 1
@@ -77,7 +79,7 @@ setup: .venv/ready $(if $(filter-out 0,$(GPU)),.venv/ready-gpu)
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 ifneq (,$(filter figures,$(MAKECMDGOALS)))
 # ($(shell) of this make does not see what is exported.)
-RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS $(SIZES),THESIS_REPRO_$(name)='$(THESIS_REPRO_$(name))') \
+RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS $(SIZES),THESIS_REPRO_$(name)='$(subst ','\'',$(THESIS_REPRO_$(name)))') \
          $(PYTHON) -m thesis_repro.settings)
 ifeq (,$(RUN))
 $(error the settings above are wrong)
@@ -119,7 +121,7 @@ $(foreach notebook,$(notdir $(NOTEBOOKS)),\
 endif
 
 plan: setup
-	@$(BIN)/python -m thesis_repro plan $(if $(KITTI),--kitti "$(KITTI)") $(if $(CITYSCAPES),--cityscapes "$(CITYSCAPES)")
+	@$(BIN)/python -m thesis_repro plan $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI") $(if $(CITYSCAPES),--cityscapes "$$THESIS_REPRO_CITYSCAPES")
 
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS)
@@ -139,13 +141,13 @@ lab: setup
 
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
-	@$(BIN)/python -m thesis_repro.bench.odometry --kitti "$(or $(KITTI),build/world-demo/kitti)" --output build/bench.json
+	@$(BIN)/python -m thesis_repro.bench.odometry --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}" --output build/bench.json
 	@$(BIN)/python -m thesis_repro.bench.segmentation
 
 .PHONY: evidence
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.report.evidence "$(KITTI)" figures/kitti_excerpts $(if $(JOBS),--jobs $(JOBS))
+	@$(BIN)/python -m thesis_repro.report.evidence "$$THESIS_REPRO_KITTI" figures/kitti_excerpts $(if $(JOBS),--jobs $(JOBS))
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
