@@ -87,3 +87,42 @@ def test_public_signatures_of_the_method_have_types():
             if node.returns is None or not typed:
                 bare.append(f"{path.relative_to(PACKAGE)}: {node.name}")
     assert bare == []
+
+
+# what would execute what a file carries, or listen where nobody said so; of a call with a keyword, what it must be
+UNSAFE = {"eval", "exec", "compile_command", "pickle", "cPickle", "cloudpickle", "dill", "shelve", "marshal",
+          "read_pickle", "to_pickle", "yaml", "joblib.load", "joblib.dump", "os.system", "os.popen",
+          "enable_unsafe_deserialization", "LocalCluster", "urllib", "requests", "httpx", "urlopen"}
+MUST_SAY = {"np.load": ("allow_pickle", False), "numpy.load": ("allow_pickle", False),
+            "keras.models.load_model": ("safe_mode", True)}
+
+
+def unsafe(tree):
+    """What a module imports, names or calls that could execute what is in a file, or reach out."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = {alias.name for alias in node.names} | {getattr(node, "module", None) or ""}
+            found |= {name for name in names if name.split(".")[0] in UNSAFE}
+        elif isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            given = {word.arg: getattr(word.value, "value", None) for word in node.keywords}
+            if name in MUST_SAY and given.get(MUST_SAY[name][0]) is not MUST_SAY[name][1]:
+                found.add(name)
+            if given.get("shell") or given.get("allow_pickle") or name in UNSAFE or name.split(".")[-1] in UNSAFE:
+                found.add(name)
+    return found
+
+
+def test_nothing_that_a_file_carries_is_executed():
+    wrong = {str(path.relative_to(PACKAGE)): names for path in PACKAGE.rglob("*.py")
+             if (names := unsafe(ast.parse(path.read_text())))}
+    assert wrong == {}
+
+
+def test_the_check_of_what_is_executed_can_fail():
+    for line in ("import pickle", "from pickle import loads", "eval(text)", "np.load(path)", "np.load(path, "
+                 "allow_pickle=True)", "keras.models.load_model(path)", "pd.read_pickle(path)", "joblib.load(path)",
+                 "subprocess.run(text, shell=True)", "from dask.distributed import LocalCluster", "os.system(text)"):
+        assert unsafe(ast.parse(line)), line
+    assert not unsafe(ast.parse("with np.load(path, allow_pickle=False) as kept: model.evaluate(kept)"))

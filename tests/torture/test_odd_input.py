@@ -4,6 +4,7 @@ import ctypes
 import hashlib
 import os
 import shutil
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 
@@ -89,6 +90,30 @@ def test_names_of_every_kind_work_and_data_is_only_read(tmp_path, command, ledge
     assert not Tags(page).found & {"script", "b", "i"}
 
 
+def make(*words):
+    """What make says, without setting anything up."""
+    return subprocess.run(["make", "-C", trials.ROOT, "-o", ".venv/ready", *words], capture_output=True, text=True,
+                          env=trials.environment())
+
+
+def test_make_takes_folders_of_any_name_and_refuses_what_it_does_not_know(tmp_path, ledger):
+    odd = ODD.replace("$x$_", "").replace("\n", " ")  # make has its own idea of dollars, and none of lines
+    sequence(tmp_path / odd, "00")
+    with ledger("bad inputs", "make: an odd name"):
+        checked = make("check-data", f"KITTI={tmp_path / odd / 'kitti'}")
+        assert checked.returncode == 0 and "sequence 00: 8 frames of 64x48" in checked.stdout, checked
+        planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={tmp_path / odd}", f"BUILD={tmp_path / 'build'}")
+        assert planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout, planned
+    for word, says in (("EPOCHS=0", "EPOCHS=0: must be"), ("WIDTHS=1-99999999999", "WIDTHS=1-99999999999: must be"),
+                       ("JOBS=many", "JOBS=many: must be"), ("PROFILE=huge", "PROFILE=huge: unknown profile"),
+                       ("KITTI=/nowhere", "KITTI=/nowhere: no such folder"), ("EPOCH=3", "EPOCH: unknown setting"),
+                       ("DASK_SCHEDULER=mine", "Dask scheduler mine: is no address")):
+        with ledger("bad inputs", f"make: {word}"):
+            refused = make("figures", word, f"BUILD={tmp_path / 'other'}")
+            trials.lost_unless(refused.returncode != 0 and not (tmp_path / "other").exists(), refused)
+            assert says in refused.stderr and "Traceback" not in refused.stderr, refused
+
+
 @pytest.mark.short
 def test_a_page_says_what_is_in_a_name_as_text(tmp_path):
     from thesis_repro.report import page
@@ -166,7 +191,7 @@ def test_nothing_is_fetched(tmp_path, command, ledger):
     for words in [*commands(tmp_path, "00"), ["predict", "--images", "kitti/sequences/00", "--output", "labels2"],
                   ["synthesize", "world", "--profile", "smoke"]]:
         with ledger("faults", f"no network: {words[0]}"):
-            result = command(*words, before=cut_off, **watched)
+            result = command(*words, before=cut_off, timeout=900, **watched)
             assert result.returncode == 0, result
             trials.lost_unless(not reached.exists(), f"{words[0]} reaches out")
     # the watch does see what reaches out
