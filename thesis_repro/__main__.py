@@ -138,6 +138,12 @@ def _mask_settings(options):
                         options.margin)
 
 
+def _refuse_mask_settings(settings):
+    if settings != type(settings)():
+        raise InputError("--boundaries, --symmetric, --classes, --without-movable, --margin: need --labels DIR, "
+                         "the label maps that masks are made from")
+
+
 def masks(options):
     """write the keypoint masks of a sequence (A.8): one 8-bit PNG a frame, 255 keep, 0 ignore, for odometry --masks"""
     from thesis_repro.kitti import Sequence
@@ -162,7 +168,7 @@ def odometry(options):
     from thesis_repro import odometry
     from thesis_repro.files import write_text
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
-    from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings
+    from thesis_repro.masks import LabelMasks, MaskFolder
     from thesis_repro.odometry import boresight, metrics
     from thesis_repro.report import trajectories, video
 
@@ -172,9 +178,8 @@ def odometry(options):
         raise InputError("--dilation: needs --labels DIR, the label maps whose boundaries are dilated")
     chosen = {name: value for name, value in vars(options).items() if value is not None
               and name in {field.name for field in fields(odometry.OdometrySettings)}}
-    if _mask_settings(options) != MaskSettings() and not options.labels:
-        raise InputError("--boundaries, --symmetric, --classes, --without-movable, --margin: need --labels DIR, "
-                         "the label maps that masks are made from")
+    if not options.labels:
+        _refuse_mask_settings(_mask_settings(options))
     settings = replace(odometry.PRESETS[options.pyslam], **chosen)
     if options.video:
         video.check_name(options.video)
@@ -236,10 +241,7 @@ def _errors(poses, sequence, alignment):
     names = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_m")
     if not sequence.has_truth:
         return dict.fromkeys(names)
-    relative = metrics.relative_errors(poses, sequence.poses)
-    values = (metrics.rmse(poses, sequence.poses, alignment), metrics.mae(poses, sequence.poses, alignment),
-              metrics.ate(poses, sequence.poses, "se3")["rmse"], relative["translation_percent"],
-              relative["rotation_deg_per_m"])
+    values = metrics.errors(poses, sequence.poses, alignment).values()
     return {name: _number(value) for name, value in zip(names, values, strict=True)}
 
 
@@ -309,18 +311,19 @@ def study(options):
 
     if not options.sources:
         raise InputError("no masks: name a folder of label maps with --labels or of masks with --masks")
-    widths = options.widths
+    widths, settings = options.widths, _mask_settings(options)
     if not any(kind == "labels" for kind, _ in options.sources):
         if widths or not (options.controls is None or options.controls is True):
             raise InputError(f"{'--widths' if widths else f'--controls {options.controls}'}: only masks from label "
                              "maps (--labels) have a width")
+        _refuse_mask_settings(settings)
         widths = ()
     elif widths is None:
         widths = ALL_WIDTHS
     scheduler_address(options.dask)
     planned = series.checked(series.Study(
         options.kitti.absolute(), tuple(options.sequences or kitti.sequences(options.kitti)),
-        series.named(options.sources, options.name), tuple(sorted(set(widths))),
+        series.named(options.sources, options.name, settings), tuple(sorted(set(widths))),
         jobs.CONTROL_WIDTH if options.controls is True else options.controls, tuple(dict.fromkeys(options.pose)),
         options.repetitions, options.frames))
     if options.plan:
@@ -541,6 +544,7 @@ def build_parser():
                      help="of each --labels and --masks, in their order (the folder's)")
     sub.add_argument("--widths", type=int, nargs="+", metavar="W",
                      help="dilation widths in pixels of masks from label maps (1 to 15)")
+    add_mask_settings(sub)
     sub.add_argument("--controls", type=int, nargs="?", const=True, metavar="W",
                      help="masks and limits that know no segmentation, beside masks of width W (10)")
     sub.add_argument("--repetitions", type=int, default=5, metavar="N",

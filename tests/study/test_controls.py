@@ -149,7 +149,8 @@ def test_another_width_is_that_of_every_mask(small_world, small_labels, tmp_path
 
 def test_all_masks_have_the_boundaries_that_are_asked_for(sequence, small_labels, made):
     exact = masks.LabelMasks(small_labels / "00", sequence, WIDTH, "exact")
-    chosen = {variant: controls.masks(variant, Source(small_labels), sequence, WIDTH, "exact")
+    source = Source(small_labels, settings=masks.MaskSettings("exact"))
+    chosen = {variant: controls.masks(variant, source, sequence, WIDTH)
               for variant in controls.MASKS}
     assert not np.array_equal(exact[5], made["masked"][5])
     assert np.array_equal(chosen["other-frame"][5], exact[11])
@@ -157,6 +158,16 @@ def test_all_masks_have_the_boundaries_that_are_asked_for(sequence, small_labels
     assert np.array_equal(chosen["mirrored"][5], cv2.flip(exact[5], 1))
     for variant in ("random-lines", "image-edges"):
         assert masks.coverage(chosen[variant][5]) == pytest.approx(masks.coverage(exact[5]), abs=0.01)
+
+
+def test_corrected_masks_have_all_corrections_and_nothing_where_things_move(sequence, small_labels, made):
+    corrected = made["corrected"][5]
+    label_map = cv2.imread(str(small_labels / "00" / "000005.png"), cv2.IMREAD_GRAYSCALE)
+    settings = masks.MaskSettings("exact", symmetric=True, movable=2, margin=10)
+    assert np.array_equal(corrected, masks.keypoint_mask(label_map, sequence.size, WIDTH, settings))
+    assert not corrected[:10].any() and not corrected[:, -10:].any() and corrected.any()
+    moving = np.isin(cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT), masks.MOVABLE)
+    assert moving.any() and not corrected[moving].any()
 
 
 def test_without_true_label_maps_that_control_is_left_out(tiny_kitti):

@@ -151,7 +151,7 @@ def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, sm
     jobs, kitti = first_jobs(["00"], ()), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
     record = runner.stages.made_from(tmp_path / "00")
-    study = runner._Study(kitti, runner.by_name(small_labels), tmp_path, frames=None, boundaries="canny")
+    study = runner._Study(kitti, runner.by_name(small_labels), tmp_path, frames=None)
     elsewhere = runner._run_pass(jobs, replace(study, folder=tmp_path / "elsewhere"), record, 1)
     assert "same folders under the same paths" in elsewhere[jobs[0]]
     (tmp_path / "00" / "baseline-0.csv").unlink()

@@ -33,6 +33,7 @@ def summary_of(names, errors, repetitions=5, noise=0.0, widths=(5, 10, 15), cont
                 job = Job(name, variant, width, pose=pose, repetition=repetition)
                 rows.append({"sequence": name, "run": job.name, "variant": variant, "dilation_width": width,
                              "pose": pose, "repetition": repetition, "frames": 100, "rmse": error, "mae": error / 2,
+                             "se3": error / 3, "translation_percent": 2 * error, "rotation_deg_per_m": error / 100,
                              "mean_keypoints": 2000 if variant == "baseline" else 500 + (width or 10), "flagged": 0})
     return pd.DataFrame(rows).astype({"dilation_width": float})
 
@@ -66,6 +67,28 @@ def test_the_mae_table_has_the_thesis_mae():
         assert table.loc["sum (the thesis's aggregate)", column] == pytest.approx(-25.65, abs=0.06)
         assert table.loc["median", column] == pytest.approx(1.76, abs=0.05)
         assert table.loc["sequences improved", column] == 4
+
+
+def test_what_no_constant_angle_moves_stands_beside_rmse():
+    summary = summary_of(["00", "01", "02", "03"], lambda name, variant, width: 1.0 if variant == "baseline" else 0.5)
+    summary.loc[summary["variant"] != "baseline", "se3"] *= 3  # the angle was all that masks made better
+    summary.loc[summary["sequence"] == "03", "translation_percent"] = np.nan  # too short
+    summary["rotation_deg_per_m"] = np.nan  # all of them
+    table = tables.table_of_change(summary, "rmse", "thesis").set_index("sequence")
+    assert table.loc["00", ["change (%)", "aligned ATE (%)", "translation over 20 m (%)"]].tolist() == [-50, 50, -50]
+    assert pd.isna(table.loc["03", "translation over 20 m (%)"]) and table.loc["mean", "aligned ATE (%)"] == 50
+    shown = tables.table_controls(summary).set_index("keypoints")
+    assert shown["aligned ATE (%)"]["segmentation mask, width 10"].iloc[0] == "+50.0 (+50.0 to +50.0)"
+    assert shown["translation over 20 m (%)"]["mirrored mask"].iloc[0] == "-50.0 (-50.0 to -50.0)"
+    assert shown["rotation over 20 m (%)"].drop("all keypoints").isna().all()
+    for written in (tables.table_sources, tables.table_errors):  # a source by its name
+        named = summary[summary["variant"].isin(["baseline", "masked"])].assign(
+            source=lambda rows: np.where(rows["variant"] == "masked", "net", ""))
+        text = markdown(written(named))
+        assert "nan" not in text and "50" in text
+    text = findings.words(summary, "made up")
+    assert "; aligned ATE 1.50 (1.50 to 1.50) times, translation over 20 m 0.50 (0.50 to 0.50) times." in text
+    assert "rotation over" not in text
 
 
 def test_a_sequence_that_the_thesis_does_not_report_stays_empty():
@@ -182,7 +205,7 @@ def test_controls_are_compared_within_their_estimator():
     summary = summary_of(ELEVEN, segmentation_matters)
     summary.loc[summary["pose"] == "refined", "rmse"] *= 0.1
     table = results.controls(summary).set_index(["pose", "variant"])
-    assert len(table) == 2 * 10
+    assert len(table) == 2 * 11
     for pose in results.POSES:
         assert table.loc[(pose, "masked"), "rmse"] == pytest.approx(-50)
         assert table.loc[(pose, "mirrored"), ["rmse", "rmse_minus"]].tolist() == pytest.approx([0, -50])

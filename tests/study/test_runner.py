@@ -6,10 +6,11 @@ import pytest
 
 from thesis_repro import InputError, odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks
+from thesis_repro.masks import LabelMasks, MaskSettings
 from thesis_repro.odometry import metrics
 from thesis_repro.study import budget, results, runner
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
+from thesis_repro.study.sources import Source
 
 WIDTHS = (5, 10, 15)
 
@@ -29,7 +30,9 @@ def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finish
     sequence = Sequence(small_world / "kitti", "01")
     alone = odometry.run(sequence, masks=LabelMasks(small_labels / "01", sequence, 15))
     row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
-    assert row["rmse"] == metrics.rmse(alone.poses, sequence.poses)
+    assert {name: row[name] for name in (*results.ERRORS, *results.BESIDE)} == pytest.approx(
+        metrics.errors(alone.poses, sequence.poses), nan_ok=True, rel=0)
+    assert row["se3"] <= row["rmse"]
     assert np.array_equal(runner.paths(summary, folder)["01", "masked-15-0"], alone.poses[:, :3, 3])
 
 
@@ -108,29 +111,27 @@ def test_a_broken_label_map_costs_only_the_runs_that_need_it(small_world, small_
             f"{broken}: the image is truncated") in capsys.readouterr().out
 
 
-def test_the_boundaries_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path, monkeypatch):
+def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_path, monkeypatch):
     kitti, jobs = small_world / "kitti", [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)]
 
-    def keypoints(**chosen):
-        summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=4, **chosen)
+    def keypoints(*settings):
+        summary = runner.run(jobs, kitti, [Source(small_labels, "labels", "", *settings)], tmp_path, frames=4)
         return summary.set_index("variant")["mean_keypoints"]
 
     thesis = keypoints()
     assert thesis["masked"] != thesis["exact-boundaries"]
-    exact = keypoints(boundaries="exact")  # in the same folder: nothing of the others is left
+    exact = keypoints(MaskSettings("exact"))  # in the same folder: nothing of the others is left
     assert exact["masked"] == exact["exact-boundaries"] == thesis["exact-boundaries"]
+    chosen = MaskSettings("exact", symmetric=True, classes=("road", "building"), movable=3, margin=20)
+    few = keypoints(chosen)
+    sequence = Sequence(kitti, "00").subset(4)
+    alone = odometry.run(sequence, masks=LabelMasks(small_labels / "00", sequence, 10, chosen))
+    assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
     # the times of these runs are those of their own masks
     asked = []
-    monkeypatch.setattr(budget, "masks_of", lambda *given: asked.append(given[-1]) or runner.masks_of(*given))
-    budget.time_runs(jobs, kitti, small_labels, tmp_path, frames=3)
-    assert asked == ["exact"]
-
-
-def test_unknown_boundaries_are_one_clear_line_and_cost_no_result(small_world, small_labels, finished):
-    folder, jobs, _ = finished
-    with pytest.raises(InputError, match="boundaries='fuzzy': unknown; choose one of canny, exact"):
-        runner.run(jobs, small_world / "kitti", small_labels, folder, boundaries="fuzzy")
-    assert list(folder.rglob("*.csv"))
+    monkeypatch.setattr(budget, "masks_of", lambda *given: asked.append(given[-1][""]) or runner.masks_of(*given))
+    budget.time_runs(jobs, kitti, [Source(small_labels, settings=chosen)], tmp_path, frames=3)
+    assert [source.settings for source in asked] == [chosen]
 
 
 def test_times_without_runs_are_one_clear_line(small_world, small_labels, tmp_path):

@@ -90,7 +90,7 @@ def test_masks_ready_made_are_what_label_maps_of_that_width_give(done, small_wor
     # all keypoints are run once for both, and each source has controls of its own
     assert (runs["variant"] == "baseline").sum() == 4 and set(runs.loc[runs["variant"] == "baseline", "source"]) == {""}
     variants = {name: set(runs.loc[runs["source"] == name, "variant"]) for name in ("net", "by-hand")}
-    assert variants["net"] - variants["by-hand"] == {"exact-boundaries", "true-labels"}
+    assert variants["net"] - variants["by-hand"] == {"exact-boundaries", "corrected", "true-labels"}
     assert {"mirrored", "other-frame", "random-lines", "image-edges", "fewer", "spread"} < variants["by-hand"]
     table = pd.read_csv(done / "sources.csv")
     assert table["masks"].tolist() == ["all keypoints", "net", "net", "by-hand"]
@@ -162,6 +162,8 @@ def test_one_estimator_is_enough(small_world, small_labels, tmp_path):
     (["--labels", "LABELS", "--name", "a", "--name", "b"], "--name b: 2 names for 1 folders"),
     (["--labels", "LABELS", "--name", "a/b"], "--name a/b: a name may have letters"),
     (["--masks", "MASKS", "--widths", "5"], "--widths: only masks from label maps"),
+    (["--masks", "MASKS", "--symmetric"], "--symmetric, --classes, --without-movable, --margin: need --labels DIR"),
+    (["--labels", "LABELS", "--margin", "-1"], "margin=-1: must be 0 or more pixels"),
     (["--masks", "LABELS"], "320x320 pixels, but the frames have"),
     (["--masks", "TRUE", "--sequences", "00"], "different values; a mask has 0 and 255 (label maps go with --labels)"),
     (["--labels", "LABELS", "--sequences", "77"], "77/image_0: no such folder"),
@@ -207,7 +209,8 @@ def test_a_mask_that_breaks_in_the_middle_costs_only_the_runs_that_need_it(small
 def test_errors_side_by_side_are_those_of_the_runs():
     rows = [{"sequence": name, "source": source, "variant": "masked" if source else "baseline", "dilation_width": width,
              "pose": "all", "repetition": repetition, "frames": 9, "flagged": 0, "mean_keypoints": count,
-             "rmse": error * (1 + repetition), "mae": error}
+             "rmse": error * (1 + repetition), "mae": error, "se3": error / 2, "translation_percent": np.nan,
+             "rotation_deg_per_m": np.nan}
             for name, factor in (("00", 1), ("01", 3)) for source, width, count, error in
             (("", np.nan, 2000, 1.0 * factor), ("b", 5, 500, 0.5 * factor), ("a", np.nan, 1000, 2.0))
             for repetition in (0, 1)]
@@ -216,6 +219,7 @@ def test_errors_side_by_side_are_those_of_the_runs():
     assert table.index.tolist() == ["", "b", "a"]  # in the order of the runs
     assert table.loc["b", "rmse_change"] == -50 and table.loc["b", "rmse_improved"] == 2
     assert table.loc["b", "kept"] == 25
+    assert table.loc["b", "se3_change"] == -50 and np.isnan(table.loc["b", "translation_percent_change"])
     assert table.loc["a", "mae_change"] == pytest.approx((100 - 100 / 3) / 2) and np.isnan(table.loc["a", "rmse_low"])
     errors = results.errors(summary).set_index(["source", "sequence"])
     assert errors.loc[("b", "01"), ["rmse", "rmse_lowest", "rmse_highest"]].tolist() == [2.25, 1.5, 3.0]

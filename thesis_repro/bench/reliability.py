@@ -22,6 +22,7 @@ from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.continuity import AMBIGUOUS, NOT_DETERMINED
 from thesis_repro.study import controls
 from thesis_repro.study.budget import opencv_threads
+from thesis_repro.study.sources import Source
 
 SPREAD, MOVING, WRONG = 1.5, 0.25, 2.0
 KEYPOINTS = (300, 500, 1000, 2000, 4000)
@@ -39,7 +40,7 @@ def methods(sequence, labels=None):
             found[f"masked-{width}"] = THESIS, LabelMasks(labels, sequence, width)
             found[f"exact-{width}"] = THESIS, LabelMasks(labels, sequence, width, "exact")
         for name in CONTROLS:
-            found[name] = THESIS, controls.masks(name, labels, sequence, WIDTHS[-1])
+            found[name] = THESIS, controls.masks(name, Source(labels), sequence, WIDTHS[-1])
     return found
 
 

@@ -155,6 +155,17 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
             "rotation_deg_per_m": float(np.degrees(np.mean(off)) / length), "segments": len(first), "note": ""}
 
 
+def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> dict[str, float]:
+    """What stands side by side wherever runs are compared: rmse and mae (metres; alignment as in `rmse`), se3, the RMSE
+    in metres after the rotation and shift that fit best, and translation_percent and rotation_deg_per_m of
+    `relative_errors`. NaN where a path is too short or too straight for one.
+    """
+    relative = relative_errors(estimated, true)
+    return {"rmse": rmse(estimated, true, alignment), "mae": mae(estimated, true, alignment),
+            "se3": ate(estimated, true, "se3")["rmse"],
+            **{name: relative[name] for name in ("translation_percent", "rotation_deg_per_m")}}
+
+
 def travelled(poses: np.ndarray) -> np.ndarray:
     """Metres along a path (n, 4, 4) up to each of its poses, (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])

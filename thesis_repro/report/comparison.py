@@ -7,8 +7,9 @@ from thesis_repro.report.findings import ENOUGH, UNAIDED
 from thesis_repro.report.style import BASELINE, BLACK, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, SKY, new_figure
 from thesis_repro.study import answer, results
 
-MARKERS = "oDs^v<>PpXh"
-COLORS = (BASELINE, MASKED, GREEN, ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b", "#5d3a9b")  # in METHODS' order
+MARKERS = "oDs*^v<>PpXh"
+COLORS = (BASELINE, MASKED, GREEN, "#7fb800", ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b",
+          "#5d3a9b")  # in METHODS' order
 
 
 def _style(variant):
@@ -107,6 +108,8 @@ def table(summary):
         if not len(results.of_variant(summary, "baseline", pose)):
             continue
         for metric, name in answer.SHOWN.items():
+            if summary[metric].isna().all():  # paths too short for it
+                continue
             for one in answer.compared(summary, metric, pose).itertuples():
                 rows.append({"estimator": estimator, "error": name, "keypoints": answer.METHODS[one.variant],
                              "mean number": round(one.keypoints), "sequences": one.sequences,

@@ -30,7 +30,7 @@ LARGEST = 3_000_000  # bytes, of everything together
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
 # Beside the tested width, for the lines of error against number of keypoints: under the estimator that judges alone.
 OTHER_WIDTHS, OTHER_REPETITIONS = (5, 15), 3
-LINES = ("masked", "exact-boundaries", "mirrored", "random-lines", "image-edges")  # that have a width
+LINES = ("masked", "exact-boundaries", "corrected", "mirrored", "random-lines", "image-edges")  # that have a width
 LOOKED_AT = 12  # frames of each sequence whose boundaries and keypoints are looked at one by one
 
 

@@ -95,7 +95,7 @@ def _masks(summary, pose, quality=None):
     masks = "masks" if width is None else f"masks of width {width}"
     of_quality = f" from label maps of {quality}" if quality else ""
     text = (f"Under the {POSES[pose].replace(' estimator', '')} estimator {masks} make RMSE {_times(change)} that of "
-            f"all keypoints ({_lower(change)}).")
+            f"all keypoints ({_lower(change)}){_beside(summary, pose)}.")
     count = int(change.notna().sum())
     if count < ENOUGH:
         return (f"{text} {_number(count, 'sequence')} cannot tell whether masks help, nor whether the segmentation "
@@ -112,6 +112,14 @@ def _masks(summary, pose, quality=None):
         rest = ", ".join(CONTROLS[variant] for variant in signs if variant not in beaten)
         return f"{text}, and the segmentation is not shown to matter: not shown to do worse are {rest}.**"
     return f"{text}, and the segmentation is not shown to matter: no control without it is shown to do worse.**"
+
+
+def _beside(summary, pose):
+    """What errors say that no constant angle between camera and truth moves, the same masks over all keypoints."""
+    masked, every = results.of_control(summary, "masked", pose), results.of_variant(summary, "baseline", pose)
+    found = {name: answer.ratios(masked, every, metric) for metric, name in results.BESIDE.items()}
+    said = [f"{name} {_times(ratios)}" for name, ratios in found.items() if len(ratios)]
+    return f"; {', '.join(said)}" if said else ""
 
 
 def _controls(summary):

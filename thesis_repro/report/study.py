@@ -26,7 +26,7 @@ def write(study, summary, folder):
             write_text(folder / f"{file}.md", content)
         made[kind, file] = tuple(text.replace("NAME", source) for text in captions.STUDY[kind, name])
 
-    style.save_table(summary.round({"rmse": 6, "mae": 6, "mean_keypoints": 1}), folder, "runs", note)
+    style.save_table(summary.round(results.DIGITS), folder, "runs", note)
     keep("text", "findings", findings.study_words(summary, note))
     keep("table", "sources", tables.table_sources(summary))
     for pose in study.poses:
@@ -55,13 +55,20 @@ def data_note(study):
     return f"odometry: {frames}; masks: {masks}"
 
 
+def _corrected(source):
+    """What of a source's masks is not the thesis's way."""
+    default = vars(type(source.settings)())
+    found = [f"{name} {value}" for name, value in vars(source.settings).items() if value != default[name]]
+    return f"; {', '.join(found)}" if found and source.kind == "labels" else ""
+
+
 def _facts(study, summary):
     lengths = results.of_variant(summary, "baseline").groupby("sequence")["frames"].first()
     of_labels = any(source.kind == "labels" for source in study.sources)
     return {
         "odometry data": "embedded world" if is_embedded(study.kitti) else f"KITTI folder “{study.kitti.name}”",
         "sequences": ", ".join(f"{name} ({count} frames)" for name, count in lengths.items()),
-        **{f"masks “{source.name}”": f"{KINDS[source.kind]} in the folder “{source.folder.name}”"
+        **{f"masks “{source.name}”": f"{KINDS[source.kind]} in the folder “{source.folder.name}”{_corrected(source)}"
            for source in study.sources},
         "widths": ", ".join(map(str, sorted({*study.widths, *([study.tested] if of_labels and study.tested else [])}))),
         "controls": "" if not study.tested else f"beside masks of width {study.tested}" if of_labels

@@ -9,9 +9,10 @@ import pandas as pd
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import results
 
-SHORT = {"exact-boundaries": "exact", "true-labels": "true", "other-frame": "other frame", "mirrored": "mirrored",
-         "random-lines": "random lines", "image-edges": "image edges", "fewer": "fewer",
+SHORT = {"exact-boundaries": "exact", "corrected": "corrected", "true-labels": "true", "other-frame": "other frame",
+         "mirrored": "mirrored", "random-lines": "random lines", "image-edges": "image edges", "fewer": "fewer",
          "spread": "spread out"}  # the controls as columns
+UNITS = {"se3": "m", "translation_percent": "%", "rotation_deg_per_m": "degrees a metre"}
 INTERVAL = f"mean, {results.LEVEL} % interval"
 
 
@@ -36,7 +37,8 @@ def _reported(reported, name, key):
 def table_of_change(summary, metric, reported_as):
     """Tables 4.2 and 4.3: percent change (Equation 4.1) of the metric from all keypoints to the best mask.
 
-    Beside the thesis's choice of width: one width for all, the width chosen on the other sequences, and the controls.
+    Beside the thesis's choice of width: one width for all, the width chosen on the other sequences, and the controls;
+    for RMSE also what other errors say of the thesis's choice (`results.BESIDE`).
     The thesis's "aggregate" is the sum of the sequences' percentages; mean, its interval and median stand beside it.
     """
     baseline = results.over_orders(results.of_variant(summary, "baseline"), metric)
@@ -49,6 +51,7 @@ def table_of_change(summary, metric, reported_as):
     changes = pd.DataFrame({
         "change (%)": chosen[f"best_{metric}"],
         theirs: reported.reindex(baseline.index),
+        **{f"{name} (%)": chosen[f"best_{other}"] for other, name in results.BESIDE.items() if metric == "rmse"},
         "one width for all (%)": chosen[f"fixed_{metric}"],
         "left-out width (%)": chosen[f"left_out_{metric}"],
         **{f"{short[variant]} (%)": change
@@ -109,12 +112,13 @@ def table_controls(summary):
     names = {"baseline": "all keypoints", **results.control_names(summary)}
     shown = pd.DataFrame({"estimator": table["pose"].map(results.POSES), "keypoints": table["variant"].map(names),
                           "mean number": table["keypoints"].round().astype(int), "sequences": table["sequences"]})
-    for metric in ("rmse", "mae"):
+    for metric in results.ERRORS:
         label = metric.upper()
         shown[f"{label} (%)"] = table[metric].round(1)
         shown[f"{label}, {results.LEVEL} % interval"] = _between(table, f"{metric}_low", f"{metric}_high")
         shown[f"{label}, repetitions"] = _between(table, f"{metric}_lowest", f"{metric}_highest")
         shown[f"{label} improved"] = table[f"{metric}_improved"].astype("Int64")
+    shown = shown.assign(**_beside(table))
     shown["mask minus this, RMSE (points)"] = table["rmse_minus"].round(1)
     shown["points, interval"] = _between(table, "rmse_minus_low", "rmse_minus_high")
     return shown
@@ -124,31 +128,44 @@ def _between(table, low, high):
     return [pd.NA if np.isnan(one) else f"{one:+.1f} to {other:+.1f}" for one, other in zip(table[low], table[high])]
 
 
+def _beside(table, change=""):
+    """Columns of the other errors (`results.BESIDE`): mean changes (%) with their intervals, in one cell each."""
+    found = {}
+    for metric, name in results.BESIDE.items():
+        between = _between(table, f"{metric}_low", f"{metric}_high")
+        found[f"{name} (%)"] = [pd.NA if np.isnan(mean) else f"{mean:+.1f}{'' if pd.isna(span) else f' ({span})'}"
+                                for mean, span in zip(table[f"{metric}{change}"], between, strict=True)]
+    return found
+
+
 def table_sources(summary):
     """Every source of masks and width side by side: mean changes from all keypoints, with intervals."""
     table = results.side_by_side(summary)
     shown = _source_columns(table).assign(sequences=table["sequences"])
     shown["mean keypoints"] = table["mean_keypoints"].round().astype(int)
     shown["kept (%)"] = table["kept"].round(1)
-    for metric in ("rmse", "mae"):
+    for metric in results.ERRORS:
         label = metric.upper()
         shown[f"{label} (%)"] = table[f"{metric}_change"].round(1)
         shown[f"{label}, {results.LEVEL} % interval"] = _between(table, f"{metric}_low", f"{metric}_high")
         shown[f"{label} improved"] = table[f"{metric}_improved"].astype("Int64")
-    return shown
+    return shown.assign(**_beside(table, "_change"))
 
 
 def table_errors(summary):
-    """Every sequence by itself: errors in metres, mean and range of the repetitions, and keypoints."""
+    """Every sequence by itself: errors, mean and range of the repetitions, and keypoints."""
     table = results.errors(summary)
     shown = pd.concat([table["sequence"], _source_columns(table)], axis=1).assign(frames=table["frames"])
     shown["mean keypoints"] = table["mean_keypoints"].round().astype(int)
-    for metric in ("rmse", "mae"):
+    for metric in results.ERRORS:
         label = metric.upper()
         spread = table[[f"{metric}_lowest", f"{metric}_highest"]].set_axis(["lowest", "highest"], axis=1)
         shown[f"{label} (m)"] = table[metric].map(_significant)
         shown[f"{label}, range"] = _ranges(spread)
         shown[f"{label} (%)"] = table[f"{metric}_change"].where(table["source"] != "").round(1)
+    for metric, name in results.BESIDE.items():
+        shown[f"{name} ({UNITS[metric]})"] = table[metric].map(_significant)
+        shown[f"{name}, change (%)"] = table[f"{metric}_change"].where(table["source"] != "").round(1)
     shown["flagged frames"] = table["flagged"].round(1)
     return shown.sort_values("sequence", kind="stable", ignore_index=True)
 

@@ -21,6 +21,7 @@ from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import by_name, masks_of
+from thesis_repro.study.sources import Source
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
 PLAIN = "all keypoints"  # the variant without network and mask; the other is "masked, width 10" or whatever width
@@ -41,49 +42,43 @@ def opencv_threads(count: int) -> Iterator[None]:
 # Every width, without the network
 
 
-def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path, folder: Path, *, frames: int,
+def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *, frames: int,
               processes: int = 1) -> pd.DataFrame:
     """What each job costs as a run of its own: a table of sequence, run, variant, dilation_width and seconds.
 
     Only the first `frames` frames are timed; the first two steps are left out, since they load compiled code. The jobs
     of a sequence take turns at every frame, so that what else the machine does falls on all of them alike.
-    To be called after `runner.run`, whose folder and whose boundaries it shares. Raises InputError where there are no
+    To be called after `runner.run`, whose folder and whose label maps it shares. Raises InputError where there are no
     runs.
     """
-    jobs = list(jobs)
+    jobs, sources = list(jobs), by_name(labels)
     files = {name: folder / name / f"seconds-{frames}.csv" for name in sorted({job.sequence for job in jobs})}
     waiting = {name: [job for job in jobs if job.sequence == name] for name in files}
     waiting = {name: of_name for name, of_name in waiting.items() if not files[name].is_file()
                or not {job.name for job in of_name} <= set(pd.read_csv(files[name])["run"])}
+    for name in waiting:
+        if stages.record(folder / name) is None:
+            raise InputError(f"{folder / name}: holds no odometry runs; they are timed after runner.run has made them")
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")(
-        joblib.delayed(_time_jobs)(of_name, Sequence(kitti, name).subset(frames), labels, _boundaries(folder / name),
-                                   files[name])
+        joblib.delayed(_time_jobs)(of_name, Sequence(kitti, name).subset(frames), sources, files[name])
         for name, of_name in waiting.items())
     for _ in progress(work, "timing", total=len(waiting), unit="sequence"):
         pass
     return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in files.values()], ignore_index=True)
 
 
-def _boundaries(folder: Path) -> str:
-    """Those of the runs in a folder."""
-    record = stages.record(folder)
-    if record is None:
-        raise InputError(f"{folder}: holds no odometry runs; they are timed after runner.run has made them")
-    return str(record["boundaries"])
-
-
-def _time_jobs(jobs: list[Job], sequence: Sequence, labels: Path, boundaries: str, path: Path) -> None:
+def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path) -> None:
     scales = odometry.scales(sequence)
-    sources, _ = masks_of(jobs, sequence, by_name(labels), boundaries)
-    followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in sources}
-    seconds = dict.fromkeys(sources, 0.0)
+    found, _ = masks_of(jobs, sequence, sources)
+    followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in found}
+    seconds = dict.fromkeys(found, 0.0)
     with opencv_threads(1):  # one thread makes times comparable
         for index in range(len(sequence)):
             frame = sequence.frame(index)
             for job, follower in followers.items():
                 masks.forget_edges()  # each run of its own would have to make them
-                source = sources[job]
-                mask, masking = (None, 0.0) if source is None else _timed(source.__getitem__, index)
+                its_masks = found[job]
+                mask, masking = (None, 0.0) if its_masks is None else _timed(its_masks.__getitem__, index)
                 step = follower.step(frame, scales[index], mask)
                 if index > 1:
                     # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import dilate
+from thesis_repro.masks import MaskSettings, dilate
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import SharedKeypoints
 from thesis_repro.study.sources import FileMasks, Source
@@ -23,6 +23,9 @@ CLOSE = 0.002  # of the frame: a difference of coverage that is none
 SAMPLE = 12  # frames on which a distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
 SEED = 0  # of the random lines
+# All corrections together, fixed before any run: a label map of 320 columns places a boundary no better than within 2
+# pixels of the frame, and within 10 of its rim the window of 21 in which Lucas and Kanade track is cut off.
+CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)
 LINE_WIDTH = 10  # pixels, of lines and edges beside masks that come ready made and have no width
 
 
@@ -34,8 +37,8 @@ def true_labels(kitti: Path, name: str) -> Path:
 class OtherFrame:
     """The mask of the frame half a sequence away: as many boundaries, of the same kind, in the wrong place."""
 
-    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> None:
-        self.masks = source.masks(sequence, dilation_width, boundaries)
+    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
+        self.masks = source.masks(sequence, dilation_width)
         self.paths = self.masks.paths
         self.line_width = dilation_width or LINE_WIDTH
 
@@ -85,8 +88,8 @@ class RandomLines(OtherFrame):
 class ImageEdges(OtherFrame):
     """The strongest Canny edges of the frame itself, dilated, that cover what its mask covers: no network at all."""
 
-    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> None:
-        super().__init__(source, sequence, dilation_width, boundaries)
+    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
+        super().__init__(source, sequence, dilation_width)
         self.sequence = sequence
 
     def __getitem__(self, index: int) -> np.ndarray:
@@ -110,28 +113,31 @@ class ImageEdges(OtherFrame):
         return best
 
 
-def _exact_boundaries(source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> FileMasks:
-    return source.masks(sequence, dilation_width, "exact")
+def _exact_boundaries(source: Source, sequence: Sequence, dilation_width: int | None) -> FileMasks:
+    return replace(source, settings=replace(source.settings, boundaries="exact")).masks(sequence, dilation_width)
 
 
-def _true_labels(source: Source, sequence: Sequence, dilation_width: int | None, boundaries: str) -> FileMasks:
-    return Source(true_labels(sequence.root, sequence.name)).masks(sequence, dilation_width, boundaries)
+def _corrected(source: Source, sequence: Sequence, dilation_width: int | None) -> FileMasks:
+    return replace(source, settings=CORRECTED).masks(sequence, dilation_width)
+
+
+def _true_labels(source: Source, sequence: Sequence, dilation_width: int | None) -> FileMasks:
+    return replace(source, folder=true_labels(sequence.root, sequence.name)).masks(sequence, dilation_width)
 
 
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-MASKS: dict[str, Callable[[Source, Sequence, int | None, str], ControlMasks]] = {
+MASKS: dict[str, Callable[[Source, Sequence, int | None], ControlMasks]] = {
     "other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges,
-    "exact-boundaries": _exact_boundaries, "true-labels": _true_labels}
-OF_LABEL_MAPS = ("exact-boundaries", "true-labels")  # ask what label maps are good for; other masks have none
+    "exact-boundaries": _exact_boundaries, "corrected": _corrected, "true-labels": _true_labels}
+OF_LABEL_MAPS = ("exact-boundaries", "corrected", "true-labels")  # ask what label maps are good for
 
 
-def masks(variant: str, source: Source, sequence: Sequence, dilation_width: int | None,
-          boundaries: str = "canny") -> ControlMasks:
+def masks(variant: str, source: Source, sequence: Sequence, dilation_width: int | None) -> ControlMasks:
     """The masks of one of MASKS for a sequence, as control of the source's own.
 
-    dilation_width: pixels, and boundaries, see `masks.edges`, of label maps; "exact-boundaries" has its own.
+    dilation_width: pixels, of masks from label maps.
     """
-    return MASKS[variant](source, sequence, dilation_width, boundaries)
+    return MASKS[variant](source, sequence, dilation_width)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:

@@ -21,11 +21,11 @@ from thesis_repro.kitti import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
 from thesis_repro.odometry.passes import Masks, poses_of
+from thesis_repro.study.controls import CORRECTED
 from thesis_repro.study.jobs import CONTROL_WIDTH
 
 POSES = ("all", "inliers", "refined")
 FEW = (100, 200, 400)  # keypoints: a twentieth, a tenth and a fifth of the thesis's 2000
-CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)  # all corrections of masks together
 WRONG = 2.0  # degrees: a step of FAST metres or more whose rotation is further off has failed
 FAST = 0.25
 TURN, STRAIGHT = 1.0, 0.3  # degrees a frame: a turn is more than the first, a straight stretch less than the second
@@ -91,8 +91,8 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, plan:
     kitti: the odometry root. labels: a folder with one folder of label maps a sequence. folder: where the tables of
     each sequence are kept; a stopped series goes on where it was.
 
-    runs has a row for each sequence, variant, pose and repetition: errors in metres (rmse, mae, se3, sim3), relative
-    ones (`step_errors`), mean_keypoints and flagged frames. prefixes has the RMSE of all keypoints over the first
+    runs has a row for each sequence, variant, pose and repetition: errors (those of `metrics.errors`, sim3 in
+    metres, `step_errors`), mean_keypoints and flagged frames. prefixes has the RMSE of all keypoints over the first
     `frames` frames and `metres` of each sequence, a row an order, under the thesis's estimator.
     """
     calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, plan) for name in names]
@@ -156,8 +156,7 @@ def runs_of(sequence: Sequence, labels: Path, plan: Plan
 
 def _row(result: odometry.Result, sequence: Sequence) -> dict[str, Any]:
     poses, true = poses_of(result.frames), sequence.poses
-    return {"frames": len(true), "rmse": metrics.rmse(poses, true), "mae": metrics.mae(poses, true),
-            **{kind: metrics.ate(poses, true, kind)["rmse"] for kind in ("se3", "sim3")},
+    return {"frames": len(true), **metrics.errors(poses, true), "sim3": metrics.ate(poses, true, "sim3")["rmse"],
             "mean_keypoints": result.frames["detected"].mean(), **step_errors(poses, true),
             "flagged": int(result.flagged.drop("stationary", errors="ignore").sum())}
 

@@ -61,18 +61,14 @@ class Job:
                                 "permute": self.repetition or None, "pose": self.pose}
         return replace(THESIS, **{name: value for name, value in said.items() if value is not None})
 
-    def masks(self, sequence: Sequence, sources: Mapping[str, Source], boundaries: str = "canny"
-              ) -> controls.ControlMasks | None:
-        """Its masks; None where the detector may look everywhere.
-
-        sources: by name. boundaries: see `masks.edges`.
-        """
+    def masks(self, sequence: Sequence, sources: Mapping[str, Source]) -> controls.ControlMasks | None:
+        """Its masks; None where the detector may look everywhere. sources: by name."""
         if self.variant in UNMASKED:
             return None
         source = sources[self.source]
         if self.variant == "masked":
-            return source.masks(sequence, self.dilation_width, boundaries)
-        return controls.masks(self.variant, source, sequence, self.dilation_width, boundaries)
+            return source.masks(sequence, self.dilation_width)
+        return controls.masks(self.variant, source, sequence, self.dilation_width)
 
 
 def first_jobs(names: Iterable[str], widths: Iterable[int], repetitions: int = 1) -> list[Job]:

@@ -1,9 +1,9 @@
 """What the odometry runs of chapter 4 amount to: tables in, tables out.
 
 `summary` is the table that `runner.run` returns: one row a run, with sequence, variant, dilation_width, pose,
-repetition, rmse and mae in metres, mean_keypoints. A change is always Equation 4.1, in percent, of means over the
-repetitions, from all keypoints under the same pose; negative is better. Where masks come from several sources, all but
-the last functions take the runs `of_source`.
+repetition, the errors of `metrics.errors`, mean_keypoints. A change is always Equation 4.1, in percent, of means over
+the repetitions, from all keypoints under the same pose; negative is better. Where masks come from several sources, all
+but the last functions take the runs `of_source`.
 """
 
 from typing import Any
@@ -13,13 +13,14 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from thesis_repro import InputError
-from thesis_repro.odometry.metrics import percent_change
+from thesis_repro.odometry.metrics import RELATIVE_LENGTH, percent_change
 from thesis_repro.study.controls import MASKS
 from thesis_repro.study.jobs import CONTROL_WIDTH, POSES
 
 CONTROLS = {  # what the runs at one width are called, in the order in which they are shown
     "masked": "segmentation mask",
     "exact-boundaries": "exact class boundaries",
+    "corrected": "corrected mask",
     "true-labels": "true label maps",
     "other-frame": "mask of another frame",
     "mirrored": "mirrored mask",
@@ -28,6 +29,11 @@ CONTROLS = {  # what the runs at one width are called, in the order in which the
     "fewer": "fewer keypoints",
     "spread": "keypoints spread out",
 }
+ERRORS = ("rmse", "mae")  # that the thesis reports
+BESIDE = {"se3": "aligned ATE",  # and others, which no constant angle between camera and truth moves
+          "translation_percent": f"translation over {RELATIVE_LENGTH:g} m",
+          "rotation_deg_per_m": f"rotation over {RELATIVE_LENGTH:g} m"}
+DIGITS = dict.fromkeys((*ERRORS, *BESIDE), 6) | {"mean_keypoints": 1}  # of a table of runs
 FEWEST = 3  # sequences for an interval
 LEVEL = 95  # percent
 DRAWS = 10_000
@@ -122,12 +128,12 @@ def _lowest(changes: pd.DataFrame) -> Any:
 def widths(summary: pd.DataFrame) -> pd.DataFrame:
     """What each choice of width gives: one row a sequence.
 
-    Columns best, left_out, fixed (widths); the changes of both metrics at each, such as left_out_rmse; and how far
+    Columns best, left_out, fixed (widths); the changes of all errors at each, such as left_out_rmse; and how far
     the best width is chance (`stability`): same_best, elsewhere.
     """
     chosen = chosen_widths(summary)
     table = chosen.copy()
-    for metric in ("rmse", "mae"):
+    for metric in (*ERRORS, *BESIDE):
         changes = width_changes(summary, metric)
         for choice in chosen:
             table[f"{choice}_{metric}"] = [np.nan if pd.isna(width) else changes.loc[name, width]
@@ -217,11 +223,11 @@ def controls(summary: pd.DataFrame) -> pd.DataFrame:
     Columns pose, variant, sequences, keypoints; rmse, rmse_low, rmse_high (mean and interval); rmse_improved (number
     of sequences); rmse_lowest, rmse_highest (of the repetitions, each a mean over sequences); rmse_minus,
     rmse_minus_low, rmse_minus_high (the change with masks minus that of the variant, in percentage points, and its
-    interval); the same for mae.
+    interval); the same for mae and those of BESIDE.
     """
     rows = []
     for pose in POSES:
-        changes = {metric: control_changes(summary, metric, pose) for metric in ("rmse", "mae")}
+        changes = {metric: control_changes(summary, metric, pose) for metric in (*ERRORS, *BESIDE)}
         for variant in ("baseline", *changes["rmse"]):
             runs = of_control(summary, variant, pose)
             if not len(runs):
@@ -239,7 +245,7 @@ def _row(runs: pd.DataFrame, metric: str, changes: pd.DataFrame, variant: str, b
     repeated = runs.assign(change=percent_change(runs[metric], runs["sequence"].map(baseline)))
     repeated = repeated.groupby("repetition")["change"].mean()
     row = {f"{metric}_lowest": repeated.min(), f"{metric}_highest": repeated.max()}
-    own = changes[variant] if variant in changes else pd.Series(0.0, changes.index)
+    own = changes[variant] if variant in changes else pd.Series(0.0 if variant == "baseline" else np.nan, changes.index)
     row[metric] = own.mean()
     if variant != "baseline":
         row[f"{metric}_low"], row[f"{metric}_high"] = interval(own)
@@ -268,19 +274,19 @@ def errors(summary: pd.DataFrame) -> pd.DataFrame:
     """What the repetitions of each run amount to: one row for each pose, source, width and sequence.
 
     Columns pose, source, dilation_width, sequence, frames, repetitions, mean_keypoints, kept (percent of all
-    keypoints); rmse, rmse_lowest, rmse_highest, rmse_change (percent), the same for mae; flagged (mean number of
-    frames). All keypoints come first, with the source "".
+    keypoints); rmse, rmse_lowest, rmse_highest, rmse_change (percent), the same for mae and those of BESIDE; flagged
+    (mean number of frames). All keypoints come first, with the source "".
     """
     keys = ["pose", "source", "dilation_width", "sequence"]
     runs = summary[summary["variant"].isin(["baseline", "masked"])].groupby(keys, dropna=False, sort=False)
     table = pd.DataFrame({"frames": runs["frames"].first(), "repetitions": runs["repetition"].nunique(),
                           "mean_keypoints": runs["mean_keypoints"].mean(), "flagged": runs["flagged"].mean(),
-                          **{f"{metric}{name}": getattr(runs[metric], how)() for metric in ("rmse", "mae")
+                          **{f"{metric}{name}": getattr(runs[metric], how)() for metric in (*ERRORS, *BESIDE)
                              for name, how in (("", "mean"), ("_lowest", "min"), ("_highest", "max"))}}).reset_index()
     every = table[table["source"] == ""].set_index(["pose", "sequence"])
     own = every.reindex(pd.MultiIndex.from_frame(table[["pose", "sequence"]]))
     table["kept"] = 100 * table["mean_keypoints"] / own["mean_keypoints"].to_numpy()
-    for metric in ("rmse", "mae"):
+    for metric in (*ERRORS, *BESIDE):
         table[f"{metric}_change"] = percent_change(table[metric], own[metric].to_numpy())
     order = {value: place for place, value in enumerate([*POSES, "", *sources(summary)])}
     return table.sort_values(keys, key=lambda column: column.map(order) if column.name in ("pose", "source")
@@ -291,14 +297,14 @@ def side_by_side(summary: pd.DataFrame) -> pd.DataFrame:
     """Means over sequences: one row for each pose, source and width, all keypoints first under each pose.
 
     Columns pose, source, dilation_width, sequences, mean_keypoints, kept; rmse_change, rmse_low, rmse_high (mean and
-    interval), rmse_improved (number of sequences), the same for mae.
+    interval), rmse_improved (number of sequences), the same for mae and those of BESIDE.
     """
     rows = []
     for (pose, source, width), of_row in errors(summary).groupby(["pose", "source", "dilation_width"], dropna=False,
                                                                  sort=False):
         row = {"pose": pose, "source": source, "dilation_width": width, "sequences": len(of_row),
                "mean_keypoints": of_row["mean_keypoints"].mean(), "kept": of_row["kept"].mean()}
-        for metric in ("rmse", "mae") if source else ():
+        for metric in (*ERRORS, *BESIDE) if source else ():
             changes = of_row[f"{metric}_change"]
             row[f"{metric}_change"] = changes.mean()
             row[f"{metric}_low"], row[f"{metric}_high"] = interval(changes)

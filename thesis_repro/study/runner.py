@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, longrun, masks, odometry, stages
+from thesis_repro import InputError, longrun, odometry, stages
 from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
@@ -32,7 +32,6 @@ class _Study:
     sources: dict[str, Source]
     folder: Path
     frames: int | None
-    boundaries: str
 
     def sequence(self, name: str) -> Sequence:
         return Sequence(self.kitti, name).subset(self.frames)
@@ -47,13 +46,12 @@ class _Study:
         return self.folder / jobs[0].sequence / f"pass-{digest}.npz"
 
 
-def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *, boundaries: str = "canny",
+def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *,
         frames: int | None = None, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
     """Run the jobs that have no result yet; returns the summary of all that succeeded, one row a job.
 
     kitti: the odometry root. labels: folder with one folder of label maps a sequence, or the sources that the jobs
-    name. folder: where results are kept; those of other data, code or boundaries are deleted.
-    boundaries: how all masks from label maps find them, see `masks.edges`.
+    name. folder: where results are kept; those of other data, code or settings of masks are deleted.
     frames: how many of each sequence, None for all. processes: how many work at once on this machine.
     scheduler: address of a Dask scheduler ("tcp://host:8786"); its workers do the work then, with the same results.
     They need this package, and the three folders under the same paths. One thread a worker is best.
@@ -65,9 +63,7 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
     Raises InputError where another run is at work in the folder, where all jobs fail, or where the machine lacks
     something, such as space or memory; what is finished is kept.
     """
-    if boundaries not in masks.BOUNDARIES:
-        raise InputError(f"boundaries={boundaries!r}: unknown; choose one of {', '.join(masks.BOUNDARIES)}")
-    study = _Study(kitti, by_name(labels), folder, frames, boundaries)
+    study = _Study(kitti, by_name(labels), folder, frames)
     jobs = list(dict.fromkeys(jobs))
     with longrun.claimed(folder):
         return _run(jobs, study, processes, scheduler)
@@ -119,7 +115,7 @@ def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
 
 
 def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
-    """The jobs' sequences by name; what the folder holds of other data, code or boundaries is deleted.
+    """The jobs' sequences by name; what the folder holds of other data, code or settings is deleted.
 
     Each source has a folder of its own in that of the sequence, so that what is made from one outlives another.
     """
@@ -131,7 +127,7 @@ def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
         true_labels, folder = controls.true_labels(study.kitti, name), study.folder / name
         records = {source.name: source.record(name) for source in study.sources.values()}
         stages.stage(folder, **_versions(), frames=stages.listing(sequence.frame_paths),
-                     poses=stages.content(sequence.poses_path), boundaries=study.boundaries,
+                     poses=stages.content(sequence.poses_path),
                      true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None,
                      **records.pop("", {}))
         for source, record in records.items():
@@ -186,7 +182,7 @@ def _frames_done(state: Path) -> int:
     return int(kept[0]["done"]) if kept else 0
 
 
-def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source], boundaries: str
+def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
              ) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
     """The masks of each job over a sequence, {job: masks}, and {job: reason} of those whose masks cannot be made.
 
@@ -198,7 +194,7 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Sour
     for job in jobs:
         alike = (job.source, job.variant, job.dilation_width)
         if alike not in made:
-            made[alike] = _checked_masks(job, sequence, sources, boundaries)
+            made[alike] = _checked_masks(job, sequence, sources)
         masks_or_error = made[alike]
         if isinstance(masks_or_error, InputError):
             failures[job] = str(masks_or_error)
@@ -208,10 +204,10 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Sour
     return found, failures
 
 
-def _checked_masks(job: Job, sequence: Sequence, sources: Mapping[str, Source], boundaries: str
+def _checked_masks(job: Job, sequence: Sequence, sources: Mapping[str, Source]
                    ) -> controls.ControlMasks | InputError | None:
     try:
-        its_masks = job.masks(sequence, sources, boundaries)
+        its_masks = job.masks(sequence, sources)
         for path in () if its_masks is None else its_masks.paths:
             # here, since in the middle of a pass it would stop all of it
             _check_file(sources[job.source], path, sequence.size)
@@ -235,7 +231,7 @@ def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict
         sequence = study.sequence(name)
         # all of them where there is a checkpoint to go on from, for it is one of all of them
         waiting = jobs if state.is_file() else [job for job in jobs if not study.result(job).is_file()]
-        found, failures = masks_of(waiting, sequence, study.sources, study.boundaries)
+        found, failures = masks_of(waiting, sequence, study.sources)
         if not found:  # or Dask does again what it lost the answer of
             return failures
         results = odometry.run_many(sequence, {job.name: (job.settings, its_masks) for job, its_masks in found.items()},
@@ -265,12 +261,11 @@ def _check_machine(folder: Path, digest: str) -> None:
 
 def _summarize(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
     frames = pd.read_csv(result, keep_default_na=False, na_values={"detected": "", "tracked": ""})
-    poses = poses_of(frames)
     return {
         "sequence": job.sequence, "run": job.name, "source": job.source, "variant": job.variant,
         "dilation_width": job.dilation_width, "max_keypoints": job.max_keypoints, "min_distance": job.min_distance,
         "pose": job.pose, "repetition": job.repetition, "frames": len(frames),
-        "rmse": metrics.rmse(poses, sequence.poses), "mae": metrics.mae(poses, sequence.poses),
+        **metrics.errors(poses_of(frames), sequence.poses),
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
     }

@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from thesis_repro import InputError, kitti, longrun, masks, stages
+from thesis_repro.masks import MaskSettings
 from thesis_repro.settings import LIMITS, MOST_REPETITIONS
 from thesis_repro.study import jobs, results, runner, sources
 from thesis_repro.study.sources import Source
@@ -83,9 +84,11 @@ class Study:
         return summary
 
 
-def named(folders: Iterable[tuple[str, Path]], names: Iterable[str]) -> tuple[Source, ...]:
+def named(folders: Iterable[tuple[str, Path]], names: Iterable[str],
+          settings: MaskSettings) -> tuple[Source, ...]:
     """Sources from (kind, folder), the first with the first name; those without one are called as their folder.
 
+    settings: of all masks from label maps.
     Raises InputError for a name that cannot be a folder's, for two of the same, and for more names than folders.
     """
     folders, names = list(folders), list(names)
@@ -102,7 +105,7 @@ def named(folders: Iterable[tuple[str, Path]], names: Iterable[str]) -> tuple[So
     if twice:
         raise InputError(f"--name: two folders of masks would be called {twice[0]!r}; give each a --name of its own, "
                          "in the order of --labels and --masks")
-    return tuple(Source(folder, kind, name) for (kind, folder), name in zip(folders, names, strict=True))
+    return tuple(Source(folder, kind, name, settings) for (kind, folder), name in zip(folders, names, strict=True))
 
 
 def checked(study: Study) -> Study:

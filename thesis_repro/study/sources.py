@@ -9,7 +9,7 @@ from thesis_repro import InputError, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import glance, listed
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks, MaskFolder, check_mask_size, read_mask
+from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, check_mask_size, read_mask
 
 KINDS = {"labels": "label maps", "masks": "masks"}
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both know the `paths` of the files that they read
@@ -22,11 +22,13 @@ class Source:
     folder: holds one folder a sequence; or, where one sequence is all there is, its files.
     kind: "labels", label maps of any size whose boundaries are dilated; "masks", masks of the frames' size.
     name: that its runs are called by; empty where there is only one source and nobody needs to ask.
+    settings: how masks are made from label maps.
     """
 
     folder: Path
     kind: str = "labels"
     name: str = ""
+    settings: MaskSettings = MaskSettings()
 
     def of(self, sequence: str) -> Path:
         """The folder with the files of one sequence."""
@@ -38,15 +40,15 @@ class Source:
         """Whether the folder itself holds files, as `thesis-repro predict` and `masks` write them."""
         return any(self.folder.glob("[!.]*.png"))
 
-    def masks(self, sequence: Sequence, dilation_width: int | None, boundaries: str = "canny") -> FileMasks:
-        """The masks of a sequence. dilation_width: pixels, and boundaries, see `masks.edges`, of label maps.
+    def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
+        """The masks of a sequence. dilation_width: pixels, of masks from label maps.
 
         Raises InputError where a frame has no file.
         """
         if self.kind == "masks":
             return MaskFolder(self.of(sequence.name), sequence)
         assert dilation_width is not None  # label maps have no masks without one
-        return LabelMasks(self.of(sequence.name), sequence, dilation_width, boundaries)
+        return LabelMasks(self.of(sequence.name), sequence, dilation_width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError where a file is no label map, or no mask of a (height, width)."""
@@ -56,10 +58,11 @@ class Source:
         read_mask(path, size)
 
     def record(self, sequence: str) -> dict[str, str | None]:
-        """What tells results of these files from those of others."""
+        """What tells results of these files and settings from those of others."""
         folder = self.of(sequence)
         made_from = stages.made_from(folder) if stages.record(folder) is not None else None
-        return {self.kind: stages.listing(listed(folder)), "made_from": made_from}
+        settings = {"settings": str(self.settings)} if self.kind == "labels" else {}
+        return {self.kind: stages.listing(listed(folder)), "made_from": made_from, **settings}
 
 
 def check(sources: Iterable[Source], sequences: Collection[Sequence]) -> None:
