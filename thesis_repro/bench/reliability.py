@@ -29,7 +29,7 @@ KEYPOINTS = (300, 500, 1000, 2000, 4000)
 WIDTHS = (5, 10)
 ORDERS = 20
 SPREAD_OUT = 12  # pixels between keypoints
-CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges")
+CONTROLS = ("corrected", "other-frame", "mirrored", "random-lines", "image-edges")
 
 
 def methods(sequence, labels=None):
