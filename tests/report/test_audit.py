@@ -1,6 +1,7 @@
 """The audit's rows, what they are joined with, and the answer in words."""
 
 import json
+import re
 
 import numpy as np
 import pandas as pd
@@ -83,6 +84,17 @@ def test_the_answer_is_chosen_by_the_numbers(factors, says):
 def test_few_sequences_say_nothing_in_general():
     text = comparison.words(summary(["00", "01", "02"], {"baseline": 1.0, "masked": 0.5, "fewer": 1.0}), "made up")
     assert "3 sequences say nothing of sequences in general" in text and "help here" not in text
+
+
+def test_corrected_masks_and_other_errors_are_said_in_words_where_there_are_any():
+    factors = {"baseline": 1.0, "masked": 0.5, "corrected": 0.25, "fewer": 1.0}
+    runs = summary([f"{number:02d}" for number in range(8)], factors)
+    runs.loc[runs["variant"] == "masked", "se3"] *= 4
+    text = comparison.words(runs, "made up")
+    aligned, translation = re.search(r"beside them, aligned ATE (\S+) .*, translation over 20 m (\S+) ", text).groups()
+    assert float(aligned) == pytest.approx(2, abs=0.05) and float(translation) == pytest.approx(0.5, abs=0.02)
+    assert "rotation over" not in text and "With all of the thesis's slips corrected: RMSE without the angle 0.25 [" in text
+    assert "corrected" not in comparison.words(runs[runs["variant"] != "corrected"], "made up")
 
 
 def test_half_and_double_are_equally_far_from_one():

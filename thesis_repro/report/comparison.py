@@ -138,14 +138,15 @@ def words(summary, data, quality=None):
     if "masked" not in first.index:
         return ""
     count = int(first.loc["masked", "sequences"])
-    parts = []
-    for metric, name in answer.METRICS.items():
-        one = found[metric].loc["masked"]
-        interval = "" if np.isnan(one["low"]) else f" [{one['low']:.2f}, {one['high']:.2f}]"
-        parts.append(f"the {name} is {one['ratio']:.2f}{interval} times that of all keypoints")
+    parts = [f"the {name} is {_ratio(found[metric].loc['masked'])} times that of all keypoints"
+             for metric, name in answer.METRICS.items()]
     text = (f"**Do masks help?** Data: {data}. Refined estimator, width {results.tested_width(summary)}, "
             f"{first.loc['masked', 'keypoints']:.0f} keypoints instead of {first.loc['baseline', 'keypoints']:.0f}, "
-            f"geometric means over {count} sequence{'s' * (count != 1)}: with masks {' and '.join(parts)}.")
+            f"geometric means over {count} sequence{'s' * (count != 1)}: with masks {' and '.join(parts)}"
+            f"{_beside(summary)}.")
+    if "corrected" in first.index:
+        text += " With all of the thesis's slips corrected: " + ", ".join(
+            f"{name} {_ratio(found[metric].loc['corrected'])}" for metric, name in answer.METRICS.items()) + "."
     beaten, better, same = [], [], []
     for variant in UNAIDED:
         signs = [_sign(found[metric].loc[variant, "masks_low"], found[metric].loc[variant, "masks_high"])
@@ -164,6 +165,18 @@ def words(summary, data, quality=None):
         return f"{text} **{masks} help here, " + ("and the segmentation matters.**\n" if not better and not same
                                                  else "but not for what the segmentation knows.**\n")
     return f"{text} **{masks} {'do worse than all keypoints' if helps == {1} else 'are not shown to help'} here.**\n"
+
+
+def _beside(summary):
+    said = []
+    for metric, name in results.BESIDE.items():
+        if summary[metric].notna().any():
+            said.append(f"{name} {_ratio(answer.compared(summary, metric).set_index('variant').loc['masked'])}")
+    return f" (beside them, {', '.join(said)})" if said else ""
+
+
+def _ratio(one):
+    return f"{one['ratio']:.2f}" + ("" if np.isnan(one["low"]) else f" [{one['low']:.2f}, {one['high']:.2f}]")
 
 
 def _sign(low, high):
