@@ -93,7 +93,8 @@ def test_corrected_masks_and_other_errors_are_said_in_words_where_there_are_any(
     text = comparison.words(runs, "made up")
     aligned, translation = re.search(r"beside them, aligned ATE (\S+) .*, translation over 20 m (\S+) ", text).groups()
     assert float(aligned) == pytest.approx(2, abs=0.05) and float(translation) == pytest.approx(0.5, abs=0.02)
-    assert "rotation over" not in text and "With all of the thesis's slips corrected: RMSE without the angle 0.25 [" in text
+    assert "rotation over" not in text
+    assert "With all of the thesis's slips corrected: RMSE without the angle 0.25 [" in text
     assert "corrected" not in comparison.words(runs[runs["variant"] != "corrected"], "made up")
 
 
