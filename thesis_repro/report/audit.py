@@ -223,12 +223,12 @@ def of_switches(runs):
         found = _ratio(every[kind] / every["rmse"])
         if found:
             effects.append(Effect("15", f"RMSE after {kind} alignment over raw {found[0]} (refined)", found[1]))
-    masks_over = {metric: _ratio(answer.ratios(of("masks", "refined"), of("all", "refined"), metric))
-                  for metric in ("rmse", "se3", "rotation")}
-    said = [f"{name} {masks_over[metric][0]}" for metric, name in (("rmse", "raw RMSE"), ("se3", "aligned RMSE"),
-                                                                  ("rotation", "rotation error")) if masks_over[metric]]
-    effects.append(Effect("15", f"masks over all keypoints by {', '.join(said)}",
-                          "; ".join(found[1] for found in masks_over.values() if found)))
+    masks_over = {name: _ratio(answer.ratios(of("masks", "refined"), of("all", "refined"), metric)) for metric, name in
+                  {"rmse": "raw RMSE", **results.BESIDE, "rotation": "rotation error a frame"}.items()}
+    masks_over = {name: found for name, found in masks_over.items() if found}
+    said = ", ".join(f"{name} {found[0]}" for name, found in masks_over.items())
+    effects.append(Effect("15", f"masks over all keypoints by {said}",
+                          "; ".join(found[1] for found in masks_over.values())))
     angle = every[["across", "down"]]
     effects.append(Effect("30", "direction of motion off by {:+.2f} degrees to the right and {:+.2f} down (refined, "
                                 "medians)".format(*angle.median()),
