@@ -7,7 +7,7 @@ from thesis_repro.report.findings import ENOUGH, UNAIDED
 from thesis_repro.report.style import BASELINE, BLACK, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, SKY, new_figure
 from thesis_repro.study import answer, results
 
-MARKERS = "oDs*^v<>PpXh"
+MARKERS = "oDsh^v<>PpX"
 COLORS = (BASELINE, MASKED, GREEN, "#7fb800", ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b",
           "#5d3a9b")  # in METHODS' order
 

@@ -51,7 +51,7 @@ def is_embedded(kitti):
 def data_note(study):
     """One line for captions: where the numbers come from."""
     frames = "embedded world (rendered)" if is_embedded(study.kitti) else f"KITTI folder {study.kitti.name}"
-    masks = ", ".join(f"{source.name} ({KINDS[source.kind]})" for source in study.sources)
+    masks = ", ".join(f"{source.name} ({KINDS[source.kind]}{_corrected(source)})" for source in study.sources)
     return f"odometry: {frames}; masks: {masks}"
 
 
