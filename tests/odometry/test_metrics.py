@@ -182,6 +182,19 @@ def test_relative_errors_by_hand():
         "too short: 14.0 m, stretches of 20 m are compared")
 
 
+def test_errors_side_by_side_are_each_one_of_its_own():
+    true = winding()
+    found = metrics.errors(drifted(true), true)
+    assert list(found) == ["rmse", "mae", "se3", "translation_percent", "rotation_deg_per_m"]
+    assert found["se3"] == metrics.ate(drifted(true), true, "se3")["rmse"] < found["rmse"] == metrics.rmse(
+        drifted(true), true)
+    angle = metrics.errors(turned(true, np.array([0.5, 1.0, 0.2])), true)
+    assert angle["rmse"] > 0.1 and angle["se3"] < 0.1 * angle["rmse"]
+    assert angle["translation_percent"] == pytest.approx(0, abs=1e-4)
+    short = metrics.errors(true[:5], true[:5])
+    assert short["rmse"] == 0 and np.isnan(short["translation_percent"])
+
+
 def test_evo_opens_the_trajectories(tmp_path):
     poses = drifted(winding())
     write_kitti_poses(tmp_path / "path.txt", poses)

@@ -149,8 +149,10 @@ def test_plain_folders_are_taken_for_a_single_sequence(small_world, small_labels
 
 def test_one_estimator_is_enough(small_world, small_labels, tmp_path):
     assert study("--kitti", small_world / "kitti", "--sequences", "00", "--labels", small_labels, "--widths", 5,
-                 "--repetitions", 1, "--frames", 5, "--pose", "refined", "--jobs", 1, "--output", tmp_path / "out") == 0
-    assert "refined estimator" in (tmp_path / "out" / "findings.md").read_text()
+                 "--repetitions", 1, "--frames", 5, "--pose", "refined", "--margin", 30, "--jobs", 1, "--output",
+                 tmp_path / "out") == 0
+    words = (tmp_path / "out" / "findings.md").read_text()
+    assert "refined estimator" in words and "(label maps; margin 30)" in words
     assert set(pd.read_csv(tmp_path / "out" / "runs.csv")["pose"]) == {"refined"}
     assert not (tmp_path / "out" / "keypoints-all.svg").exists()
 
