@@ -156,5 +156,5 @@ weights: setup
 
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache
-	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -exec rm -rf {} +
+	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -not -name timings -exec rm -rf {} +
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -116,6 +116,12 @@ def test_nothing_is_loaded_from_elsewhere_and_no_folder_of_the_machine_is_named(
         assert str(ROOT) not in text and str(run.settings.figures.parent) not in text
 
 
+def test_the_page_in_git_says_nothing_of_the_machine_or_the_day(run):
+    assert {"code", "Python", "results of"} <= page._facts(run.settings).keys()
+    in_git = replace(run.settings, figures=ROOT / "figures")
+    assert not {"code", "Python", "results of"} & page._facts(in_git).keys()
+
+
 def test_the_page_in_git_has_no_link_out_of_its_folder(run):
     tracked = replace(run.settings, figures=ROOT / "figures")  # read, not written
     shown = Reader(page.build(tracked))
@@ -225,7 +231,8 @@ def test_thesis_numbers_stand_beside_those_of_the_run(run):
     (run.settings.build / "model" / "history.csv").write_text(
         "epoch,loss,f1-score,iou_score,val_loss,val_f1-score,val_iou_score\n"
         "1,0.9,0.1,0.1,0.8,0.21,0.2\n2,0.7,0.3,0.2,0.9,0.2,0.1\n")
-    (run.settings.build / "seconds.csv").write_text(
+    (run.settings.figures / "timings").mkdir()
+    (run.settings.figures / "timings" / "seconds.csv").write_text(
         "sequence,variant,dilation_width,seconds\n"
         "00,baseline,,4\n01,baseline,,6\n00,masked,1,4\n01,masked,1,4\n00,masked,2,11\n")
     (run.settings.build / "runs.csv").write_text(

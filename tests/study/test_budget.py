@@ -5,6 +5,7 @@ import time
 import cv2
 import keras
 import numpy as np
+import pandas as pd
 import pytest
 
 from thesis_repro import InputError, cityscapes, masks, odometry, stages
@@ -103,3 +104,12 @@ def test_it_is_measured_once_for_a_model(sequence, model, tmp_path, monkeypatch)
 def test_too_few_frames_are_one_clear_line(sequence, model):
     with pytest.raises(InputError, match="sequence 00: 3 frames; the budget needs 5 or more"):
         budget.measure(sequence.subset(3), model)
+
+
+def test_figures_in_git_keep_the_timings_that_came_with_them(tmp_path):
+    path = tmp_path / "timings" / "seconds.csv"
+    first, second = (pd.DataFrame({"sequence": ["00"], "seconds": [value]}) for value in (1.5, 2.5))
+    assert budget.recorded(first, path, keep=True).equals(first)  # there were none
+    assert budget.recorded(second, path, keep=True).equals(first)
+    assert budget.recorded(second, path, keep=False).equals(second)
+    assert budget.recorded(first, path, keep=True).equals(second)

@@ -116,7 +116,8 @@ CHAPTERS = {
                         "saved), added up over the first frames of every sequence, which alone are timed; dots are "
                         "single sequences. The thesis "
                         "adds up whole sequences. Masks are counted, the network that predicts the label maps is "
-                        "not, as in the thesis; the budget below counts everything."),
+                        "not, as in the thesis; the budget below counts everything. Figures in the repository "
+                        "keep the timings that came with them; a machine's own are in notebook 8."),
     },
     "Appendix": {
         "figure_a_01": ("Model summary", "Every layer of the thesis's network at its full size, 320x320 with 64 "

@@ -108,7 +108,7 @@ def build(settings):
         _artefact(settings, kind, name, title, caption, makers)
         for (kind, name), (title, caption) in captions.ADDED.items()]})
     notebooks = {}
-    if settings.figures != ROOT / "figures":  # that page is in git, where there is no build folder to link to
+    if not settings.figures_in_git:  # in a clone there is no build folder to link to
         notebooks = {path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
                      for path in _executed(settings)}
     words = settings.figures / "findings.md"
@@ -125,6 +125,12 @@ def build(settings):
 
 def _facts(settings):
     sizes = settings.sizes
+    # A page in git is that of its commit, made anywhere on any day.
+    made = {} if settings.figures_in_git else {
+        "results of": _when(settings),
+        "code": _commit(),
+        "Python": f"{platform.python_version()} on {platform.system()} {platform.machine()}, {settings.jobs} processes",
+    }
     frames = "all frames" if sizes.frames is None else f"at most {sizes.frames} frames"
     images = "all images" if sizes.training_images is None else f"at most {sizes.training_images} images"
     network = (f"network {sizes.image_size}x{sizes.image_size} with {sizes.base_filters} filters in the first block, "
@@ -143,9 +149,7 @@ def _facts(settings):
                    f"{len(sizes.widths)} dilation widths, {sizes.repetitions} repetitions",
         "seeds": f"{settings.seed} throughout; repetition 0 keeps the order of the correspondences, repetition n "
                  "shuffles it with seed n",
-        "results of": _when(settings),
-        "code": _commit(),
-        "Python": f"{platform.python_version()} on {platform.system()} {platform.machine()}, {settings.jobs} processes",
+        **made,
         "packages": _packages(),
     }
 
@@ -241,8 +245,8 @@ def _reported(settings, name):
 def _here(settings):
     """This run's numbers of the kind that the thesis reports in words, {name: text}, from the files that there are."""
     found = {}
-    history, runs, seconds = (_numbers(settings.build / name)
-                              for name in ("model/history.csv", "runs.csv", "seconds.csv"))
+    history, runs = (_numbers(settings.build / name) for name in ("model/history.csv", "runs.csv"))
+    seconds = _numbers(settings.figures / "timings" / "seconds.csv")
     if len(history):
         best = history.loc[history["val_loss"].idxmin()]
         scores = (f"{split} loss {best[f'{prefix}loss']:.2f}, F1 {best[f'{prefix}f1-score']:.2f}, "

@@ -171,6 +171,16 @@ def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20
     return measured, overlapped
 
 
+def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
+    """The timings to draw: `measured`, which is written to a file; or with `keep` those that the file has already.
+
+    Figures in git keep the timings that came with them, or every machine and every run would change them.
+    """
+    if not (keep and path.is_file()):
+        write_text(path, measured.to_csv(index=False))
+    return pd.read_csv(path, dtype={"sequence": str})
+
+
 def _masked(width: int) -> str:
     return f"masked, width {width}"
 
