@@ -330,7 +330,7 @@ def study(options):
         print(plan.of_study(planned))
         return
     if options.jobs is not None and not 1 <= options.jobs <= MOST_JOBS:
-        raise InputError(f"--jobs {options.jobs}: must be 1 to {MOST_JOBS}")
+        raise InputError(f"--jobs {options.jobs}: must be 1 or more, and at most {MOST_JOBS}")
     folder = options.output.absolute()
     _apart("--output", folder, options.kitti, *(source.folder for source in planned.sources))
     with longrun.logged(folder, options.words) as run, longrun.claimed(folder):
