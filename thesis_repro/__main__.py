@@ -170,7 +170,6 @@ def odometry(options):
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder
     from thesis_repro.odometry import boresight, metrics
-    from thesis_repro.report import trajectories, video
 
     if options.labels and options.dilation is None:
         raise InputError("--labels: needs --dilation W, the width in pixels by which the boundaries are dilated")
@@ -182,8 +181,12 @@ def odometry(options):
         _refuse_mask_settings(_mask_settings(options))
     settings = replace(odometry.PRESETS[options.pyslam], **chosen)
     if options.video:
+        from thesis_repro.report import video
+
         video.check_name(options.video)
     if options.plot:
+        from thesis_repro.report import trajectories
+
         trajectories.check_name(options.plot)
     sequence = Sequence(options.kitti, options.sequence, options.camera, options.speed)
     _new_files({"--output": options.output, "--tum": options.tum, "--plot": options.plot, "--video": options.video,
@@ -305,9 +308,8 @@ def _text(value, form):
 def study(options):
     """run the odometry with masks of your own beside all keypoints and controls, and leave tables, figures, a page"""
     from thesis_repro import kitti
-    from thesis_repro.report import study
     from thesis_repro.settings import ALL_WIDTHS, MOST_JOBS, cores, scheduler_address
-    from thesis_repro.study import jobs, plan, series
+    from thesis_repro.study import jobs, series
 
     if not options.sources:
         raise InputError("no masks: name a folder of label maps with --labels or of masks with --masks")
@@ -327,12 +329,16 @@ def study(options):
         jobs.CONTROL_WIDTH if options.controls is True else options.controls, tuple(dict.fromkeys(options.pose)),
         options.repetitions, options.frames))
     if options.plan:
+        from thesis_repro.study import plan
+
         print(plan.of_study(planned))
         return
     if options.jobs is not None and not 1 <= options.jobs <= MOST_JOBS:
         raise InputError(f"--jobs {options.jobs}: must be 1 or more, and at most {MOST_JOBS}")
     folder = options.output.absolute()
     _apart("--output", folder, options.kitti, *(source.folder for source in planned.sources))
+    from thesis_repro.report import study  # with all that draws, so not before everything is known to be there
+
     with longrun.logged(folder, options.words) as run, longrun.claimed(folder):
         summary = planned.run(folder, options.jobs or cores(), options.dask)
         counts, page = summary.attrs, study.write(planned, summary, folder)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from sklearn.model_selection import train_test_split
 
 from thesis_repro import InputError
 from thesis_repro.files import listed, progress, read_color, read_gray, read_ids
@@ -164,6 +163,8 @@ def load(some_pairs, size, channels=1, description="reading images"):
 
 def split_train_validation(some_pairs):
     """The appendix's split of the training folder: 80 % and 20 %, random state 0 (A.2.3)."""
+    from sklearn.model_selection import train_test_split  # a second to load, and every command loads this module
+
     if len(some_pairs) < 2:
         raise InputError(f"{len(some_pairs)} training image: at least 2 are needed to split off a validation set")
     return train_test_split(some_pairs, test_size=VALIDATION_FRACTION, random_state=SPLIT_RANDOM_STATE)
