@@ -4,6 +4,7 @@ import shutil
 import cv2
 import numpy as np
 
+from thesis_repro import files
 from thesis_repro.__main__ import main
 from thesis_repro.check import check_cityscapes, check_kitti
 
@@ -37,6 +38,50 @@ def test_every_problem_is_listed_and_the_exit_code_says_so(tiny_kitti, tiny_city
     assert len(problems) == len(patterns)
     for pattern in patterns:
         assert any(re.search(pattern, problem) for problem in problems), pattern
+
+
+def flip_a_byte(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def test_damage_in_the_middle_is_found_by_a_deep_look_alone(tiny_kitti, tiny_cityscapes, monkeypatch):
+    frame, label = tiny_kitti / "sequences/00/image_0/000001.png", tiny_cityscapes / "trainannot/street_1.png"
+    flip_a_byte(frame)
+    cv2.imwrite(str(label), np.full((16, 32), 200, np.uint8))
+    decoded = []
+    original = files._decoded
+    monkeypatch.setattr(files, "_decoded", lambda path, *rest: (decoded.append(path), original(path, *rest))[1])
+    assert check_kitti(tiny_kitti)[1] == check_cityscapes(tiny_cityscapes)[1] == []
+    assert len(decoded) == 2 + 2 * 4  # the first and last frame; the first and last pair of each of two splits
+    facts, problems = check_kitti(tiny_kitti, deep=True)
+    assert len(problems) == 1 and problems[0].startswith(f"{frame}: the image is truncated or corrupt")
+    assert "cannot be run: odometry, predict and masks" in facts
+    facts, problems = check_cityscapes(tiny_cityscapes, deep=True)
+    assert len(problems) == 1 and f"{label}: label id 200" in problems[0] and "cannot be run: " in facts[-1]
+
+
+def test_what_is_missing_is_counted_and_named(tiny_kitti, tiny_cityscapes):
+    images = tiny_kitti / "sequences/00/image_0"
+    for index in range(4, 40):
+        shutil.copy(images / "000000.png", images / f"{index:06d}.png")
+    (tiny_kitti / "sequences/00/times.txt").write_text("".join(f"{index}\n" for index in range(40)))
+    (tiny_kitti / "poses/00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 40)
+    assert check_kitti(tiny_kitti)[1] == []
+    for index in (0, 3, 4, 5, 9, 38, 39):
+        (images / f"{index:06d}.png").unlink()
+    facts, problems = check_kitti(tiny_kitti)
+    assert problems == [f"{images}: 000000.png, 000003.png to 000005.png, 000009.png, 000038.png to 000039.png are "
+                        "missing (7 in all), copy them again"]
+    assert facts[0].startswith("sequence 00: 33 of 40 frames of 64x48")
+    for index in range(4):
+        (tiny_cityscapes / "trainannot" / f"street_{index}.png").unlink()
+    for index in range(12):
+        (tiny_cityscapes / "val" / f"lonely_{index}.png").write_bytes(b"")
+    counts = [len(check_cityscapes(tiny_cityscapes, deep)[1]) for deep in (False, True)]
+    # four images without label maps and so no pair; of twelve such ones ten are named, and the count of the others
+    assert counts == [4 + 1 + 11, 4 + 1 + 12]
 
 
 def test_street_scenes_need_no_validation_split(tiny_cityscapes, capsys):
