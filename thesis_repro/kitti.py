@@ -96,7 +96,8 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
 class Sequence:
     """One odometry sequence in the official layout: sequences/NN/image_0, calib.txt, times.txt and poses/NN.txt.
 
-    Frames are PNG or JPEG; without gray ones in image_0 the colour ones of image_2 are read, as gray. (The true poses
+    Frames are PNG or JPEG, numbered without gaps; without gray ones in image_0 the colour ones of image_2 are read, as
+    gray. Times increase, and poses are rotations of right-handed axes with positions in metres. (The true poses
     are those of image_0's camera, 6 cm beside the other's.) Where there is no times.txt, `times` has KITTI's ten
     frames a second. Where there is no file of poses, `has_truth` is False.
     Everything but the frames is read and checked when the object is made; frames are read when asked for.
@@ -356,7 +357,8 @@ def read_times(path: str | Path) -> np.ndarray:
     times = _read_numbers(path, 1)[:, 0]
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
-        raise InputError(f"{path}, line {late[0] + 2}: time does not increase; the file is damaged, so copy it again")
+        raise InputError(f"{path}, line {late[0] + 2}: time does not increase; copy the file again, or take it away: "
+                         f"then frames count as {FRAME_TIME:g} s apart")
     return times
 
 
