@@ -65,7 +65,7 @@ setup: .venv/ready $(if $(filter-out 0,$(GPU)),.venv/ready-gpu)
 	  echo "$(PYTHON) has no venv module: install it (Debian and Ubuntu: apt-get install python3-venv)" >&2; exit 1; }
 	@echo "installing the pinned packages into .venv (2.4 GB, some minutes)"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -r environment.txt 2> >(grep -v '^WARNING' >&2)
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile -r environment.txt 2> >(grep -v '^WARNING' >&2)
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . 2> >(grep -v '^WARNING' >&2)
 	@touch $@
 

@@ -170,6 +170,7 @@ def odometry(options):
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder
     from thesis_repro.odometry import boresight, metrics
+    from thesis_repro.report import terminal
 
     if options.labels and options.dilation is None:
         raise InputError("--labels: needs --dilation W, the width in pixels by which the boundaries are dilated")
@@ -201,14 +202,7 @@ def odometry(options):
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.boresight:
         result = boresight.apply(result, options.boresight)
-    seconds = result.frames.filter(like="_seconds").sum(axis=1)
-    summary = {
-        "sequence": sequence.name, "frames": len(sequence),
-        **_errors(result.poses, sequence, settings.alignment),
-        "mean_keypoints": float(result.frames["detected"].mean()),
-        "ms_per_frame": 1000 * float(seconds.mean()),
-        "flagged": {flag: int(count) for flag, count in result.flagged.items()},
-    }
+    record = terminal.run(result, sequence, settings.alignment)
     if options.output:
         write_kitti_poses(options.output, result.poses)
     if options.tum:
@@ -221,31 +215,7 @@ def odometry(options):
         trajectories.write(options.plot, trajectories.figure(paths, true, f"sequence {sequence.name}"))
     if options.frames_csv:
         write_text(options.frames_csv, result.frames.to_csv(index=False))
-    if options.json:
-        print(json.dumps(summary))
-    else:
-        steps = "1 m a frame" if options.speed is None else f"{options.speed:g} m/s"
-        errors = (f"RMSE            {summary['rmse_m']:.6f} m\nMAE             {summary['mae_m']:.6f} m\n"
-                  f"ATE, aligned    {_text(summary['ate_se3_m'], '.6f')} m\nover {metrics.RELATIVE_LENGTH:g} m       "
-                  f"{_text(summary['relative_translation_percent'], '.3f')} %, "
-                  f"{_text(summary['relative_rotation_deg_per_m'], '.5f')} degrees a metre"
-                  if sequence.has_truth else
-                  f"no truth to compare with ({sequence.poses_path} does not exist); steps of {steps} are assumed")
-        print(f"sequence {sequence.name}, {len(sequence)} frames\n{errors}\n"
-              f"mean keypoints  {summary['mean_keypoints']:.1f}\ntime a frame    {summary['ms_per_frame']:.1f} ms")
-        for flag, count in summary["flagged"].items():
-            print(f"{flag:16}{count} frame{'s' * (count > 1)}")
-
-
-def _errors(poses, sequence, alignment):
-    """The errors of a run by name, all None where there are no true poses; None too where a path is too short."""
-    from thesis_repro.odometry import metrics
-
-    names = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_m")
-    if not sequence.has_truth:
-        return dict.fromkeys(names)
-    values = metrics.errors(poses, sequence.poses, alignment).values()
-    return {name: _number(value) for name, value in zip(names, values, strict=True)}
+    print(json.dumps(record) if options.json else terminal.run_text(record, sequence, options.speed))
 
 
 def boresight(options):
@@ -253,6 +223,7 @@ def boresight(options):
     from thesis_repro import odometry
     from thesis_repro.kitti import Sequence
     from thesis_repro.odometry import boresight
+    from thesis_repro.report import terminal
 
     paths = {}
     for name in dict.fromkeys(options.sequences):
@@ -260,49 +231,7 @@ def boresight(options):
         estimated = odometry.run(sequence, replace(odometry.THESIS, pose="refined"), description=f"sequence {name}")
         paths[name] = estimated.poses, sequence.poses
     found, table = boresight.estimate(list(paths.values())), boresight.explained(paths)
-    if options.json:
-        units = dict.fromkeys(("steps", "others"), "") | dict.fromkeys(
-            ("rmse", "rmse_own", "rmse_others", "rotations", "directions", "ate"), "_m")
-        sequences = {row.pop("sequence"): {f"{key}{units.get(key, '_deg')}": _number(value)
-                                           for key, value in row.items()} for row in table.to_dict("records")}
-        print(json.dumps(_angles(found) | {"steps": found.steps, "sequences": sequences}))
-        return
-    for index, angle in enumerate(boresight.ANGLES):
-        print(f"{angle:6}{_degrees(found.angles[index], found.low[index], found.high[index])}")
-    print(f"from {found.steps} steps of sequences {', '.join(paths)}\n")
-    print("RMSE in metres: as it is, with the sequence's own angles, with those of the others of its recording day;\n"
-          "and what is left where rotations alone, or directions of motion alone, are the odometry's. ATE: aligned.\n"
-          "Degrees: how much the sideways direction of motion sways on straight steps, to the camera and in the\n"
-          f"truth, and by how much the rotations of both part over the first {boresight.START} steps.")
-    for row in table.to_dict("records"):
-        angles = (f"{angle} {_degrees(row[angle], row[f'{angle}_low'], row[f'{angle}_high'])}"
-                  for angle in boresight.ANGLES)
-        print(f"\nsequence {row['sequence']}: {', '.join(angles)}")
-        others = f", of {row['others']} {row['rmse_others']:.3f}" if row["others"] else ""
-        print(f"  RMSE {row['rmse']:.3f}, own angles {row['rmse_own']:.3f}{others}; rotations alone "
-              f"{row['rotations']:.3f}, directions alone {row['directions']:.3f}; ATE "
-              f"{_text(_number(row['ate']), '.3f')}\n  sway: camera {_text(_number(row['camera_sway']), '.2f')}, truth "
-              f"{_text(_number(row['truth_sway']), '.2f')}; first steps {row['start']:.2f}")
-
-
-def _angles(found):
-    from thesis_repro.odometry.boresight import ANGLES
-
-    values = {f"{name}_deg": _number(float(angle)) for name, angle in zip(ANGLES, found.angles, strict=True)}
-    return values | {f"{name}_interval_deg": None if low != low else [float(low), float(high)]
-                     for name, low, high in zip(ANGLES, found.low, found.high, strict=True)}
-
-
-def _degrees(angle, low, high):
-    return "not determined" if angle != angle else f"{angle:+.3f} ({low:+.3f} to {high:+.3f})"
-
-
-def _number(value):
-    return None if value != value else value  # JSON knows no NaN
-
-
-def _text(value, form):
-    return "none (too short or straight)" if value is None else format(value, form)
+    print(json.dumps(terminal.angles(found, table)) if options.json else terminal.angles_text(found, table))
 
 
 def study(options):

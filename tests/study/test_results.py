@@ -87,7 +87,7 @@ def test_what_no_constant_angle_moves_stands_beside_rmse():
         text = markdown(written(named))
         assert "nan" not in text and "50" in text
     text = findings.words(summary, "made up")
-    assert "; aligned ATE 1.50 (1.50 to 1.50) times, translation over 20 m 0.50 (0.50 to 0.50) times." in text
+    assert "estimator: aligned ATE 1.50 (1.50 to 1.50) times, translation over 20 m 0.50 (0.50 to 0.50) times." in text
     assert "rotation over" not in text
 
 

@@ -38,7 +38,7 @@ def study_words(summary, data):
     for source in results.sources(summary):
         own = results.of_source(summary, source)
         parts += [f"### {source}", " ".join(said for pose in POSES if (said := _masks(own, pose))), _controls(own),
-                  _choice(own)]
+                  _beside(own), _choice(own)]
     parts += [_against_each_other(summary, pose) for pose in POSES]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -52,7 +52,8 @@ def words(summary, data, label_maps=None, quality=None):
              *(_masks(summary, pose, quality) for pose in POSES)]
     if "embedded" in data.split(";")[0]:
         short.append("These are rendered streets: nothing here is evidence about KITTI.")
-    parts = [" ".join(part for part in short if part), _controls(summary), _choice(summary)]
+    parts = [" ".join(part for part in short if part), _controls(summary), _beside(summary),
+             _choice(summary)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -95,7 +96,7 @@ def _masks(summary, pose, quality=None):
     masks = "masks" if width is None else f"masks of width {width}"
     of_quality = f" from label maps of {quality}" if quality else ""
     text = (f"Under the {POSES[pose].replace(' estimator', '')} estimator {masks} make RMSE {_times(change)} that of "
-            f"all keypoints ({_lower(change)}){_beside(summary, pose)}.")
+            f"all keypoints ({_lower(change)}).")
     count = int(change.notna().sum())
     if count < ENOUGH:
         return (f"{text} {_number(count, 'sequence')} cannot tell whether masks help, nor whether the segmentation "
@@ -114,12 +115,16 @@ def _masks(summary, pose, quality=None):
     return f"{text}, and the segmentation is not shown to matter: no control without it is shown to do worse.**"
 
 
-def _beside(summary, pose):
+def _beside(summary):
     """What errors say that no constant angle between camera and truth moves, the same masks over all keypoints."""
-    masked, every = results.of_control(summary, "masked", pose), results.of_variant(summary, "baseline", pose)
-    found = {name: answer.ratios(masked, every, metric) for metric, name in results.BESIDE.items()}
-    said = [f"{name} {_times(ratios)}" for name, ratios in found.items() if len(ratios)]
-    return f"; {', '.join(said)}" if said else ""
+    said = []
+    for pose, name in POSES.items():
+        masked, every = results.of_control(summary, "masked", pose), results.of_variant(summary, "baseline", pose)
+        found = {kind: answer.ratios(masked, every, metric) for metric, kind in results.BESIDE.items()}
+        of_pose = [f"{kind} {_times(ratios)}" for kind, ratios in found.items() if len(ratios)]
+        if of_pose:
+            said.append(f"{name}: {', '.join(of_pose)}")
+    return f"**Masks by other errors, times all keypoints.** {'; '.join(said)}." if said else ""
 
 
 def _controls(summary):

@@ -120,7 +120,7 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
           replace=False):
     """Write the embedded world to OUT/kitti and OUT/cityscapes; goes on where a stopped run left off.
 
-    sequences: names among 00 to 10; frames: of each, None for as many as show its whole drive, from 46 to 156; scale:
+    sequences: names among 00 to 10; frames: of each, None for as many as show its whole drive, from 41 to 132; scale:
     of KITTI's image size (and of 1024x512 for the training images); jobs: processes, -1 for one a core. A complete
     world of the same parameters is left as it is.
     replace: delete an embedded world of other parameters first; nothing else is ever deleted.
