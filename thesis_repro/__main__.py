@@ -522,6 +522,7 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     options.words = shlex.join(["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)])  # for a log
     try:
+        longrun.need_addresses(4 if options.function is predict else 1)
         return options.function(options) or 0
     except Exception as error:
         return longrun.told(error)

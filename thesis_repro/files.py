@@ -69,6 +69,7 @@ def _decoded(path, data, flag):
     except cv2.error:
         image = None
     if image is None:
+        np.empty((*_size(data), 8), np.uint8)  # raises MemoryError where that is the reason, of which OpenCV is silent
         raise InputError(f"{path}: not an image that OpenCV can read; copy or download it again")
     return image
 
@@ -217,10 +218,12 @@ def atomic(path):
     try:
         yield temporary
         os.replace(temporary, path)
-    except OSError as error:  # a full disk has no name, and the user does not know the temporary one
-        if error.filename in (None, str(temporary), temporary):
-            error.filename, error.filename2 = str(path), None
-        raise
+    except Exception as error:
+        number, name = longrun.number_of(error), getattr(error, "filename", None)
+        if number is None or name not in (None, str(temporary), temporary):
+            raise
+        # libraries do not name the file, or by its temporary name
+        raise OSError(number, os.strerror(number), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

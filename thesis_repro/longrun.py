@@ -8,6 +8,7 @@ import fcntl
 import logging
 import os
 import re
+import resource
 import sys
 import time
 from contextlib import contextmanager
@@ -52,14 +53,12 @@ def explained(error):
     if isinstance(error, InputError):
         return str(error)
     while error is not None:
-        number, text = getattr(error, "errno", None), str(error)
+        number, text = number_of(error), str(error)
         if (isinstance(error, MemoryError) or number == errno.ENOMEM or type(error).__name__ == "ResourceExhaustedError"
                 or any(words in text for words in SAYS_NO_MEMORY)):
             return NO_MEMORY
         if type(error).__name__ == "TerminatedWorkerError":  # of joblib
             return WORKER_KILLED
-        if number is None:  # HDF5 has the system's words in its own
-            number = next((one for one in (errno.ENOSPC, errno.EFBIG) if os.strerror(one) in text), None)
         name = getattr(error, "filename", None)
         if number in REMEDIES:
             return f"{name or 'a file'}: {os.strerror(number)}; {REMEDIES[number]}"
@@ -67,6 +66,25 @@ def explained(error):
             return f"{name}: {os.strerror(number)}; check the path"
         error = error.__cause__ or error.__context__
     return None
+
+
+def number_of(error):
+    """The system's number of an error, or None: HDF5 and others have its words alone."""
+    if getattr(error, "errno", None) is not None:
+        return error.errno
+    return next((number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error)),
+                None)
+
+
+def need_addresses(gigabytes):
+    """Raise InputError where `ulimit -v` leaves this process less than the libraries take before they do anything.
+
+    Some of them end the process by a signal then, without a word.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < gigabytes * 2**30:
+        raise InputError(f"ulimit -v {limit // 1024}: too little memory, for the libraries alone take more; allow "
+                         f"{gigabytes * 2**20} or more, or unlimited")
 
 
 def remedy(text):
@@ -158,6 +176,12 @@ class _File(logging.FileHandler):
         self.ours = self.ours or any(self.folder.glob(RECORD)) or any(self.folder.glob(f"*/{RECORD}"))
         while self.ours and self.waiting:
             super().emit(self.waiting.pop(0))
+
+    def close(self):
+        try:
+            super().close()
+        except OSError:
+            pass
 
     def handleError(self, record):
         pass  # a full disk is told of by what needs it more than a log

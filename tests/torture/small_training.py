@@ -5,10 +5,13 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "segmentation"))
 
-import test_training
-
 from thesis_repro import longrun, stages
-from thesis_repro.segmentation import training
+from thesis_repro.segmentation import quietly
+
+with quietly():
+    from thesis_repro.segmentation import training  # isort: split
+
+    import test_training  # after what sets the libraries' variables
 
 if __name__ == "__main__":
     try:

@@ -107,7 +107,7 @@ def test_a_small_embedded_world(ledger, tmp_path):
 
 
 def test_training(ledger, tmp_path):
-    torture(ledger, "training", [sys.executable, HERE / "small_training.py", "model", 8], tmp_path, "model", 7, 2)
+    torture(ledger, "training", [sys.executable, HERE / "small_training.py", "model", 6], tmp_path, "model", 5, 2)
 
 
 def test_label_maps(ledger, tmp_path):
@@ -119,7 +119,7 @@ def test_label_maps(ledger, tmp_path):
     for index, image in enumerate(np.random.default_rng(0).integers(0, 256, (400, 64, 96), np.uint8)):
         cv2.imwrite(str(tmp_path / "images" / f"{index:06d}.png"), image)
     torture(ledger, "predict", [*COMMAND, "predict", "--images", "images", "--model", "model.keras", "--output",
-                                "labels"], tmp_path, "labels", 7, 3)
+                                "labels"], tmp_path, "labels", 5, 3)
 
 
 def study(small_world, small_labels):
@@ -160,7 +160,7 @@ def test_the_figures_of_a_notebook(ledger, tmp_path):
                "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
                f"--Execution.log_file={done}/one.log", f"--output-dir={done}", "--output=one.ipynb", "one.ipynb"]
     command = ["bash", "-c", f"{shlex.join(execute)} && {shlex.join(PAGE)}"]
-    torture(ledger, "a notebook that draws", command, tmp_path, ".", 5, 6, prepare, **changes)
+    torture(ledger, "a notebook that draws", command, tmp_path, ".", 4, 6, prepare, **changes)
 
 
 PAGE = [sys.executable, "-m", "thesis_repro.report.page"]

@@ -173,7 +173,7 @@ def _content(path):
         return table[[name for name in table if not name.endswith("_seconds")]].to_csv()
     if path.suffix == ".keras":
         with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as file:
-            return {name: file.read(name) for name in file.namelist() if name != "metadata.json"}
+            return {name: file.read(name) for name in file.namelist() if name.endswith(".h5")}
     if path.suffix == ".ipynb":
         return [cell.get("outputs") for cell in json.loads(path.read_text())["cells"]]
     if path.suffix == ".html":  # the executed notebooks that it was made from hold times

@@ -12,6 +12,7 @@ import tempfile
 import time
 import traceback
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from threading import Thread
 
@@ -43,8 +44,8 @@ class Execution(ExecutePreprocessor):
 
     def preprocess(self, nb, resources=None, km=None):
         name, started = resources["metadata"]["name"], time.monotonic()
-        sys.excepthook = _in_one_line  # where the executed notebook itself cannot be written
         folder = Path(self.log_file).parent  # of all executed notebooks of a run
+        sys.excepthook = partial(_in_one_line, folder)  # where the executed notebook itself cannot be written
         with longrun.claimed(folder), longrun.logged(folder, f"make figures, {name}", ours=True):
             longrun.say(name)
             done = self._executed(name, nb, resources, km)
@@ -143,7 +144,9 @@ def _explained(error):
     return COLORS.sub("", why).strip().partition("\n")[0], COLORS.sub("", report)
 
 
-def _in_one_line(kind, error, trace):
+def _in_one_line(folder, kind, error, trace):
+    if isinstance(error, OSError) and error.filename is None:
+        error.filename = str(folder)
     if longrun.explained(error) is None:
         sys.__excepthook__(kind, error, trace)
     else:

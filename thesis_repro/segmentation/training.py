@@ -4,6 +4,7 @@ import json
 import os
 import zlib
 from contextlib import ExitStack
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -173,6 +174,7 @@ class GoingOn(keras.callbacks.Callback):
 
     def on_train_begin(self, logs=None):
         self._claim.enter_context(longrun.claimed(self.folder))
+        self.model.save = partial(_save_whole, self.model)  # Keras itself writes in place
         for other, counters in zip(self.others, self._counters):
             vars(other).update(counters)
         total = self.params["epochs"] * len(self.batches)
@@ -197,6 +199,12 @@ class GoingOn(keras.callbacks.Callback):
     def on_train_end(self, logs=None):
         self._bar.close()
         self._claim.close()
+        del self.model.save
+
+
+def _save_whole(model, path, **options):
+    with files.atomic(path) as temporary:
+        type(model).save(model, temporary, **options)
 
 
 def load_model(path):

@@ -45,7 +45,7 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
         if not client.nthreads():
             raise InputError(f"Dask scheduler {scheduler}: has no workers; start some with "
                              f"'dask worker {scheduler} --nthreads 1'")
-        yield _Workers(client)
+        yield _Workers(client, scheduler)
 
 
 class _Processes:
@@ -66,8 +66,8 @@ def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:
 
 
 class _Workers:
-    def __init__(self, client: Any) -> None:
-        self.client = client
+    def __init__(self, client: Any, scheduler: str) -> None:
+        self.client, self.scheduler = client, scheduler
         self.size = sum(client.nthreads().values())
 
     def run(self, function: Callable, calls: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
@@ -78,6 +78,9 @@ class _Workers:
         for future in as_completed(list(index), loop=self.client.loop):
             if future.status == "finished":
                 yield index[future], future.result()
+            elif self.client.status != "running":
+                raise InputError(f"Dask scheduler {self.scheduler}: answers no more; what was finished is kept, so "
+                                 "start it again, and then the same command")
             else:
                 error = future.exception() if future.status == "error" else None
                 yield index[future], str(error or f"the cluster says: {future.status}").splitlines()[0]
