@@ -1,0 +1,154 @@
+"""What long runs rest on: folders that one process holds, logs, and one line for what the machine lacks."""
+
+import errno
+import logging
+import os
+import signal
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+from thesis_repro import InputError, files, longrun, stages
+
+HOLD = "import sys, time; from thesis_repro import longrun\n" \
+       "with longrun.claimed(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(100)"
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds the folder `out`."""
+    process = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path / "out"], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_a_folder_is_held_by_one_process_until_it_ends_in_whatever_way(tmp_path, holder):
+    for attempt in (lambda: longrun.claimed(tmp_path / "out").__enter__(), lambda: stages.stage(tmp_path / "out")):
+        with pytest.raises(InputError, match="out: another run is at work there; wait until it has ended"):
+            attempt()
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    with longrun.claimed(tmp_path / "out"), longrun.claimed(tmp_path / "out"):  # by one process as often as it likes
+        stages.stage(tmp_path / "out", size=3)
+    assert not longrun._held
+
+
+def test_a_claim_of_which_nothing_comes_leaves_nothing(tmp_path):
+    with pytest.raises(ZeroDivisionError), longrun.claimed(tmp_path / "a" / "b"):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file: is a file"), longrun.claimed(tmp_path / "file"):
+        pass
+
+
+def test_what_a_killed_run_left_half_written_is_deleted_and_nothing_else(tmp_path):
+    folder = stages.stage(tmp_path / "out", size=3)
+    (folder / "in").mkdir()
+    half, own = longrun.temporary(folder / "in" / "a.png"), folder / "in" / ".hidden"
+    half.touch()
+    own.touch()
+    stages.stage(folder, size=3)
+    assert not half.exists() and own.exists()
+    # a run that was killed while it wrote its very record
+    other = tmp_path / "other"
+    other.mkdir()
+    longrun.temporary(other / stages.RECORD).touch()
+    assert [path.name for path in stages.stage(other, size=3).iterdir()] == [stages.RECORD]
+
+
+def test_results_are_deleted_with_their_records_last_and_the_log_is_kept(tmp_path, monkeypatch):
+    folder, gone = stages.stage(tmp_path / "out", size=3), []
+    stages.stage(folder / "in", size=3)
+    for path in (folder / "result", folder / "in" / "result", folder / longrun.LOG):
+        path.touch()
+    unlink = type(folder).unlink
+
+    def noted(path, **options):
+        gone.append(path.name)
+        unlink(path, **options)
+
+    monkeypatch.setattr(type(folder), "unlink", noted)
+    stages.stage(folder, size=4)
+    gone = [name for name in gone if not name.startswith(".")]
+    assert gone.count("result") == gone.count(stages.RECORD) == 2 and gone[-1] == stages.RECORD
+    assert gone.index("result") < gone.index(stages.RECORD)
+    assert {path.name for path in folder.iterdir()} == {stages.RECORD, longrun.LOG}
+
+
+def chained(inner, outer):
+    try:
+        try:
+            raise inner
+        except Exception:
+            raise outer  # noqa: B904
+    except Exception as error:
+        return error
+
+
+@pytest.mark.parametrize("error, says", [
+    (OSError(errno.ENOSPC, "x", "a.png"), "a.png: No space left on device; make room"),
+    (OSError(errno.EROFS, "x", "a.png"), "a.png: Read-only file system; name a folder"),
+    (PermissionError(errno.EACCES, "x", "a.png"), "a.png: Permission denied; check who may"),
+    (OSError("Can't write data (error message = 'No space left on device')"), "No space left on device; make room"),
+    (chained(OSError(errno.ENOSPC, "x", "a.npz"), ValueError("Can't close the ZIP file")), "a.npz: No space left"),
+    (MemoryError(), "memory ran out; free some"),
+    (RuntimeError("can't start new thread"), "memory ran out; free some"),
+    (InputError("a.png: truncated"), "a.png: truncated"),
+])
+def test_what_the_machine_lacks_is_one_line(error, says, capsys):
+    assert longrun.told(error) == 1
+    line = capsys.readouterr().err
+    assert line.startswith("error: ") and says in line and line.count("\n") == 1
+
+
+def test_errors_that_nobody_expects_are_raised():
+    with pytest.raises(ZeroDivisionError):
+        longrun.told(ZeroDivisionError("1/0"))
+
+
+def test_a_full_disk_names_the_file_and_not_its_temporary_name(tmp_path):
+    for filename in (None, "temporary"):
+        with pytest.raises(OSError, match="No space left on device") as caught:
+            with files.atomic(tmp_path / "a.txt") as temporary:
+                raise OSError(errno.ENOSPC, "x", *([str(temporary)] if filename else []))
+        assert caught.value.filename == str(tmp_path / "a.txt")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_log_has_what_was_said_every_warning_and_the_error(tmp_path, capsys):
+    with pytest.raises(InputError), longrun.logged(tmp_path / "out", "thesis-repro study") as run:
+        stages.stage(tmp_path / "out", size=3)
+        warnings.warn("odd", stacklevel=1)
+        longrun.say("sequence 00 failed", warning=True)
+        run.end("3 runs")
+        raise InputError("bad")
+    told = capsys.readouterr().out
+    assert told.startswith("sequence 00 failed\n3 runs\n0 s; 2 warnings; log: ")
+    lines = (tmp_path / "out" / longrun.LOG).read_text().splitlines()
+    assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
+    assert any("WARNING" in line and "odd" in line for line in lines)
+    assert not [one for one in logging.getLogger("thesis_repro").handlers if isinstance(one, longrun._File)]
+
+
+def test_a_run_that_is_refused_leaves_no_log(tmp_path):
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(InputError), longrun.logged(tmp_path, "thesis-repro study"):
+        stages.stage(tmp_path, size=3)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("seconds, text", [(0.4, "0 s"), (75, "1 min 15 s"), (11_530, "3 h 12 min")])
+def test_times_in_words(seconds, text):
+    assert longrun.duration(seconds) == text
+
+
+def test_temporary_names_are_those_that_are_swept(tmp_path):
+    for name in ("a.png", "made-from.json", "no-suffix", "two.dots.csv"):
+        assert longrun.TEMPORARY.fullmatch(longrun.temporary(tmp_path / name).name)
+    for name in ("a.123.png", ".hidden", ".hidden.png", f"{os.getpid()}"):
+        assert not longrun.TEMPORARY.fullmatch(name)
