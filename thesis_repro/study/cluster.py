@@ -33,7 +33,8 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     from dask.distributed import Client  # takes a second
 
     # what the client would say about connections and workers that come and go
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "distributed.client"):  # Dask gives each a level of its own
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, ImportError) as error:
