@@ -19,7 +19,7 @@ import pytest
 from thesis_repro import longrun
 
 ROOT = Path(__file__).resolve().parents[2]
-TIMEOUT = 120  # seconds; a command that takes longer hangs
+TIMEOUT = 300  # seconds; a command that takes longer hangs
 KINDS, OUTCOMES = ("kills", "faults", "bad inputs"), ("clear", "unclear", "lost")
 # what tests/conftest.py sets for the tests' own process and a user does not have
 NOT_THE_USERS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
