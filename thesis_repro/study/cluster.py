@@ -46,7 +46,7 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
         if not client.nthreads():
             raise InputError(f"Dask scheduler {scheduler}: has no workers; start some with "
                              f"'dask worker {scheduler} --nthreads 1'")
-        yield _Workers(client, scheduler)
+        yield _Workers(client, str(scheduler))
 
 
 class _Processes:
