@@ -223,7 +223,7 @@ def load_model(path):
         raise InputError(f"{path}: not a model that Keras can read, or a truncated one ({reason}); "
                          "copy it again or train anew") from None
     check_shape(model, path)
-    if not all(np.isfinite(weights).all() for weights in model.get_weights()):
+    if not all(np.isfinite(variable.numpy()).all() for variable in model.variables):
         raise InputError(f"{path}: holds weights that are not finite, of a training that failed; train anew")
     return model
 
