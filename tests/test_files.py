@@ -1,11 +1,13 @@
 import os
+import struct
+import zlib
 
 import cv2
 import numpy as np
 import pytest
 
 from thesis_repro import InputError
-from thesis_repro.files import atomic, progress, read_gray, write_png
+from thesis_repro.files import atomic, glance, progress, read_gray, read_ids, write_png
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
 
@@ -29,6 +31,50 @@ def test_damaged_image_is_named(tmp_path, damage, says):
     with pytest.raises(InputError, match=f"a.png: .*{says}") as error:
         read_gray(path)
     assert "\n" not in str(error.value)
+
+
+def png(rows, width, height, bits, colour, interlaced=0, palette=b""):
+    """A PNG file of any kind from its rows of bytes."""
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, interlaced)
+    chunks = [(b"IHDR", head), *([(b"PLTE", palette)] if palette else []),
+              (b"IDAT", zlib.compress(b"".join(b"\0" + bytes(row) for row in rows))), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*one) for one in chunks)
+
+
+def interlaced(image):
+    """Its rows in the seven passes of Adam7."""
+    passes = ((0, 8, 0, 8), (0, 8, 4, 8), (4, 8, 0, 4), (0, 4, 2, 4), (2, 4, 0, 2), (0, 2, 1, 2), (1, 2, 0, 1))
+    return [row.tobytes() for top, down, left, across in passes for row in image[top::down, left::across] if row.size]
+
+
+GRAYS = bytes(value for value in range(256) for _ in range(3))
+
+
+@pytest.mark.parametrize("data, ids", [
+    (png(interlaced(IMAGE), 60, 40, 8, 0, interlaced=1), True),
+    (png(IMAGE, 60, 40, 8, 3, palette=GRAYS), False),  # of its colours; numbers are not those of a palette
+    (png(np.repeat(IMAGE, 3, axis=1), 60, 40, 8, 2), True),  # three equal channels
+    (png(np.dstack([IMAGE] * 3 + [np.full_like(IMAGE, 255)]).reshape(40, 240), 60, 40, 8, 6), True),
+    (png(np.dstack([IMAGE, np.full_like(IMAGE, 9)]).reshape(40, 120), 60, 40, 8, 4), True),
+], ids=["interlaced", "palette", "colours", "colours and transparency", "transparency"])
+def test_harmless_kinds_of_png_have_the_right_pixels(tmp_path, data, ids):
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    assert np.array_equal(read_gray(path), IMAGE) and glance(path)[0] == (40, 60)
+    if ids:
+        assert np.array_equal(read_ids(path), IMAGE)
+    else:
+        with pytest.raises(InputError, match="palette"):
+            read_ids(path)
+
+
+def test_one_bit_is_black_and_white(tmp_path):
+    path = tmp_path / "mask.png"
+    path.write_bytes(png([[0b10100000], [0b01100000]], 3, 2, 1, 0))
+    assert np.array_equal(read_gray(path), [[255, 0, 255], [0, 255, 255]])
 
 
 def test_missing_image_is_named(tmp_path):
