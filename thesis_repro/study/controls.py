@@ -23,7 +23,7 @@ CLOSE = 0.002  # of the frame: a difference of coverage that is none
 SAMPLE = 12  # frames on which a distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
 SEED = 0  # of the random lines
-# All corrections together, fixed before any run: a label map of 320 columns places a boundary no better than within 2
+# All corrections together, chosen by no error: a label map of 320 columns places a boundary no better than within 2
 # pixels of the frame, and within 10 of its rim the window of 21 in which Lucas and Kanade track is cut off.
 CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)
 LINE_WIDTH = 10  # pixels, of lines and edges beside masks that come ready made and have no width
