@@ -61,7 +61,7 @@ def test_a_failure_is_one_line_a_report_and_no_notebook(start, tmp_path):
                     "raise InputError('00.txt: no such file; check KITTI\\nmore of it')")
     _, stderr = process.communicate()
     assert process.returncode == 1 and stderr.splitlines() == [
-        "one failed: InputError: 00.txt: no such file; check KITTI",
+        "one failed: InputError: 00.txt: no such file; check KITTI\\nmore of it",
         "the whole report: out/one.log; the same command goes on from here"]
     log = (tmp_path / "out" / "one.log").read_text()
     assert "ERROR   one failed: InputError: 00.txt: no such file" in (tmp_path / "out" / "log.txt").read_text()

@@ -52,8 +52,7 @@ def words(summary, data, label_maps=None, quality=None):
              *(_masks(summary, pose, quality) for pose in POSES)]
     if "embedded" in data.split(";")[0]:
         short.append("These are rendered streets: nothing here is evidence about KITTI.")
-    parts = [" ".join(part for part in short if part), _controls(summary), _beside(summary),
-             _choice(summary)]
+    parts = ["\n".join(f"- {part}" for part in short if part), _controls(summary), _beside(summary), _choice(summary)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
