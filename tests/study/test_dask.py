@@ -138,10 +138,11 @@ def test_a_scheduler_without_workers_says_so(scheduler):
             pass
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"])
-def test_a_scheduler_that_does_not_answer_is_one_clear_line(address, monkeypatch):
+@pytest.mark.parametrize(("address", "said"), [("tcp://127.0.0.1:9", "none answers there"),
+                                               ("nonsense://127.0.0.1:9", "is no address")])
+def test_a_scheduler_that_does_not_answer_is_one_clear_line(address, said, monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 1)
-    with pytest.raises(InputError, match=f"Dask scheduler {address}: none answers there") as error:
+    with pytest.raises(InputError, match=f"Dask scheduler {address}: {said}") as error:
         with cluster.open_pool(1, address):
             pass
     assert "\n" not in str(error.value)

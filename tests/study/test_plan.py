@@ -26,14 +26,14 @@ CALIBRATION = plan.Calibration([EXCERPT], timing=0.5, networks=dict.fromkeys(MOD
 def test_the_complete_benchmark_is_added_up(tmp_path):
     work = plan.Thesis(tmp_path, (), repetitions=2)
     made = plan.make(work, kitti.FRAME_COUNTS, CALIBRATION, (1, 4, 64), training_images=2975)
-    # 34 thesis runs without the 2 reduced, refined baseline and masks, 5 mask controls under both estimators
-    assert made.jobs == dict(zip(SERIES, (11 * (32 + 4 + 20), 11 * (2 + 4 + 4))))
+    # 34 thesis runs without the 2 reduced, refined baseline and masks, 6 mask controls under both estimators
+    assert made.jobs == dict(zip(SERIES, (11 * (32 + 4 + 24), 11 * (2 + 4 + 4))))
     assert made.label_hours == dict.fromkeys(MODELS, pytest.approx(23201 / 3600))
     # one pass a sequence: what all share, and a hundredth of a second a job
-    assert made.odometry_hours == pytest.approx(dict(zip(SERIES, (23201 * (0.05 + 0.56) / 3600,
+    assert made.odometry_hours == pytest.approx(dict(zip(SERIES, (23201 * (0.05 + 0.60) / 3600,
                                                                   23201 * (0.05 + 0.1) / 3600))))
     assert made.timing_hours == pytest.approx(11 * 200 * 0.5 / 3600)
-    assert made.label_bytes == 23201 * 6000 and made.result_bytes == pytest.approx(23201 * 66 * 500)
+    assert made.label_bytes == 23201 * 6000 and made.result_bytes == pytest.approx(23201 * 70 * 500)
     hours = made.wall_hours
     assert hours[1] == pytest.approx(sum(made.odometry_hours.values()) + made.timing_hours)
     assert hours[1] / 4 < hours[4] < hours[1] / 3 and hours[64] < hours[4]
@@ -82,8 +82,8 @@ def test_the_command_prints_a_table(small_world, quick, capsys):
     assert main(["plan", "--kitti", str(small_world / "kitti"), "--repetitions", "1", "--cores", "2", "6"]) == 0
     text = capsys.readouterr().out
     assert "2 sequences, 24 frames" in text and "--complete plans for it" in text
-    # 16 runs, 2 refined ones and 12 controls, the true label maps among them, for each of two sequences
-    assert f"{2 * (16 + 2 + 12)} runs" in text and f"{2 * 5} runs" in text
+    # 16 runs, 2 refined ones and 14 controls, the true label maps among them, for each of two sequences
+    assert f"{2 * (16 + 2 + 14)} runs" in text and f"{2 * 5} runs" in text
     table = text[text.index("cores  odometry"):text.index("\n\ndisk")].splitlines()[1:]
     assert [int(line.split()[0]) for line in table] == [1, 2, 6]
 

@@ -223,7 +223,7 @@ def _predict(model: Any, where: Path) -> float:
     """Write the label maps of an excerpt; returns their mean size in bytes."""
     from thesis_repro.segmentation import prediction
 
-    labels = stages.stage(where / "labels" / NAME)
+    labels = where / "labels" / NAME
     prediction.write_label_maps(model, kitti.Sequence(where / "kitti", NAME).frame_paths, labels)
     return float(np.mean([path.stat().st_size for path in labels.glob("*.png")]))
 
