@@ -114,7 +114,7 @@ def test_the_calibration_is_near_what_a_run_takes(small_world, tmp_path):
 
 @pytest.mark.parametrize("options, says", [
     (["--kitti", "nowhere"], "nowhere: holds no folder 'sequences'"),
-    (["--kitti", ".", "--repetitions", "0"], "--repetitions and --cores: need whole numbers"),
+    (["--kitti", ".", "--repetitions", "0"], "--repetitions 0: must be 1 to 1,000"),
 ])
 def test_bad_input_is_one_clear_line(options, says, capsys):
     assert main(["plan", *options]) == 1

@@ -21,7 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, cityscapes, kitti, odometry, stages
+from thesis_repro import InputError, cityscapes, kitti, odometry
 from thesis_repro.files import progress, write_text
 from thesis_repro.odometry import passes
 from thesis_repro.settings import PROFILES, Profile
