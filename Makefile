@@ -92,7 +92,7 @@ endif
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
-SOURCES := $(shell find thesis_repro -type f -not -name '*.pyc' -not -path '*/report/page.*' -not -name '*.html')
+SOURCES := $(shell find thesis_repro -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html')
 DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
         $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*)) $(if $(KITTI_SEMANTIC),$(wildcard $(KITTI_SEMANTIC)/*))
 
