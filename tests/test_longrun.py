@@ -121,6 +121,7 @@ def test_a_full_disk_names_the_file_and_not_its_temporary_name(tmp_path):
 
 
 def test_a_log_has_what_was_said_every_warning_and_the_error(tmp_path, capsys):
+    warnings.simplefilter("always")  # whatever the environment says; pytest puts it back
     with pytest.raises(InputError), longrun.logged(tmp_path / "out", "thesis-repro study") as run:
         stages.stage(tmp_path / "out", size=3)
         warnings.warn("odd", stacklevel=1)
