@@ -109,7 +109,7 @@ def test_only_what_changed_is_made_again(tmp_path):
     template = root / "thesis_repro" / "report" / "template.html"
     template.touch()
     assert make()[1] == [] and page.stat().st_mtime_ns == first
-    template.write_text(template.read_text() + "{# another word #}\n")
+    template.write_text(template.read_text() + "<!-- another word -->\n")
     assert make()[1] == [] and page.stat().st_mtime_ns > first
     (root / "thesis_repro" / "report" / "style.py").touch()
     assert make()[1] == ["01_one", "02_two"]

@@ -120,6 +120,11 @@ def test_the_page_in_git_says_nothing_of_the_machine_or_the_day(run):
     assert {"code", "Python", "results of"} <= page._facts(run.settings).keys()
     in_git = replace(run.settings, figures=ROOT / "figures")
     assert not {"code", "Python", "results of"} & page._facts(in_git).keys()
+    before, notebook = page.build(in_git), json.loads(run.executed.read_text())
+    for cell in notebook["cells"]:
+        cell["metadata"]["execution"] = {"iopub.execute_input": "2030-01-01T00:00:00Z"}
+    run.executed.write_text(json.dumps(notebook))
+    assert page.build(in_git) == before and "2030" in page._facts(run.settings)["results of"]
 
 
 def test_the_page_in_git_has_no_link_out_of_its_folder(run):
@@ -223,7 +228,7 @@ def test_page_and_notebooks_are_made_again_only_where_something_has_changed(run)
     notebook = json.loads(run.executed.read_text())
     notebook["cells"][1]["outputs"][0]["text"] = "a number: 43"
     run.executed.write_text(json.dumps(notebook))
-    assert page.update(run.settings) and "a number: 43" in html.read_text()
+    assert not page.update(run.settings) and "a number: 43" in html.read_text()  # which the page does not show
 
 
 def test_thesis_numbers_stand_beside_those_of_the_run(run):

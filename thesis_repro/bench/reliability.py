@@ -55,9 +55,8 @@ def trial(sequence, settings, masks, keypoints=KEYPOINTS, orders=ORDERS):
 
 
 def _steps(result, sequence, moving):
-    turns = [np.linalg.inv(poses[:-1, :3, :3]) @ poses[1:, :3, :3] for poses in (sequence.poses, result.poses)]
-    cosines = (np.einsum("nij,nij->n", *turns) - 1) / 2
-    wrong = np.where(moving, np.degrees(np.arccos(np.clip(np.concatenate([[1.0], cosines]), -1, 1))), 0)
+    true, turns = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (sequence.poses, result.poses))
+    wrong = np.where(moving, np.concatenate([[0.0], metrics.angles(np.linalg.inv(true) @ turns)]), 0)
     flags = result.frames["flag"]
     return {"steps": int(moving.sum()), "largest": wrong.max(),
             "wrong": int((wrong > WRONG).sum()), "unflagged": int(((wrong > WRONG) & (flags == "")).sum()),

@@ -51,22 +51,22 @@ def update(settings):
             longrun.sweep(settings.figures)
         page, executed = settings.figures / PAGE, _executed(settings)
         write_notebooks(executed, page)
-        made = _made_from([*executed, *(path for path in settings.figures.glob("*.*") if path != page)])
-        if _ends_with(page, made):
+        html = build(settings)
+        if page.is_file() and page.read_bytes() == html.encode():
             return False
-        write_text(page, build(settings) + made)
+        write_text(page, html)
     return True
 
 
-def _made_from(paths):
-    """A comment at the end of a page that says which files it shows, and what they and this module hold.
+def _made_from(path):
+    """A comment at the end of a notebook's page that says what the notebook and this module hold.
 
     Dates would not do: the clock of a machine can jump.
     """
     digest = hashlib.sha256()
-    for path in sorted([*paths, *HERE.iterdir()]):
-        if path.is_file():
-            digest.update(f"{path.name} {stages.content(path)}\n".encode())
+    for part in sorted([path, *HERE.iterdir()]):
+        if part.is_file():
+            digest.update(f"{part.name} {stages.content(part)}\n".encode())
     return f"<!-- made from {digest.hexdigest()[:12]} -->\n"
 
 
@@ -81,7 +81,7 @@ def _executed(settings):
 
 def write_notebooks(paths, page):
     """Write each executed notebook as HTML beside it, with a link back to the page, where that is not done yet."""
-    made_from = {path: _made_from([path]) for path in paths}
+    made_from = {path: _made_from(path) for path in paths}
     paths = [path for path in paths if not _ends_with(path.with_suffix(".html"), made_from[path])]
     if not paths:
         return
