@@ -35,6 +35,8 @@ export NO_ALBUMENTATIONS_UPDATE := 1
 export TF_CPP_MIN_LOG_LEVEL := 3
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
+# pip leaves the compiling to Python; where it may keep nothing, each start of TensorFlow would take 20 s instead of 5
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup figures evidence test torture lint lab bench weights clean check-data plan
 

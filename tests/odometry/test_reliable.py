@@ -68,6 +68,25 @@ def test_the_sign_survives_a_slow_step():
     assert pose.sides(turn(0.2), AHEAD, current, previous, 1.0) == (0, 0)  # no ray meets another at such an angle
 
 
+def test_the_normal_equations_of_all_points_are_the_sums_of_those_of_some():
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (2 * refine.BLOCK + 7, 4))
+    rotation, ahead, scale = cv2.Rodrigues(np.array([0.01, 0.02, -0.01]))[0], np.array([0.0, 0.6, 0.8]), 0.1
+    whole = refine._normal_equations(rotation, ahead, points[:, :2], points[:, 2:], scale)
+    one_by_one = [refine._normal_equations(rotation, ahead, one[None, :2], one[None, 2:], scale) for one in points]
+    for total, parts in zip(whole, zip(*one_by_one, strict=True), strict=True):
+        np.testing.assert_allclose(total, sum(parts), rtol=1e-12, atol=1e-12)
+    residual = epipolar_distance(rotation, ahead, points)
+    assert whole[0] == pytest.approx(np.log1p((residual / scale) ** 2).sum())
+
+
+def epipolar_distance(rotation, ahead, points):
+    """Sampson distances (N,) of correspondences (N, 4: x, y, u, v), by matrices."""
+    essential = np.cross(np.eye(3), ahead) @ rotation
+    one, other = (np.column_stack([some, np.ones(len(some))]) for some in (points[:, :2], points[:, 2:]))
+    lines, back = one @ essential.T, other @ essential
+    return (other * lines).sum(axis=1) / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
+
+
 def test_points_on_one_line_leave_the_motion_open():
     along = np.linspace(0, 1, 200)[:, None]
     hedge = np.array([-3.0, 0.5, 5.0]) + along * [0.5, -0.2, 25.0]

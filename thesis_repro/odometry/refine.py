@@ -15,6 +15,7 @@ REFINE_ROUNDS = 3
 NEAR = 2  # thresholds within which a correspondence supports a motion
 WIDE = (4, 1)  # thresholds: scales of the second start
 ELSEWHERE = np.cos(np.radians(15.0))  # of the angle between two directions of motion
+BLOCK = 64  # points that are looked at together
 BETTER = 0.99  # of the first start's cost: more than what rounding makes of one and the same minimum
 
 
@@ -167,29 +168,40 @@ def _normal_equations(r, t, current, previous, scale):
         derivatives[k] = np.dot(_skew(t), np.dot(_skew(unit), r))
     derivatives[3] = np.dot(_skew(first), r)
     derivatives[4] = np.dot(_skew(second), r)
-    hessian, gradient, jacobian = np.zeros((5, 5)), np.zeros(5), np.empty(5)
+    hessian, gradient = np.zeros((5, 5)), np.zeros(5)
     cost = 0.0
-    for index in range(len(current)):
-        x, y = current[index, 0], current[index, 1]
-        u, v = previous[index, 0], previous[index, 1]
-        algebraic, l0, l1, m0, m1 = epipolar.lines(essential, x, y, u, v)
-        square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
-        if square < 1e-18:
-            continue
-        inverse = 1 / np.sqrt(square)
-        residual = algebraic * inverse  # the Sampson distance, with its sign
+    # In blocks, each quantity of all points at once, which the processor does several at a time; the sums go point by
+    # point, so the bits are those of one loop over all points.
+    x, y, u, v = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    l0, l1, m0, m1 = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    inverse, residual, rarity, weight = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    jacobian = np.empty((5, BLOCK))
+    for start in range(0, len(current), BLOCK):
+        count = min(BLOCK, len(current) - start)
+        for i in range(count):
+            x[i], y[i] = current[start + i, 0], current[start + i, 1]
+            u[i], v[i] = previous[start + i, 0], previous[start + i, 1]
+        for i in range(count):
+            algebraic, l0[i], l1[i], m0[i], m1[i] = epipolar.lines(essential, x[i], y[i], u[i], v[i])
+            square = l0[i] * l0[i] + l1[i] * l1[i] + m0[i] * m0[i] + m1[i] * m1[i]
+            inverse[i] = 1 / np.sqrt(square) if square >= 1e-18 else 0.0  # at the epipoles a point says nothing
+            residual[i] = algebraic * inverse[i]  # the Sampson distance, with its sign
+            ratio = residual[i] / scale
+            rarity[i] = 1 + ratio * ratio
+            weight[i] = 1 / rarity[i]
         for k in range(5):
-            change, d0, d1, c0, c1 = epipolar.lines(epipolar.entries(derivatives[k]), x, y, u, v)
-            # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2 + m1^2
-            slope = l0 * d0 + l1 * d1 + m0 * c0 + m1 * c1
-            jacobian[k] = (change - residual * inverse * slope) * inverse
-        ratio = residual / scale
-        weight = 1 / (1 + ratio * ratio)
-        cost += np.log(1 + ratio * ratio)
-        for k in range(5):
-            gradient[k] += weight * residual * jacobian[k]
-            for j in range(k + 1):
-                hessian[k, j] += weight * jacobian[k] * jacobian[j]
+            derivative, column = epipolar.entries(derivatives[k]), jacobian[k]
+            for i in range(count):
+                change, d0, d1, c0, c1 = epipolar.lines(derivative, x[i], y[i], u[i], v[i])
+                # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2 + m1^2
+                slope = l0[i] * d0 + l1[i] * d1 + m0[i] * c0 + m1[i] * c1
+                column[i] = (change - residual[i] * inverse[i] * slope) * inverse[i]
+        for i in range(count):
+            cost += np.log(rarity[i])
+            for k in range(5):
+                gradient[k] += weight[i] * residual[i] * jacobian[k, i]
+                for j in range(k + 1):
+                    hessian[k, j] += weight[i] * jacobian[k, i] * jacobian[j, i]
     for k in range(5):
         for j in range(k):
             hessian[j, k] = hessian[k, j]
