@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import thesis_repro as tr
 from thesis_repro.cityscapes import read_label_map
 
-README = Path(__file__).resolve().parent.parent / "README.md"
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
 
 
 def test_what_is_offered_is_there():
@@ -48,3 +50,24 @@ def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, caps
     assert len(names["every"].poses) == len(names["masked"].poses) == 12
     assert names["masked"].frames["detected"].mean() < names["every"].frames["detected"].mean()
     assert len(example.splitlines()) <= 14 and capsys.readouterr().out
+
+
+@pytest.mark.parametrize("heading, folder", [("What the default run shows", "figures"),
+                                             ("On real frames", "figures/kitti_excerpts"),
+                                             ("Keypoint masks", "figures/kitti_excerpts")])
+def test_every_number_of_a_result_stands_in_what_a_command_writes(heading, folder):
+    """Ratios, those with an interval together with it, and numbers of frames and keypoints."""
+    sections = re.split(r"^#+ ", README.read_text(), flags=re.MULTILINE)
+    (section,) = [text for text in sections if text.startswith(heading)]
+    section = re.sub(r"\]\(.*?\)", "]", section)  # links
+    written = " ".join((ROOT / folder / name).read_text() for name in ("findings.md", "answer_in_words.md"))
+    written = re.sub(r"\[(\S+), (\S+)\]", r"(\1 to \2)", written)  # as the answer writes intervals
+    number = r"\d+\.\d+"
+    told = re.findall(rf"({number})[^()]{{0,40}}? (\({number} to {number}\))", section)
+    assert told
+    for ratio, interval in told:
+        assert f"{ratio} {interval}" in written, (ratio, interval)
+    known = set(re.findall(number, written)) | {"0.38"}  # of the label maps, on the model's card
+    assert set(re.findall(number, section)) <= known
+    for count in re.findall(r"\b\d{3,4}(?= (?:frames|real frames|keypoints))", section):
+        assert re.search(rf"\b{count}\b", written), count
