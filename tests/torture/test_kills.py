@@ -123,8 +123,8 @@ def test_label_maps(ledger, tmp_path):
 
 
 def study(small_world, small_labels):
-    return [*COMMAND, "study", "--kitti", small_world / "kitti", "--labels", small_labels, "--widths", 5, 10,
-            "--controls", 10, "--repetitions", 2, "--pose", "all", "refined", "--output", "study"]
+    return [*COMMAND, "study", "--kitti", small_world / "kitti", "--labels", small_labels, "--widths", 5,
+            "--controls", 5, "--repetitions", 1, "--pose", "all", "refined", "--output", "study"]
 
 
 def test_a_study(ledger, tmp_path, small_world, small_labels):

@@ -8,7 +8,6 @@ files. A few frames of KITTI's size, with the estimator, show where a process st
 
 import argparse
 import contextlib
-import resource
 import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
@@ -24,6 +23,7 @@ from thesis_repro.masks import LabelMasks
 from thesis_repro.odometry import THESIS, Odometry
 from thesis_repro.odometry.pose import Motion
 from thesis_repro.settings import ALL_WIDTHS
+from thesis_repro.study.plan import peak_memory
 
 DRIVE, SHORT, SCALE = "09", 40, 0.2  # the sequence whose first frames are driven to and fro, and their size
 FULL_FRAMES = 12  # of KITTI's size
@@ -56,19 +56,15 @@ def peak(folder: Path, runs: int, estimated: bool) -> tuple[int, int]:
             stack.callback(setattr, Odometry, "estimate", Odometry.estimate)
             Odometry.estimate = _ahead  # type: ignore[method-assign, assignment]
         odometry.run_many(sequence.subset(3), wanted)  # loads all code
-        start = _most()
+        start = peak_memory()
         results = odometry.run_many(sequence, wanted, checkpoint=folder / "pass.npz")
         for name in list(results):
             (folder / f"{name}.csv").write_text(results.pop(name).frames.to_csv(index=False))
-    return start, _most()
+    return start, peak_memory()
 
 
 def _ahead(self: Odometry, step: odometry.Step, essential: object = None) -> None:
     step.motion = Motion(np.eye(3), np.array([0.0, 0.0, 1.0]), np.ones(len(step.current), bool))
-
-
-def _most() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def measure(frames: int, runs: int, full_frames: int = FULL_FRAMES) -> dict[str, int]:

@@ -59,9 +59,10 @@ def words(summary, data, label_maps=None, quality=None):
 def _about(summary, data):
     baseline = results.of_variant(summary, "baseline")
     frames = baseline.groupby("sequence")["frames"].first()
+    runs = baseline["repetition"].nunique()
+    orders = f"{runs} repetitions of every run with the correspondences in another order" if runs > 1 else "once each"
     return (f"{_number(len(frames), 'sequence')} ({', '.join(frames.index)}; {frames.sum():,} frames), with all "
-            f"keypoints, with masks and with controls, {_number(baseline['repetition'].nunique(), 'repetition')} of "
-            f"every run with the correspondences in another order ({data}).")
+            f"keypoints, with masks and with controls, {orders} ({data}).")
 
 
 def _chance(summary):

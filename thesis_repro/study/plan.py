@@ -131,7 +131,7 @@ def calibrate(work: Work) -> Calibration:
         own = _own_model(sizes)
         networks = {SHIPPED: _network_seconds(model), OWN: _network_seconds(own)}
         bar.update()
-        network_bytes = _peak_memory()
+        network_bytes = peak_memory()
         training, training_bytes = _training(own, sizes)
         bar.update()
         return Calibration(done, time.perf_counter() - started, timing, networks, network_bytes, label_bytes, training,
@@ -252,7 +252,7 @@ def _measure(where: Path, name: str, work: Work) -> Excerpt:
     alone -= result[""].frames[["essential_seconds", "pose_seconds"]].sum().sum()
     row_bytes = sum(path.stat().st_size for path in files) / len(files) / FRAMES
     return Excerpt(where=name, jobs={FIRST_SERIES: len(first), SECOND_SERIES: len(second)}, series=series,
-                   shared=max(alone, 0) / FRAMES, row_bytes=row_bytes, worker_bytes=_peak_memory())
+                   shared=max(alone, 0) / FRAMES, row_bytes=row_bytes, worker_bytes=peak_memory())
 
 
 def _slope(some: list[jobs.Job], work: Work, start: Path, whole: Path) -> float:
@@ -280,7 +280,8 @@ def _cpu(work: Callable[[], Any]) -> tuple[float, Any]:
     return time.process_time() - started, result
 
 
-def _peak_memory() -> int:
+def peak_memory() -> int:
+    """Bytes: the most that this process has taken so far, without what the one that started it had."""
     try:
         status = Path("/proc/self/status").read_text(encoding="ascii")
         return 1024 * next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
