@@ -29,8 +29,9 @@ def start(tmp_path):
         nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "one.ipynb")
         (tmp_path / "out").mkdir()
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
-        return subprocess.Popen(COMMAND, cwd=tmp_path, env=environment, stdout=subprocess.PIPE,
-                                stderr=subprocess.PIPE, text=True)
+        # (what runs in the background of a shell script is deaf to an interrupt)
+        return subprocess.Popen(COMMAND, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True,
+                                stderr=subprocess.PIPE, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
 
     return started
 
