@@ -318,7 +318,7 @@ def _size(path):
 
 class _Renderer(mistune.HTMLRenderer):
     def heading(self, text, level, **attributes):
-        return super().heading(text, min(6, level + 3), **attributes)  # below those of the page
+        return super().heading(text, max(4, level + 1), **attributes)  # below those of the page
 
 
 def _markdown(text):
