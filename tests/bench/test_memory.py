@@ -22,6 +22,7 @@ def test_a_short_drive_is_driven_to_and_fro(tmp_path):
 @pytest.mark.slow
 def test_memory_grows_by_the_rows_alone():
     found = memory.measure(400, 16, full_frames=3)
-    assert 2e8 < found["start"] < 1e9 and found["grown"] < 1e8
+    # half of it here; the small frames alone would be 12 MB, were they kept
+    assert 2e8 < found["start"] < 1e9 and found["grown"] < 1e7
     with pytest.raises(InputError, match="--frames 5"):
         memory.measure(5, 16)

@@ -142,6 +142,6 @@ def quality(build):
         return None
     scores = pd.read_csv(path)
     scores = scores[scores["used"]].set_index("domain", drop=False)
-    best = scores.loc[FRAMES] if FRAMES in scores.index else scores.iloc[0]
-    seen = " on scenes of which some were in its training" if (best["model"], best["domain"]) == SEEN else ""
-    return f"mean IoU {best['mean_iou']:.2f}{seen}"
+    judged = scores.loc[FRAMES] if FRAMES in scores.index else scores.iloc[0]
+    seen = " on scenes of which some were in its training" if (judged["model"], judged["domain"]) == SEEN else ""
+    return f"mean IoU {judged['mean_iou']:.2f}{seen}"
