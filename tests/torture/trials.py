@@ -126,12 +126,18 @@ def kill(process):
 
 
 def snapshot(where):
-    """What lies below a folder, {relative path: what tells it from another version}; folders have none."""
+    """What lies below a folder, {relative path: what tells it from another version}; folders have none.
+
+    The folder may be in use: what is renamed away between its listing and its reading is left out.
+    """
     found = {}
     for folder, folders, names in os.walk(where):
         for name in (*folders, *names):
             path = Path(folder, name)
-            about = path.lstat()
+            try:
+                about = path.lstat()
+            except FileNotFoundError:
+                continue
             found[path.relative_to(where)] = None if path.is_dir() else (about.st_size, about.st_mtime_ns)
     return found
 
