@@ -107,7 +107,23 @@ $(RUN)/checked: .venv/ready $(DATA)
 	@$(if $(KITTI)$(CITYSCAPES)$(KITTI_SEMANTIC),$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS),true)
 	@touch $@
 
-# Each notebook needs the one before it: they hand results on through files.
+# What a notebook needs of others, by their numbers: they hand results on through files. One that is not listed needs
+# the one before it. Two that do not need each other are executed beside each other, for most are at times at work with
+# one core alone, and the training all the time.
+NEEDS_01 :=
+NEEDS_02 := 01
+NEEDS_03 :=
+NEEDS_04 := 01 02 03
+NEEDS_05 := 01 04
+NEEDS_06 := 05
+NEEDS_07 := 05 06
+NEEDS_08 := 05 06
+NEEDS_09 := 01 04 05 06 08
+ifneq (1,$(JOBS))
+MAKEFLAGS += -j2
+endif
+needed = $(foreach number,$(NEEDS_$(1)),$(filter $(RUN)/notebooks/$(number)_%,$(EXECUTED)))
+
 define execute
 $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 	@mkdir -p $$(@D)
@@ -118,8 +134,19 @@ $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 endef
 previous :=
 $(foreach notebook,$(notdir $(NOTEBOOKS)),\
-  $(eval $(call execute,$(notebook),$(previous)))\
+  $(eval number := $(firstword $(subst _, ,$(notebook))))\
+  $(eval $(call execute,$(notebook),$(if $(filter undefined,$(origin NEEDS_$(number))),$(previous),$(call needed,$(number)))))\
   $(eval previous := $(RUN)/notebooks/$(notebook)))
+
+# The drives of the embedded world are rendered and the odometry is compiled while the network is trained. That is a
+# head start alone: notebook 5 asks for the same drives, and says what is wrong with them.
+ifeq (,$(THESIS_REPRO_KITTI))
+$(filter $(RUN)/notebooks/05_%,$(EXECUTED)): $(RUN)/drives
+$(RUN)/drives: $(filter $(RUN)/notebooks/01_%,$(EXECUTED)) $(RUN)/checked
+	@nice $(BIN)/python -m thesis_repro.world && \
+	  nice $(BIN)/python -m thesis_repro odometry --kitti $(dir $(RUN))world-$(PROFILE)/kitti --sequence 00 >/dev/null || true
+	@touch $@
+endif
 endif
 
 plan: setup

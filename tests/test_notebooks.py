@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -73,6 +74,16 @@ def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path, name, fir
         env=environment, capture_output=True, text=True)
     assert done.returncode != 0
     assert f"not there yet; run notebook {first} first" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_order_of_the_notebooks_has_what_each_of_them_asks_for():
+    listed = dict(re.findall(r"^NEEDS_(\d\d) :=(.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    before = {}
+    for number, needs in sorted(listed.items()):
+        before[number] = {*needs.split(), *(other for one in needs.split() for other in before[one])}
+    asked = {name[:2]: set(re.findall(r'\\"(\d\d)_\w+\\"', (ROOT / "notebooks" / name).read_text())) for name in NOTEBOOKS}
+    assert listed.keys() == asked.keys() and sum(map(len, asked.values())) > 10
+    assert {number: some - before[number] for number, some in asked.items() if some - before[number]} == {}
 
 
 @pytest.mark.notebooks

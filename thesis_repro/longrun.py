@@ -131,7 +131,21 @@ def claimed(folder):
         raise InputError(f"{folder}: is a file; name a folder for the results")
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)  # a lock on it ends with the process, so that none can be left behind
+    try:
+        with locked(folder):
+            yield
+    finally:
+        for path in new:  # where nothing came of it, nothing is left
+            try:
+                path.rmdir()
+            except OSError:
+                break
+
+
+@contextmanager
+def locked(path):
+    """Hold a folder or file that is there, as `claimed` does."""
+    descriptor = os.open(path, os.O_RDONLY)  # a lock on it ends with the process, so that none can be left behind
     about = os.fstat(descriptor)
     key = about.st_dev, about.st_ino
     try:
@@ -139,7 +153,7 @@ def claimed(folder):
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise InputError(f"{folder}: another run is at work there; wait until it has ended, or name another "
+                raise InputError(f"{path}: another run is at work there; wait until it has ended, or name another "
                                  "folder") from None
             except OSError:
                 pass
@@ -152,11 +166,6 @@ def claimed(folder):
                 del _held[key]
     finally:
         os.close(descriptor)
-        for path in new:  # where nothing came of it, nothing is left
-            try:
-                path.rmdir()
-            except OSError:
-                break
 
 
 # The log and the word at the end

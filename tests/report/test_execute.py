@@ -50,7 +50,7 @@ def test_progress_is_shown_and_what_libraries_log_stays_out(start, tmp_path):
         "print('2026-01-01 00:00:00.1: I tensorflow/core/util/port.cc:153] oneDNN custom operations are on.')")
     stdout, stderr = process.communicate()
     assert process.returncode == 0 and stderr == "half way\n"
-    assert stdout.startswith("one\n  done in ")
+    assert stdout.startswith("one\none: done in ")
     first, second = nbformat.read(tmp_path / "out" / "done.ipynb", 4).cells
     assert [(output.name, output.text) for output in first.outputs] == [
         ("stdout", "mine\nmine too\n"), ("stderr", "mine as well\n")]

@@ -241,6 +241,15 @@ def test_complete_world_is_left_alone(out):
     assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*")}
 
 
+def test_the_two_halves_make_the_whole_in_either_order(out, tmp_path):
+    for number, order in enumerate((("cityscapes", "kitti"), ("kitti", "cityscapes"))):
+        half = tmp_path / str(number)
+        for part in order:
+            dataset.write(half, **SMALL, only=part)
+            assert {path.name for path in half.iterdir() if path.is_dir()} == set(order[:order.index(part) + 1])
+        assert contents(half) == contents(out)
+
+
 def test_faults_name_the_folder_or_the_parameter(out, tmp_path):
     before = contents(out)
     with pytest.raises(InputError, match="frames 12, not 13"):

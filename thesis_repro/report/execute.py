@@ -44,12 +44,15 @@ class Execution(ExecutePreprocessor):
 
     def preprocess(self, nb, resources=None, km=None):
         name, started = resources["metadata"]["name"], time.monotonic()
-        folder = Path(self.log_file).parent  # of all executed notebooks of a run
+        log = Path(self.log_file)
+        folder = log.parent  # of all executed notebooks of a run, of which two may be at work at once
         sys.excepthook = partial(_in_one_line, folder)  # where the executed notebook itself cannot be written
-        with longrun.claimed(folder), longrun.logged(folder, f"make figures, {name}", ours=True):
+        folder.mkdir(parents=True, exist_ok=True)
+        log.touch()
+        with longrun.locked(log), longrun.logged(folder, f"make figures, {name}", ours=True):
             longrun.say(name)
             done = self._executed(name, nb, resources, km)
-            longrun.say(f"  done in {time.monotonic() - started:.0f} s")
+            longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
         return done
 
     def _executed(self, name, nb, resources, km):

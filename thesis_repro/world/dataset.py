@@ -117,13 +117,14 @@ def _bonnet(rng, picture, labels):
 
 
 def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100, validation_images=20, seed=0, jobs=-1,
-          replace=False):
+          replace=False, only=None):
     """Write the embedded world to OUT/kitti and OUT/cityscapes; goes on where a stopped run left off.
 
     sequences: names among 00 to 10; frames: of each, None for as many as show its whole drive, from 41 to 132; scale:
     of KITTI's image size (and of 1024x512 for the training images); jobs: processes, -1 for one a core. A complete
     world of the same parameters is left as it is.
     replace: delete an embedded world of other parameters first; nothing else is ever deleted.
+    only: "kitti" or "cityscapes", to write one of the two now.
     Returns how many pictures were rendered, and how many there are.
     Raises InputError for a folder that holds something else or that another run is at work in, a world of other
     parameters, or a bad parameter.
@@ -132,7 +133,8 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
     parameters = _parameters(sequences, frames, scale, train_images, validation_images, seed)
     with longrun.claimed(out):
         stages.stage(out, replace=replace, code=stages.code("world"), **parameters)
-        pictures = list(_pictures(out, **parameters))
+        pictures = [picture for picture in _pictures(out, **parameters)
+                    if only in (None, picture[1].relative_to(out).parts[0])]
         missing = [picture for picture in pictures if not all(path.is_file() for path in picture[1:])]
         workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
         if workers > 1:
@@ -142,7 +144,7 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
             work = (delayed(_write_some)(missing[k:k + 10]) for k in range(0, len(missing), 10))
             for count in Parallel(n_jobs=workers, return_as="generator_unordered")(work):
                 bar.update(count)
-        for name in parameters["sequences"]:
+        for name in parameters["sequences"] if only != "cityscapes" else ():
             if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # the last of them
                 _write_sequence_texts(out, name, parameters["frames"] or drives.DRIVES[name].frames, scale, seed)
     return len(missing), len(pictures)
