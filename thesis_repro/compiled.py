@@ -34,13 +34,23 @@ for _folder in (path.parent for path in Path(__file__).parent.glob("*/__init__.p
     forget_stale(_folder)
 
 
-def fast(function):
+def fast(function, **options):
     """Compile a function of numbers and arrays; kept on disk where possible, free to run beside other threads.
 
     Compiled functions call only what lies in their own folder. Division by zero gives infinity or NaN, as in numpy and
     OpenCV, not an exception.
     """
+    options = {"nogil": True, "error_model": "numpy", **options}
     try:
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder that numba may write its cache to
-        return numba.njit(nogil=True, error_model="numpy")(function)
+        return numba.njit(**options)(function)
+
+
+def inner(function):
+    """Compile a small function, as `fast` does, into the compiled ones that call it.
+
+    Python cannot call it: without a way in from there it takes less time to compile, and as part of its callers, less
+    to run.
+    """
+    return fast(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

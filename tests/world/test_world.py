@@ -209,7 +209,7 @@ def test_neighbouring_faces_leave_no_crack():
 def test_what_is_compiled_ahead_is_what_is_used():
     render.compile_for_all()
     view(one_square())
-    assert len(raster.draw.signatures) == 1
+    assert [len(part.signatures) for part in (raster._surfaces, raster._shadows, raster._pixels)] == [1, 1, 1]
 
 
 def test_same_seed_gives_the_same_bytes_for_any_number_of_processes(out, tmp_path):

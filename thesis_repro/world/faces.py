@@ -51,8 +51,10 @@ def rows(corner, edge_s, edge_t, uv, texture, label, ground, triangle):
 
     texture, label: their numbers.
     """
-    columns = [*corner.T, *edge_s.T, *edge_t.T, *uv, texture, label, 1.0, triangle, ground, 0, 1]
-    return np.stack(np.broadcast_arrays(*columns), axis=1).astype(np.float64)
+    matrix = np.empty((len(corner), COLUMNS))
+    for k, column in enumerate([*corner.T, *edge_s.T, *edge_t.T, *uv, texture, label, 1.0, triangle, ground, 0, 1]):
+        matrix[:, k] = column
+    return matrix
 
 
 def place(faces, x, z, yaw, y=0.0):

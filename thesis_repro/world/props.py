@@ -184,22 +184,22 @@ class Footprint:
         """Whether a point may lie within it; quicker to say than `covers`."""
         return (x - self.x) ** 2 + (z - self.z) ** 2 < (self.half + self.depth + 1.0) ** 2
 
-    def points(self):
-        """35 points spread over it: x and z."""
+    def __post_init__(self):
+        self.cosine, self.sine = np.cos(self.yaw), np.sin(self.yaw)
         across, along = np.meshgrid(np.linspace(-self.half, self.half, 7), np.linspace(0.0, self.depth, 5))
         across, along = across.ravel(), along.ravel()
-        return (self.x + np.cos(self.yaw) * across + np.sin(self.yaw) * along,
-                self.z - np.sin(self.yaw) * across + np.cos(self.yaw) * along)
+        self.points = (self.x + self.cosine * across + self.sine * along,  # 35 spread over it: x and z
+                       self.z - self.sine * across + self.cosine * along)
 
     def covers(self, x, z, margin=-0.3):
         """Whether it reaches within `margin` metres of any of the points; a negative margin lets walls touch."""
         dx, dz = x - self.x, z - self.z
-        across = np.cos(self.yaw) * dx - np.sin(self.yaw) * dz
-        along = np.sin(self.yaw) * dx + np.cos(self.yaw) * dz
+        across = self.cosine * dx - self.sine * dz
+        along = self.sine * dx + self.cosine * dz
         return bool(np.any((np.abs(across) < self.half + margin) & (along > -margin) & (along < self.depth + margin)))
 
     def overlaps(self, other):
         """Whether two buildings stand in each other."""
-        if np.hypot(self.x - other.x, self.z - other.z) > 45:
+        if (self.x - other.x) ** 2 + (self.z - other.z) ** 2 > 45 ** 2:
             return False
-        return self.covers(*other.points()) or other.covers(*self.points())
+        return self.covers(*other.points) or other.covers(*self.points)

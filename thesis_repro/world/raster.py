@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesis_repro.cityscapes import ID
-from thesis_repro.compiled import fast
+from thesis_repro.compiled import fast, inner
 
 # Columns of the face matrix, one row a face.
 CORNER, EDGE_S, EDGE_T = 0, 3, 6  # three each; CORNER + Y is the corner's y
@@ -93,33 +93,41 @@ class Environment(NamedTuple):
 # Textures
 
 
-@fast
-def _sample(data, level, u, v):
-    """A texture at (u, v), bilinear and periodic; level: (offset, log2 of rows, log2 of columns)."""
-    offset, log_height, log_width = level
-    width, height = 1 << log_width, 1 << log_height
-    x, y = u * width - 0.5, v * height - 0.5
-    x0, y0 = int(x), int(y)
+@inner
+def _between(place, log_size):
+    """Which two of the texels along one axis a place (in repeats) lies between, and how near to the second one."""
+    size = 1 << log_size
+    x = place * size - 0.5
+    x0 = int(x)
     if x < x0:
         x0 -= 1
-    if y < y0:
-        y0 -= 1
-    fx, fy = x - x0, y - y0
-    x0, y0 = x0 & (width - 1), y0 & (height - 1)
-    x1, y1 = (x0 + 1) & (width - 1), (y0 + 1) & (height - 1)
+    return x0 & (size - 1), (x0 + 1) & (size - 1), x - x0
+
+
+@inner
+def _mix(data, offset, log_width, x, y):
+    """A texture's level between its texels: offset: where it starts; x, y: of `_between`."""
+    (x0, x1, fx), (y0, y1, fy) = x, y
     row0, row1 = offset + (y0 << log_width), offset + (y1 << log_width)
     top = data[row0 + x0] * (1 - fx) + data[row0 + x1] * fx
     bottom = data[row1 + x0] * (1 - fx) + data[row1 + x1] * fx
     return top * (1 - fy) + bottom * fy
 
 
-@fast
+@inner
+def _sample(data, level, u, v):
+    """A texture at (u, v), bilinear and periodic; level: (offset, log2 of rows, log2 of columns)."""
+    offset, log_height, log_width = level
+    return _mix(data, offset, log_width, _between(u, log_width), _between(v, log_height))
+
+
+@inner
 def _whole(textures, index):
     """The level of a texture that is not reduced."""
     return textures.gray[index, 0, 0], textures.sides[index, 0], textures.sides[index, 1]
 
 
-@fast
+@inner
 def _level(step, levels):
     """Which reduced level suits a step of so many texels, and the part of the next one: log2, linear between powers."""
     level = 0
@@ -129,24 +137,27 @@ def _level(step, levels):
     return level, (step - 1.0 if level < levels and step > 1.0 else 0.0)
 
 
-@fast
+@inner
 def _filtered(data, gray, texture, log_height, log_width, u, v, u_step, v_step):
     """Texture value for a sample that covers u_step by v_step repeats; blends neighbouring levels of both axes."""
     i, u_part = _level(u_step * (1 << log_width), log_width)
     j, v_part = _level(v_step * (1 << log_height), log_height)
     rows, columns = log_height - j, log_width - i
-    value = _sample(data, (gray[texture, j, i], rows, columns), u, v)
+    x, y = _between(u, columns), _between(v, rows)
+    value = _mix(data, gray[texture, j, i], columns, x, y)
     if u_part > 0.0:
-        value += u_part * (_sample(data, (gray[texture, j, i + 1], rows, columns - 1), u, v) - value)
+        half_x = _between(u, columns - 1)
+        value += u_part * (_mix(data, gray[texture, j, i + 1], columns - 1, half_x, y) - value)
     if v_part > 0.0:
-        other = _sample(data, (gray[texture, j + 1, i], rows - 1, columns), u, v)
+        half_y = _between(v, rows - 1)
+        other = _mix(data, gray[texture, j + 1, i], columns, x, half_y)
         if u_part > 0.0:
-            other += u_part * (_sample(data, (gray[texture, j + 1, i + 1], rows - 1, columns - 1), u, v) - other)
+            other += u_part * (_mix(data, gray[texture, j + 1, i + 1], columns - 1, half_x, half_y) - other)
         value += v_part * (other - value)
     return value
 
 
-@fast
+@inner
 def _steps(coefficients, faces, index, s, t, w):
     """How far u and v move from one sample to the next, the larger of both image directions.
 
@@ -160,7 +171,7 @@ def _steps(coefficients, faces, index, s, t, w):
     return u_step, v_step
 
 
-@fast
+@inner
 def _alpha_level(alpha, sides, coefficients, faces, index, row, x):
     """The level of a face's alpha that suits one row of it: (offset, log2 of rows, log2 of columns)."""
     c, n, texture = coefficients, index, int(faces[index, TEXTURE])
@@ -180,7 +191,7 @@ def _alpha_level(alpha, sides, coefficients, faces, index, row, x):
     return alpha[texture, j, i], log_height - j, log_width - i
 
 
-@fast
+@inner
 def _opaque(data, level, face, c, row, x, w):
     """Whether a cut-out is there at a sample, where its inverse depth is w."""
     ws, wt, z = c[S] + c[S_Y] * row + c[S_X] * x, c[T] + c[T_Y] * row + c[T_X] * x, 1.0 / w
@@ -192,16 +203,15 @@ def _opaque(data, level, face, c, row, x, w):
 # Which samples a face covers
 
 
-@fast
-def _turn(rotation, values, start, result):
-    """Three of the values, a vector in the street, in camera coordinates."""
-    for k in range(3):
-        result[k] = 0.0
-        for m in range(3):
-            result[k] += rotation[k, m] * values[start + m]
+@inner
+def _turn(rotation, x, y, z):
+    """A vector in the street in camera coordinates."""
+    return (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+            rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+            rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z)
 
 
-@fast
+@inner
 def _set_up(corner, edge_s, edge_t, view, c):
     """Fill in a face's coefficients; returns the first and last row that it may cover (0, -1: none).
 
@@ -250,7 +260,7 @@ def _set_up(corner, edge_s, edge_t, view, c):
     return max(0, math.ceil(y_min)), min(height - 1, math.floor(y_max))
 
 
-@fast
+@inner
 def _narrow(value, slope, low, high):
     """Keep the part of [low, high] where value + slope x >= 0."""
     if slope > 0:
@@ -262,7 +272,7 @@ def _narrow(value, slope, low, high):
     return low, high
 
 
-@fast
+@inner
 def _span(c, triangle, row, width):
     """First and last sample of a row inside the face: w > 0, z > NEAR, s >= 0, t >= 0, and s, t or s + t <= 1."""
     ws, wt, w = c[S] + c[S_Y] * row, c[T] + c[T_Y] * row, c[W] + c[W_Y] * row
@@ -287,14 +297,12 @@ def _surfaces(faces, textures, view, coefficients, depth, nearest):
     """The nearest face at each sample: fills `depth` (w), `nearest` (row of `faces`) and the faces' coefficients."""
     data, alpha, sides = textures.data, textures.alpha, textures.sides
     rotation, position, width = view.rotation, view.position, view.size[1]
-    away, corner, edge_s, edge_t = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for index in range(faces.shape[0]):
         face, c = faces[index], coefficients[index]
-        for k in range(3):
-            away[k] = face[CORNER + k] - position[k]
-        _turn(rotation, away, 0, corner)
-        _turn(rotation, face, EDGE_S, edge_s)
-        _turn(rotation, face, EDGE_T, edge_t)
+        corner = _turn(rotation, face[CORNER + X] - position[X], face[CORNER + Y] - position[Y],
+                       face[CORNER + Z] - position[Z])
+        edge_s = _turn(rotation, face[EDGE_S + X], face[EDGE_S + Y], face[EDGE_S + Z])
+        edge_t = _turn(rotation, face[EDGE_T + X], face[EDGE_T + Y], face[EDGE_T + Z])
         first_row, last_row = _set_up(corner, edge_s, edge_t, view, c)
         if last_row < first_row:
             continue
@@ -304,19 +312,21 @@ def _surfaces(faces, textures, view, coefficients, depth, nearest):
             start, stop = _span(c, triangle, row, width)
             if stop < start:
                 continue
+            w_row, w_x = c[W] + c[W_Y] * row, c[W_X]
             if cut_out:
                 level = _alpha_level(alpha, sides, coefficients, faces, index, row, (start + stop) // 2)
                 for x in range(start, stop + 1):
-                    w = c[W] + c[W_Y] * row + c[W_X] * x
+                    w = w_row + w_x * x
                     if w > depth[row, x] and _opaque(data, level, face, c, row, x, w):
                         depth[row, x] = w
                         nearest[row, x] = index
             else:
-                for x in range(start, stop + 1):
-                    w = c[W] + c[W_Y] * row + c[W_X] * x
-                    if w > depth[row, x]:
-                        depth[row, x] = w
-                        nearest[row, x] = index
+                depths, hits = depth[row, start:stop + 1], nearest[row, start:stop + 1]
+                for k in range(len(depths)):  # from 0, so that many are compared at once
+                    w = w_row + w_x * (start + k)
+                    if w > depths[k]:
+                        depths[k] = w
+                        hits[k] = index
 
 
 @fast
@@ -328,7 +338,6 @@ def _shadows(faces, textures, view, sun, nearest, shadow):
     """
     data, alpha, sides = textures.data, textures.alpha, textures.sides
     rotation, position, width = view.rotation, view.position, view.size[1]
-    corner, edge_s, edge_t = np.empty(3), np.empty(3), np.empty(3)
     flat_corner, flat_s, flat_t = np.empty(3), np.empty(3), np.empty(3)
     coefficients = np.empty((faces.shape[0], 9))
     for index in range(faces.shape[0]):
@@ -345,10 +354,10 @@ def _shadows(faces, textures, view, sun, nearest, shadow):
                 flat_corner[k] = face[CORNER + k] + sun[k] * fall - position[k]
                 flat_s[k] = face[EDGE_S + k] - sun[k] * face[EDGE_S + Y] / sun[Y]
                 flat_t[k] = face[EDGE_T + k] - sun[k] * face[EDGE_T + Y] / sun[Y]
-            _turn(rotation, flat_corner, 0, corner)
-            _turn(rotation, flat_s, 0, edge_s)
-            _turn(rotation, flat_t, 0, edge_t)
-            first_row, last_row = _set_up(corner, edge_s, edge_t, view, c)
+            first_row, last_row = _set_up(
+                _turn(rotation, flat_corner[X], flat_corner[Y], flat_corner[Z]),
+                _turn(rotation, flat_s[X], flat_s[Y], flat_s[Z]), _turn(rotation, flat_t[X], flat_t[Y], flat_t[Z]),
+                view, c)
             for row in range(first_row, last_row + 1):
                 start, stop = _span(c, triangle, row, width)
                 if stop < start:
@@ -368,7 +377,7 @@ def _shadows(faces, textures, view, sun, nearest, shadow):
 # From samples to pixels
 
 
-@fast
+@inner
 def _surface_value(faces, coefficients, index, row, column, w, spread, data, gray, sides):
     """Texture of a face at a place (in samples), averaged over a square of `spread` samples."""
     c, f, n, texture = coefficients, faces, index, int(faces[index, TEXTURE])
@@ -380,7 +389,7 @@ def _surface_value(faces, coefficients, index, row, column, w, spread, data, gra
     return _filtered(data, gray, texture, sides[texture, 0], sides[texture, 1], u, v, u_step * spread, v_step * spread)
 
 
-@fast
+@inner
 def _background(x, y, rotation, environment, skyline, skyline_labels, data, clouds, leaves):
     """Value and label where no face is, in direction (x, y, 1): sky and clouds, the skyline, the ground far away.
 
@@ -404,7 +413,7 @@ def _background(x, y, rotation, environment, skyline, skyline_labels, data, clou
     return 0.75 * sky, TERRAIN
 
 
-@fast
+@inner
 def _most(labels, counts, depths, found):
     """The label of most samples; where two have as many, that of the nearer surface."""
     best, best_count, best_depth = labels[0], 0.0, -1.0
@@ -419,7 +428,6 @@ def _most(labels, counts, depths, found):
     return best
 
 
-@fast
 def draw(faces, brightness, textures, view, environment):
     """Draw faces: image float32 (height, width) and label map uint8 of the same shape, each pixel of 2x2 samples.
 
@@ -432,10 +440,16 @@ def draw(faces, brightness, textures, view, environment):
     coefficients = np.empty((faces.shape[0], 9))
     _surfaces(faces, textures, view, coefficients, depth, nearest)
     _shadows(faces, textures, view, environment.sun, nearest, shadow)
+    return _pixels(faces, brightness, textures, view, environment, coefficients, nearest, shadow)
+
+
+@fast
+def _pixels(faces, brightness, textures, view, environment, coefficients, nearest, shadow):
+    """Image and label map, from what each sample sees."""
     height, width = view.size[0] // SUPERSAMPLING, view.size[1] // SUPERSAMPLING
     image = np.empty((height, width), np.float32)
     label_map = np.empty((height, width), np.uint8)
-    hits, counts, labels, depths = np.empty(4, np.int64), np.empty(4), np.empty(4, np.uint8), np.empty(4)
+    hits, counts, labels, depths = np.empty(4, np.int32), np.empty(4), np.empty(4, np.uint8), np.empty(4)
     data, gray, sides = textures.data, textures.gray, textures.sides
     clouds, leaves = _whole(textures, textures.clouds), _whole(textures, textures.leaves)
     rotation, focal, centre = view.rotation, view.focal, view.centre

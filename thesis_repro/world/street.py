@@ -107,9 +107,10 @@ class Plan:
     def __post_init__(self):
         middles = [np.stack([road.track.x, road.track.z], axis=1)[::2] for road in self.roads]
         self.middle = np.concatenate(middles)  # (n, 2) points of all roads: x, z
-        counts = [len(points) for points in middles]
-        self._halves = np.repeat([road.half for road in self.roads], counts)
-        self._halves_parked = np.repeat([road.half + max(road.parking) for road in self.roads], counts)
+        self._middle_x, self._middle_z = np.ascontiguousarray(self.middle.T)
+        self._starts = np.cumsum([0, *map(len, middles[:-1])])  # of each road among them
+        self._halves = np.array([road.half for road in self.roads])
+        self._halves_parked = np.array([road.half + max(road.parking) for road in self.roads])
 
     @property
     def main(self):
@@ -125,9 +126,13 @@ class Plan:
         result = np.empty(len(x))
         for start in range(0, len(x), 256):  # a bounded table of distances
             part = slice(start, start + 256)
-            dx = x[part, None] - self.middle[None, :, 0]
-            dz = z[part, None] - self.middle[None, :, 1]
-            result[part] = (np.sqrt(dx * dx + dz * dz) - halves).min(axis=1)
+            squared = x[part, None] - self._middle_x
+            squared *= squared
+            dz = z[part, None] - self._middle_z
+            dz *= dz
+            squared += dz
+            nearest = np.minimum.reduceat(squared, self._starts, axis=1)  # of each road
+            result[part] = (np.sqrt(nearest) - halves).min(axis=1)
         return result
 
     def free(self, x, z, margin):

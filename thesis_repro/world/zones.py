@@ -97,7 +97,7 @@ def _house_row(plan, lot, gap, setback, floors, pitched):
         x, z, heading = lot.road.track.at(s + width / 2, lot.side * distance)
         yaw = heading + lot.side * np.pi / 2
         footprint = Footprint(x, z, yaw, width / 2, depth)
-        if plan.off_road(*footprint.points()).min() > min(1.8, plan.style.sidewalk) and not any(
+        if plan.off_road(*footprint.points).min() > min(1.8, plan.style.sidewalk) and not any(
                 other.overlaps(footprint) for other in plan.buildings):
             faces = building(plan.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched)
             plan.put(faces, x, z, yaw)
