@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import segmentation_models as sm
+import tensorflow as tf
 
 from thesis_repro import InputError
 from thesis_repro.segmentation import augmentation, training
@@ -36,7 +37,8 @@ def prepared(sets=SETS, filters=2, rate=0.01, loss=None, strategy=None):
     keras.utils.set_random_seed(0)
     with (strategy or training.strategy()).scope():
         model = build_unet((SIZE, SIZE, 1), 35, filters)
-        model.compile(keras.optimizers.Adam(rate), loss or training.total_loss(), metrics=training.metrics())
+        model.compile(keras.optimizers.Adam(rate), training.one_pass(loss or training.total_loss()),
+                      metrics=training.metrics())
         model.optimizer.build(model.trainable_variables)
     augmented = augmentation.augment_set(*sets[:2], augmentation.training_augmenter(SIZE), 0)
     blurred = augmentation.augment_set(*sets[2:], augmentation.validation_augmenter(SIZE), 1)
@@ -94,6 +96,26 @@ def test_loss_is_the_sum_of_the_librarys_two():
     focal = -(true * 0.25 * (1 - predicted) ** 2 * np.log(predicted)).mean()
 
     assert float(training.total_loss()(true, predicted)) == pytest.approx(1 - (weights * dice).mean() + focal, rel=1e-4)
+
+
+def test_one_pass_is_the_same_loss_with_the_same_gradient():
+    random = np.random.default_rng(0)
+    true = tf.one_hot(random.integers(0, 35, (2, 16, 16)), 35)
+    predicted = tf.constant(random.dirichlet(np.ones(35), (2, 16, 16)).astype(np.float32))
+
+    def value_and_gradient(loss):
+        with tf.GradientTape() as tape:
+            tape.watch(predicted)
+            value = 3 * loss(true, predicted)
+        return value.numpy(), tape.gradient(value, predicted).numpy()
+
+    loss = training.total_loss()
+    value, gradient = value_and_gradient(loss)
+    compiled_value, compiled_gradient = value_and_gradient(training.one_pass(loss))
+
+    assert compiled_value == pytest.approx(value, rel=1e-6)
+    assert np.abs(compiled_gradient - gradient).max() < 1e-5 * np.abs(gradient).max()
+    assert training.one_pass(loss).__name__ == loss.name
 
 
 def test_each_epoch_shows_each_image_once_in_an_order_of_its_own():

@@ -30,6 +30,28 @@ def total_loss():
     return sm.losses.DiceLoss(class_weights=CLASS_WEIGHTS) + sm.losses.CategoricalFocalLoss()
 
 
+def one_pass(loss):
+    """The same loss (true masks, probabilities), but its gradient comes with its value, in one pass over the memory.
+
+    The library's loss is some forty operations, each of which reads and writes 35 values a pixel: a quarter of a
+    training step on a CPU. Compiled together they take a third of that and round otherwise. A GPU has them as they are.
+    """
+    @tf.function(jit_compile=not tf.config.list_physical_devices("GPU"))
+    def value_and_gradient(true, predicted):
+        with tf.GradientTape() as tape:
+            tape.watch(predicted)
+            value = loss(true, predicted)
+        return value, tape.gradient(value, predicted)
+
+    @tf.custom_gradient
+    def compiled(true, predicted):
+        value, gradient = value_and_gradient(true, predicted)
+        return value, lambda upstream: (None, upstream * gradient)
+
+    compiled.__name__ = loss.__name__
+    return compiled
+
+
 def metrics():
     """The library's IoU and F1 scores: means over all 35 classes of each batch, absent classes scoring 1."""
     return [sm.metrics.IOUScore(threshold=0.5), sm.metrics.FScore(threshold=0.5)]
