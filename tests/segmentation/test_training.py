@@ -118,6 +118,19 @@ def test_one_pass_is_the_same_loss_with_the_same_gradient():
     assert training.one_pass(loss).__name__ == loss.name
 
 
+@pytest.mark.parametrize("loss", [keras.losses.CategoricalCrossentropy(), keras.losses.categorical_crossentropy])
+def test_one_pass_takes_losses_of_keras_too(loss):
+    random, histories = np.random.default_rng(0), []
+    images = random.random((4, SIZE, SIZE, 1), np.float32)
+    masks = np.eye(35, dtype=np.float32)[random.integers(0, 35, (4, SIZE, SIZE))]
+    for each in (loss, training.one_pass(loss)):
+        keras.utils.set_random_seed(0)
+        model = build_unet((SIZE, SIZE, 1), 35, 4)
+        model.compile(keras.optimizers.Adam(), each)
+        histories.append(model.fit(images, masks, epochs=2, shuffle=False, verbose=0).history["loss"])
+    np.testing.assert_allclose(*histories, rtol=1e-4)
+
+
 def test_each_epoch_shows_each_image_once_in_an_order_of_its_own():
     second = (SETS[0][:5] // 2, SETS[1][:5])
     batches = training.Batches([SETS[:2], second], 4, seed=3)

@@ -40,7 +40,7 @@ def one_pass(loss):
     def value_and_gradient(true, predicted):
         with tf.GradientTape() as tape:
             tape.watch(predicted)
-            value = loss(true, predicted)
+            value = tf.reduce_mean(loss(true, predicted))  # of one value a pixel, as Keras does
         return value, tape.gradient(value, predicted)
 
     @tf.custom_gradient
@@ -48,7 +48,7 @@ def one_pass(loss):
         value, gradient = value_and_gradient(true, predicted)
         return value, lambda upstream: (None, upstream * gradient)
 
-    compiled.__name__ = loss.__name__
+    compiled.__name__ = getattr(loss, "__name__", None) or loss.name  # the library's losses and Keras' own
     return compiled
 
 
