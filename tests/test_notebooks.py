@@ -81,7 +81,8 @@ def test_the_order_of_the_notebooks_has_what_each_of_them_asks_for():
     before = {}
     for number, needs in sorted(listed.items()):
         before[number] = {*needs.split(), *(other for one in needs.split() for other in before[one])}
-    asked = {name[:2]: set(re.findall(r'\\"(\d\d)_\w+\\"', (ROOT / "notebooks" / name).read_text())) for name in NOTEBOOKS}
+    asked = {name[:2]: set(re.findall(r'\\"(\d\d)_\w+\\"', (ROOT / "notebooks" / name).read_text()))
+             for name in NOTEBOOKS}
     assert listed.keys() == asked.keys() and sum(map(len, asked.values())) > 10
     assert {number: some - before[number] for number, some in asked.items() if some - before[number]} == {}
 

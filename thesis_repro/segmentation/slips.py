@@ -7,10 +7,12 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
 
 import albumentations as A
+import joblib
 import keras
 import numpy as np
 import pandas as pd
 import segmentation_models as sm
+import tensorflow as tf
 
 from thesis_repro import files
 from thesis_repro.cityscapes import CLASS_WEIGHTS, ID, N_CLASSES
@@ -20,28 +22,40 @@ from thesis_repro.segmentation.unet import build_unet
 NOISE_OF_TODAY = (0.2, 0.44)  # standard deviation of A.GaussNoise's defaults, as shares of 255
 
 
-def trials(images, labels, validation, *, steps, seeds, base_filters=8, batch_size=8, rate=3e-3):
+def trials(images, labels, validation, *, steps, seeds, base_filters=8, batch_size=8, rate=3e-3, threads=1,
+           processes=1):
     """Train the thesis's network and four that differ in one slip for a few steps: a row for each variant and seed.
 
     images (n, size, size, 1) and labels (n, size, size), uint8, and the same of `validation`. What can be seen after so
     few steps is how a slip changes the beginning of a training, not where a whole one ends. Columns variant, seed,
     steps, mean_iou and accuracy as Cityscapes measures them, person (IoU of that class, NaN where it is absent).
+    threads: inside an operation, where TensorFlow has not begun; their number is part of the bits. processes: at once.
     """
     person = CLASS_WEIGHTS.copy()
     person[ID["person"]] = 1
-    rows = []
-    for corrected, weights, variants in ((False, CLASS_WEIGHTS, ("thesis", "divided by 255", "noise of today")),
-                                         (False, person, ("person weight 1",)),
-                                         (True, CLASS_WEIGHTS, ("corrected blocks",))):
-        fresh = partial(build_unet, images.shape[1:], N_CLASSES, base_filters, corrected_blocks=corrected)
-        model = fresh()
-        model.compile(keras.optimizers.Adam(rate),  # once for all of its trainings, for that takes longest
-                      sm.losses.DiceLoss(class_weights=weights) + sm.losses.CategoricalFocalLoss())
-        for variant in variants:
-            for seed in files.progress(range(seeds), variant, unit="training"):
-                rows.append({"variant": variant, "seed": seed, "steps": steps}
-                            | _trial(model, fresh, images, labels, validation, variant, seed, steps, batch_size))
-    return pd.DataFrame(rows)
+    train = partial(_trials, images, labels, validation, steps, seeds, base_filters, batch_size, rate, threads)
+    work = joblib.Parallel(n_jobs=processes, return_as="generator")(
+        joblib.delayed(train)(*alike) for alike in (
+            (False, CLASS_WEIGHTS, ("thesis", "divided by 255", "noise of today")),
+            (False, person, ("person weight 1",)), (True, CLASS_WEIGHTS, ("corrected blocks",))))
+    work = files.progress(work, "short trainings", total=3, unit="network")
+    return pd.DataFrame([row for rows in work for row in rows])
+
+
+def _trials(images, labels, validation, steps, seeds, base_filters, batch_size, rate, threads, corrected, weights,
+            variants):
+    """The trainings of one network with one loss, compiled once for all of them, for that takes longest."""
+    try:
+        tf.config.threading.set_intra_op_parallelism_threads(threads)
+    except RuntimeError:  # it has begun in this process
+        pass
+    fresh = partial(build_unet, images.shape[1:], N_CLASSES, base_filters, corrected_blocks=corrected)
+    model = fresh()
+    model.compile(keras.optimizers.Adam(rate),
+                  sm.losses.DiceLoss(class_weights=weights) + sm.losses.CategoricalFocalLoss())
+    return [{"variant": variant, "seed": seed, "steps": steps}
+            | _trial(model, fresh, images, labels, validation, variant, seed, steps, batch_size)
+            for variant in variants for seed in range(seeds)]
 
 
 def _trial(model, fresh, images, labels, validation, variant, seed, steps, batch_size):
