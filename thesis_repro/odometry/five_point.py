@@ -12,14 +12,18 @@ After Nister (2004), An efficient solution to the five-point relative pose probl
 His last step, rotation and translation from E and the vote, is pose.recover_pose.
 """
 
+import math
+
 import numpy as np
 
 from thesis_repro.compiled import fast
 
 SAMPLE = 5
-ERROR = 1e-12  # by which all equations are changed, at random, to see what rounding does to their solutions
-ROOT_ERROR = 1e-13  # relative to the polynomial's terms: of finding a root
-SAFETY = 8.0  # times such changes, and more where elimination is ill-conditioned, is granted to OpenCV's solutions
+ROUNDING = 2.0**-52  # of a number of the size of 1
+# This many times the estimate of what rounding does to a solution is granted to OpenCV's: of 200,000 solutions, of real
+# and of degenerate scenes, none needed more than 1.4 times.
+SAFETY = 3.0
+TOGETHER = 0.1  # of the errors of B(z), which largely move its rows alike, in det B(z): measured
 LEAST_MARGIN, LARGEST_MARGIN = 1e-9, 1e-3  # of a unit-norm essential matrix
 
 
@@ -52,7 +56,6 @@ def _products() -> tuple[np.ndarray, np.ndarray]:
 
 
 SIGNS = _signs()
-CHANGES = ERROR * np.random.default_rng(0).choice([-1.0, 1.0], (2, 10, 20))
 TO_QUADRATIC, TO_CUBIC = _products()
 
 
@@ -64,66 +67,38 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     which (Frobenius norm, up to sign) OpenCV's rounding leaves its own.
     """
     nothing, no_margins = np.empty((0, 9)), np.empty(0)
-    sure, basis = _null_space(five)  # step 1
+    independence, basis = _null_space(five)  # step 1
+    if not independence > 1e-8:
+        return False, nothing, no_margins
+    b, errors = _eliminate(_constraints(basis))  # steps 2 and 3
+    polynomial = _determinant(b)  # step 4
+    sure, roots, extrema = real_roots(polynomial)  # step 5
     if not sure:
         return False, nothing, no_margins
-    equations = _constraints(basis)  # step 2
-    # Steps 3 and 4, and once more with the equations changed a little in two ways: what changes is what rounding may.
-    first, second = _eliminate(equations + CHANGES[0]), _eliminate(equations + CHANGES[1])
-    b = _eliminate(equations)
-    polynomial, polynomial_first, polynomial_second = _determinant(b), _determinant(first), _determinant(second)
-    safety = SAFETY * (1 + 0.01 * np.abs(b).max())  # OpenCV inverts a matrix, at which the rounding grows
-    # Step 5
-    sure, roots = real_roots(polynomial, safety * (polynomial_first - polynomial),
-                             safety * (polynomial_second - polynomial))
-    if not sure:
-        return False, nothing, no_margins
+    terms, work = np.abs(b), np.empty((4, 3, 3))
+    for z in extrema:  # one as small as rounding may be a double root or none at all
+        if not abs(_value(polynomial, 10, z)) > SAFETY * ROUNDING * _at(b, terms, errors, z, work):
+            return False, nothing, no_margins
     # Step 6
     found, margins = np.empty((len(roots), 9)), np.empty(len(roots))
-    absolute, moved = np.abs(polynomial), np.empty(9)
     for k in range(len(roots)):
-        z = roots[k]
-        _essential(b, basis, z, found[k])
-        _essential(first, basis, _nearby_root(polynomial_first, z), moved)
-        change = _distance(found[k], moved)
-        _essential(second, basis, _nearby_root(polynomial_second, z), moved)
-        change = np.hypot(change, _distance(found[k], moved))  # unlike a maximum, this keeps what is not a number
-        _essential(b, basis, z + ROOT_ERROR * _horner(absolute, 10, abs(z))[0] / _horner(polynomial, 10, z)[1], moved)
-        margins[k] = LEAST_MARGIN + safety * (change + _distance(found[k], moved))
+        _essential(b, basis, roots[k], found[k])
+        change = 1 / independence + _change(b, terms, errors, roots[k], polynomial, work)
+        margins[k] = LEAST_MARGIN + SAFETY * ROUNDING * change
         if not margins[k] < LARGEST_MARGIN:
             return False, nothing, no_margins
     return True, found, margins
 
 
 @fast
-def _nearby_root(polynomial, z):
-    for _ in range(2):
-        value, slope = _horner(polynomial, 10, z)
-        z -= value / slope
-    return z
-
-
-@fast
-def _distance(e, other):
-    """Between two essential matrices (9, unit norm), whose signs mean nothing."""
-    plus, minus = 0.0, 0.0
-    for k in range(9):
-        plus += (e[k] + other[k]) ** 2
-        minus += (e[k] - other[k]) ** 2
-    if plus < minus:
-        return np.sqrt(plus)
-    return np.sqrt(minus)
-
-
-@fast
 def _null_space(five):
-    """Step 1: whether the epipolar constraints of five correspondences, (u, v, 1) E (x, y, 1)^T = 0, are independent,
-    and the basis X, Y, Z, W (4, 9) that OpenCV takes of the matrices that meet them, each row by row.
+    """Step 1: how independent the epipolar constraints of five correspondences, (u, v, 1) E (x, y, 1)^T = 0, are, from
+    0 to 1, and the basis X, Y, Z, W (4, 9) that OpenCV takes of the matrices that meet them, each row by row.
 
     Where Nister has a QR factorisation this is Gram and Schmidt's, twice over for the rounding. With another basis the
     solutions would be the same, but not how much rounding changes them.
     """
-    rows = np.empty((9, 9))
+    rows, independence = np.empty((9, 9)), 1.0
     for k in range(9):
         if k < SAMPLE:
             x, y, u, v = five[k]
@@ -141,10 +116,11 @@ def _null_space(five):
                 for i in range(9):
                     rows[k, i] -= along * rows[j, i]
         norm = np.sqrt((rows[k] * rows[k]).sum())
-        if not norm > 1e-8 * before:
-            return False, rows[SAMPLE:]
+        independence = min(independence, norm / before)
+        if not independence > 1e-8:
+            return 0.0, rows[SAMPLE:]
         rows[k] /= norm
-    return True, rows[SAMPLE:]
+    return independence, rows[SAMPLE:]
 
 
 @fast
@@ -188,7 +164,7 @@ def _eliminate(a):
 
     Gauss and Jordan's elimination with partial pivoting of the ten equations a (10, 20), which it overwrites. A row
     of B is one row less z times the next, in which nothing but x, y and 1 is left; a polynomial has its highest power
-    first, of degree 3, 3 and 4.
+    first, of degree 3, 3 and 4. With it the errors of the six rows of which it is made (see _elimination_errors).
     """
     b = np.zeros((3, 13))
     for k in range(10):
@@ -197,7 +173,7 @@ def _eliminate(a):
             if abs(a[i, k]) > abs(a[pivot, k]):
                 pivot = i
         if a[pivot, k] == 0:
-            return np.full((3, 13), np.nan)
+            return np.full((3, 13), np.nan), np.full(6, np.nan)
         if pivot != k:
             for j in range(k, 20):
                 a[k, j], a[pivot, j] = a[pivot, j], a[k, j]
@@ -211,13 +187,121 @@ def _eliminate(a):
                 a[k, j] -= a[k, i] * a[i, j]
         for j in range(10, 20):
             a[k, j] /= a[k, k]
+    largest = 1.0
+    for k in range(4, 10):
+        for j in range(10, 20):
+            largest = max(largest, abs(a[k, j]))
+    errors = _elimination_errors(a[4:, 4:10], largest)
     for i in range(3):
         # the columns of x z^2 to x, y z^2 to y, z^3 to 1
         for start, stop, place in ((10, 13, 0), (13, 16, 4), (16, 20, 8)):
             for j in range(start, stop):
                 b[i, place + j - start + 1] += a[4 + 2 * i, j]
                 b[i, place + j - start] -= a[5 + 2 * i, j]
-    return b
+    return b, errors
+
+
+@fast
+def _elimination_errors(u, largest):
+    """By how many units of rounding the six rows from which B(z) is made may be wrong, OpenCV's among them.
+
+    u: the triangle U (6, 6) that elimination leaves of the last six unknowns; largest: of the result's entries.
+    Equations that are wrong by a unit make the result wrong by |U^-1| times its size. Besides, OpenCV inverts the
+    matrix and multiplies, where elimination would do, which adds |U^-1| |U| |U^-1|: with ill-conditioned equations far
+    more. Of their products with what is of the size of 1 only sums of rows are needed.
+    """
+    inverse, sums, total = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    for i in range(5, -1, -1):
+        inverse[i, i] = 1 / u[i, i]
+        for j in range(i + 1, 6):
+            for k in range(i + 1, j + 1):
+                inverse[i, j] -= u[i, k] * inverse[k, j]
+            inverse[i, j] /= u[i, i]
+        for j in range(i, 6):
+            sums[i] += abs(inverse[i, j])
+    for j in range(6):
+        error = largest
+        for k in range(j, 6):
+            error += abs(u[j, k]) * sums[k]
+        for i in range(j + 1):
+            total[i] += abs(inverse[i, j]) * error
+    return total
+
+
+@fast
+def _at(b, terms, errors, z, work):
+    """By how many units of rounding det B(z) may be wrong, after Wilkinson: the sizes of all terms, whatever cancels.
+
+    terms: the sizes of B(z)'s coefficients. Written to work (4, 3, 3): B(z), the sizes of its terms, by how many units
+    it may be wrong, its cofactors.
+    """
+    values, sizes, wrong, cofactors = work[0], work[1], work[2], work[3]
+    size = abs(z)
+    powers = 1 + size + size * size
+    for i in range(3):
+        values[i, 0], values[i, 1], values[i, 2] = _row(b[i], z)
+        sizes[i, 0], sizes[i, 1], sizes[i, 2] = _row(terms[i], size)
+        error = errors[2 * i] + size * errors[2 * i + 1]
+        wrong[i, 0], wrong[i, 1] = error * powers + sizes[i, 0], error * powers + sizes[i, 1]
+        wrong[i, 2] = error * (1 + size * powers) + sizes[i, 2]
+    error = 0.0
+    for i in range(3):
+        p, q = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            m, n = (j + 1) % 3, (j + 2) % 3
+            cofactors[i, j] = values[p, m] * values[q, n] - values[p, n] * values[q, m]
+            error += TOGETHER * abs(cofactors[i, j]) * wrong[i, j]
+        error += sizes[i, 0] * (sizes[p, 1] * sizes[q, 2] + sizes[p, 2] * sizes[q, 1])
+    return error
+
+
+@fast
+def _change(b, terms, errors, z, polynomial, work):
+    """By how many units of rounding the essential matrix (unit norm) of a root z may be wrong, to the first order.
+
+    As coordinates in the orthonormal basis it is (x, y, w z, w), (x, y, w) normal to B(z). It changes as z does, by the
+    error of det B(z) over its slope, and as the plane of B(z)'s rows does, by their errors over its second singular
+    value, which is about the norm of the cofactors over that of B(z).
+    """
+    error = _at(b, terms, errors, z, work)
+    values, wrong, cofactors = work[0], work[2], work[3]
+    best, largest, cofactor_norm, norm = 0, -1.0, 0.0, 0.0
+    for i in range(3):
+        square = 0.0
+        for j in range(3):
+            square += cofactors[i, j] * cofactors[i, j]
+            norm += values[i, j] * values[i, j]
+        cofactor_norm += square
+        if square > largest:
+            best, largest = i, square
+    p, q, (x, y, w) = values[(best + 1) % 3], values[(best + 2) % 3], cofactors[best]
+    p0, p1, p2 = _row_slopes(b[(best + 1) % 3], z)
+    q0, q1, q2 = _row_slopes(b[(best + 2) % 3], z)
+    dx = p1 * q[2] - p2 * q[1] + p[1] * q2 - p[2] * q1
+    dy = p2 * q[0] - p0 * q[2] + p[2] * q0 - p[0] * q2
+    dw = p0 * q[1] - p1 * q[0] + p[0] * q1 - p[1] * q0
+    dwz = dw * z + w
+    square = x * x + y * y + w * w * (1 + z * z)
+    along = (x * dx + y * dy + w * dw + w * z * dwz) / square  # what a unit norm undoes
+    speed = (dx - along * x)**2 + (dy - along * y)**2 + (dw - along * w)**2 + (dwz - along * w * z)**2
+    tilt = 0.0
+    for i in range(3):
+        tilt += (abs(x) * wrong[i, 0] + abs(y) * wrong[i, 1] + abs(w) * wrong[i, 2])**2
+    tilt *= norm / cofactor_norm * (1 + z * z)
+    return (error / abs(_slope(polynomial, z)) * np.sqrt(speed) + np.sqrt(tilt)) / np.sqrt(square)
+
+
+@fast
+def _row(c, z):
+    """One row of B(z)."""
+    return (((c[0] * z + c[1]) * z + c[2]) * z + c[3], ((c[4] * z + c[5]) * z + c[6]) * z + c[7],
+            (((c[8] * z + c[9]) * z + c[10]) * z + c[11]) * z + c[12])
+
+
+@fast
+def _row_slopes(c, z):
+    return ((3 * c[0] * z + 2 * c[1]) * z + c[2], (3 * c[4] * z + 2 * c[5]) * z + c[6],
+            ((4 * c[8] * z + 3 * c[9]) * z + 2 * c[10]) * z + c[11])
 
 
 @fast
@@ -238,67 +322,84 @@ def _determinant(b):
 
 
 @fast
-def _horner(polynomial, degree, z):
-    """A polynomial's value and slope at z."""
+def _slope(polynomial, z):
+    """The slope at z of a polynomial of degree ten."""
     value, slope = polynomial[0], 0.0
-    for k in range(1, degree + 1):
+    for k in range(1, 11):
         slope = slope * z + value
         value = value * z + polynomial[k]
-    return value, slope
+    return slope
 
 
 @fast
-def real_roots(polynomial: np.ndarray, error: np.ndarray, other: np.ndarray) -> tuple[bool, np.ndarray]:
-    """Step 5: the real roots of a polynomial of degree ten (11, highest power first), and first whether they are
-    surely all.
+def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
+    """Step 5: whether a polynomial of degree ten (11, highest power first) could be solved, its real roots, and the
+    places of its extrema, of which one that is nearly 0 may be a double root or none at all.
 
-    error, other: polynomials; an extremum no larger than both together may be a double root or none at all.
-    Between two roots of the derivative lies at most one, so the derivatives are solved one after the other.
+    Between two roots of the derivative lies at most one, so the derivatives are solved one after the other: those of
+    low degree, whose roots only part those of the next, no more precisely than that needs.
     """
     bound = 0.0
     for k in range(1, 11):
         if not abs(polynomial[k]) < 1e15 * abs(polynomial[0]):
-            return False, np.empty(0)
+            return False, np.empty(0), np.empty(0)
         bound = max(bound, 2 * (abs(polynomial[k]) / abs(polynomial[0])) ** (1.0 / k))
     if abs(polynomial[0]) < 1e-12:  # OpenCV drops a leading coefficient of 2e-16
-        return False, np.empty(0)
-    derivative = np.empty(11)
-    edges, roots = np.empty(12), np.empty(11)
-    found = 0
+        return False, np.empty(0), np.empty(0)
+    derivatives = np.empty((11, 11))
+    derivatives[10] = polynomial
+    for degree in range(10, 0, -1):
+        for k in range(degree):
+            derivatives[degree - 1, k] = derivatives[degree, k] * (degree - k)
+    edges, roots, bends = np.empty(12), np.empty(11), np.empty(12)
+    found, intervals = 0, 0
     for degree in range(1, 11):
-        for k in range(degree + 1):
-            factor = 1.0
-            for power in range(degree - k + 1, 10 - k + 1):
-                factor *= power
-            derivative[k] = polynomial[k] * factor
+        derivative, slopes = derivatives[degree], derivatives[degree - 1]
         edges[0], edges[found + 1] = -bound, bound
         for k in range(found):
             edges[k + 1] = roots[k]
-            if degree == 10:
-                doubt = abs(_horner(error, 10, roots[k])[0]) + abs(_horner(other, 10, roots[k])[0])
-                if not abs(_horner(polynomial, 10, roots[k])[0]) > doubt:
-                    return False, np.empty(0)
         intervals, found = found + 1, 0
-        left = _horner(derivative, degree, edges[0])[0]
+        left = _value(derivative, degree, -bound)
         for k in range(intervals):
-            right = _horner(derivative, degree, edges[k + 1])[0]
+            right = _value(derivative, degree, edges[k + 1])
             if (left < 0) != (right < 0):
-                roots[found] = _root_between(derivative, degree, edges[k], edges[k + 1], left < 0)
+                start = 0.5 * (edges[k] + edges[k + 1])
+                if 0 < k < intervals - 1:  # between two extrema, where a cubic that shares them is 0
+                    part = 0.5 - math.sin(math.asin((left + right) / (left - right)) / 3)
+                    start = edges[k] + part * (edges[k + 1] - edges[k])
+                elif k > 0:  # beyond one, where a parabola would be
+                    start = edges[k] + math.sqrt(abs(2 * left / bends[k]))
+                elif intervals > 1:
+                    start = edges[1] - math.sqrt(abs(2 * right / bends[1]))
+                roots[found] = _root_between(derivative, slopes, degree, edges[k], edges[k + 1], left < 0, start,
+                                             1e-14 if degree > 8 else 1e-6)
                 found += 1
             left = right
-    return True, roots[:found].copy()
+        for k in range(found):
+            bends[k + 1] = _value(slopes, degree - 1, roots[k])
+    return True, roots[:found].copy(), edges[1:intervals].copy()
 
 
 @fast
-def _root_between(polynomial, degree, left, right, rising):
+def _value(polynomial, degree, z):
+    """A polynomial at z: even and odd powers apart, which a processor works on at the same time."""
+    square = z * z
+    first, second = polynomial[0], polynomial[1] if degree else 0.0
+    for k in range(2, degree, 2):
+        first = first * square + polynomial[k]
+        second = second * square + polynomial[k + 1]
+    if degree % 2:
+        return first * z + second
+    return first * square + polynomial[degree] + second * z if degree else first
+
+
+@fast
+def _root_between(polynomial, slopes, degree, left, right, rising, start, precision):
     """Newton's iteration, with bisection where it would leave the interval or is slow."""
-    z = 0.5 * (left + right)
+    z = start if left < start < right else 0.5 * (left + right)
     before = right - left
     for _ in range(100):
-        value, slope = polynomial[0], 0.0
-        for k in range(1, degree + 1):
-            slope = slope * z + value
-            value = value * z + polynomial[k]
+        value, slope = _value(polynomial, degree, z), _value(slopes, degree - 1, z)
         if (value < 0) == rising:
             left = z
         else:
@@ -308,7 +409,7 @@ def _root_between(polynomial, degree, left, right, rising):
             step = z - 0.5 * (left + right)
         before = abs(step)
         z -= step
-        if before <= 1e-14 * abs(z) + 1e-300:
+        if before <= precision * abs(z) + 1e-300:
             break
     return z
 
@@ -318,9 +419,7 @@ def _essential(b, basis, z, matrix):
     """Step 6: write the essential matrix (9, unit norm) that belongs to a root z: (x, y, 1) is normal to B(z)."""
     rows = np.empty((3, 3))
     for i in range(3):
-        rows[i, 0] = ((b[i, 0] * z + b[i, 1]) * z + b[i, 2]) * z + b[i, 3]
-        rows[i, 1] = ((b[i, 4] * z + b[i, 5]) * z + b[i, 6]) * z + b[i, 7]
-        rows[i, 2] = (((b[i, 8] * z + b[i, 9]) * z + b[i, 10]) * z + b[i, 11]) * z + b[i, 12]
+        rows[i, 0], rows[i, 1], rows[i, 2] = _row(b[i], z)
     x, y, w, largest = 0.0, 0.0, 1.0, -1.0
     for i in range(3):  # the rows span a plane; the best conditioned pair gives its normal
         p, q = rows[i], rows[(i + 1) % 3]

@@ -4,10 +4,10 @@ Nearly all of OpenCV's time goes into the five-point solver (Nister 2004: An eff
 relative pose problem), most of it into finding all ten complex roots of a polynomial by Durand and Kerner's iteration,
 which runs to its last round although the roots settled long before. Of all these solutions RANSAC keeps one. So
 five_point.solve, not the same to the last bit but with a margin for the difference, says of each sample of five how
-many correspondences agree with its best solution; OpenCV itself solves those samples for which the margin leaves open
-whether they are better than the best so far, and the winner. Should the winner's inliers not be as many as foretold,
-OpenCV does everything. Samples are drawn with OpenCV's generator of random numbers. The margin is an estimate with
-room to spare, not a proof; the tests compare.
+many correspondences agree with its best solution, which a look in single precision shows to be too few of most; OpenCV
+itself solves those samples for which the margin leaves open whether they are better than the best so far, and the
+winner. Should the winner's inliers not be as many as foretold, OpenCV does everything. Samples are drawn with OpenCV's
+generator of random numbers. The margin is an estimate with room to spare, not a proof; the tests compare.
 """
 
 import math
@@ -38,6 +38,7 @@ def find(current: np.ndarray, previous: np.ndarray, threshold: float,
         return _opencv(current, previous, threshold, probability)
     columns = np.ascontiguousarray(np.hstack([current, previous]).T)
     limit = np.float32(threshold * threshold)
+    rough = _rough(columns)
 
     def solve_now(winner):
         return _solved(columns, winner, threshold, probability, limit)
@@ -47,11 +48,12 @@ def find(current: np.ndarray, previous: np.ndarray, threshold: float,
     state, sample, low, high, winner, solution = SEED, 0, SAMPLE - 1, SAMPLE - 1, None, None
     while True:
         enough = MAX_SAMPLES if winner is None else _samples_needed(probability, (count - high) / count)
-        state, sample, chosen, fewest, most = _next_better(columns, float(limit), np.uint64(state), sample, enough, low)
+        state, sample, chosen, fewest, most = _next_better(columns, rough, float(limit), np.uint64(state), sample,
+                                                           enough, low)
         if most > low and fewest > high:
             low, high, winner, solution = fewest, most, chosen, None
             continue
-        if winner is not None and solution is None:
+        if winner is not None and solution is None and (most == 0 or low < high):
             solution = solve_now(winner)
             if not low <= solution[0] <= high:
                 return _opencv(current, previous, threshold, probability)
@@ -122,8 +124,15 @@ def draw(state, columns, chosen, five):
     return state
 
 
+def _rough(columns):
+    """Correspondences in single precision, and how much an error of a matrix's entries may matter to each: (5, N)."""
+    x, y, u, v = np.abs(columns)
+    with np.errstate(over="ignore"):
+        return np.vstack([columns, (1 + x + y) * (1 + u + v)]).astype(np.float32)
+
+
 @fast
-def _next_better(columns, limit, state, sample, samples, best):
+def _next_better(columns, rough, limit, state, sample, samples, best):
     """Draw samples until one may have more than `best` inliers, or until there are `samples` of them.
 
     Returns the generator's state, the number of samples drawn, the five indices, and the bounds between which the
@@ -140,11 +149,44 @@ def _next_better(columns, limit, state, sample, samples, best):
             return state, sample, chosen, 0, count
         low, high = 0, 0
         for k in range(len(solutions)):
+            if not _may_beat(solutions[k], margins[k], rough, limit, max(best, low)):
+                continue
             fewest, most = _bounds(solutions[k], margins[k], columns, limit, max(best, low))
             low, high = max(low, fewest), max(high, most)
         if high > best:
             return state, sample, chosen, low, high
     return state, sample, chosen, 0, 0
+
+
+@fast
+def _may_beat(e, margin, rough, limit, best):
+    """False if no matrix within the margin of e has more than `best` inliers: a look in single precision."""
+    count, allowed = rough.shape[1], rough.shape[1] - best
+    root = np.sqrt(limit)
+    # What the margin (see _bounds_of_block) and nine roundings of 2^-24 may change: `algebraic`, and `root` times the
+    # root of the sum of squares. The rounding of what is made of those two is in `wide`.
+    doubt = np.float32(4.001 * margin + 1e-6 * (1 + root))
+    wide = np.float32(1.00001 * limit)
+    matrix = (np.float32(e[0]), np.float32(e[1]), np.float32(e[2]), np.float32(e[3]), np.float32(e[4]),
+              np.float32(e[5]), np.float32(e[6]), np.float32(e[7]), np.float32(e[8]))
+    outliers = 0
+    for start in range(0, count, BLOCK):
+        stop = min(start + BLOCK, count)
+        outliers += _surely_out(matrix, doubt, wide, rough[0, start:stop], rough[1, start:stop], rough[2, start:stop],
+                                rough[3, start:stop], rough[4, start:stop])
+        if outliers >= allowed:
+            return False
+    return True
+
+
+@fast
+def _surely_out(matrix, doubt, limit, x, y, u, v, reach):
+    outliers = np.int32(0)  # as wide as the numbers, so that several are counted at once
+    for k in range(len(x)):
+        algebraic, l0, l1, m0, m1 = epipolar.lines(matrix, x[k], y[k], u[k], v[k])
+        least = max(abs(algebraic) - doubt * reach[k], np.float32(0))
+        outliers = np.int32(outliers + np.int32(least * least > limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)))
+    return outliers
 
 
 @fast
