@@ -113,10 +113,10 @@ $(RUN)/checked: .venv/ready $(DATA)
 
 # What a notebook needs of others, by their numbers: they hand results on through files. One that is not listed needs
 # the one before it. Two that do not need each other are executed beside each other, for most are at times at work with
-# one core alone, and the training all the time.
+# one core alone, and the training all the time. (03 needs nothing, but at first both would compile TensorFlow's modules.)
 NEEDS_01 :=
 NEEDS_02 := 01
-NEEDS_03 :=
+NEEDS_03 := 01
 NEEDS_04 := 01 02 03
 NEEDS_05 := 01 04
 NEEDS_06 := 05
@@ -131,7 +131,7 @@ needed = $(foreach number,$(NEEDS_$(1)),$(filter $(RUN)/notebooks/$(number)_%,$(
 define execute
 $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 	@mkdir -p $$(@D)
-	@$(BIN)/jupyter nbconvert --to notebook --execute --log-level=CRITICAL \
+	@$(BIN)/jupyter-nbconvert --to notebook --execute --log-level=CRITICAL \
 	  --NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution \
 	  --Execution.log_file=$$(@D)/$(basename $(1)).log --output-dir $$(@D) --output .$(1) $$<
 	@mv $$(@D)/.$(1) $$@
