@@ -60,7 +60,7 @@ help:
 
 setup: .venv/ready $(if $(filter-out 0,$(GPU)),.venv/ready-gpu)
 
-# (two at once, every other line each, take half the time)
+# (two at once, every other line each, take half the time; what a shell starts beside itself is deaf to Ctrl-C)
 install = $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile \
             -r <(awk '$(1)' environment.txt) 2> >(grep -v '^WARNING' >&2)
 
@@ -71,7 +71,7 @@ install = $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-
 	  echo "$(PYTHON) has no venv module: install it (Debian and Ubuntu: apt-get install python3-venv)" >&2; exit 1; }
 	@echo "installing the pinned packages into .venv (2.4 GB, some minutes)"
 	@$(PYTHON) -m venv .venv
-	@$(call install,NR % 2) & other=$$!; $(call install,NR % 2 == 0) && wait $$other || { wait; exit 1; }
+	@trap 'kill $$other; exit 130' INT TERM; $(call install,NR % 2) & other=$$!; $(call install,NR % 2 == 0) && wait $$other || { wait; exit 1; }
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . 2> >(grep -v '^WARNING' >&2)
 	@touch $@
 
