@@ -33,8 +33,8 @@ def total_loss():
 def one_pass(loss):
     """The same loss (true masks, probabilities), but its gradient comes with its value, in one pass over the memory.
 
-    The library's loss is some forty operations, each of which reads and writes 35 values a pixel: a quarter of a
-    training step on a CPU. Compiled together they take a third of that and round otherwise. A GPU has them as they are.
+    The library's loss is many operations, each of which reads and writes 35 values a pixel. Compiled together they read
+    and write them once, which saves time on a CPU, and round otherwise. A GPU has them as they are.
     """
     @tf.function(jit_compile=not tf.config.list_physical_devices("GPU"))
     def value_and_gradient(true, predicted):
