@@ -92,7 +92,7 @@ def test_what_a_run_depends_on_is_found():
         return {str(path.relative_to(stages._PACKAGE).with_suffix("")) for path in found}
 
     found = modules("odometry", "study/jobs")
-    assert {"kitti", "masks", "odometry/five_point", "study/controls", "cityscapes"} <= found
+    assert {"kitti", "masks", "odometry/opencv_exact/five_point", "study/controls", "cityscapes"} <= found
     assert not {name for name in found if name.startswith(("report", "segmentation", "world"))}
     assert not {"study/results", "study/runner"} & found
 

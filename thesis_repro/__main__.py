@@ -169,7 +169,8 @@ def odometry(options):
     from thesis_repro.files import write_text
     from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
     from thesis_repro.masks import LabelMasks, MaskFolder
-    from thesis_repro.odometry import boresight, metrics
+    from thesis_repro.odometry import metrics
+    from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import terminal
 
     if options.labels and options.dilation is None:
@@ -222,13 +223,13 @@ def boresight(options):
     """estimate the constant rotation between camera and ground truth (degrees; for odometry --boresight)"""
     from thesis_repro import odometry
     from thesis_repro.kitti import Sequence
-    from thesis_repro.odometry import boresight
+    from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import terminal
 
     paths = {}
     for name in dict.fromkeys(options.sequences):
         sequence = Sequence(options.kitti, name)
-        estimated = odometry.run(sequence, replace(odometry.THESIS, pose="refined"), description=f"sequence {name}")
+        estimated = odometry.run(sequence, replace(odometry.THESIS, estimator="refined"), description=f"sequence {name}")
         paths[name] = estimated.poses, sequence.poses
     found, table = boresight.estimate(list(paths.values())), boresight.explained(paths)
     print(json.dumps(terminal.angles(found, table)) if options.json else terminal.angles_text(found, table))
@@ -255,7 +256,7 @@ def study(options):
     planned = series.checked(series.Study(
         options.kitti.absolute(), tuple(options.sequences or kitti.sequences(options.kitti)),
         series.named(options.sources, options.name, settings), tuple(sorted(set(widths))),
-        jobs.CONTROL_WIDTH if options.controls is True else options.controls, tuple(dict.fromkeys(options.pose)),
+        jobs.CONTROL_WIDTH if options.controls is True else options.controls, tuple(dict.fromkeys(options.estimator)),
         options.repetitions, options.frames))
     if options.plan:
         from thesis_repro.study import plan
@@ -443,12 +444,12 @@ def build_parser():
     add_mask_settings(sub)
     sub.add_argument("--pyslam", choices=("2021", "2024"), default="2021",
                      help="the preset: PySLAM of the thesis (default), or its later algorithm; what follows changes it")
-    sub.add_argument("--pose", metavar="all|inliers|refined",
+    sub.add_argument("--estimator", metavar="thesis|inliers|refined",
                      help="who votes on the motion: all points (PySLAM), RANSAC's inliers, or these and then a fit")
-    sub.add_argument("--permute", type=int, metavar="SEED", help="shuffle the correspondences before RANSAC")
+    sub.add_argument("--shuffle-seed", type=int, metavar="SEED", help="shuffle the correspondences before RANSAC")
     sub.add_argument("--mask-mode", metavar="detect|filter",
                      help="give the mask to the detector (default), or drop what it found outside")
-    sub.add_argument("--estimator", metavar="ransac|usac|usac-magsac", help="of the essential matrix")
+    sub.add_argument("--essential-method", metavar="ransac|usac|usac-magsac", help="of the essential matrix")
     sub.add_argument("--detector", metavar="shi-tomasi|orb", help="of keypoints; they are tracked all the same")
     sub.add_argument("--min-distance", type=float, metavar="PIXELS", help="between keypoints (3)")
     sub.add_argument("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")
@@ -484,8 +485,8 @@ def build_parser():
                      help="masks and limits that know no segmentation, beside masks of width W (10)")
     sub.add_argument("--repetitions", type=int, default=5, metavar="N",
                      help="of every run, each with the correspondences in another order (5)")
-    sub.add_argument("--pose", nargs="+", choices=("all", "refined"), default=["all"],
-                     help="the estimator: the thesis's (all, default), the refined one, or both")
+    sub.add_argument("--estimator", nargs="+", choices=("thesis", "refined"), default=["thesis"],
+                     help="the estimator: the thesis's (default), the refined one, or both")
     sub.add_argument("--frames", type=int, metavar="N", help="from the start of each sequence (all)")
     place = sub.add_mutually_exclusive_group()
     place.add_argument("--jobs", type=int, metavar="N", help="processes at once (as many as there are cores)")

@@ -48,7 +48,7 @@ def test_colour_is_left_out_where_the_images_have_none(monkeypatch):
     monkeypatch.setattr(proposals, "train", lambda build, images, labels, seconds, seed: ((images.shape, seconds), 1))
     monkeypatch.setattr(proposals.backbones, "ensemble", len)
     monkeypatch.setattr(proposals.backbones, "backbone_unet", lambda name: name)
-    found = {name: model for name, model, *_ in proposals.variants(data(colour=False), 60, 0)}
+    found = {name: model for name, model, *_ in proposals.methods(data(colour=False), 60, 0)}
     assert found == {"the thesis's network": ((6, 64, 64, 1), 60), "backbone resnet18": ((6, 64, 64, 1), 60),
                      "ensemble of 2": 2}
-    assert "in colour" in {name for name, *_ in proposals.variants(data(colour=True), 60, 0)}
+    assert "in colour" in {name for name, *_ in proposals.methods(data(colour=True), 60, 0)}

@@ -9,8 +9,9 @@ import pytest
 from thesis_repro import InputError
 from thesis_repro.__main__ import main
 from thesis_repro.kitti import read_poses
-from thesis_repro.odometry import boresight, metrics
-from thesis_repro.odometry.boresight import rotation, turned
+from thesis_repro.odometry import metrics
+from thesis_repro.odometry.refined import boresight
+from thesis_repro.odometry.refined.boresight import rotation, turned
 
 KNOWN = np.array([0.4, -0.6, 0.3])  # pitch, yaw, roll in degrees
 

@@ -12,7 +12,7 @@ from evo.tools import file_interface
 from thesis_repro import InputError
 from thesis_repro.kitti import write_kitti_poses, write_tum
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.boresight import turned
+from thesis_repro.odometry.refined.boresight import turned
 
 
 def path(positions):

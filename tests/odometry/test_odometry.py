@@ -13,7 +13,8 @@ from street import Street, Stripes
 from thesis_repro import InputError, odometry
 from thesis_repro.files import read_gray
 from thesis_repro.kitti import Sequence, write_kitti_poses
-from thesis_repro.odometry import PYSLAM_2024, THESIS, Odometry, keypoints, metrics, pose, refine
+from thesis_repro.odometry import PYSLAM_2024, THESIS, Odometry, keypoints, metrics, pose
+from thesis_repro.odometry.refined import fit as refine
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {"points": "n_kps_to_lk", "detected": "n_detected", "tracked": "n_tracked", "inliers": "n_inliers_E",
@@ -301,13 +302,13 @@ def test_masks_in_the_detector_refill_the_quota_and_filters_do_not(drive):
 
 def test_permutations_vary_the_path_and_repeat_by_seed(drive):
     few = Changed(drive, frames=4)
-    first, again, other, plain = (odometry.run(few, replace(SMALL, permute=seed)).poses for seed in (0, 0, 1, None))
+    first, again, other, plain = (odometry.run(few, replace(SMALL, shuffle_seed=seed)).poses for seed in (0, 0, 1, None))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-6 and np.abs(first - plain).max() > 1e-6
 
 
 def test_permuted_inliers_belong_to_their_correspondences(drive):
-    follower = Odometry(drive.intrinsics, replace(THESIS, permute=3))
+    follower = Odometry(drive.intrinsics, replace(THESIS, shuffle_seed=3))
     follower.step(drive.frame(0))
     step = follower.step(drive.frame(1), 0.4)
     t = step.motion.translation
@@ -322,7 +323,7 @@ def test_permuted_inliers_belong_to_their_correspondences(drive):
 
 def test_refinement_is_closer_to_the_truth_and_varies_less(drive):
     few = Changed(drive, frames=6)
-    errors = {choice: [metrics.rmse(odometry.run(few, replace(THESIS, pose=choice, permute=seed)).poses, few.poses)
+    errors = {choice: [metrics.rmse(odometry.run(few, replace(THESIS, estimator=choice, shuffle_seed=seed)).poses, few.poses)
                        for seed in range(3)] for choice in ("inliers", "refined")}
     assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
     assert np.std(errors["refined"]) < 0.5 * np.std(errors["inliers"])
@@ -358,7 +359,7 @@ def test_inliers_alone_decide_the_sign():
 @pytest.mark.parametrize("estimator", ["usac", "usac-magsac"])
 def test_other_estimators_find_the_way(drive, estimator):
     few = Changed(drive, frames=5)
-    result = odometry.run(few, replace(THESIS, estimator=estimator))
+    result = odometry.run(few, replace(THESIS, essential_method=estimator))
     assert metrics.rmse(result.poses, few.poses) < 0.05
     assert np.abs(result.poses - odometry.run(few).poses).max() > 1e-9
 
@@ -427,8 +428,8 @@ def test_runs_that_differ_after_the_tracking_share_masks_keypoints_and_essential
             return super().__getitem__(index)
 
     stripes = Counted(20)
-    runs = {(order, way): (replace(THESIS, permute=order, pose=way), stripes)
-            for order in (None, 1, 2) for way in ("all", "refined")}
+    runs = {(order, way): (replace(THESIS, shuffle_seed=order, estimator=way), stripes)
+            for order in (None, 1, 2) for way in ("thesis", "refined")}
     estimated = []
     monkeypatch.setattr(pose, "essential_matrix",
                         lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1])
@@ -505,7 +506,7 @@ def test_what_fails_in_a_thread_stops_the_pass(drive, monkeypatch):
 
 @pytest.mark.parametrize("setting, value, message", [
     ("pose", "best", "odometry setting pose: 'best' is unknown; choose one of all, inliers, refined"),
-    ("estimator", "lmeds", "estimator: 'lmeds'"), ("max_keypoints", -1, "max_keypoints: -1"),
+    ("essential_method", "lmeds", "essential_method: 'lmeds'"), ("max_keypoints", -1, "max_keypoints: -1"),
     ("threshold", 0.0, "threshold: 0.0")])
 def test_unknown_settings_are_named(setting, value, message):
     with pytest.raises(InputError, match=message):

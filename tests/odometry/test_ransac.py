@@ -8,7 +8,8 @@ import pytest
 
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.odometry import THESIS, five_point, pose, ransac
+from thesis_repro.odometry import THESIS, pose
+from thesis_repro.odometry.opencv_exact import five_point, ransac
 
 
 def opencv(current, previous, threshold):

@@ -9,11 +9,14 @@ from street import Street
 
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.odometry import THESIS, Odometry, continuity, guided, metrics, pose, refine
-from thesis_repro.odometry.continuity import AMBIGUOUS, NOT_DETERMINED, Course
+from thesis_repro.odometry import THESIS, Odometry, metrics, pose
+from thesis_repro.odometry.refined import fit as refine
+from thesis_repro.odometry.refined import guided
+from thesis_repro.odometry.refined import motion_prior as continuity
+from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED, Course
 
 AHEAD = np.array([0.0, 0.0, 1.0])
-REFINED = replace(THESIS, pose="refined")
+REFINED = replace(THESIS, estimator="refined")
 
 
 def turn(degrees):
@@ -195,7 +198,7 @@ def column_at(drive, index):
 @pytest.mark.parametrize("seed", [None, 1, 2])
 def test_a_line_beside_the_road_costs_one_flagged_step(seed):
     drive = Street(8)
-    result = odometry.run(drive, replace(REFINED, permute=seed), column_at(drive, 4))
+    result = odometry.run(drive, replace(REFINED, shuffle_seed=seed), column_at(drive, 4))
     flagged = result.frames.loc[result.frames["flag"] != "", ["frame", "flag"]].to_numpy().tolist()
     assert flagged == [[5, NOT_DETERMINED]]
     assert result.frames["updated"][1:].all()
@@ -223,8 +226,8 @@ def test_a_stopped_pass_knows_its_course(tmp_path, monkeypatch):
 
 def test_a_plain_drive_is_not_flagged():
     drive = Street(6)
-    for way in ("all", "inliers", "refined"):
-        assert odometry.run(drive, replace(THESIS, pose=way, max_keypoints=400)).flagged.empty
+    for way in ("thesis", "inliers", "refined"):
+        assert odometry.run(drive, replace(THESIS, estimator=way, max_keypoints=400)).flagged.empty
 
 
 @pytest.mark.real
@@ -232,7 +235,7 @@ def test_a_plain_drive_is_not_flagged():
 def test_few_keypoints_keep_their_way_through_a_turn(kitti_real, seed):
     """05, frames 128 to 150: a turn seen in points far away, where a shift to the side explains 500 points as well."""
     sequence = Sequence(kitti_real, "05")
-    follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=500, permute=seed), sequence.poses[128])
+    follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=500, shuffle_seed=seed), sequence.poses[128])
     follower.count = 128  # the frame's number is part of the order's seed
     metres = odometry.scales(sequence)
     flags = set()
@@ -251,7 +254,7 @@ def test_a_second_start_leaves_a_poor_minimum(kitti_real):
     sequence = Sequence(kitti_real, "05")
     directions = []
     for seed in range(6):
-        follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=300, permute=seed or None))
+        follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=300, shuffle_seed=seed or None))
         follower.step(sequence.frame(0))
         directions.append(follower.step(sequence.frame(1), 1.0).motion.translation)
     assert np.degrees(np.arccos(min(one @ other for one in directions for other in directions))) < 4

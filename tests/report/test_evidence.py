@@ -28,8 +28,8 @@ def test_a_folder_of_evidence_has_every_method_and_error_and_no_frame(small_worl
     # six frames may be too short a way for the errors over stretches
     assert set(table["error"]) == {name for metric, name in answer.SHOWN.items() if runs[metric].notna().any()}
     assert {*results.ERRORS, *results.BESIDE} <= set(runs) and set(runs["sequence"]) == {"00", "01"}
-    corrected = runs[runs["variant"] == "corrected"]
-    assert set(corrected["dilation_width"]) == {5, jobs.CONTROL_WIDTH} and set(corrected["pose"]) == set(jobs.POSES)
+    corrected = runs[runs["method"] == "corrected"]
+    assert set(corrected["dilation_width"]) == {5, jobs.CONTROL_WIDTH} and set(corrected["estimator"]) == set(jobs.ESTIMATORS)
     assert "With all of the thesis's slips corrected" in (tmp_path / "out" / "README.md").read_text()
     before = {path.name: path.read_bytes() for path in files}
     monkeypatch.setattr(odometry, "run_many", None)  # nothing may run again

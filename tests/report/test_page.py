@@ -238,10 +238,10 @@ def test_thesis_numbers_stand_beside_those_of_the_run(run):
         "1,0.9,0.1,0.1,0.8,0.21,0.2\n2,0.7,0.3,0.2,0.9,0.2,0.1\n")
     (run.settings.figures / "timings").mkdir()
     (run.settings.figures / "timings" / "seconds.csv").write_text(
-        "sequence,variant,dilation_width,seconds\n"
+        "sequence,method,dilation_width,seconds\n"
         "00,baseline,,4\n01,baseline,,6\n00,masked,1,4\n01,masked,1,4\n00,masked,2,11\n")
     (run.settings.build / "runs.csv").write_text(
-        "sequence,variant,repetition,mean_keypoints\n"
+        "sequence,method,repetition,mean_keypoints\n"
         "00,baseline,0,1990\n00,baseline,1,2010\n01,baseline,0,900\n00,masked,0,7\n")
     (run.settings.figures / "table_4_1.csv").write_text("sequence,mean keypoints\n00,500\n01,300\n")
     text = read(run).text

@@ -30,8 +30,8 @@ def sequence(small_world):
 
 def test_every_stage_of_both_variants_takes_time(sequence, model):
     table = budget.measure(sequence, model, frames=4)
-    assert list(table.columns) == ["variant", "stage", "milliseconds"] and (table["milliseconds"] > 0).all()
-    by_variant = table.groupby("variant")["stage"].agg(list)
+    assert list(table.columns) == ["method", "stage", "milliseconds"] and (table["milliseconds"] > 0).all()
+    by_variant = table.groupby("method")["stage"].agg(list)
     assert by_variant["masked, width 10"] == list(budget.STAGES)
     assert by_variant["all keypoints"] == [stage for stage in budget.STAGES if stage not in ("segmentation", "mask")]
 
@@ -42,15 +42,15 @@ def test_the_masks_may_have_another_width(sequence, model, monkeypatch):
     monkeypatch.setattr(masks, "keypoint_mask", lambda *given: asked.append(given[2:]) or keypoint_mask(*given))
     for measure in (budget.measure, budget.measure_overlapped):
         table = measure(sequence, model, frames=2, width=5, boundaries="exact")
-        assert list(table["variant"].unique()) == ["all keypoints", "masked, width 5"]
+        assert list(table["method"].unique()) == ["all keypoints", "masked, width 5"]
     assert set(asked) == {(5, "exact")}
 
 
 def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
-    fast = budget.measure(sequence, model, frames=4).set_index(["variant", "stage"])["milliseconds"]
+    fast = budget.measure(sequence, model, frames=4).set_index(["method", "stage"])["milliseconds"]
     keypoint_mask = masks.keypoint_mask
     monkeypatch.setattr(masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0])
-    slow = budget.measure(sequence, model, frames=4).set_index(["variant", "stage"])["milliseconds"]
+    slow = budget.measure(sequence, model, frames=4).set_index(["method", "stage"])["milliseconds"]
     assert slow["masked, width 10", "mask"] > 500 > fast["masked, width 10", "mask"]
     assert slow.drop(("masked, width 10", "mask")).max() < 500
 
@@ -83,7 +83,7 @@ def test_overlapping_hides_the_shorter_side(sequence, model, monkeypatch):
     monkeypatch.setattr(budget, "_segment", lambda *given: (time.sleep(0.5), segment(*given))[1])
     step = odometry.Odometry.step
     monkeypatch.setattr(odometry.Odometry, "step", lambda *given: (time.sleep(0.5), step(*given))[1])
-    table = budget.measure_overlapped(sequence, model, frames=4).set_index("variant")["milliseconds"]
+    table = budget.measure_overlapped(sequence, model, frames=4).set_index("method")["milliseconds"]
     assert (table >= 499).all() and (table < 990).all()
 
 

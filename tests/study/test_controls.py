@@ -22,20 +22,20 @@ def sequence(small_world):
 @pytest.fixture(scope="module")
 def made(sequence, small_labels):
     """Every control's masks and the thesis's own."""
-    return {variant: controls.masks(variant, Source(small_labels), sequence, WIDTH) for variant in controls.MASKS} | {
+    return {method: controls.masks(method, Source(small_labels), sequence, WIDTH) for method in controls.MASKS} | {
         "masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
 
 
 def test_every_control_gives_masks_that_the_odometry_takes_and_always_the_same(sequence, made):
-    for variant, source in made.items():
+    for method, source in made.items():
         assert len(source) == len(sequence)
         mask = source[3]
-        assert mask.shape == sequence.size and mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}, variant
+        assert mask.shape == sequence.size and mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}, method
         assert mask.flags.c_contiguous
         source[7]
-        assert np.array_equal(source[3], mask), variant
-        if variant != "masked":
-            assert not np.array_equal(mask, made["masked"][3]), variant
+        assert np.array_equal(source[3], mask), method
+        if method != "masked":
+            assert not np.array_equal(mask, made["masked"][3]), method
 
 
 def test_masks_of_another_frame_come_from_half_a_sequence_away(made):
@@ -67,8 +67,8 @@ def test_image_edges_lie_along_the_strongest_edges_of_the_frame(sequence, made):
     dx, dy = cv2.spatialGradient(sequence.frame(3))
     strength = np.abs(dx.astype(int)) + np.abs(dy)
     strongest = strength >= np.quantile(strength, 0.995)
-    for variant, least in (("image-edges", 0.9), ("random-lines", 0)):
-        share = (made[variant][3][strongest] > 0).mean()
+    for method, least in (("image-edges", 0.9), ("random-lines", 0)):
+        share = (made[method][3][strongest] > 0).mean()
         assert share > least
     assert share < 0.6  # of random lines
 
@@ -76,7 +76,7 @@ def test_image_edges_lie_along_the_strongest_edges_of_the_frame(sequence, made):
 @pytest.mark.parametrize("value", [0, 255])
 def test_masks_that_are_empty_or_full_have_controls_of_their_kind(sequence, made, monkeypatch, value):
     monkeypatch.setattr(masks.LabelMasks, "__getitem__", lambda self, index: np.full(self.size, value, np.uint8))
-    covered = {variant: masks.coverage(made[variant][0]) for variant in ("random-lines", "image-edges")}
+    covered = {method: masks.coverage(made[method][0]) for method in ("random-lines", "image-edges")}
     if value == 0:
         assert set(covered.values()) == {0.0}
     else:
@@ -118,8 +118,8 @@ def test_jobs_of_the_controls_have_both_estimators_and_every_repetition(small_wo
     assert len({job.name for job in jobs}) == len(jobs)
     summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
     assert list(summary["run"]) == [job.name for job in jobs]
-    compared = summary[~((summary["variant"] == "masked") & (summary["dilation_width"] != WIDTH))]
-    runs = compared[compared["variant"] != "reduced"].groupby("variant").size()
+    compared = summary[~((summary["method"] == "masked") & (summary["dilation_width"] != WIDTH))]
+    runs = compared[compared["method"] != "reduced"].groupby("method").size()
     assert set(runs.index) == {"baseline", "masked", "fewer", "spread", *controls.MASKS} and set(runs) == {4}
     number = summary.set_index("run")["mean_keypoints"]
     assert number[_named(number, "fewer")] == pytest.approx(number["masked-10-0"], abs=1)
@@ -130,34 +130,34 @@ def test_jobs_of_the_controls_have_both_estimators_and_every_repetition(small_wo
     assert len({error["baseline-0"], error["baseline-1"], error["baseline-refined-0"]}) == 3
 
 
-def _named(series, variant):
-    return next(name for name in series.index if name.startswith(variant))
+def _named(series, method):
+    return next(name for name in series.index if name.startswith(method))
 
 
 def test_another_width_is_that_of_every_mask(small_world, small_labels, tmp_path):
     kitti = small_world / "kitti"
     jobs = [*first_jobs(["00"], (5, WIDTH)), *mask_control_jobs(kitti, ["00"], width=5)]
-    assert {job.dilation_width for job in jobs if job.variant in controls.MASKS} == {5}
+    assert {job.dilation_width for job in jobs if job.method in controls.MASKS} == {5}
     summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=4)
     number = summary.set_index("run")["mean_keypoints"]
     assert results.tested_width(summary) == 5 and number["masked-05-0"] < number["masked-10-0"]
     left = results.keypoints_left(summary)
     assert left["00"] == number["masked-05-0"]
-    fewer = [job for job in keypoint_control_jobs(left, kitti, frames=4) if job.variant == "fewer"]
+    fewer = [job for job in keypoint_control_jobs(left, kitti, frames=4) if job.method == "fewer"]
     assert {job.max_keypoints for job in fewer} == {round(left["00"])}
 
 
 def test_all_masks_have_the_boundaries_that_are_asked_for(sequence, small_labels, made):
     exact = masks.LabelMasks(small_labels / "00", sequence, WIDTH, "exact")
     source = Source(small_labels, settings=masks.MaskSettings("exact"))
-    chosen = {variant: controls.masks(variant, source, sequence, WIDTH)
-              for variant in controls.MASKS}
+    chosen = {method: controls.masks(method, source, sequence, WIDTH)
+              for method in controls.MASKS}
     assert not np.array_equal(exact[5], made["masked"][5])
     assert np.array_equal(chosen["other-frame"][5], exact[11])
     assert np.array_equal(chosen["exact-boundaries"][5], exact[5])
     assert np.array_equal(chosen["mirrored"][5], cv2.flip(exact[5], 1))
-    for variant in ("random-lines", "image-edges"):
-        assert masks.coverage(chosen[variant][5]) == pytest.approx(masks.coverage(exact[5]), abs=0.01)
+    for method in ("random-lines", "image-edges"):
+        assert masks.coverage(chosen[method][5]) == pytest.approx(masks.coverage(exact[5]), abs=0.01)
 
 
 def test_corrected_masks_have_all_corrections_and_nothing_where_things_move(sequence, small_labels, made):
@@ -171,5 +171,5 @@ def test_corrected_masks_have_all_corrections_and_nothing_where_things_move(sequ
 
 
 def test_without_true_label_maps_that_control_is_left_out(tiny_kitti):
-    variants = {job.variant for job in mask_control_jobs(tiny_kitti, ["00"])}
-    assert variants == {"baseline", "masked", *controls.MASKS} - {"true-labels"}
+    methods = {job.method for job in mask_control_jobs(tiny_kitti, ["00"])}
+    assert methods == {"baseline", "masked", *controls.MASKS} - {"true-labels"}

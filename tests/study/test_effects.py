@@ -76,14 +76,14 @@ def test_keypoints_by_lot_are_keypoints_and_as_many_as_asked_for(small_world):
 def test_every_switch_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
     runs = effects.runs_of(sequence, small_labels / "00", effects.Plan(orders=2, chance=3))
-    settings, own = runs["masks", "all", 0]
+    settings, own = runs["masks", "thesis", 0]
     assert settings == THESIS and np.array_equal(own[0], masks.LabelMasks(small_labels / "00", sequence, 10)[0])
-    dropped, same = runs["filter", "all", 0]
+    dropped, same = runs["filter", "thesis", 0]
     assert dropped.mask_mode == "filter" and same is own
-    assert {order for variant, pose, order in runs if (variant, pose) == ("all", "all")} == {0, 1, 2}
-    assert {order for variant, pose, order in runs if (variant, pose) == ("all", "refined")} == {0, 1}
-    for variant in ("nearest", "symmetric"):
-        other = runs[variant, "all", 0][1][0]
+    assert {order for method, estimator, order in runs if (method, estimator) == ("all", "thesis")} == {0, 1, 2}
+    assert {order for method, estimator, order in runs if (method, estimator) == ("all", "refined")} == {0, 1}
+    for method in ("nearest", "symmetric"):
+        other = runs[method, "thesis", 0][1][0]
         assert not np.array_equal(other, own[0]) and 0.5 < (other > 0).sum() / (own[0] > 0).sum() < 2
 
 

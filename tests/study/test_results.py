@@ -11,37 +11,37 @@ from thesis_repro.study import results
 from thesis_repro.study.jobs import Job
 
 ELEVEN = [f"{number:02d}" for number in range(11)]
-OTHERS = [variant for variant in results.CONTROLS if variant != "masked"]
+OTHERS = [method for method in results.CONTROLS if method != "masked"]
 
 
 def summary_of(names, errors, repetitions=5, noise=0.0, widths=(5, 10, 15), controls=OTHERS, seed=0, tested=10):
     """A summary of runs with made-up errors in metres.
 
-    errors(sequence, variant, width) -> RMSE, MAE is half of it. noise: relative spread of repetitions.
+    errors(sequence, method, width) -> RMSE, MAE is half of it. noise: relative spread of repetitions.
     tested: the width of the controls.
     """
     generator = np.random.default_rng(seed)
-    runs = [("baseline", None, "all"), *(("masked", width, "all") for width in widths), ("reduced", None, "all"),
+    runs = [("baseline", None, "thesis"), *(("masked", width, "thesis") for width in widths), ("reduced", None, "thesis"),
             ("baseline", None, "refined"), ("masked", tested, "refined")]
-    runs += [(variant, None if variant in ("fewer", "spread") else tested, pose)
-             for variant in controls for pose in results.POSES]
+    runs += [(method, None if method in ("fewer", "spread") else tested, estimator)
+             for method in controls for estimator in results.ESTIMATORS]
     rows = []
     for name in names:
-        for variant, width, pose in runs:
+        for method, width, estimator in runs:
             for repetition in range(repetitions):
-                error = errors(name, variant, width) * np.exp(noise * generator.normal())
-                job = Job(name, variant, width, pose=pose, repetition=repetition)
-                rows.append({"sequence": name, "run": job.name, "variant": variant, "dilation_width": width,
-                             "pose": pose, "repetition": repetition, "frames": 100, "rmse": error, "mae": error / 2,
+                error = errors(name, method, width) * np.exp(noise * generator.normal())
+                job = Job(name, method, width, estimator=estimator, repetition=repetition)
+                rows.append({"sequence": name, "run": job.name, "method": method, "dilation_width": width,
+                             "estimator": estimator, "repetition": repetition, "frames": 100, "rmse": error, "mae": error / 2,
                              "se3": error / 3, "translation_percent": 2 * error, "rotation_deg_per_m": error / 100,
-                             "mean_keypoints": 2000 if variant == "baseline" else 500 + (width or 10), "flagged": 0})
+                             "mean_keypoints": 2000 if method == "baseline" else 500 + (width or 10), "flagged": 0})
     return pd.DataFrame(rows).astype({"dilation_width": float})
 
 
 def thesis_summary(reported):
     """Width 10 is the best and changes a baseline of 2 m by the thesis's percentages; so does every control."""
-    def errors(name, variant, width):
-        return 2.0 if variant == "baseline" else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
+    def errors(name, method, width):
+        return 2.0 if method == "baseline" else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
     return summary_of(list(reported), errors)
 
 
@@ -70,8 +70,8 @@ def test_the_mae_table_has_the_thesis_mae():
 
 
 def test_what_no_constant_angle_moves_stands_beside_rmse():
-    summary = summary_of(["00", "01", "02", "03"], lambda name, variant, width: 1.0 if variant == "baseline" else 0.5)
-    summary.loc[summary["variant"] != "baseline", "se3"] *= 3  # the angle was all that masks made better
+    summary = summary_of(["00", "01", "02", "03"], lambda name, method, width: 1.0 if method == "baseline" else 0.5)
+    summary.loc[summary["method"] != "baseline", "se3"] *= 3  # the angle was all that masks made better
     summary.loc[summary["sequence"] == "03", "translation_percent"] = np.nan  # too short
     summary["rotation_deg_per_m"] = np.nan  # all of them
     table = tables.table_of_change(summary, "rmse", "thesis").set_index("sequence")
@@ -82,8 +82,8 @@ def test_what_no_constant_angle_moves_stands_beside_rmse():
     assert shown["translation over 20 m (%)"]["mirrored mask"].iloc[0] == "-50.0 (-50.0 to -50.0)"
     assert shown["rotation over 20 m (%)"].drop("all keypoints").isna().all()
     for written in (tables.table_sources, tables.table_errors):  # a source by its name
-        named = summary[summary["variant"].isin(["baseline", "masked"])].assign(
-            source=lambda rows: np.where(rows["variant"] == "masked", "net", ""))
+        named = summary[summary["method"].isin(["baseline", "masked"])].assign(
+            source=lambda rows: np.where(rows["method"] == "masked", "net", ""))
         text = markdown(written(named))
         assert "nan" not in text and "50" in text
     text = findings.words(summary, "made up")
@@ -99,7 +99,7 @@ def test_a_sequence_that_the_thesis_does_not_report_stays_empty():
 
 def test_repetitions_are_averaged_before_changes_are_taken_and_their_range_is_shown():
     summary = summary_of(["00"], lambda *_: 1.0)
-    baseline = (summary["variant"] == "baseline") & (summary["pose"] == "all")
+    baseline = (summary["method"] == "baseline") & (summary["estimator"] == "thesis")
     summary.loc[baseline, "rmse"] = [1, 2, 3, 4, 10]
     row = tables.table_of_change(summary, "rmse", "thesis").iloc[0]
     assert row["RMSE, all keypoints (m)"] == 4 and row["all keypoints, range"] == "1 to 10"
@@ -138,9 +138,9 @@ def test_fewer_than_three_sequences_have_no_interval():
 # The choice of width
 
 
-def own_optimum(name, variant, width):
+def own_optimum(name, method, width):
     """Each sequence has a width of its own that is good for it alone."""
-    if variant != "masked":
+    if method != "masked":
         return 1.0
     return 0.5 if width == 1 + int(name) else 1.2 + 0.01 * width
 
@@ -158,7 +158,7 @@ def test_leaving_one_out_never_sees_its_own_sequence():
     chosen = results.chosen_widths(summary)
     for name in ("00", "04"):
         other = summary.copy()
-        own = (other["sequence"] == name) & (other["variant"] == "masked")
+        own = (other["sequence"] == name) & (other["method"] == "masked")
         other.loc[own, "rmse"] = np.random.default_rng(5).uniform(0.01, 50, own.sum())
         assert results.chosen_widths(other).loc[name, "left_out"] == chosen.loc[name, "left_out"]
         alone = results.chosen_widths(summary[summary["sequence"] != name])
@@ -183,8 +183,8 @@ def test_a_real_optimum_is_found_again_in_other_repetitions_and_luck_is_not():
 
 
 def test_a_width_that_failed_in_one_sequence_is_not_chosen_for_all():
-    summary = summary_of(["00", "01", "02"], lambda name, variant, width: 0.1 if width == 15 else 1.0)
-    failed = (summary["sequence"] == "01") & (summary["dilation_width"] == 15) & (summary["variant"] == "masked")
+    summary = summary_of(["00", "01", "02"], lambda name, method, width: 0.1 if width == 15 else 1.0)
+    failed = (summary["sequence"] == "01") & (summary["dilation_width"] == 15) & (summary["method"] == "masked")
     chosen = results.chosen_widths(summary[~failed])
     assert set(chosen["fixed"]) == {5} and chosen["left_out"].tolist() == [5, 15, 5]
     assert np.isnan(results.widths(summary[~failed]).loc["01", "left_out_rmse"])
@@ -193,45 +193,45 @@ def test_a_width_that_failed_in_one_sequence_is_not_chosen_for_all():
 # The controls
 
 
-def segmentation_matters(name, variant, width):
-    return (0.5 if variant == "masked" else 1.0) * (1 + int(name) / 10)
+def segmentation_matters(name, method, width):
+    return (0.5 if method == "masked" else 1.0) * (1 + int(name) / 10)
 
 
-def edges_do_as_well(name, variant, width):
-    return (0.5 if variant in ("masked", "image-edges") else 1.0) * (1 + int(name) / 10)
+def edges_do_as_well(name, method, width):
+    return (0.5 if method in ("masked", "image-edges") else 1.0) * (1 + int(name) / 10)
 
 
 def test_controls_are_compared_within_their_estimator():
     summary = summary_of(ELEVEN, segmentation_matters)
-    summary.loc[summary["pose"] == "refined", "rmse"] *= 0.1
-    table = results.controls(summary).set_index(["pose", "variant"])
+    summary.loc[summary["estimator"] == "refined", "rmse"] *= 0.1
+    table = results.controls(summary).set_index(["estimator", "method"])
     assert len(table) == 2 * 11
-    for pose in results.POSES:
-        assert table.loc[(pose, "masked"), "rmse"] == pytest.approx(-50)
-        assert table.loc[(pose, "mirrored"), ["rmse", "rmse_minus"]].tolist() == pytest.approx([0, -50])
-        assert table.loc[(pose, "masked"), "rmse_improved"] == 11
-    assert table.loc[("all", "masked"), "keypoints"] == 510
+    for estimator in results.ESTIMATORS:
+        assert table.loc[(estimator, "masked"), "rmse"] == pytest.approx(-50)
+        assert table.loc[(estimator, "mirrored"), ["rmse", "rmse_minus"]].tolist() == pytest.approx([0, -50])
+        assert table.loc[(estimator, "masked"), "rmse_improved"] == 11
+    assert table.loc[("thesis", "masked"), "keypoints"] == 510
 
 
 def test_the_spread_over_repetitions_is_of_the_mean_over_sequences():
     summary = summary_of(["00", "01"], lambda *_: 1.0, repetitions=2)
-    rows = (summary["variant"] == "mirrored") & (summary["pose"] == "all") & (summary["repetition"] == 1)
+    rows = (summary["method"] == "mirrored") & (summary["estimator"] == "thesis") & (summary["repetition"] == 1)
     summary.loc[rows, "rmse"] = [3.0, 2.0]
-    row = results.controls(summary).set_index(["pose", "variant"]).loc[("all", "mirrored")]
+    row = results.controls(summary).set_index(["estimator", "method"]).loc[("thesis", "mirrored")]
     assert (row["rmse_lowest"], row["rmse_highest"], row["rmse"]) == (0, 150, 75)
 
 
-def narrow_is_good(name, variant, width):
+def narrow_is_good(name, method, width):
     """Masks of width 5 halve the error, wider ones double it."""
-    return (1.0 if variant != "masked" else 0.5 if width == 5 else 2.0) * (1 + int(name) / 10)
+    return (1.0 if method != "masked" else 0.5 if width == 5 else 2.0) * (1 + int(name) / 10)
 
 
 def test_the_width_that_is_tested_is_that_of_the_runs():
     summary = summary_of(ELEVEN, narrow_is_good, noise=0.02, tested=5)
     assert results.tested_width(summary) == 5 and (results.keypoints_left(summary) == 505).all()
-    for pose in results.POSES:
-        assert set(results.of_control(summary, "masked", pose)["dilation_width"]) == {5}
-        assert results.control_changes(summary, "rmse", pose)["masked"].mean() == pytest.approx(-50, abs=3)
+    for estimator in results.ESTIMATORS:
+        assert set(results.of_control(summary, "masked", estimator)["dilation_width"]) == {5}
+        assert results.control_changes(summary, "rmse", estimator)["masked"].mean() == pytest.approx(-50, abs=3)
     table = tables.table_of_change(summary, "rmse", "thesis").set_index("sequence")
     assert table.loc["00", "width 5 (%)"] == pytest.approx(-50, abs=3) and "width 10 (%)" not in table
     assert "segmentation mask, width 5" in set(tables.table_controls(summary)["keypoints"])
@@ -245,7 +245,7 @@ def test_the_width_that_is_tested_is_that_of_the_runs():
 
 def test_runs_without_a_test_have_the_width_of_the_thesis_and_two_tests_have_none():
     summary = summary_of(ELEVEN, narrow_is_good)
-    assert results.tested_width(summary[summary["pose"] == "all"]) == 10
+    assert results.tested_width(summary[summary["estimator"] == "thesis"]) == 10
     both = pd.concat([summary, summary_of(ELEVEN, narrow_is_good, tested=5)])
     with pytest.raises(InputError, match="controls of the widths 5, 10; masks are put to the test at one"):
         results.tested_width(both)
@@ -277,7 +277,7 @@ def test_a_verdict_never_stands_without_the_quality_of_the_label_maps():
 
 def test_one_sequence_carries_no_ratio():
     """Ten times the error in one of eleven sequences: +82 % as a mean of percentages, 1.23 times as a ratio."""
-    text = findings.words(summary_of(ELEVEN, lambda name, variant, _: 10.0 if (name, variant) == ("03", "masked")
+    text = findings.words(summary_of(ELEVEN, lambda name, method, _: 10.0 if (name, method) == ("03", "masked")
                                      else 1.0, noise=0.01), "made up")
     assert text.count("masks of width 10 make RMSE 1.2") == 2
     assert text.count("Masks are not shown to help here") == 2
@@ -312,13 +312,13 @@ def test_one_sequence_and_missing_variants_are_handled():
     assert np.isnan(table.loc["00", "left-out: width"])
     assert "true (%)" not in tables.table_of_change(summary, "rmse", "thesis")
     assert "nan" not in markdown(tables.table_controls(summary)).lower()
-    without = summary[~((summary["pose"] == "refined") & (summary["variant"] == "baseline"))]
+    without = summary[~((summary["estimator"] == "refined") & (summary["method"] == "baseline"))]
     assert "refined estimator" not in findings.words(without, "made up")
 
 
 def test_thesis_runs_alone_give_tables_and_words():
     summary = summary_of(["00", "01", "02"], own_optimum, controls=[])
-    summary = summary[summary["pose"] == "all"]
+    summary = summary[summary["estimator"] == "thesis"]
     assert "other controls" not in findings.words(summary, "made up")
     assert len(tables.table_controls(summary)) == 2
 
@@ -327,7 +327,7 @@ def test_thesis_runs_alone_give_tables_and_words():
 
 
 def test_paths_of_all_repetitions_are_drawn_and_the_first_is_bold():
-    rows = results.of_variant(summary_of(["00", "05"], lambda *_: 1.0, noise=0.2), "baseline")
+    rows = results.of_method(summary_of(["00", "05"], lambda *_: 1.0, noise=0.2), "baseline")
     paths = {(row.sequence, row.run): np.full((4, 3), row.repetition) for row in rows.itertuples()}
     truths = {name: np.zeros((4, 3)) for name in ("00", "05")}
     figure = outcome.figure_paths(truths, rows[::-1], paths, "baseline", "All keypoints")
@@ -352,7 +352,7 @@ def test_every_figure_can_be_drawn_and_names_its_units(names):
 
 def test_bars_reach_from_the_lowest_to_the_highest_repetition():
     summary = summary_of(["00"], lambda *_: 1.0)
-    rows = (summary["variant"] == "baseline") & (summary["pose"] == "all")
+    rows = (summary["method"] == "baseline") & (summary["estimator"] == "thesis")
     summary.loc[rows, "rmse"] = [1, 2, 3, 4, 10]
     figure = outcome.figure_comparison(summary, "rmse")
     (segment,) = figure.axes[0].collections[0].get_segments()
@@ -364,18 +364,18 @@ def test_bars_reach_from_the_lowest_to_the_highest_repetition():
 
 
 def test_time_savings_follow_equation_4_2():
-    seconds = pd.DataFrame([(name, variant, width, spent) for name in ("00", "01") for variant, width, spent in
+    seconds = pd.DataFrame([(name, method, width, spent) for name in ("00", "01") for method, width, spent in
                             (("baseline", np.nan, 10.0), ("masked", 5, 9.0), ("masked", 10, 11.0))],
-                           columns=["sequence", "variant", "dilation_width", "seconds"])
+                           columns=["sequence", "method", "dilation_width", "seconds"])
     assert results.time_savings(seconds).to_dict() == pytest.approx({5: -10, 10: 10})
 
 
 def test_the_budget_adds_up():
-    measured = pd.DataFrame([(variant, stage, 10.0) for variant, stages in
+    measured = pd.DataFrame([(method, stage, 10.0) for method, stages in
                              (("all keypoints", ("read", "detection", "tracking", "pose")),
                               ("masked, width 10", tuple(outcome.STAGES))) for stage in stages],
-                            columns=["variant", "stage", "milliseconds"])
-    overlapped = pd.DataFrame({"variant": ["masked, width 10", "all keypoints"], "milliseconds": [25.0, 20.0]})
+                            columns=["method", "stage", "milliseconds"])
+    overlapped = pd.DataFrame({"method": ["masked, width 10", "all keypoints"], "milliseconds": [25.0, 20.0]})
     table = tables.table_budget(measured, overlapped).set_index("stage")
     assert table.loc["all stages (ms)"].tolist() == [40, 60] and table.loc["frames a second"].tolist() == [25, 16.7]
     assert table.loc["between frames, overlapped (ms)"].tolist() == [20, 25]

@@ -40,9 +40,9 @@ def test_reduced_runs_have_the_keypoints_of_the_best_width(finished):
     _, _, summary = finished
     best = results.best_widths(summary)
     for name in ("00", "01"):
-        of_name = summary[(summary["sequence"] == name) & (summary["variant"] == "masked")]
+        of_name = summary[(summary["sequence"] == name) & (summary["method"] == "masked")]
         assert best.loc[name, "rmse"] == of_name["rmse"].min()
-        reduced = summary[(summary["sequence"] == name) & (summary["variant"] == "reduced")]
+        reduced = summary[(summary["sequence"] == name) & (summary["method"] == "reduced")]
         assert reduced["max_keypoints"].item() == round(best.loc[name, "mean_keypoints"])
 
 
@@ -69,7 +69,7 @@ def test_a_failing_run_is_reported_and_stops_no_other(small_world, small_labels,
 def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small_labels, finished, tmp_path,
                                                               monkeypatch, error):
     folder, jobs, _ = finished
-    jobs = [job for job in jobs if job.variant != "reduced"]
+    jobs = [job for job in jobs if job.method != "reduced"]
     monkeypatch.setattr(odometry.passes, "CHECKPOINT", 5)
     read, plugged = [], []
 
@@ -116,7 +116,7 @@ def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_pat
 
     def keypoints(*settings):
         summary = runner.run(jobs, kitti, [Source(small_labels, "labels", "", *settings)], tmp_path, frames=4)
-        return summary.set_index("variant")["mean_keypoints"]
+        return summary.set_index("method")["mean_keypoints"]
 
     thesis = keypoints()
     assert thesis["masked"] != thesis["exact-boundaries"]
@@ -141,7 +141,7 @@ def test_times_without_runs_are_one_clear_line(small_world, small_labels, tmp_pa
 
 def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finished, monkeypatch):
     folder, jobs, _ = finished
-    first = [job for job in jobs if job.variant != "reduced"]
+    first = [job for job in jobs if job.method != "reduced"]
     timed = budget.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
     assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
     again = budget.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)

@@ -84,14 +84,14 @@ def test_a_study_leaves_tables_figures_words_and_a_page_that_shows_them(done):
 
 def test_masks_ready_made_are_what_label_maps_of_that_width_give(done, small_world):
     runs = pd.read_csv(done / "runs.csv", dtype={"sequence": str}, keep_default_na=False)
-    by_hand, net = (runs[(runs["source"] == name) & (runs["variant"] == "masked")
+    by_hand, net = (runs[(runs["source"] == name) & (runs["method"] == "masked")
                          & runs["dilation_width"].isin(["", "7.0"])] for name in ("by-hand", "net"))
     assert len(net) == 4 and net["rmse"].tolist() == by_hand["rmse"].tolist()
     # all keypoints are run once for both, and each source has controls of its own
-    assert (runs["variant"] == "baseline").sum() == 4 and set(runs.loc[runs["variant"] == "baseline", "source"]) == {""}
-    variants = {name: set(runs.loc[runs["source"] == name, "variant"]) for name in ("net", "by-hand")}
-    assert variants["net"] - variants["by-hand"] == {"exact-boundaries", "corrected", "true-labels"}
-    assert {"mirrored", "other-frame", "random-lines", "image-edges", "fewer", "spread"} < variants["by-hand"]
+    assert (runs["method"] == "baseline").sum() == 4 and set(runs.loc[runs["method"] == "baseline", "source"]) == {""}
+    methods = {name: set(runs.loc[runs["source"] == name, "method"]) for name in ("net", "by-hand")}
+    assert methods["net"] - methods["by-hand"] == {"exact-boundaries", "corrected", "true-labels"}
+    assert {"mirrored", "other-frame", "random-lines", "image-edges", "fewer", "spread"} < methods["by-hand"]
     table = pd.read_csv(done / "sources.csv")
     assert table["masks"].tolist() == ["all keypoints", "net", "net", "by-hand"]
     assert table["kept (%)"].iloc[2] == table["kept (%)"].iloc[3] < 100
@@ -149,11 +149,11 @@ def test_plain_folders_are_taken_for_a_single_sequence(small_world, small_labels
 
 def test_one_estimator_is_enough(small_world, small_labels, tmp_path):
     assert study("--kitti", small_world / "kitti", "--sequences", "00", "--labels", small_labels, "--widths", 5,
-                 "--repetitions", 1, "--frames", 5, "--pose", "refined", "--margin", 30, "--jobs", 1, "--output",
+                 "--repetitions", 1, "--frames", 5, "--estimator", "refined", "--margin", 30, "--jobs", 1, "--output",
                  tmp_path / "out") == 0
     words = (tmp_path / "out" / "findings.md").read_text()
     assert "refined estimator" in words and "(label maps; margin 30)" in words
-    assert set(pd.read_csv(tmp_path / "out" / "runs.csv")["pose"]) == {"refined"}
+    assert set(pd.read_csv(tmp_path / "out" / "runs.csv")["estimator"]) == {"refined"}
     assert not (tmp_path / "out" / "keypoints-all.svg").exists()
 
 
@@ -212,8 +212,8 @@ def test_a_mask_that_breaks_in_the_middle_costs_only_the_runs_that_need_it(small
 
 
 def test_errors_side_by_side_are_those_of_the_runs():
-    rows = [{"sequence": name, "source": source, "variant": "masked" if source else "baseline", "dilation_width": width,
-             "pose": "all", "repetition": repetition, "frames": 9, "flagged": 0, "mean_keypoints": count,
+    rows = [{"sequence": name, "source": source, "method": "masked" if source else "baseline", "dilation_width": width,
+             "estimator": "thesis", "repetition": repetition, "frames": 9, "flagged": 0, "mean_keypoints": count,
              "rmse": error * (1 + repetition), "mae": error, "se3": error / 2, "translation_percent": np.nan,
              "rotation_deg_per_m": np.nan}
             for name, factor in (("00", 1), ("01", 3)) for source, width, count, error in

@@ -124,7 +124,7 @@ def test_label_maps(ledger, tmp_path):
 
 def study(small_world, small_labels):
     return [*COMMAND, "study", "--kitti", small_world / "kitti", "--labels", small_labels, "--widths", 5,
-            "--controls", 5, "--repetitions", 1, "--pose", "all", "refined", "--output", "study"]
+            "--controls", 5, "--repetitions", 1, "--estimator", "thesis", "refined", "--output", "study"]
 
 
 def test_a_study(ledger, tmp_path, small_world, small_labels):

@@ -48,8 +48,8 @@ def peak(folder: Path, runs: int, estimated: bool) -> tuple[int, int]:
     sequence = Sequence(folder, DRIVE)
     labels = sequence.folder / "labels_0"
     masks = [None, *(LabelMasks(labels, sequence, width) for width in ALL_WIDTHS)]
-    wanted = {f"{index}": (replace(THESIS, pose="refined" if estimated and index % 2 else "all",
-                                   permute=index // len(masks) or None), masks[index % len(masks)])
+    wanted = {f"{index}": (replace(THESIS, estimator="refined" if estimated and index % 2 else "thesis",
+                                   shuffle_seed=index // len(masks) or None), masks[index % len(masks)])
               for index in range(runs)}
     with contextlib.ExitStack() as stack:
         if not estimated:

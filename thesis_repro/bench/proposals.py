@@ -163,7 +163,7 @@ def unet(input_shape, n_classes):
     return build_unet(input_shape, n_classes, SIZES.base_filters)
 
 
-def variants(data, seconds, seed):
+def methods(data, seconds, seed):
     """Yield (name, trained model, its validation images, images seen in training) for the thesis's way and each other.
 
     Colour is left out where the images have none.
@@ -191,7 +191,7 @@ def compare(data, seconds=SECONDS, seeds=SEEDS):
     """A table with a row for each network and seed: mean IoU and pixel accuracy (Cityscapes), milliseconds a frame."""
     rows = []
     for seed in seeds:
-        for name, model, images, seen in variants(data, seconds, seed):
+        for name, model, images, seen in methods(data, seconds, seed):
             predicted = prediction.predict(model, images)
             mean_iou, accuracy, _ = quality.cityscapes_scores(
                 quality.confusion_matrix(data.validation_labels, predicted))

@@ -19,7 +19,7 @@ from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks
 from thesis_repro.odometry import THESIS, metrics
-from thesis_repro.odometry.continuity import AMBIGUOUS, NOT_DETERMINED
+from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED
 from thesis_repro.study import controls
 from thesis_repro.study.budget import opencv_threads
 from thesis_repro.study.sources import Source
@@ -46,7 +46,7 @@ def methods(sequence, labels=None):
 
 def trial(sequence, settings, masks, keypoints=KEYPOINTS, orders=ORDERS):
     """One method's runs, a DataFrame with a row each: RMSE (m), the largest wrong turn (degrees), steps by kind."""
-    runs = {(count, order): (replace(settings, pose="refined", max_keypoints=count, permute=order or None), masks)
+    runs = {(count, order): (replace(settings, estimator="refined", max_keypoints=count, shuffle_seed=order or None), masks)
             for count in keypoints for order in range(orders)}
     results = odometry.run_many(sequence, runs)
     moving = odometry.scales(sequence) > MOVING

@@ -14,7 +14,7 @@ their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What 
 | agreement no better than chance (scene cut) | "no agreement"                                                       |
 | moved less than the gate (PySLAM's rule)    | "stationary"                                                         |
 
-With pose="refined" two more, in which the pose moves on (see continuity):
+With estimator="refined" two more, in which the pose moves on (see continuity):
 
 | motion                                      | flag and rule                                                        |
 |---------------------------------------------|----------------------------------------------------------------------|

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from thesis_repro import InputError
-from thesis_repro.odometry import continuity, guided, keypoints, pose
+from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refine import fit
+from thesis_repro.odometry.refined import guided
+from thesis_repro.odometry.refined import motion_prior as continuity
+from thesis_repro.odometry.refined.fit import fit
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 SECONDS = ("detect", "track", "essential", "pose")
@@ -123,7 +125,7 @@ class Odometry:
     def estimate(self, step: Step, essential: "Essential | None" = None) -> "Essential | None":
         """The motion from the step's correspondences; returns the essential matrix with what it was made from.
 
-        essential: what another Odometry with the same settings but for `pose` returned for the same correspondences.
+        essential: what another Odometry with the same settings but for `estimator` returned for the same correspondences.
         Safe in threads: reads nothing that later steps change.
         """
         if not step.points:
@@ -136,11 +138,11 @@ class Odometry:
             return found
         started = time.perf_counter()
         current, previous, inliers = found.current, found.previous, found.inliers
-        if chosen.pose == "refined":
+        if chosen.estimator == "refined":
             motion = fit(*pose.smaller_rotation(found.matrix), current, previous, inliers, chosen.threshold)
             step.motion = replace(motion, inliers=found.in_order())
         else:
-            voters = inliers if chosen.pose == "inliers" else slice(None)
+            voters = inliers if chosen.estimator == "inliers" else slice(None)
             votes, rotation, translation = pose.recover_pose(found.matrix, current[voters], previous[voters])
             step.motion = Motion(rotation, translation, found.in_order(), votes)
         step.seconds["pose"] = time.perf_counter() - started
@@ -158,7 +160,7 @@ class Odometry:
                   or chosen.shift_gate and _mean_shift(step) < chosen.shift_gate):
                 step.flags.append("stationary")
             else:
-                if chosen.pose == "refined":
+                if chosen.estimator == "refined":
                     self._believe(step)
                 self.pose = self._moved(step.motion, step.scale)
                 step.updated = True
@@ -230,10 +232,10 @@ def _essential(step, settings, intrinsics):
     current = pose.normalise(step.current, intrinsics)
     previous = pose.normalise(step.previous, intrinsics)
     order = None
-    if settings.permute is not None:
-        order = np.random.default_rng((settings.permute, step.frame)).permutation(len(current))
+    if settings.shuffle_seed is not None:
+        order = np.random.default_rng((settings.shuffle_seed, step.frame)).permutation(len(current))
         current, previous = current[order], previous[order]
-    found = pose.essential_matrix(current, previous, settings.threshold, settings.estimator)
+    found = pose.essential_matrix(current, previous, settings.threshold, settings.essential_method)
     return Essential(current, previous, order, *found, time.perf_counter() - started)
 
 

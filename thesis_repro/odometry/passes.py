@@ -16,14 +16,14 @@ from thesis_repro import InputError, stages
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
-from thesis_repro.odometry.continuity import Course
 from thesis_repro.odometry.odometry import COLUMNS, ROTATION, Odometry, Step
+from thesis_repro.odometry.refined.motion_prior import Course
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 CHECKPOINT = 300  # frames
 # What the observed points depend on, and what the essential matrix depends on besides: runs that agree share the work
 OBSERVED = ("detector", "max_keypoints", "min_distance", "mask_mode", "redetect_below")
-ESTIMATED = ("estimator", "threshold", "permute")
+ESTIMATED = ("essential_method", "threshold", "shuffle_seed")
 NUMBERS = [*(column for column in COLUMNS if column != "flag"), "mask_seconds"]
 
 
@@ -85,7 +85,7 @@ def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Mask
 
     Frames are decoded, corner strengths computed and points tracked once for all runs, so the times of detection and
     tracking belong to no run and are blank. Runs with the same masks (one object) and settings that differ only after
-    the tracking also share their masks and keypoints, and those that differ only in `pose` their essential matrices.
+    the tracking also share their masks and keypoints, and those that differ only in `estimator` their essential matrices.
     workers: threads for the estimators, which are most of what remains.
     checkpoint: a file to keep the state in, every CHECKPOINT frames; a killed run that is started again with the same
     file, sequence and settings goes on from there. Whoever names the file deletes it once the results are stored,

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 
 from thesis_repro.compiled import fast
-from thesis_repro.odometry import ransac
+from thesis_repro.odometry.opencv_exact import ransac
 
 PROBABILITY = 0.999  # of RANSAC
 MAX_DEPTH = 50.0  # in units of the translation: recoverPose lets no point beyond it vote
 MIN_CORRESPONDENCES = 5
 
-ESTIMATORS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
+ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float,
-                     estimator: str = "ransac") -> tuple[np.ndarray | None, np.ndarray, str]:
+                     method: str = "ransac") -> tuple[np.ndarray | None, np.ndarray, str]:
     """The essential matrix of normalised correspondences (N, 2): (matrix, inliers, problem).
 
     `matrix` is None, and `problem` says why, where there is none or more than one: OpenCV stacks all solutions of
@@ -55,11 +55,11 @@ def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float
     if len(current) < MIN_CORRESPONDENCES:
         return None, none, "fewer than five correspondences"
     try:
-        if estimator == "ransac":
+        if method == "ransac":
             matrix, inliers = ransac.find(current, previous, threshold, PROBABILITY)
         else:
             matrix, inliers = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0),
-                                                   method=ESTIMATORS[estimator], prob=PROBABILITY, threshold=threshold)
+                                                   method=ESSENTIAL_METHODS[method], prob=PROBABILITY, threshold=threshold)
     except cv2.error:  # the USAC estimators raise on degenerate points
         matrix = None
     if matrix is None or inliers is None or not np.isfinite(matrix).all():

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from thesis_repro import InputError
 from thesis_repro.odometry import pose
 
+ESTIMATORS = ("thesis", "inliers", "refined")
+
 
 @dataclass(frozen=True)
 class OdometrySettings:
@@ -15,10 +17,10 @@ class OdometrySettings:
     max_keypoints: limit of the detector, 0 for none. min_distance: between keypoints, pixels (Shi-Tomasi only).
     mask_mode: "detect" gives the mask to the detector, which fills its quota inside; "filter" drops what lies outside.
     redetect_below: detect again on a frame to which fewer points were tracked; all points are replaced then.
-    estimator: "ransac", or OpenCV's "usac", "usac-magsac".
-    threshold: of the estimator, in normalised coordinates.
-    permute: seed that shuffles the correspondences before the estimator, whose own seed is fixed; None: not shuffled.
-    pose: "all" (PySLAM) and "inliers": RANSAC's motion, on whose sign and rotation these points vote (audit rows 13,
+    essential_method: how the essential matrix is searched for: "ransac", or OpenCV's "usac", "usac-magsac".
+    threshold: of that search, in normalised coordinates.
+    shuffle_seed: seed that shuffles the correspondences before the estimator, whose own seed is fixed; None: not shuffled.
+    estimator: how the motion follows from it. "thesis" (all points, as PySLAM) and "inliers": RANSAC's motion, on whose sign and rotation these points vote (audit rows 13,
     29); or "refined": fitted to the points near it, with the smaller of the two rotations, and held against the steps
     before (see continuity).
     scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
@@ -32,10 +34,10 @@ class OdometrySettings:
     min_distance: float = 3
     mask_mode: str = "detect"
     redetect_below: int = 2000
-    estimator: str = "ransac"
+    essential_method: str = "ransac"
     threshold: float = 0.0003
-    permute: int | None = None
-    pose: str = "all"
+    shuffle_seed: int | None = None
+    estimator: str = "thesis"
     scale_gate: float = 0.1
     shift_gate: float = 0.0
     rotate_first: bool = False
@@ -43,13 +45,14 @@ class OdometrySettings:
 
     def __post_init__(self) -> None:
         for name, known in (("detector", ("shi-tomasi", "orb")), ("mask_mode", ("detect", "filter")),
-                            ("estimator", tuple(pose.ESTIMATORS)), ("pose", ("all", "inliers", "refined")),
+                            ("essential_method", tuple(pose.ESSENTIAL_METHODS)),
+                            ("estimator", ESTIMATORS),
                             ("alignment", ("position", "pose"))):
             if getattr(self, name) not in known:
                 raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
                                  f"choose one of {', '.join(known)}")
         for name, most in (("max_keypoints", 2**31 - 1), ("min_distance", 10_000), ("redetect_below", 2**31 - 1),
-                           ("permute", 2**32 - 1), ("scale_gate", math.inf), ("shift_gate", math.inf)):
+                           ("shuffle_seed", 2**32 - 1), ("scale_gate", math.inf), ("shift_gate", math.inf)):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= most:
                 wrong = f"is above {most}; give less" if value > most else "is below 0; give 0 or more"

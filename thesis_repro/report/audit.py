@@ -22,7 +22,7 @@ ROWS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf
 REAL_ONLY = "not measured in this run"
 UNTRIED = "not tried"
 WIDTHS = range(9, 12)  # that the thesis calls best
-ESTIMATORS = {"all": "thesis's estimator", "refined": "refined"}
+ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined"}
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,10 @@ def _ratio(values, digits=2):
 
 
 def _compare(row, what, runs, reference, metric="rmse"):
-    """Effects of one variant against another under each estimator that both have. runs, reference: rows of runs."""
+    """Effects of one method against another under each estimator that both have. runs, reference: rows of runs."""
     said = []
-    for pose, name in ESTIMATORS.items():
-        one, other = (some[some["pose"] == pose] for some in (runs, reference))
+    for estimator, name in ESTIMATORS.items():
+        one, other = (some[some["estimator"] == estimator] for some in (runs, reference))
         found = _ratio(answer.ratios(one, other, metric)) if len(one) and len(other) else None
         if found:
             said.append((f"{found[0]} ({name})", found[1]))
@@ -146,7 +146,7 @@ def of_runs(summary):
                                    f"it, {fair[0]} by other orders; the same width is best in "
                                    f"{stability['same_best'].mean():.0f} of 100 pairs of orders",
                               f"{best[1]}; {fair[1]}"))
-    masked, everything = (results.of_variant(summary, name) for name in ("masked", "baseline"))
+    masked, everything = (results.of_method(summary, name) for name in ("masked", "baseline"))
     widths = set(masked["dilation_width"])
     if {5, 10} <= widths:
         five, ten = (masked[masked["dilation_width"] == width] for width in (5, 10))
@@ -167,13 +167,13 @@ def of_runs(summary):
         effects += _compare("35", "with 9 to 11 over the other widths", masked[within], masked[~within])
     effects.append(Effect("35", f"lowest over all sequences at {logs.idxmin():.0f}, best of a sequence 9 to 11 in "
                                 f"{best.isin(WIDTHS).sum()} of {len(best)}", f"{best.min():.0f} to {best.max():.0f}"))
-    reduced = results.of_variant(summary, "reduced")
+    reduced = results.of_method(summary, "reduced")
     effects += _compare("33", "plainly reduced over all keypoints", reduced, everything)
     effects += _compare("33", "plainly reduced over masks of the best width", reduced, results.of_best_width(summary))
-    both = summary[summary["pose"].isin(ESTIMATORS)]
-    of = {name: both[(both["variant"] == name)] for name in ("exact-boundaries", "true-labels", "fewer", "spread",
+    both = summary[summary["estimator"].isin(ESTIMATORS)]
+    of = {name: both[(both["method"] == name)] for name in ("exact-boundaries", "true-labels", "fewer", "spread",
                                                             "baseline")}
-    tested = both[(both["variant"] == "masked") & (both["dilation_width"] == results.tested_width(summary))]
+    tested = both[(both["method"] == "masked") & (both["dilation_width"] == results.tested_width(summary))]
     effects += _compare("11", "with exact boundaries over the thesis's", of["exact-boundaries"], tested)
     if len(of["true-labels"]):
         effects += _compare("32", "with true label maps over predicted ones", of["true-labels"], tested)
@@ -186,12 +186,12 @@ def of_runs(summary):
 
 def of_switches(runs):
     """Rows 10, 12 to 15, 28 to 30, 34, 36, 37, 40, 42, 48 and 50, from the first table of `effects.measure`."""
-    def of(variant, pose=None):
-        rows = runs[runs["variant"] == variant]
-        return rows if pose is None else rows[rows["pose"] == pose]
+    def of(method, estimator=None):
+        rows = runs[runs["method"] == method]
+        return rows if estimator is None else rows[rows["estimator"] == estimator]
 
     effects = []
-    for row, what, variant, reference in (
+    for row, what, method, reference in (
             ("10", "enlarged by nearest neighbours over bilinearly", "nearest", "masks"),
             ("12", "dilated symmetrically over the thesis's way", "symmetric", "masks"),
             ("28", "drawn by lot over the strongest", "any", "strongest"),
@@ -201,19 +201,19 @@ def of_switches(runs):
             ("48", "with ORB over Shi-Tomasi", "orb", "all"),
             ("50", "with corrected masks over the thesis's", "corrected", "masks"),
             ("50", "with corrected masks over all keypoints", "corrected", "all")):
-        effects += _compare(row, what, of(variant), of(reference))
-        effects.append(_keypoints(row, of(variant), of(reference)))
-    for variant, what in (("all", "all keypoints"), ("masks", "masks")):
-        for pose, row in (("inliers", "13"), ("refined", "29")):
-            found = _ratio(answer.ratios(of(variant, pose), of(variant, "all"), "rmse"))
+        effects += _compare(row, what, of(method), of(reference))
+        effects.append(_keypoints(row, of(method), of(reference)))
+    for method, what in (("all", "all keypoints"), ("masks", "masks")):
+        for estimator, row in (("inliers", "13"), ("refined", "29")):
+            found = _ratio(answer.ratios(of(method, estimator), of(method, "thesis"), "rmse"))
             effects.append(Effect(row, f"RMSE {found[0]} ({what})", found[1]))
-    for pose, name in ESTIMATORS.items():
-        errors = of("all", pose).groupby("sequence")["rmse"].agg(["min", "max"])
+    for estimator, name in ESTIMATORS.items():
+        errors = of("all", estimator).groupby("sequence")["rmse"].agg(["min", "max"])
         spread = errors["max"] / errors["min"]
-        orders = of("all", pose)["repetition"].nunique()
+        orders = of("all", estimator)["repetition"].nunique()
         effects.append(Effect("14", f"highest over lowest RMSE of {orders} orders: {spread.median():.2f} times "
                                     f"({name}, median over sequences)", f"{spread.min():.2f} to {spread.max():.2f}"))
-        failed = [of(variant, pose).groupby("sequence")["failed"].mean() for variant in ("all", "masks")]
+        failed = [of(method, estimator).groupby("sequence")["failed"].mean() for method in ("all", "masks")]
         effects.append(Effect("29", f"steps that turn wrong by 2 degrees or go backwards ({name}): "
                                     f"{failed[0].mean():.2f} % with all keypoints, {failed[1].mean():.2f} % with masks",
                               "sequences {:.2f} to {:.2f} %, {:.2f} to {:.2f} %".format(
@@ -234,7 +234,7 @@ def of_switches(runs):
                                 "medians)".format(*angle.median()),
                           "{:+.2f} to {:+.2f} and {:+.2f} to {:+.2f}, {} sequences".format(
                               *(end for name in angle for end in (angle[name].min(), angle[name].max())), len(angle))))
-    for few in sorted(name for name in runs["variant"].unique() if name.endswith(" keypoints")):
+    for few in sorted(name for name in runs["method"].unique() if name.endswith(" keypoints")):
         effects += _compare("34", f"with {few} over all", of(few), of("all"))
     effects += _compare("40", "with as few of the strongest as masks leave over all", of("strongest"), of("all"))
     effects.append(_keypoints("40", of("strongest"), of("all")))
@@ -328,7 +328,7 @@ def of_time(seconds, measured):
     """Rows 16, 47 and 49, from the tables of `budget.time_runs` and `budget.measure`."""
     savings = results.time_savings(seconds)
     near = savings[savings.index.isin(WIDTHS)] if savings.index.isin(WIDTHS).any() else savings
-    stages = measured.pivot(index="stage", columns="variant", values="milliseconds").fillna(0)
+    stages = measured.pivot(index="stage", columns="method", values="milliseconds").fillna(0)
     plain, masked = (stages[name].sum() for name in sorted(stages, key=lambda name: name.startswith("masked")))
     parts = stages[max(stages, key=lambda name: name.startswith("masked"))]
     return [
@@ -343,11 +343,11 @@ def of_time(seconds, measured):
 
 
 def of_trials(trials):
-    """Rows 5, 21, 22 and 27, from the table of `slips.trials`: variant, seed, mean_iou, accuracy, person."""
+    """Rows 5, 21, 22 and 27, from the table of `slips.trials`: method, seed, mean_iou, accuracy, person."""
     rows = {"corrected blocks": "5", "divided by 255": "21", "noise of today": "22", "person weight 1": "27"}
-    plain, effects = trials[trials["variant"] == "thesis"].set_index("seed"), []
-    for variant, row in rows.items():
-        own = trials[trials["variant"] == variant].set_index("seed")
+    plain, effects = trials[trials["method"] == "thesis"].set_index("seed"), []
+    for method, row in rows.items():
+        own = trials[trials["method"] == method].set_index("seed")
         difference = own["mean_iou"] - plain["mean_iou"]
         effects.append(Effect(row, f"mean IoU {difference.mean():+.3f} from {plain['mean_iou'].mean():.3f} after "
                                    f"{own['steps'].iloc[0]} steps", f"{difference.min():+.3f} to "

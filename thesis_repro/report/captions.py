@@ -100,10 +100,10 @@ CHAPTERS = {
                         "4.1."),
         "figure_4_12": ("Paths with plainly fewer keypoints", "No masks: the detector is limited to the mean number of "
                         "keypoints of Table 4.1."),
-        "figure_4_13": ("RMSE of the three variants", "All keypoints, masks of the best width, and plainly fewer "
+        "figure_4_13": ("RMSE of the three methods", "All keypoints, masks of the best width, and plainly fewer "
                         "keypoints, every sequence: mean of the repetitions, and the range that they span."),
         "figure_4_14": ("RMSE of each sequence", "The errors of Figure 4.13, one panel a sequence with its own scale."),
-        "figure_4_15": ("MAE of the three variants", "As Figure 4.13, for the mean absolute error."),
+        "figure_4_15": ("MAE of the three methods", "As Figure 4.13, for the mean absolute error."),
         "figure_4_16": ("MAE of each sequence", "As Figure 4.14, for the mean absolute error."),
         "table_4_2": ("Change of RMSE", "Percent change from all keypoints (Equation 4.1; negative is better) with "
                       "each sequence's best width, beside it what aligned ATE and the errors over short stretches, "

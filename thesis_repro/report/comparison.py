@@ -12,9 +12,9 @@ COLORS = (BASELINE, MASKED, GREEN, "#7fb800", ORANGE, PINK, SKY, BLACK, "#777777
           "#5d3a9b")  # in METHODS' order
 
 
-def _style(variant):
-    index = list(answer.METHODS).index(variant)
-    return {"color": COLORS[index], "marker": MARKERS[index], "label": answer.METHODS[variant]}
+def _style(method):
+    index = list(answer.METHODS).index(method)
+    return {"color": COLORS[index], "marker": MARKERS[index], "label": answer.METHODS[method]}
 
 
 def figure_answer(summary, every=None):
@@ -24,20 +24,20 @@ def figure_answer(summary, every=None):
     bars their bootstrap intervals; lines lead through the other widths and limits of `every`, which holds `summary`.
     """
     every = summary if every is None else every
-    poses = [pose for pose in results.POSES if len(results.of_variant(summary, "baseline", pose))]
+    poses = [estimator for estimator in results.ESTIMATORS if len(results.of_method(summary, "baseline", estimator))]
     figure, axes = new_figure(len(poses), len(answer.METRICS), height=1.0 + 2.5 * len(poses), squeeze=False)
-    for row, pose in zip(axes, poses, strict=True):
+    for row, estimator in zip(axes, poses, strict=True):
         for panel, (metric, name) in zip(row, answer.METRICS.items(), strict=True):
-            for variant, line in _lines(every, metric, pose).groupby("variant", sort=False):
-                panel.plot(line["keypoints"], line["ratio"], color=_style(variant)["color"], linewidth=0.9, alpha=0.6)
-            for one in answer.compared(summary, metric, pose).itertuples():
+            for method, line in _lines(every, metric, estimator).groupby("method", sort=False):
+                panel.plot(line["keypoints"], line["ratio"], color=_style(method)["color"], linewidth=0.9, alpha=0.6)
+            for one in answer.compared(summary, metric, estimator).itertuples():
                 if np.isfinite(one.low):
-                    panel.plot([one.keypoints] * 2, [one.low, one.high], color=_style(one.variant)["color"],
+                    panel.plot([one.keypoints] * 2, [one.low, one.high], color=_style(one.method)["color"],
                                linewidth=1.6)
                 panel.plot(one.keypoints, one.ratio, linestyle="none", markersize=6.5, markeredgecolor="white",
-                           markeredgewidth=0.5, **_style(one.variant))
+                           markeredgewidth=0.5, **_style(one.method))
             panel.axhline(1, color="black", linewidth=0.8)
-            panel.set(xscale="log", yscale="log", title=f"{name}, {results.POSES[pose]}")
+            panel.set(xscale="log", yscale="log", title=f"{name}, {results.ESTIMATORS[estimator]}")
             panel.minorticks_off()
             _plain_ticks(panel)
         row[0].set_ylabel("times the error of all keypoints")
@@ -57,10 +57,10 @@ def figure_by_sequence(summary, metric):
     for panel in axes.flat[len(names):]:
         panel.set_axis_off()
     for panel, name in zip(axes.flat, names, strict=False):
-        for variant, line in lines[lines["sequence"] == name].groupby("variant", sort=False):
+        for method, line in lines[lines["sequence"] == name].groupby("method", sort=False):
             spread = [line["mean"] - line["lowest"], line["highest"] - line["mean"]]
             panel.errorbar(line["keypoints"], line["mean"], yerr=np.maximum(spread, 0), linewidth=0.9, elinewidth=0.9,
-                           markersize=4, markeredgewidth=0, **_style(variant))
+                           markersize=4, markeredgewidth=0, **_style(method))
         panel.set(xscale="log", yscale="log", title=name)
         panel.minorticks_off()
         _plain_ticks(panel)
@@ -76,16 +76,16 @@ def figure_by_sequence(summary, metric):
     return figure
 
 
-def _lines(summary, metric, pose):
+def _lines(summary, metric, estimator):
     """Geometric means over sequences of the ratios to all keypoints, for methods run with several settings."""
-    every = answer.logs(results.of_variant(summary, "baseline", pose), metric)
-    found = answer.lines(summary, metric, pose)
-    found["setting"] = found.groupby(["sequence", "variant"]).cumcount()
-    counts = found.groupby("variant")["setting"].transform("max")
-    found = found[(counts > 0) & (found["variant"] != "baseline")]
+    every = answer.logs(results.of_method(summary, "baseline", estimator), metric)
+    found = answer.lines(summary, metric, estimator)
+    found["setting"] = found.groupby(["sequence", "method"]).cumcount()
+    counts = found.groupby("method")["setting"].transform("max")
+    found = found[(counts > 0) & (found["method"] != "baseline")]
     found = found.assign(ratio=np.log(found["mean"]) - found["sequence"].map(every),
                          keypoints=np.log(found["keypoints"]))
-    return np.exp(found.groupby(["variant", "setting"], sort=False)[["keypoints", "ratio"]].mean()).reset_index()
+    return np.exp(found.groupby(["method", "setting"], sort=False)[["keypoints", "ratio"]].mean()).reset_index()
 
 
 def _plain_ticks(panel):
@@ -104,14 +104,14 @@ def _plain_ticks(panel):
 def table(summary):
     """Every method under both estimators and metrics: keypoints, ratios to all keypoints and of masks to it."""
     rows = []
-    for pose, estimator in results.POSES.items():
-        if not len(results.of_variant(summary, "baseline", pose)):
+    for estimator, estimator in results.ESTIMATORS.items():
+        if not len(results.of_method(summary, "baseline", estimator)):
             continue
         for metric, name in answer.SHOWN.items():
             if summary[metric].isna().all():  # paths too short for it
                 continue
-            for one in answer.compared(summary, metric, pose).itertuples():
-                rows.append({"estimator": estimator, "error": name, "keypoints": answer.METHODS[one.variant],
+            for one in answer.compared(summary, metric, estimator).itertuples():
+                rows.append({"estimator": estimator, "error": name, "keypoints": answer.METHODS[one.method],
                              "mean number": round(one.keypoints), "sequences": one.sequences,
                              "times all keypoints": _number(one.ratio), "interval": _between(one.low, one.high),
                              "thesis's mean of percentages (%)": round(one.percent, 1),
@@ -133,7 +133,7 @@ def words(summary, data, quality=None):
 
     quality: of the label maps, for the verdict (`gap.quality`).
     """
-    found = {metric: answer.compared(summary, metric).set_index("variant") for metric in answer.METRICS}
+    found = {metric: answer.compared(summary, metric).set_index("method") for metric in answer.METRICS}
     first = found["turned"]
     if "masked" not in first.index:
         return ""
@@ -148,11 +148,11 @@ def words(summary, data, quality=None):
         text += " With all of the thesis's slips corrected: " + ", ".join(
             f"{name} {_ratio(found[metric].loc['corrected'])}" for metric, name in answer.METRICS.items()) + "."
     beaten, better, same = [], [], []
-    for variant in UNAIDED:
-        signs = [_sign(found[metric].loc[variant, "masks_low"], found[metric].loc[variant, "masks_high"])
-                 for metric in answer.METRICS if variant in found[metric].index]
+    for method in UNAIDED:
+        signs = [_sign(found[metric].loc[method, "masks_low"], found[metric].loc[method, "masks_high"])
+                 for metric in answer.METRICS if method in found[metric].index]
         if signs:
-            (beaten if set(signs) == {-1} else better if set(signs) == {1} else same).append(answer.METHODS[variant])
+            (beaten if set(signs) == {-1} else better if set(signs) == {1} else same).append(answer.METHODS[method])
     for names, said in ((beaten, "worse than masks by both measures"), (better, "better than masks by both measures"),
                         (same, "not told apart from masks by both measures")):
         if names and count >= results.FEWEST:
@@ -171,7 +171,7 @@ def _beside(summary):
     said = []
     for metric, name in results.BESIDE.items():
         if summary[metric].notna().any():
-            said.append(f"{name} {_ratio(answer.compared(summary, metric).set_index('variant').loc['masked'])}")
+            said.append(f"{name} {_ratio(answer.compared(summary, metric).set_index('method').loc['masked'])}")
     return f" (beside them, {', '.join(said)})" if said else ""
 
 

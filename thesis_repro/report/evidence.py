@@ -21,7 +21,7 @@ import pandas as pd
 from thesis_repro import InputError, kitti, longrun, masks, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
-from thesis_repro.odometry import boresight
+from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import audit, comparison, findings, outcome, style, tables
 from thesis_repro.study import answer, controls, effects, jobs, results, runner
 from thesis_repro.study.sources import Source
@@ -92,16 +92,16 @@ def _runs(root, names, build, frames, repetitions, processes):
 
     tested = jobs.first_jobs(names, WIDTHS, repetitions) + jobs.mask_control_jobs(root, names, repetitions)
     fewer = min(repetitions, OTHER_REPETITIONS)
-    other = [jobs.Job(name, variant, width, pose=answer.POSE, repetition=repetition) for name in names
-             for variant in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
+    other = [jobs.Job(name, method, width, estimator=answer.POSE, repetition=repetition) for name in names
+             for method in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
     summary = run([*tested, *other])
     first = summary[summary["run"].isin({job.name for job in tested})]
     tested += jobs.reduced_jobs(results.best_widths(first), repetitions)
     tested += jobs.keypoint_control_jobs(results.keypoints_left(first), root, frames, repetitions)
     for width in OTHER_WIDTHS:
-        left = summary[(summary["variant"] == "masked") & (summary["dilation_width"] == width)]
+        left = summary[(summary["method"] == "masked") & (summary["dilation_width"] == width)]
         limited = jobs.keypoint_control_jobs(left.groupby("sequence")["mean_keypoints"].mean(), root, frames, fewer)
-        other += [job for job in limited if job.pose == answer.POSE]
+        other += [job for job in limited if job.estimator == answer.POSE]
     keys = {(job.sequence, job.name) for job in tested}
     every = answer.with_relative(run([*tested, *other]), root, build / "odometry", frames)
     chosen = [key in keys for key in zip(every["sequence"], every["run"], strict=True)]

@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from thesis_repro.study import answer, results
-from thesis_repro.study.jobs import CONTROL_WIDTH, POSES
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 from thesis_repro.study.results import CONTROLS, LEVEL
 
 # Below this, changes of one sign in all sequences happen by chance more often than one time in twenty (2 / 2**n), and
@@ -37,9 +37,9 @@ def study_words(summary, data):
     parts = [_about(summary, data), _chance(summary)]
     for source in results.sources(summary):
         own = results.of_source(summary, source)
-        parts += [f"### {source}", " ".join(said for pose in POSES if (said := _masks(own, pose))), _controls(own),
+        parts += [f"### {source}", " ".join(said for estimator in ESTIMATORS if (said := _masks(own, estimator))), _controls(own),
                   _beside(own), _choice(own)]
-    parts += [_against_each_other(summary, pose) for pose in POSES]
+    parts += [_against_each_other(summary, estimator) for estimator in ESTIMATORS]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -49,7 +49,7 @@ def words(summary, data, label_maps=None, quality=None):
     label_maps: one line on how good these are (`gap.line`). quality: the same in short, for verdicts (`gap.quality`).
     """
     short = [_about(summary, data), label_maps and f"{label_maps[0].upper()}{label_maps[1:]}.", _chance(summary),
-             *(_masks(summary, pose, quality) for pose in POSES)]
+             *(_masks(summary, estimator, quality) for estimator in ESTIMATORS)]
     if "embedded" in data.split(";")[0]:
         short.append("These are rendered streets: nothing here is evidence about KITTI.")
     parts = ["\n".join(f"- {part}" for part in short if part), _controls(summary), _beside(summary), _choice(summary)]
@@ -57,7 +57,7 @@ def words(summary, data, label_maps=None, quality=None):
 
 
 def _about(summary, data):
-    baseline = results.of_variant(summary, "baseline")
+    baseline = results.of_method(summary, "baseline")
     frames = baseline.groupby("sequence")["frames"].first()
     runs = baseline["repetition"].nunique()
     orders = f"{runs} repetitions of every run with the correspondences in another order" if runs > 1 else "once each"
@@ -66,7 +66,7 @@ def _about(summary, data):
 
 
 def _chance(summary):
-    baseline = results.of_variant(summary, "baseline")
+    baseline = results.of_method(summary, "baseline")
     if baseline["repetition"].nunique() < 2:
         return "One repetition cannot say how much of any difference is chance."
     errors = results.over_orders(baseline, "rmse")
@@ -76,26 +76,26 @@ def _chance(summary):
             f"its lowest with all keypoints (median over sequences{widest}).")
 
 
-def _compared(summary, pose):
-    """The masks of the tested width over all keypoints, and over each control: {variant: ratio of each sequence}."""
-    masked = results.of_control(summary, "masked", pose)
-    every = results.of_variant(summary, "baseline", pose)
+def _compared(summary, estimator):
+    """The masks of the tested width over all keypoints, and over each control: {method: ratio of each sequence}."""
+    masked = results.of_control(summary, "masked", estimator)
+    every = results.of_method(summary, "baseline", estimator)
     if not len(masked) or not len(every):
         return {}
-    others = {variant: results.of_control(summary, variant, pose) for variant in CONTROLS if variant != "masked"}
+    others = {method: results.of_control(summary, method, estimator) for method in CONTROLS if method != "masked"}
     return {"baseline": answer.ratios(masked, every, "rmse"),
-            **{variant: answer.ratios(masked, rows, "rmse") for variant, rows in others.items() if len(rows)}}
+            **{method: answer.ratios(masked, rows, "rmse") for method, rows in others.items() if len(rows)}}
 
 
-def _masks(summary, pose, quality=None):
+def _masks(summary, estimator, quality=None):
     """What masks of the tested width do under one estimator, and whether it is the segmentation that does it."""
-    compared = _compared(summary, pose)
+    compared = _compared(summary, estimator)
     if not compared:
         return ""
     change, width = compared["baseline"], results.tested_width(summary)
     masks = "masks" if width is None else f"masks of width {width}"
     of_quality = f" from label maps of {quality}" if quality else ""
-    text = (f"Under the {POSES[pose].replace(' estimator', '')} estimator {masks} make RMSE {_times(change)} that of "
+    text = (f"Under the {ESTIMATORS[estimator].replace(' estimator', '')} estimator {masks} make RMSE {_times(change)} that of "
             f"all keypoints ({_lower(change)}).")
     count = int(change.notna().sum())
     if count < ENOUGH:
@@ -103,14 +103,14 @@ def _masks(summary, pose, quality=None):
                 "does.")
     helps = {-1: "help", 0: "are not shown to help", 1: "do worse than all keypoints"}[verdict(change)]
     text += f" **Masks{of_quality} {helps} here"
-    signs = {variant: verdict(ratio) for variant, ratio in compared.items() if variant in UNAIDED}
+    signs = {method: verdict(ratio) for method, ratio in compared.items() if method in UNAIDED}
     if not signs:
         return f"{text}.**"
-    beaten = [variant for variant, sign in signs.items() if sign < 0]
+    beaten = [method for method, sign in signs.items() if sign < 0]
     if len(beaten) == len(signs):
         return f"{text}, and the segmentation matters: every control without it does worse.**"
     if beaten:
-        rest = ", ".join(CONTROLS[variant] for variant in signs if variant not in beaten)
+        rest = ", ".join(CONTROLS[method] for method in signs if method not in beaten)
         return f"{text}, and the segmentation is not shown to matter: not shown to do worse are {rest}.**"
     return f"{text}, and the segmentation is not shown to matter: no control without it is shown to do worse.**"
 
@@ -118,8 +118,8 @@ def _masks(summary, pose, quality=None):
 def _beside(summary):
     """What errors say that no constant angle between camera and truth moves, the same masks over all keypoints."""
     said = []
-    for pose, name in POSES.items():
-        masked, every = results.of_control(summary, "masked", pose), results.of_variant(summary, "baseline", pose)
+    for estimator, name in ESTIMATORS.items():
+        masked, every = results.of_control(summary, "masked", estimator), results.of_method(summary, "baseline", estimator)
         found = {kind: answer.ratios(masked, every, metric) for metric, kind in results.BESIDE.items()}
         of_pose = [f"{kind} {_times(ratios)}" for kind, ratios in found.items() if len(ratios)]
         if of_pose:
@@ -129,23 +129,23 @@ def _beside(summary):
 
 def _controls(summary):
     """A Markdown table: every method as times all keypoints, and masks as times it, under each estimator."""
-    found = {pose: answer.compared(summary, "rmse", pose) for pose in POSES if _compared(summary, pose)}
+    found = {estimator: answer.compared(summary, "rmse", estimator) for estimator in ESTIMATORS if _compared(summary, estimator)}
     if not found:
         return ""
-    head = "| RMSE | keypoints | " + " | ".join(f"{POSES[pose]}: times all keypoints | masks are times this"
-                                                for pose in found) + " |"
+    head = "| RMSE | keypoints | " + " | ".join(f"{ESTIMATORS[estimator]}: times all keypoints | masks are times this"
+                                                for estimator in found) + " |"
     lines = [head, "| :--- | ---: |" + " :--- | :--- |" * len(found)]
     names = results.control_names(summary)
-    rows = {pose: table.set_index("variant") for pose, table in found.items()}
-    for variant in next(iter(rows.values())).index.drop("baseline"):
+    rows = {estimator: table.set_index("method") for estimator, table in found.items()}
+    for method in next(iter(rows.values())).index.drop("baseline"):
         cells = []
         for table in rows.values():
-            row = table.loc[variant] if variant in table.index else None
+            row = table.loc[method] if method in table.index else None
             cells += ["", ""] if row is None else [
                 _ratio(row["ratio"], row["low"], row["high"]),
-                "" if variant == "masked" else _ratio(row["masks"], row["masks_low"], row["masks_high"])]
-        keypoints = next(table.loc[variant, "keypoints"] for table in rows.values() if variant in table.index)
-        lines.append(f"| {names[variant]} | {keypoints:.0f} | {' | '.join(cells)} |")
+                "" if method == "masked" else _ratio(row["masks"], row["masks_low"], row["masks_high"])]
+        keypoints = next(table.loc[method, "keypoints"] for table in rows.values() if method in table.index)
+        lines.append(f"| {names[method]} | {keypoints:.0f} | {' | '.join(cells)} |")
     note = (f"Geometric means over sequences; in brackets their {LEVEL} % bootstrap interval, where there are "
             f"{results.FEWEST} or more. A ratio whose interval holds 1 shows no difference; of those that exclude it, "
             "one in twenty does so by chance.")
@@ -154,7 +154,7 @@ def _controls(summary):
 
 def _choice(summary):
     """What the choice of width makes of the comparison: a Markdown table and what it is worth."""
-    table, number = results.widths(summary), results.of_variant(summary, "masked")["dilation_width"].nunique()
+    table, number = results.widths(summary), results.of_method(summary, "masked")["dilation_width"].nunique()
     if table.empty or number < 2:
         return ""
     lines = ["| width chosen | RMSE, times all keypoints | lower in | MAE, times all keypoints | lower in |",
@@ -165,7 +165,7 @@ def _choice(summary):
             cells = [cell for metric in ("rmse", "mae")
                      for cell in (f"{np.exp(np.log1p(changes[metric] / 100).mean()):.2f}", _lower_of(changes[metric]))]
             lines.append(f"| {name} | {' | '.join(cells)} |")
-    text = (f"**The choice of width, {POSES[results.main_pose(summary)]}.** The best of {number} widths looks good "
+    text = (f"**The choice of width, {ESTIMATORS[results.main_estimator(summary)]}.** The best of {number} widths looks good "
             "even where masks do nothing, so it is no test.")
     return "\n".join([f"{text} {_again(summary, number)}{_tested(summary)}".strip(), "", *lines])
 
@@ -182,7 +182,7 @@ def _again(summary, number):
 def _tested(summary):
     """Where the width that is put to the test comes from."""
     width = results.tested_width(summary)
-    if not _compared(summary, results.main_pose(summary)):
+    if not _compared(summary, results.main_estimator(summary)):
         return ""
     if width != CONTROL_WIDTH:
         return (f"The width put to the test is {width}, set in place of Section 3.6's {CONTROL_WIDTH}; the test is "
@@ -192,11 +192,11 @@ def _tested(summary):
         f"{text}; it is the best width of no sequence.")
 
 
-def _against_each_other(summary, pose):
+def _against_each_other(summary, estimator):
     masked, called = {}, {}
     for source in results.sources(summary):
         own = results.of_source(summary, source)
-        rows, width = results.of_control(own, "masked", pose), results.tested_width(own)
+        rows, width = results.of_control(own, "masked", estimator), results.tested_width(own)
         if len(rows):
             masked[source] = rows
             called[source] = source if width is None else f"{source} (width {width})"
@@ -207,7 +207,7 @@ def _against_each_other(summary, pose):
         found.append(f"with {called[one]} RMSE {said[verdict(ratio)]} {called[other]} ({_times(ratio)})")
     if not found:
         return ""
-    return f"### One against the other, {POSES[pose]}\n\n{'; '.join(found)}."
+    return f"### One against the other, {ESTIMATORS[estimator]}\n\n{'; '.join(found)}."
 
 
 def _times(ratios):

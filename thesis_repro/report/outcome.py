@@ -31,15 +31,15 @@ STAGES = {"read": (SKY, ""), "segmentation": (RED, ""), "mask": (ORANGE, "//"), 
           "tracking": (GREEN, "\\\\"), "pose": (PINK, "")}
 
 
-def figure_paths(truths, rows, paths, variant, title):
+def figure_paths(truths, rows, paths, method, title):
     """Figures 4.6, 4.11, 4.12: estimated against true path of each sequence, seen from above.
 
-    truths: {sequence: true positions (n, 3)}. rows: the runs to draw, of one variant; repetition 0 is drawn bold, the
+    truths: {sequence: true positions (n, 3)}. rows: the runs to draw, of one method; repetition 0 is drawn bold, the
     others faint. paths: {(sequence, run): estimated positions (n, 3)}.
     """
     groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
     figure, panels, columns = _panels(len(groups), PAGE_WIDTH / min(4, len(groups)))
-    color = VARIANTS[variant][1]
+    color = VARIANTS[method][1]
     errors = results.over_orders(rows, "rmse")
     for panel, (name, runs) in zip(panels, groups.items()):
         panel.plot(truths[name][:, 0], truths[name][:, 2], color=TRUTH, linewidth=2.2, alpha=0.45, label="true path")
@@ -77,9 +77,9 @@ def _panels(count, height):
 
 def figure_4_07(summary):
     """Fraction of keypoints kept, relative to the baseline's mean number, against dilation width."""
-    masked = results.of_variant(summary, "masked")
+    masked = results.of_method(summary, "masked")
     kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack()
-    kept = kept.div(results.over_orders(results.of_variant(summary, "baseline"), "mean_keypoints")["mean"], axis=0)
+    kept = kept.div(results.over_orders(results.of_method(summary, "baseline"), "mean_keypoints")["mean"], axis=0)
     figure, axes = new_figure(height=4.0)
     _lines(axes, kept)
     axes.set(xlabel="dilation width (pixels)", ylabel="fraction of keypoints kept", ylim=(0, None),
@@ -99,8 +99,8 @@ def _lines(axes, table):
 def figure_against_width(summary, metric):
     """Figures 4.9, 4.10: the metric against dilation width, one line a sequence, and one panel a sequence below with
     the band of its repetitions and that of all keypoints."""
-    masked = results.of_variant(summary, "masked")
-    baseline = results.over_orders(results.of_variant(summary, "baseline"), metric)
+    masked = results.of_method(summary, "masked")
+    baseline = results.over_orders(results.of_method(summary, "baseline"), metric)
     names = sorted(masked["sequence"].unique())
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
@@ -142,15 +142,15 @@ def figure_against_width(summary, metric):
 
 
 def _compared(summary, metric):
-    """Mean, lowest and highest of the three variants of the thesis, {variant: table with one row a sequence}."""
-    rows = {"baseline": results.of_variant(summary, "baseline"), "masked": results.of_best_width(summary),
-            "reduced": results.of_variant(summary, "reduced")}
+    """Mean, lowest and highest of the three methods of the thesis, {method: table with one row a sequence}."""
+    rows = {"baseline": results.of_method(summary, "baseline"), "masked": results.of_best_width(summary),
+            "reduced": results.of_method(summary, "reduced")}
     names = sorted(rows["baseline"]["sequence"].unique())
-    return names, {variant: results.over_orders(runs, metric).reindex(names) for variant, runs in rows.items()}
+    return names, {method: results.over_orders(runs, metric).reindex(names) for method, runs in rows.items()}
 
 
-def _bar(axes, position, table, width, variant):
-    text, color, hatch = VARIANTS[variant]
+def _bar(axes, position, table, width, method):
+    text, color, hatch = VARIANTS[method]
     axes.set_axisbelow(True)
     axes.bar(position, table["mean"], width, label=text, color=color, hatch=hatch, edgecolor="white", linewidth=0)
     errors = np.array([table["mean"] - table["lowest"], table["highest"] - table["mean"]])
@@ -163,8 +163,8 @@ def figure_comparison(summary, metric):
     names, tables = _compared(summary, metric)
     figure, axes = new_figure(height=3.2)
     positions = np.arange(len(names))
-    for offset, (variant, table) in enumerate(tables.items()):
-        _bar(axes, positions + (offset - 1) * 0.27, table, 0.25, variant)
+    for offset, (method, table) in enumerate(tables.items()):
+        _bar(axes, positions + (offset - 1) * 0.27, table, 0.25, method)
     axes.set_xticks(positions, names)
     axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
     axes.grid(axis="x", visible=False)
@@ -177,8 +177,8 @@ def figure_breakdown(summary, metric):
     names, tables = _compared(summary, metric)
     figure, panels, columns = _panels(len(names), 1.7)
     for panel, name in zip(panels, names):
-        for offset, (variant, table) in enumerate(tables.items()):
-            _bar(panel, offset, table.loc[name], 0.8, variant)
+        for offset, (method, table) in enumerate(tables.items()):
+            _bar(panel, offset, table.loc[name], 0.8, method)
         panel.set_title(name)
         panel.set_xticks([])
         panel.grid(axis="x", visible=False)
@@ -191,32 +191,32 @@ def figure_breakdown(summary, metric):
 def figure_controls(summary):
     """Mean change of RMSE and MAE with masks of one width and with each control; one column of panels an estimator."""
     table = results.controls(summary)
-    table = table[table["variant"] != "baseline"]
-    variants = [variant for variant in results.CONTROLS if variant in set(table["variant"])]
-    poses = [pose for pose in results.POSES if (table["pose"] == pose).any()]
-    figure, axes = new_figure(2, len(poses), height=1.6 + 0.5 * len(variants), sharex="col", sharey=True, squeeze=False)
-    for column, pose in enumerate(poses):
+    table = table[table["method"] != "baseline"]
+    methods = [method for method in results.CONTROLS if method in set(table["method"])]
+    poses = [estimator for estimator in results.ESTIMATORS if (table["estimator"] == estimator).any()]
+    figure, axes = new_figure(2, len(poses), height=1.6 + 0.5 * len(methods), sharex="col", sharey=True, squeeze=False)
+    for column, estimator in enumerate(poses):
         extreme = [0.0]
         for panel, metric in zip(axes[:, column], ("rmse", "mae")):
-            changes = results.control_changes(summary, metric, pose)
+            changes = results.control_changes(summary, metric, estimator)
             panel.axvline(0, color="black", linewidth=0.8)
-            for row in table[table["pose"] == pose].to_dict("records"):
-                y, masked = variants.index(row["variant"]), row["variant"] == "masked"
+            for row in table[table["estimator"] == estimator].to_dict("records"):
+                y, masked = methods.index(row["method"]), row["method"] == "masked"
                 color = MASKED if masked else BASELINE
-                values = changes[row["variant"]].dropna()
+                values = changes[row["method"]].dropna()
                 panel.plot(values, np.full(len(values), y - 0.24), "o", color="#555555", alpha=0.45, markersize=3.5,
                            markeredgewidth=0)
                 panel.plot([row[f"{metric}_low"], row[f"{metric}_high"]], [y + 0.1] * 2, color=color, linewidth=2.4)
                 panel.plot(row[metric], y + 0.1, "D" if masked else "o", color=color, markersize=5.5,
                            markeredgecolor="white")
                 extreme += list(values)
-            panel.set_title(f"{metric.upper()}, {results.POSES[pose]}")
+            panel.set_title(f"{metric.upper()}, {results.ESTIMATORS[estimator]}")
             panel.grid(axis="y", visible=False)
         scaled = _percent_scale(axes[:, column], min(extreme), max(extreme))
         axes[1, column].set_xlabel("change from all keypoints (%)" + scaled * ",\non the scale of the errors' ratio")
     names = results.control_names(summary)
-    axes[0, 0].set_yticks(range(len(variants)), [names[variant] for variant in variants])
-    axes[0, 0].set_ylim(len(variants) - 0.5, -0.6)
+    axes[0, 0].set_yticks(range(len(methods)), [names[method] for method in methods])
+    axes[0, 0].set_ylim(len(methods) - 0.5, -0.6)
     figure.suptitle("Grey: sequences. Marker and bar: their mean and its "
                     f"{results.LEVEL} % interval. Left of 0 is better than all keypoints.", fontsize=8)
     return figure
@@ -241,13 +241,13 @@ def _percent_scale(panels, lowest, highest):
     return True
 
 
-def figure_keypoints(summary, pose):
+def figure_keypoints(summary, estimator):
     """Error against number of keypoints, one line a source of masks: over all sequences, then each by itself.
 
-    pose: estimator. A line joins the widths of a source; bars go from the lowest to the highest repetition, above over
+    estimator: estimator. A line joins the widths of a source; bars go from the lowest to the highest repetition, above over
     the interval of the mean.
     """
-    table, means = (rows[rows["pose"] == pose] for rows in (results.errors(summary), results.side_by_side(summary)))
+    table, means = (rows[rows["estimator"] == estimator] for rows in (results.errors(summary), results.side_by_side(summary)))
     names, sources = sorted(table["sequence"].unique()), results.sources(summary)
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
@@ -264,7 +264,7 @@ def figure_keypoints(summary, pose):
     axes.plot(100, 0, "D", color="black", markersize=5, label="all keypoints")
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set(xlabel="keypoints kept (%)", ylabel="change of RMSE (%)",
-             title=f"Error against keypoints, mean over sequences, {results.POSES[pose]}")
+             title=f"Error against keypoints, mean over sequences, {results.ESTIMATORS[estimator]}")
     axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     panels = below.subplots(rows, columns, squeeze=False)
     for panel, name in zip(panels.flat, names):
@@ -308,31 +308,31 @@ def figure_4_17(seconds):
 
 
 def figure_budget(measured, overlapped):
-    """Milliseconds a frame of every stage, from reading the frame to its pose, against KITTI's ten frames a second.
+    """Milliseconds a frame of every stage, from reading the frame to its estimator, against KITTI's ten frames a second.
 
-    measured: variant, stage and milliseconds (`budget.measure`). overlapped: variant and milliseconds between frames
+    measured: method, stage and milliseconds (`budget.measure`). overlapped: method and milliseconds between frames
     where the next frame is read and segmented beside the odometry of this one (`budget.measure_overlapped`).
     """
-    variants = list(measured["variant"].unique())
-    figure, axes = new_figure(height=1.4 + 0.5 * len(variants))
+    methods = list(measured["method"].unique())
+    figure, axes = new_figure(height=1.4 + 0.5 * len(methods))
     axes.set_axisbelow(True)
-    left = dict.fromkeys(variants, 0.0)
+    left = dict.fromkeys(methods, 0.0)
     for stage, (color, hatch) in STAGES.items():
-        rows = measured[measured["stage"] == stage].set_index("variant")["milliseconds"].reindex(variants).fillna(0)
-        axes.barh(variants, rows, 0.6, left=list(left.values()), label=stage, color=color, hatch=hatch,
+        rows = measured[measured["stage"] == stage].set_index("method")["milliseconds"].reindex(methods).fillna(0)
+        axes.barh(methods, rows, 0.6, left=list(left.values()), label=stage, color=color, hatch=hatch,
                   edgecolor="white", linewidth=0.5)
-        for variant in variants:
-            left[variant] += rows[variant]
-    between = overlapped.set_index("variant")["milliseconds"].reindex(variants)
-    axes.plot(between, range(len(variants)), "D", color="black", markeredgecolor="white", markersize=6,
+        for method in methods:
+            left[method] += rows[method]
+    between = overlapped.set_index("method")["milliseconds"].reindex(methods)
+    axes.plot(between, range(len(methods)), "D", color="black", markeredgecolor="white", markersize=6,
               linestyle="none", label="between frames, overlapped")
-    for place, variant in enumerate(variants):
-        end = np.nanmax([left[variant], between[variant] + 1])
-        axes.text(end, place, f"  {left[variant]:.0f} ms", va="center", ha="left", fontsize=8)
+    for place, method in enumerate(methods):
+        end = np.nanmax([left[method], between[method] + 1])
+        axes.text(end, place, f"  {left[method]:.0f} ms", va="center", ha="left", fontsize=8)
     axes.axvline(FRAME_MS, color="black", linewidth=1, linestyle="--")
     axes.text(FRAME_MS, -0.4, "10 frames a second ", ha="right", va="bottom", fontsize=8)
     axes.set(xlim=(0, max(FRAME_MS, *left.values(), between.max()) * 1.12), xlabel="time a frame (ms)",
-             ylim=(len(variants) - 0.6, -0.65))
+             ylim=(len(methods) - 0.6, -0.65))
     axes.grid(axis="y", visible=False)
     handles = dict(zip(*reversed(axes.get_legend_handles_labels())))
     labels = [*STAGES, "between frames, overlapped"]

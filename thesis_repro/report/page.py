@@ -254,14 +254,14 @@ def _here(settings):
         found["figure_4_01"] = f"{len(history)} epochs, the best was {best['epoch']:.0f}; {'; '.join(scores)}."
     chosen = _numbers(settings.figures / "table_4_1.csv")
     if len(runs) and "mean keypoints" in chosen:
-        every = runs[runs["variant"] == "baseline"].groupby("sequence")["mean_keypoints"].mean()
+        every = runs[runs["method"] == "baseline"].groupby("sequence")["mean_keypoints"].mean()
         kept = chosen.set_index("sequence")["mean keypoints"]
         factors = (every / kept[kept > 0]).dropna()
         found["figure_4_07"] = (f"{factors.min():.1f} to {factors.max():.1f} times fewer than without masks, with the "
                                 "widths of Table 4.1.")
     if len(seconds):
-        masked = seconds[seconds["variant"] == "masked"].groupby("dilation_width")["seconds"].sum()
-        saved = 100 * (1 - masked / seconds.loc[seconds["variant"] == "baseline", "seconds"].sum())
+        masked = seconds[seconds["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
+        saved = 100 * (1 - masked / seconds.loc[seconds["method"] == "baseline", "seconds"].sum())
         found["figure_4_17"] = f"{saved.min():.0f} to {saved.max():.0f} %, by width.".replace("-", "−")
     return found
 

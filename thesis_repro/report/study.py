@@ -29,14 +29,14 @@ def write(study, summary, folder):
     style.save_table(summary.round(results.DIGITS), folder, "runs", note)
     keep("text", "findings", findings.study_words(summary, note))
     keep("table", "sources", tables.table_sources(summary))
-    for pose in study.poses:
-        keep("figure", f"keypoints-{pose}", outcome.figure_keypoints(summary, pose))
+    for estimator in study.estimators:
+        keep("figure", f"keypoints-{estimator}", outcome.figure_keypoints(summary, estimator))
     for source in results.sources(summary):
         own = results.of_source(summary, source)
         if study.tested:
             keep("figure", "controls-NAME", outcome.figure_controls(own), source)
             keep("table", "controls-NAME", tables.table_controls(own), source)
-        if results.of_variant(own, "masked")["dilation_width"].nunique() > 1:
+        if results.of_method(own, "masked")["dilation_width"].nunique() > 1:
             keep("table", "widths-NAME", tables.table_widths(own), source)
     keep("table", "errors", tables.table_errors(summary))
     write_text(folder / page.PAGE, page.build_study(folder, made, _facts(study, summary), is_embedded(study.kitti)))
@@ -63,7 +63,7 @@ def _corrected(source):
 
 
 def _facts(study, summary):
-    lengths = results.of_variant(summary, "baseline").groupby("sequence")["frames"].first()
+    lengths = results.of_method(summary, "baseline").groupby("sequence")["frames"].first()
     of_labels = any(source.kind == "labels" for source in study.sources)
     return {
         "odometry data": "embedded world" if is_embedded(study.kitti) else f"KITTI folder “{study.kitti.name}”",
@@ -73,7 +73,7 @@ def _facts(study, summary):
         "widths": ", ".join(map(str, sorted({*study.widths, *([study.tested] if of_labels and study.tested else [])}))),
         "controls": "" if not study.tested else f"beside masks of width {study.tested}" if of_labels
                     else f"beside the masks; lines and edges are {controls.LINE_WIDTH} pixels wide",
-        "estimators": ", ".join(results.POSES[pose] for pose in study.poses),
+        "estimators": ", ".join(results.ESTIMATORS[estimator] for estimator in study.estimators),
         "repetitions": f"{study.repetitions} of every run; repetition 0 keeps the order of the correspondences, "
                        "repetition n shuffles it with seed n",
     }

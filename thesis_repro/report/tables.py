@@ -41,7 +41,7 @@ def table_of_change(summary, metric, reported_as):
     for RMSE also what other errors say of the thesis's choice (`results.BESIDE`).
     The thesis's "aggregate" is the sum of the sequences' percentages; mean, its interval and median stand beside it.
     """
-    baseline = results.over_orders(results.of_variant(summary, "baseline"), metric)
+    baseline = results.over_orders(results.of_method(summary, "baseline"), metric)
     masked = results.over_orders(results.of_best_width(summary), metric).reindex(baseline.index)
     chosen = results.widths(summary).reindex(baseline.index)
     key = {"rmse": "table_4_2_rmse_percent_change", "mae": "table_4_3_mae_percent_change"}[metric]
@@ -54,8 +54,8 @@ def table_of_change(summary, metric, reported_as):
         **{f"{name} (%)": chosen[f"best_{other}"] for other, name in results.BESIDE.items() if metric == "rmse"},
         "one width for all (%)": chosen[f"fixed_{metric}"],
         "left-out width (%)": chosen[f"left_out_{metric}"],
-        **{f"{short[variant]} (%)": change
-           for variant, change in results.control_changes(summary, metric).items()},
+        **{f"{short[method]} (%)": change
+           for method, change in results.control_changes(summary, metric).items()},
     })
     label = metric.upper()
     errors = pd.DataFrame({
@@ -93,7 +93,7 @@ def _ranges(table):
 def table_widths(summary):
     """What the best, the left-out and the fixed width give, and how far the best is chance (`results.widths`)."""
     table = results.widths(summary)
-    count = results.of_variant(summary, "masked")["dilation_width"].nunique()
+    count = results.of_method(summary, "masked")["dilation_width"].nunique()
     names = {}
     for choice, name in (("best", f"best of {count}"), ("left_out", "left-out"), ("fixed", "one for all")):
         names |= {choice: f"{name}: width", f"{choice}_rmse": f"{name}: RMSE (%)", f"{choice}_mae": f"{name}: MAE (%)"}
@@ -110,7 +110,7 @@ def table_controls(summary):
     """Masks of one width and every control under both estimators: mean changes from all keypoints, with intervals."""
     table = results.controls(summary)
     names = {"baseline": "all keypoints", **results.control_names(summary)}
-    shown = pd.DataFrame({"estimator": table["pose"].map(results.POSES), "keypoints": table["variant"].map(names),
+    shown = pd.DataFrame({"estimator": table["estimator"].map(results.ESTIMATORS), "keypoints": table["method"].map(names),
                           "mean number": table["keypoints"].round().astype(int), "sequences": table["sequences"]})
     for metric in results.ERRORS:
         label = metric.upper()
@@ -171,20 +171,20 @@ def table_errors(summary):
 
 
 def _source_columns(table):
-    return pd.DataFrame({"estimator": table["pose"].map(results.POSES),
+    return pd.DataFrame({"estimator": table["estimator"].map(results.ESTIMATORS),
                          "masks": table["source"].where(table["source"] != "", "all keypoints"),
                          "width (pixels)": table["dilation_width"].astype("Int64")})
 
 
 def table_budget(measured, overlapped):
-    """Milliseconds a frame of each stage, one column a variant, and the frames a second that they allow.
+    """Milliseconds a frame of each stage, one column a method, and the frames a second that they allow.
 
-    measured: variant, stage and milliseconds (`budget.measure`). overlapped: variant and milliseconds between frames
+    measured: method, stage and milliseconds (`budget.measure`). overlapped: method and milliseconds between frames
     where the next frame is read and segmented beside the odometry of this one (`budget.measure_overlapped`).
     """
-    table = measured.pivot(index="stage", columns="variant", values="milliseconds")
-    table = table.loc[measured["stage"].unique(), measured["variant"].unique()]
-    total, between = table.sum(), overlapped.set_index("variant")["milliseconds"].reindex(table.columns)
+    table = measured.pivot(index="stage", columns="method", values="milliseconds")
+    table = table.loc[measured["stage"].unique(), measured["method"].unique()]
+    total, between = table.sum(), overlapped.set_index("method")["milliseconds"].reindex(table.columns)
     below = pd.DataFrame({"all stages (ms)": total, "frames a second": 1000 / total,
                           "between frames, overlapped (ms)": between, "frames a second, overlapped": 1000 / between}).T
     table = pd.concat([table.round(2).rename(lambda stage: f"{stage} (ms)"), below.round(1)])

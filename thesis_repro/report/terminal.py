@@ -1,6 +1,7 @@
 """What the commands about a path print: a run's errors and a camera's angles, as JSON's records and as text."""
 
-from thesis_repro.odometry import boresight, metrics
+from thesis_repro.odometry import metrics
+from thesis_repro.odometry.refined import boresight
 
 ERRORS = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_m")
 METRES = ("rmse", "rmse_own", "rmse_others", "rotations", "directions", "ate")

@@ -24,10 +24,10 @@ NOISE_OF_TODAY = (0.2, 0.44)  # standard deviation of A.GaussNoise's defaults, a
 
 def trials(images, labels, validation, *, steps, seeds, base_filters=8, batch_size=8, rate=3e-3, threads=1,
            processes=1):
-    """Train the thesis's network and four that differ in one slip for a few steps: a row for each variant and seed.
+    """Train the thesis's network and four that differ in one slip for a few steps: a row for each method and seed.
 
     images (n, size, size, 1) and labels (n, size, size), uint8, and the same of `validation`. What can be seen after so
-    few steps is how a slip changes the beginning of a training, not where a whole one ends. Columns variant, seed,
+    few steps is how a slip changes the beginning of a training, not where a whole one ends. Columns method, seed,
     steps, mean_iou and accuracy as Cityscapes measures them, person (IoU of that class, NaN where it is absent).
     threads: inside an operation, where TensorFlow has not begun; their number is part of the bits. processes: at once.
     """
@@ -53,19 +53,19 @@ def _trials(images, labels, validation, steps, seeds, base_filters, batch_size, 
     model = fresh()
     model.compile(keras.optimizers.Adam(rate),
                   sm.losses.DiceLoss(class_weights=weights) + sm.losses.CategoricalFocalLoss())
-    return [{"variant": variant, "seed": seed, "steps": steps}
-            | _trial(model, fresh, images, labels, validation, variant, seed, steps, batch_size)
-            for variant in variants for seed in range(seeds)]
+    return [{"method": method, "seed": seed, "steps": steps}
+            | _trial(model, fresh, images, labels, validation, method, seed, steps, batch_size)
+            for method in variants for seed in range(seeds)]
 
 
-def _trial(model, fresh, images, labels, validation, variant, seed, steps, batch_size):
+def _trial(model, fresh, images, labels, validation, method, seed, steps, batch_size):
     keras.utils.set_random_seed(seed)
     model.set_weights(fresh().get_weights())
     for variable in model.optimizer.variables:
         if variable.name != "learning_rate":
             variable.assign(np.zeros(variable.shape))
-    augmented = augmentation.augment_set(images, labels, _augmenter(images.shape[1], variant), seed)
-    scale = 255 if variant == "divided by 255" else 1
+    augmented = augmentation.augment_set(images, labels, _augmenter(images.shape[1], method), seed)
+    scale = 255 if method == "divided by 255" else 1
     some, true = np.concatenate([images, augmented[0]]), np.concatenate([labels, augmented[1]])
     chosen = np.random.default_rng(seed).integers(0, len(some), steps * batch_size)
     model.fit(some[chosen].astype(np.float32) / scale, augmentation.one_hot(true[chosen], N_CLASSES),
@@ -75,9 +75,9 @@ def _trial(model, fresh, images, labels, validation, variant, seed, steps, batch
     return {"mean_iou": mean_iou, "accuracy": accuracy, "person": classes["iou"].get("person", np.nan)}
 
 
-def _augmenter(size, variant):
+def _augmenter(size, method):
     transforms = augmentation.transform_list(size)
-    if variant == "noise of today":
+    if method == "noise of today":
         transforms = [A.GaussNoise(std_range=NOISE_OF_TODAY, p=one.p) if isinstance(one, A.GaussNoise) else one
                       for one in transforms]
     return augmentation.Augmenter(transforms)

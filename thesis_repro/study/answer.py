@@ -1,6 +1,6 @@
 """Do masks from a segmentation help? The comparison, which was decided before any run on real frames was seen.
 
-- **Estimator**: the refined one (pose="refined"). The thesis's spreads so far between orders of the correspondences
+- **Estimator**: the refined one (estimator="refined"). The thesis's spreads so far between orders of the correspondences
   that it sees no effect of the size in question; it stands beside.
 - **Metrics**: RMSE (Equation 3.5) once the constant angle between camera and ground truth is taken out, as the other
   sequences of the same recording day give it with all keypoints, the same angle for every method; and the mean error of
@@ -26,8 +26,9 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from thesis_repro.kitti import Sequence
-from thesis_repro.odometry import boresight, metrics
+from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
+from thesis_repro.odometry.refined import boresight
 from thesis_repro.study import results
 from thesis_repro.study.effects import step_errors
 from thesis_repro.study.jobs import Job
@@ -57,7 +58,7 @@ def with_relative(summary: pd.DataFrame, kitti: Path, folder: Path, frames: int 
 def refined_paths(names: Iterable[str], kitti: Path, folder: Path, frames: int | None = None
                   ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """{name: (estimated, true)} of all keypoints under the refined estimator, poses (n, 4, 4), for `boresight`."""
-    file = Job("", "baseline", pose=POSE).name
+    file = Job("", "baseline", estimator=POSE).name
     return {name: (poses_of(pd.read_csv(folder / name / f"{file}.csv")), Sequence(kitti, name).subset(frames).poses)
             for name in names}
 
@@ -92,21 +93,21 @@ def mean_ratio(values: ArrayLike) -> tuple[float, float, float]:
     return float(np.exp(np.nanmean(logarithms))), float(np.exp(low)), float(np.exp(high))
 
 
-def compared(summary: pd.DataFrame, metric: str, pose: str = POSE) -> pd.DataFrame:
+def compared(summary: pd.DataFrame, metric: str, estimator: str = POSE) -> pd.DataFrame:
     """Each method of one width against all keypoints, and masks against it: one row a method.
 
-    Columns variant, keypoints (mean number), sequences, ratio, low, high (over all keypoints), percent (the thesis's
+    Columns method, keypoints (mean number), sequences, ratio, low, high (over all keypoints), percent (the thesis's
     mean of percentages), masks, masks_low, masks_high (masks over this method).
     """
-    reference, masked = results.of_variant(summary, "baseline", pose), results.of_control(summary, "masked", pose)
+    reference, masked = results.of_method(summary, "baseline", estimator), results.of_control(summary, "masked", estimator)
     rows = []
-    for variant in METHODS:
-        runs = results.of_control(summary, variant, pose)
+    for method in METHODS:
+        runs = results.of_control(summary, method, estimator)
         if not len(runs):
             continue
         own, against = ratios(runs, reference, metric), ratios(masked, runs, metric)
         means = runs.groupby("sequence")[metric].mean() / reference.groupby("sequence")[metric].mean()
-        rows.append({"variant": variant, "sequences": len(own),
+        rows.append({"method": method, "sequences": len(own),
                      "keypoints": runs.groupby("sequence")["mean_keypoints"].mean().mean(),
                      **dict(zip(("ratio", "low", "high"), mean_ratio(own), strict=True)),
                      "percent": 100 * (means.mean() - 1),
@@ -114,16 +115,16 @@ def compared(summary: pd.DataFrame, metric: str, pose: str = POSE) -> pd.DataFra
     return pd.DataFrame(rows)
 
 
-def lines(summary: pd.DataFrame, metric: str, pose: str = POSE) -> pd.DataFrame:
+def lines(summary: pd.DataFrame, metric: str, estimator: str = POSE) -> pd.DataFrame:
     """Error against number of keypoints: one row a sequence, method and setting (width, limit or distance).
 
-    Columns sequence, variant, keypoints, mean (geometric, over repetitions), lowest, highest.
+    Columns sequence, method, keypoints, mean (geometric, over repetitions), lowest, highest.
     """
-    rows = summary[(summary["pose"] == pose) & summary["variant"].isin(METHODS)]
+    rows = summary[(summary["estimator"] == estimator) & summary["method"].isin(METHODS)]
     setting = rows[["dilation_width", "max_keypoints", "min_distance"]].astype(float).fillna(-1).agg(tuple, axis=1)
-    grouped = rows.assign(setting=setting).groupby(["sequence", "variant", "setting"], sort=False)
+    grouped = rows.assign(setting=setting).groupby(["sequence", "method", "setting"], sort=False)
     found = grouped.agg(keypoints=("mean_keypoints", "mean"), lowest=(metric, "min"), highest=(metric, "max"),
                         mean=(metric, lambda values: np.exp(np.log(values).mean())))
-    return found.reset_index().drop(columns="setting").sort_values(["sequence", "variant", "keypoints"],
+    return found.reset_index().drop(columns="setting").sort_values(["sequence", "method", "keypoints"],
                                                                    ignore_index=True)
 

@@ -24,7 +24,7 @@ from thesis_repro.study.runner import by_name, masks_of
 from thesis_repro.study.sources import Source
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
-PLAIN = "all keypoints"  # the variant without network and mask; the other is "masked, width 10" or whatever width
+PLAIN = "all keypoints"  # the method without network and mask; the other is "masked, width 10" or whatever width
 WARM_UP = 3  # frames that load compiled code and fill caches, not counted
 
 
@@ -44,7 +44,7 @@ def opencv_threads(count: int) -> Iterator[None]:
 
 def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *, frames: int,
               processes: int = 1) -> pd.DataFrame:
-    """What each job costs as a run of its own: a table of sequence, run, variant, dilation_width and seconds.
+    """What each job costs as a run of its own: a table of sequence, run, method, dilation_width and seconds.
 
     Only the first `frames` frames are timed; the first two steps are left out, since they load compiled code. The jobs
     of a sequence take turns at every frame, so that what else the machine does falls on all of them alike.
@@ -83,9 +83,9 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
                 if index > 1:
                     # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
                     seconds[job] += masking + sum(step.seconds.values())
-    table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "variant": job.variant,
+    table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "method": job.method,
                            "dilation_width": job.dilation_width, "seconds": value} for job, value in seconds.items()],
-                         columns=["sequence", "run", "variant", "dilation_width", "seconds"])
+                         columns=["sequence", "run", "method", "dilation_width", "seconds"])
     write_text(path, table.to_csv(index=False))
 
 
@@ -94,13 +94,13 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
 
 def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CONTROL_WIDTH,
             boundaries: str = "canny") -> pd.DataFrame:
-    """Milliseconds a frame of every stage: a table of variant, stage and milliseconds, medians over `frames` frames.
+    """Milliseconds a frame of every stage: a table of method, stage and milliseconds, medians over `frames` frames.
 
     Variants: "all keypoints", without network and mask, and "masked, width 10". Stages: read (decode the PNG),
     segmentation (stretch to the model's input, network, class of every pixel), mask (label map to 320x320, edges,
     dilation), detection, tracking, pose (essential matrix, then rotation and translation).
     model: a Keras model of `segmentation`. width: pixels, and boundaries, see `masks.edges`, of the masks.
-    The variants take turns at every frame. Raises InputError for a sequence with too few frames.
+    The methods take turns at every frame. Raises InputError for a sequence with too few frames.
     """
     sequence, metres = _start(sequence, frames)
     masked = _masked(width)
@@ -115,9 +115,9 @@ def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CO
                 seconds = run.step(frame, metres[index], mask if name == masked else None).seconds
                 before = {"read": read, **({"segmentation": network, "mask": masking} if name == masked else {})}
                 if index >= WARM_UP:
-                    rows.append({"variant": name, **before, "detection": seconds["detect"],
+                    rows.append({"method": name, **before, "detection": seconds["detect"],
                                  "tracking": seconds["track"], "pose": seconds["essential"] + seconds["pose"]})
-    medians = 1000 * pd.DataFrame(rows).groupby("variant", sort=False)[list(STAGES)].median()
+    medians = 1000 * pd.DataFrame(rows).groupby("method", sort=False)[list(STAGES)].median()
     return medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds").dropna().reset_index()
 
 
@@ -125,7 +125,7 @@ def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20, widt
                        boundaries: str = "canny") -> pd.DataFrame:
     """Milliseconds between frames where reading, network and mask of the next frame go on beside the odometry of this.
 
-    A table of variant and milliseconds (medians). A frame's own way takes as long as before or longer; more frames a
+    A table of method and milliseconds (medians). A frame's own way takes as long as before or longer; more frames a
     second come through. Variants and arguments as in `measure`.
     """
     sequence, metres = _start(sequence, frames)
@@ -145,7 +145,7 @@ def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20, widt
                     waiting = pool.submit(front, index + 1)
                 run.step(frame, metres[index], mask)
                 times.append(time.perf_counter())
-            rows.append({"variant": name, "milliseconds": 1000 * pd.Series(times).diff()[WARM_UP:].median()})
+            rows.append({"method": name, "milliseconds": 1000 * pd.Series(times).diff()[WARM_UP:].median()})
     return pd.DataFrame(rows)
 
 

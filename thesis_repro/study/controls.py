@@ -132,12 +132,12 @@ MASKS: dict[str, Callable[[Source, Sequence, int | None], ControlMasks]] = {
 OF_LABEL_MAPS = ("exact-boundaries", "corrected", "true-labels")  # ask what label maps are good for
 
 
-def masks(variant: str, source: Source, sequence: Sequence, dilation_width: int | None) -> ControlMasks:
+def masks(method: str, source: Source, sequence: Sequence, dilation_width: int | None) -> ControlMasks:
     """The masks of one of MASKS for a sequence, as control of the source's own.
 
     dilation_width: pixels, of masks from label maps.
     """
-    return MASKS[variant](source, sequence, dilation_width)
+    return MASKS[method](source, sequence, dilation_width)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:

@@ -24,7 +24,7 @@ from thesis_repro.odometry.passes import Masks, poses_of
 from thesis_repro.study.controls import CORRECTED
 from thesis_repro.study.jobs import CONTROL_WIDTH
 
-POSES = ("all", "inliers", "refined")
+ESTIMATORS = ("thesis", "inliers", "refined")
 FEW = (100, 200, 400)  # keypoints: a twentieth, a tenth and a fifth of the thesis's 2000
 WRONG = 2.0  # degrees: a step of FAST metres or more whose rotation is further off has failed
 FAST = 0.25
@@ -91,7 +91,7 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, plan:
     kitti: the odometry root. labels: a folder with one folder of label maps a sequence. folder: where the tables of
     each sequence are kept; a stopped series goes on where it was.
 
-    runs has a row for each sequence, variant, pose and repetition: errors (those of `metrics.errors`, sim3 in
+    runs has a row for each sequence, method, estimator and repetition: errors (those of `metrics.errors`, sim3 in
     metres, `step_errors`), mean_keypoints and flagged frames. prefixes has the RMSE of all keypoints over the first
     `frames` frames and `metres` of each sequence, a row an order, under the thesis's estimator.
     """
@@ -114,11 +114,11 @@ def _measure(kitti: Path, name: str, labels: Path, folder: Path, plan: Plan) -> 
         wanted = runs_of(sequence, labels, plan)
         named = {" ".join(map(str, key)): key for key in wanted}
         found = odometry.run_many(sequence, {text: wanted[key] for text, key in named.items()})
-        rows = [dict(zip(("variant", "pose", "repetition"), named[text], strict=True)) | _row(result, sequence)
+        rows = [dict(zip(("method", "estimator", "repetition"), named[text], strict=True)) | _row(result, sequence)
                 for text, result in found.items()]
         write_text(folder / "runs.csv", pd.DataFrame(rows).assign(sequence=name).to_csv(index=False))
-        rows = [row for (variant, pose, order), text in zip(named.values(), named, strict=True)
-                if variant == "all" and pose == "all"
+        rows = [row for (method, estimator, order), text in zip(named.values(), named, strict=True)
+                if method == "all" and estimator == "thesis"
                 for row in _prefixes(found[text].poses, sequence.poses, order)]
         write_text(folder / "prefixes.csv", pd.DataFrame(rows).assign(sequence=name).to_csv(index=False))
     return folder
@@ -126,12 +126,12 @@ def _measure(kitti: Path, name: str, labels: Path, folder: Path, plan: Plan) -> 
 
 def runs_of(sequence: Sequence, labels: Path, plan: Plan
             ) -> dict[tuple[str, str, int], tuple[OdometrySettings, Masks | None]]:
-    """The runs over one sequence: {(variant, pose, repetition): (settings, masks)}. labels: of its frames."""
+    """The runs over one sequence: {(method, estimator, repetition): (settings, masks)}. labels: of its frames."""
     width, boundaries = plan.dilation_width, plan.boundaries
     own = masks.LabelMasks(labels, sequence, width, boundaries)
     number = round(np.mean([len(keypoints.detect(sequence.frame(index), THESIS, own[index]))
                             for index in range(0, len(sequence), max(1, len(sequence) // 8))]))
-    variants: dict[str, tuple[OdometrySettings, Masks | None]] = {
+    methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
         "all": (THESIS, None),
         "masks": (THESIS, own),
         "filter": (replace(THESIS, mask_mode="filter"), own),
@@ -146,11 +146,11 @@ def runs_of(sequence: Sequence, labels: Path, plan: Plan
         "orb": (replace(THESIS, detector="orb"), None),
     }
     runs = {}
-    for variant, (settings, its_masks) in variants.items():
-        for order in range(plan.chance if variant == "all" else plan.orders):
-            for pose in POSES if variant in ("all", "masks") else ("all", "refined"):
-                if order < plan.orders or pose == "all":
-                    runs[variant, pose, order] = (replace(settings, pose=pose, permute=order or None), its_masks)
+    for method, (settings, its_masks) in methods.items():
+        for order in range(plan.chance if method == "all" else plan.orders):
+            for estimator in ESTIMATORS if method in ("all", "masks") else ("thesis", "refined"):
+                if order < plan.orders or estimator == "thesis":
+                    runs[method, estimator, order] = (replace(settings, estimator=estimator, shuffle_seed=order or None), its_masks)
     return runs
 
 

@@ -18,7 +18,7 @@ from thesis_repro.study.sources import Source
 # Pixels: the width of Section 3.6 and of Figures 3.6 and 4.5, at which masks are put to the test. It was fixed before
 # any run. (The code of appendix A.8 dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
-POSES = {"all": "thesis's estimator", "refined": "refined estimator"}  # the second spreads far less
+ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined estimator"}  # the second spreads far less
 UNMASKED = ("baseline", "reduced", "fewer", "spread")
 PIECES = 4  # passes for each of several workers, at the least
 
@@ -27,20 +27,20 @@ PIECES = 4  # passes for each of several workers, at the least
 class Job:
     """One run of the odometry over one sequence. What is None or left out is as in the thesis.
 
-    variant: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
+    method: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
     dilation_width: pixels, of masks from label maps. source: name of where the masks come from, or those that a limit
     of keypoints was taken from; empty where there is only one. max_keypoints, min_distance: of the detector.
-    pose: "all" or "refined", see OdometrySettings.
+    estimator: "all" or "refined", see OdometrySettings.
     repetition: 0 takes the correspondences in the order in which they come, which is the thesis's single run; any
     other number is the seed that shuffles them.
     """
 
     sequence: str
-    variant: str
+    method: str
     dilation_width: int | None = None
     max_keypoints: int | None = None
     min_distance: float | None = None
-    pose: str = "all"
+    estimator: str = "thesis"
     repetition: int = 0
     source: str = ""
 
@@ -49,8 +49,8 @@ class Job:
         """Unique in its sequence, and the stem of its file: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0."""
         width = None if self.dilation_width is None else f"{self.dilation_width:02d}"
         distance = None if self.min_distance is None else f"{self.min_distance:g}"
-        pose = None if self.pose == "all" else self.pose
-        parts = (self.variant, width, self.max_keypoints, distance, pose, self.repetition)
+        estimator = None if self.estimator == "thesis" else self.estimator
+        parts = (self.method, width, self.max_keypoints, distance, estimator, self.repetition)
         name = "-".join(str(part) for part in parts if part is not None)
         return f"{self.source}/{name}" if self.source else name
 
@@ -58,23 +58,23 @@ class Job:
     def settings(self) -> OdometrySettings:
         """What the odometry does in this job: what the thesis does, but for what the job itself says."""
         said: dict[str, Any] = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
-                                "permute": self.repetition or None, "pose": self.pose}
+                                "shuffle_seed": self.repetition or None, "estimator": self.estimator}
         return replace(THESIS, **{name: value for name, value in said.items() if value is not None})
 
     def masks(self, sequence: Sequence, sources: Mapping[str, Source]) -> controls.ControlMasks | None:
         """Its masks; None where the detector may look everywhere. sources: by name."""
-        if self.variant in UNMASKED:
+        if self.method in UNMASKED:
             return None
         source = sources[self.source]
-        if self.variant == "masked":
+        if self.method == "masked":
             return source.masks(sequence, self.dilation_width)
-        return controls.masks(self.variant, source, sequence, self.dilation_width)
+        return controls.masks(self.method, source, sequence, self.dilation_width)
 
 
 def first_jobs(names: Iterable[str], widths: Iterable[int], repetitions: int = 1) -> list[Job]:
     """The thesis's runs that depend on no other: baseline and masks of every width, for each sequence."""
-    variants = [("baseline", None), *(("masked", width) for width in widths)]
-    return [Job(name, variant, width, repetition=repetition) for name in names for variant, width in variants
+    methods = [("baseline", None), *(("masked", width) for width in widths)]
+    return [Job(name, method, width, repetition=repetition) for name in names for method, width in methods
             for repetition in range(repetitions)]
 
 
@@ -88,10 +88,10 @@ def mask_control_jobs(kitti: Path, names: Iterable[str], repetitions: int = 1,
     """
     jobs = []
     for name in names:
-        jobs += [Job(name, variant, its_width, pose="refined", repetition=repetition)
-                 for variant, its_width in (("baseline", None), ("masked", width))
+        jobs += [Job(name, method, its_width, estimator="refined", repetition=repetition)
+                 for method, its_width in (("baseline", None), ("masked", width))
                  for repetition in range(repetitions)]
-        jobs += _repeated(mask_controls(kitti, name, width), POSES, repetitions)
+        jobs += _repeated(mask_controls(kitti, name, width), ESTIMATORS, repetitions)
     return jobs
 
 
@@ -100,11 +100,11 @@ def mask_controls(kitti: Path, name: str, width: int | None, source: str = "") -
     left_out = list(controls.OF_LABEL_MAPS) if width is None else []
     if not controls.true_labels(kitti, name).is_dir():
         left_out.append("true-labels")
-    return [Job(name, variant, width, source=source) for variant in controls.MASKS if variant not in left_out]
+    return [Job(name, method, width, source=source) for method in controls.MASKS if method not in left_out]
 
 
 def study_jobs(kitti: Path, names: Iterable[str], sources: Iterable[Source], widths: Iterable[int], *,
-               tested: int | None = None, poses: Iterable[str] = ("all",), repetitions: int = 1) -> list[Job]:
+               tested: int | None = None, estimators: Iterable[str] = ("thesis",), repetitions: int = 1) -> list[Job]:
     """The runs of several sources side by side that depend on no other: all keypoints once, and each source's masks.
 
     widths: pixels, of masks from label maps. tested: that of the mask controls, None for none; where it is given, it
@@ -119,12 +119,12 @@ def study_jobs(kitti: Path, names: Iterable[str], sources: Iterable[Source], wid
             jobs += [Job(name, "masked", width, source=source.name) for width in ([None] if ready else widths)]
             if tested:
                 jobs += mask_controls(kitti, name, None if ready else tested, source.name)
-    return _repeated(jobs, poses, repetitions)
+    return _repeated(jobs, estimators, repetitions)
 
 
-def _repeated(jobs: Iterable[Job], poses: Iterable[str], repetitions: int) -> list[Job]:
-    poses = list(poses)
-    return [replace(job, pose=pose, repetition=repetition) for job in jobs for pose in poses
+def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
+    estimators = list(estimators)
+    return [replace(job, estimator=estimator, repetition=repetition) for job in jobs for estimator in estimators
             for repetition in range(repetitions)]
 
 
@@ -138,7 +138,7 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
 
 
 def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: int | None = None,
-                          repetitions: int = 1, poses: Iterable[str] = tuple(POSES), source: str = "") -> list[Job]:
+                          repetitions: int = 1, estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "") -> list[Job]:
     """As many keypoints as masks leave, {sequence: number}, without a mask: the strongest, or spread out.
 
     "fewer" limits their number; "spread" keeps them farther apart.
@@ -146,15 +146,15 @@ def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: i
     jobs = []
     for name, number in keypoints.items():
         distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
-        jobs += keypoint_controls(name, number, distance, repetitions, poses, source)
+        jobs += keypoint_controls(name, number, distance, repetitions, estimators, source)
     return jobs
 
 
 def keypoint_controls(name: str, number: float, distance: float, repetitions: int,
-                      poses: Iterable[str] = tuple(POSES), source: str = "") -> list[Job]:
+                      estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "") -> list[Job]:
     """`keypoint_control_jobs` of one sequence; distance: pixels, that leaves `number` keypoints."""
     return _repeated([Job(name, "fewer", max_keypoints=_whole(number), source=source),
-                      Job(name, "spread", min_distance=distance, source=source)], poses, repetitions)
+                      Job(name, "spread", min_distance=distance, source=source)], estimators, repetitions)
 
 
 def _whole(number: float) -> int:
@@ -169,7 +169,7 @@ def in_passes(jobs: Iterable[Job], frames: Mapping[str, int], workers: int) -> l
     """
     groups: dict[str, dict[Job, list[Job]]] = {name: {} for name in frames}
     for job in jobs:
-        groups[job.sequence].setdefault(replace(job, pose="", repetition=0), []).append(job)
+        groups[job.sequence].setdefault(replace(job, estimator="", repetition=0), []).append(job)
     everything = sum(len(groups[name]) * frames[name] for name in frames)
     passes = []
     for name, of_name in groups.items():

@@ -1,8 +1,8 @@
 """What the odometry runs of chapter 4 amount to: tables in, tables out.
 
-`summary` is the table that `runner.run` returns: one row a run, with sequence, variant, dilation_width, pose,
+`summary` is the table that `runner.run` returns: one row a run, with sequence, method, dilation_width, estimator,
 repetition, the errors of `metrics.errors`, mean_keypoints. A change is always Equation 4.1, in percent, of means over
-the repetitions, from all keypoints under the same pose; negative is better. Where masks come from several sources, all
+the repetitions, from all keypoints under the same estimator; negative is better. Where masks come from several sources, all
 but the last functions take the runs `of_source`.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from thesis_repro import InputError
 from thesis_repro.odometry.metrics import RELATIVE_LENGTH, percent_change
 from thesis_repro.study.controls import MASKS
-from thesis_repro.study.jobs import CONTROL_WIDTH, POSES
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
 CONTROLS = {  # what the runs at one width are called, in the order in which they are shown
     "masked": "segmentation mask",
@@ -39,20 +39,20 @@ LEVEL = 95  # percent
 DRAWS = 10_000
 
 
-def main_pose(summary: pd.DataFrame) -> str:
+def main_estimator(summary: pd.DataFrame) -> str:
     """The estimator that widths are judged under: the thesis's where it was run, else the refined one."""
-    return next((pose for pose in POSES if (summary["pose"] == pose).any()), next(iter(POSES)))
+    return next((estimator for estimator in ESTIMATORS if (summary["estimator"] == estimator).any()), next(iter(ESTIMATORS)))
 
 
-def of_variant(summary: pd.DataFrame, variant: str, pose: str | None = None, width: int | None = None) -> pd.DataFrame:
-    """The rows of one variant under one pose (`main_pose` for None), of one dilation width where it is given."""
-    rows = summary[(summary["variant"] == variant) & (summary["pose"] == (pose or main_pose(summary)))]
+def of_method(summary: pd.DataFrame, method: str, estimator: str | None = None, width: int | None = None) -> pd.DataFrame:
+    """The rows of one method under one estimator (`main_estimator` for None), of one dilation width where it is given."""
+    rows = summary[(summary["method"] == method) & (summary["estimator"] == (estimator or main_estimator(summary)))]
     return rows if width is None else rows[rows["dilation_width"] == width]
 
 
 def of_best_width(summary: pd.DataFrame) -> pd.DataFrame:
     """The thesis's masked runs: the rows of each sequence's best width (`best_widths`)."""
-    rows = of_variant(summary, "masked")
+    rows = of_method(summary, "masked")
     best = best_widths(summary)["dilation_width"]
     return rows[rows["dilation_width"] == rows["sequence"].map(best)]
 
@@ -87,7 +87,7 @@ def best_widths(summary: pd.DataFrame) -> pd.DataFrame:
     The thesis says "the lowest RMSE and/or MAE" (audit row 31), which leaves open which of the two decides.
     The width is chosen by its error on the very sequence it is then judged on: a best of 15, not a test.
     """
-    masked = of_variant(summary, "masked")
+    masked = of_method(summary, "masked")
     means = masked.groupby(["sequence", "dilation_width"])[["frames", "rmse", "mae", "mean_keypoints"]].mean()
     best = means.loc[means.groupby("sequence")["rmse"].idxmin()].reset_index("dilation_width")
     return best.astype({"dilation_width": int, "frames": int}).sort_index()
@@ -95,12 +95,12 @@ def best_widths(summary: pd.DataFrame) -> pd.DataFrame:
 
 def width_changes(summary: pd.DataFrame, metric: str) -> pd.DataFrame:
     """Change of the metric (%) with masks: one row a sequence, one column a dilation width."""
-    masked = of_variant(summary, "masked").groupby(["sequence", "dilation_width"])[metric].mean().unstack()
+    masked = of_method(summary, "masked").groupby(["sequence", "dilation_width"])[metric].mean().unstack()
     return percent_change(masked.T, _baseline(summary, metric)).T.reindex(masked.index)
 
 
-def _baseline(summary: pd.DataFrame, metric: str, pose: str | None = None) -> pd.Series:
-    return of_variant(summary, "baseline", pose).groupby("sequence")[metric].mean()
+def _baseline(summary: pd.DataFrame, metric: str, estimator: str | None = None) -> pd.Series:
+    return of_method(summary, "baseline", estimator).groupby("sequence")[metric].mean()
 
 
 def chosen_widths(summary: pd.DataFrame) -> pd.DataFrame:
@@ -149,7 +149,7 @@ def stability(summary: pd.DataFrame) -> pd.DataFrame:
     NaN with one repetition.
     """
     baseline, rows = _baseline(summary, "rmse"), {}
-    for name, runs in of_variant(summary, "masked").groupby("sequence"):
+    for name, runs in of_method(summary, "masked").groupby("sequence"):
         errors = runs.pivot(index="repetition", columns="dilation_width", values="rmse").dropna(axis=1)
         count = len(errors)
         if count < 2 or errors.empty:
@@ -172,10 +172,10 @@ def tested_width(summary: pd.DataFrame) -> int | None:
     CONTROL_WIDTH where neither says it; None for masks that came ready made. Raises InputError where the controls have
     several widths.
     """
-    masked = summary.loc[summary["variant"] == "masked", "dilation_width"]
+    masked = summary.loc[summary["method"] == "masked", "dilation_width"]
     if len(masked) and masked.isna().all():
         return None
-    found = summary.loc[summary["variant"].isin(MASKS), "dilation_width"].unique()
+    found = summary.loc[summary["method"].isin(MASKS), "dilation_width"].unique()
     if len(found) > 1:
         raise InputError(f"controls of the widths {', '.join(f'{width:g}' for width in sorted(found))}; masks are put "
                          "to the test at one width, so list the controls of one")
@@ -192,65 +192,65 @@ def control_names(summary: pd.DataFrame) -> dict[str, str]:
 
 def keypoints_left(summary: pd.DataFrame) -> pd.Series:
     """The mean number of keypoints that masks of the tested width leave, by sequence."""
-    width, rows = tested_width(summary), summary[summary["variant"] == "masked"]
+    width, rows = tested_width(summary), summary[summary["method"] == "masked"]
     if width is not None:
         rows = rows[rows["dilation_width"] == width]
     return rows.groupby("sequence")["mean_keypoints"].mean()
 
 
-def of_control(summary: pd.DataFrame, variant: str, pose: str | None = None) -> pd.DataFrame:
-    """The rows of one variant of the comparison: masked runs of the tested width, all rows of any other."""
-    return of_variant(summary, variant, pose, tested_width(summary) if variant == "masked" else None)
+def of_control(summary: pd.DataFrame, method: str, estimator: str | None = None) -> pd.DataFrame:
+    """The rows of one method of the comparison: masked runs of the tested width, all rows of any other."""
+    return of_method(summary, method, estimator, tested_width(summary) if method == "masked" else None)
 
 
-def control_changes(summary: pd.DataFrame, metric: str, pose: str | None = None) -> pd.DataFrame:
+def control_changes(summary: pd.DataFrame, metric: str, estimator: str | None = None) -> pd.DataFrame:
     """Change of the metric (%) with masks of the tested width and with each control that was run.
 
-    One row a sequence, one column a variant in the order of CONTROLS.
+    One row a sequence, one column a method in the order of CONTROLS.
     """
-    baseline = _baseline(summary, metric, pose)
+    baseline = _baseline(summary, metric, estimator)
     columns = {}
-    for variant in CONTROLS:
-        rows = of_control(summary, variant, pose)
+    for method in CONTROLS:
+        rows = of_control(summary, method, estimator)
         if len(rows):
-            columns[variant] = percent_change(rows.groupby("sequence")[metric].mean(), baseline)
+            columns[method] = percent_change(rows.groupby("sequence")[metric].mean(), baseline)
     return pd.DataFrame(columns, index=baseline.index, dtype=float).dropna(axis=1, how="all")
 
 
 def controls(summary: pd.DataFrame) -> pd.DataFrame:
-    """One row for each pose and variant, all keypoints first: means over sequences of the changes (%).
+    """One row for each estimator and method, all keypoints first: means over sequences of the changes (%).
 
-    Columns pose, variant, sequences, keypoints; rmse, rmse_low, rmse_high (mean and interval); rmse_improved (number
+    Columns estimator, method, sequences, keypoints; rmse, rmse_low, rmse_high (mean and interval); rmse_improved (number
     of sequences); rmse_lowest, rmse_highest (of the repetitions, each a mean over sequences); rmse_minus,
-    rmse_minus_low, rmse_minus_high (the change with masks minus that of the variant, in percentage points, and its
+    rmse_minus_low, rmse_minus_high (the change with masks minus that of the method, in percentage points, and its
     interval); the same for mae and those of BESIDE.
     """
     rows = []
-    for pose in POSES:
-        changes = {metric: control_changes(summary, metric, pose) for metric in (*ERRORS, *BESIDE)}
-        for variant in ("baseline", *changes["rmse"]):
-            runs = of_control(summary, variant, pose)
+    for estimator in ESTIMATORS:
+        changes = {metric: control_changes(summary, metric, estimator) for metric in (*ERRORS, *BESIDE)}
+        for method in ("baseline", *changes["rmse"]):
+            runs = of_control(summary, method, estimator)
             if not len(runs):
                 continue
-            row = {"pose": pose, "variant": variant, "sequences": runs["sequence"].nunique(),
+            row = {"estimator": estimator, "method": method, "sequences": runs["sequence"].nunique(),
                    "keypoints": runs.groupby("sequence")["mean_keypoints"].mean().mean()}
             for metric, table in changes.items():
-                row |= _row(runs, metric, table, variant, _baseline(summary, metric, pose))
+                row |= _row(runs, metric, table, method, _baseline(summary, metric, estimator))
             rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _row(runs: pd.DataFrame, metric: str, changes: pd.DataFrame, variant: str, baseline: pd.Series
+def _row(runs: pd.DataFrame, metric: str, changes: pd.DataFrame, method: str, baseline: pd.Series
          ) -> dict[str, float]:
     repeated = runs.assign(change=percent_change(runs[metric], runs["sequence"].map(baseline)))
     repeated = repeated.groupby("repetition")["change"].mean()
     row = {f"{metric}_lowest": repeated.min(), f"{metric}_highest": repeated.max()}
-    own = changes[variant] if variant in changes else pd.Series(0.0 if variant == "baseline" else np.nan, changes.index)
+    own = changes[method] if method in changes else pd.Series(0.0 if method == "baseline" else np.nan, changes.index)
     row[metric] = own.mean()
-    if variant != "baseline":
+    if method != "baseline":
         row[f"{metric}_low"], row[f"{metric}_high"] = interval(own)
         row[f"{metric}_improved"] = int((own < 0).sum())
-    if variant != "masked" and "masked" in changes:
+    if method != "masked" and "masked" in changes:
         minus = changes["masked"] - own
         row[f"{metric}_minus"] = minus.mean()
         row[f"{metric}_minus_low"], row[f"{metric}_minus_high"] = interval(minus)
@@ -271,38 +271,38 @@ def sources(summary: pd.DataFrame) -> list[str]:
 
 
 def errors(summary: pd.DataFrame) -> pd.DataFrame:
-    """What the repetitions of each run amount to: one row for each pose, source, width and sequence.
+    """What the repetitions of each run amount to: one row for each estimator, source, width and sequence.
 
-    Columns pose, source, dilation_width, sequence, frames, repetitions, mean_keypoints, kept (percent of all
+    Columns estimator, source, dilation_width, sequence, frames, repetitions, mean_keypoints, kept (percent of all
     keypoints); rmse, rmse_lowest, rmse_highest, rmse_change (percent), the same for mae and those of BESIDE; flagged
     (mean number of frames). All keypoints come first, with the source "".
     """
-    keys = ["pose", "source", "dilation_width", "sequence"]
-    runs = summary[summary["variant"].isin(["baseline", "masked"])].groupby(keys, dropna=False, sort=False)
+    keys = ["estimator", "source", "dilation_width", "sequence"]
+    runs = summary[summary["method"].isin(["baseline", "masked"])].groupby(keys, dropna=False, sort=False)
     table = pd.DataFrame({"frames": runs["frames"].first(), "repetitions": runs["repetition"].nunique(),
                           "mean_keypoints": runs["mean_keypoints"].mean(), "flagged": runs["flagged"].mean(),
                           **{f"{metric}{name}": getattr(runs[metric], how)() for metric in (*ERRORS, *BESIDE)
                              for name, how in (("", "mean"), ("_lowest", "min"), ("_highest", "max"))}}).reset_index()
-    every = table[table["source"] == ""].set_index(["pose", "sequence"])
-    own = every.reindex(pd.MultiIndex.from_frame(table[["pose", "sequence"]]))
+    every = table[table["source"] == ""].set_index(["estimator", "sequence"])
+    own = every.reindex(pd.MultiIndex.from_frame(table[["estimator", "sequence"]]))
     table["kept"] = 100 * table["mean_keypoints"] / own["mean_keypoints"].to_numpy()
     for metric in (*ERRORS, *BESIDE):
         table[f"{metric}_change"] = percent_change(table[metric], own[metric].to_numpy())
-    order = {value: place for place, value in enumerate([*POSES, "", *sources(summary)])}
-    return table.sort_values(keys, key=lambda column: column.map(order) if column.name in ("pose", "source")
+    order = {value: place for place, value in enumerate([*ESTIMATORS, "", *sources(summary)])}
+    return table.sort_values(keys, key=lambda column: column.map(order) if column.name in ("estimator", "source")
                              else column, kind="stable", na_position="first", ignore_index=True)
 
 
 def side_by_side(summary: pd.DataFrame) -> pd.DataFrame:
-    """Means over sequences: one row for each pose, source and width, all keypoints first under each pose.
+    """Means over sequences: one row for each estimator, source and width, all keypoints first under each estimator.
 
-    Columns pose, source, dilation_width, sequences, mean_keypoints, kept; rmse_change, rmse_low, rmse_high (mean and
+    Columns estimator, source, dilation_width, sequences, mean_keypoints, kept; rmse_change, rmse_low, rmse_high (mean and
     interval), rmse_improved (number of sequences), the same for mae and those of BESIDE.
     """
     rows = []
-    for (pose, source, width), of_row in errors(summary).groupby(["pose", "source", "dilation_width"], dropna=False,
+    for (estimator, source, width), of_row in errors(summary).groupby(["estimator", "source", "dilation_width"], dropna=False,
                                                                  sort=False):
-        row = {"pose": pose, "source": source, "dilation_width": width, "sequences": len(of_row),
+        row = {"estimator": estimator, "source": source, "dilation_width": width, "sequences": len(of_row),
                "mean_keypoints": of_row["mean_keypoints"].mean(), "kept": of_row["kept"].mean()}
         for metric in (*ERRORS, *BESIDE) if source else ():
             changes = of_row[f"{metric}_change"]
@@ -322,6 +322,6 @@ def time_savings(seconds: pd.DataFrame) -> pd.Series:
     seconds: the table of `budget.time_runs`; its timed frames of all sequences are added up. The making of masks is
     included, prediction is not, as in the thesis.
     """
-    baseline = seconds[seconds["variant"] == "baseline"]["seconds"].sum()
-    masked = seconds[seconds["variant"] == "masked"].groupby("dilation_width")["seconds"].sum()
+    baseline = seconds[seconds["method"] == "baseline"]["seconds"].sum()
+    masked = seconds[seconds["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
     return percent_change(masked, baseline)

@@ -192,7 +192,7 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Sour
     found: dict[Job, controls.ControlMasks | None] = {}
     failures: dict[Job, str] = {}
     for job in jobs:
-        alike = (job.source, job.variant, job.dilation_width)
+        alike = (job.source, job.method, job.dilation_width)
         if alike not in made:
             made[alike] = _checked_masks(job, sequence, sources)
         masks_or_error = made[alike]
@@ -262,9 +262,9 @@ def _check_machine(folder: Path, digest: str) -> None:
 def _summarize(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
     frames = pd.read_csv(result, keep_default_na=False, na_values={"detected": "", "tracked": ""})
     return {
-        "sequence": job.sequence, "run": job.name, "source": job.source, "variant": job.variant,
+        "sequence": job.sequence, "run": job.name, "source": job.source, "method": job.method,
         "dilation_width": job.dilation_width, "max_keypoints": job.max_keypoints, "min_distance": job.min_distance,
-        "pose": job.pose, "repetition": job.repetition, "frames": len(frames),
+        "estimator": job.estimator, "repetition": job.repetition, "frames": len(frames),
         **metrics.errors(poses_of(frames), sequence.poses),
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),

@@ -22,7 +22,7 @@ class Study:
     """Sources of masks side by side, against all keypoints.
 
     sequences: names. widths: pixels, of masks from label maps. tested: width of the controls, None for none.
-    poses: estimators, of `jobs.POSES`. frames: of each sequence, None for all.
+    estimators, of `jobs.ESTIMATORS`. frames: of each sequence, None for all.
     """
 
     kitti: Path
@@ -30,7 +30,7 @@ class Study:
     sources: tuple[Source, ...]
     widths: tuple[int, ...]
     tested: int | None = None
-    poses: tuple[str, ...] = ("all",)
+    estimators: tuple[str, ...] = ("thesis",)
     repetitions: int = 1
     frames: int | None = None
 
@@ -41,7 +41,7 @@ class Study:
     def first_jobs(self) -> list[jobs.Job]:
         """The runs that need no result of others."""
         return jobs.study_jobs(self.kitti, self.sequences, self.sources, self.widths, tested=self.tested,
-                               poses=self.poses, repetitions=self.repetitions)
+                               estimators=self.estimators, repetitions=self.repetitions)
 
     def second_jobs(self, summary: pd.DataFrame | None) -> list[jobs.Job]:
         """The controls that need the number of keypoints that masks leave; of unknown numbers without a summary."""
@@ -49,11 +49,11 @@ class Study:
         for source in self.sources if self.tested else ():
             if summary is None:
                 found += [job for name in self.sequences for job in jobs.keypoint_controls(
-                    name, 1, 1, self.repetitions, self.poses, source.name)]
+                    name, 1, 1, self.repetitions, self.estimators, source.name)]
             else:
                 found += jobs.keypoint_control_jobs(
                     results.keypoints_left(results.of_source(summary, source.name)), self.kitti, self.frames,
-                    self.repetitions, self.poses, source.name)
+                    self.repetitions, self.estimators, source.name)
         return found
 
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:

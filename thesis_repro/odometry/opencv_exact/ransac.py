@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from thesis_repro.compiled import fast
-from thesis_repro.odometry import epipolar
-from thesis_repro.odometry.five_point import SAMPLE, solve
+from thesis_repro.odometry.opencv_exact import epipolar
+from thesis_repro.odometry.opencv_exact.five_point import SAMPLE, solve
 
 MAX_SAMPLES = 1000
 FEWEST = 8  # correspondences: below, the few samples there are go to OpenCV

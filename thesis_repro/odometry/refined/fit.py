@@ -7,7 +7,7 @@ is its signed Sampson distance: to first order, how far it is from meeting (u, v
 import numpy as np
 
 from thesis_repro.compiled import fast
-from thesis_repro.odometry import epipolar
+from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion, sides
 
 REFINE_STEPS = 10

@@ -8,9 +8,9 @@ motion lies within given angles of an expected one are counted, so the other can
 import numpy as np
 
 from thesis_repro.compiled import fast
-from thesis_repro.odometry import epipolar
-from thesis_repro.odometry.five_point import SAMPLE, solve
-from thesis_repro.odometry.ransac import MAX_SAMPLES, SEED, draw
+from thesis_repro.odometry.opencv_exact import epipolar
+from thesis_repro.odometry.opencv_exact.five_point import SAMPLE, solve
+from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, SEED, draw
 
 
 def find(current: np.ndarray, previous: np.ndarray, threshold: float, rotation: np.ndarray, translation: np.ndarray,

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thesis_repro.odometry import guided
 from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refine import fit, near
+from thesis_repro.odometry.refined import guided
+from thesis_repro.odometry.refined.fit import fit, near
 
 TURN, SWING = 1.5, 20.0  # degrees
 FIRST_TURN = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
