@@ -21,17 +21,17 @@ def turned(poses, degrees):
 
 def test_a_perfect_path_has_no_relative_error_and_a_turned_one_has_its_angle():
     true = Street(8).poses
-    perfect = effects.step_errors(true, true)
+    perfect = metrics.step_errors(true, true)
     assert perfect["failed"] == 0 and perfect["direction"] < 0.01 and perfect["rotation"] < 1e-3
-    assert effects.step_errors(turned(true, 0.5), true)["rotation"] == pytest.approx(0.5, abs=0.01)
-    assert effects.step_errors(turned(true, 3), true)["failed"] == 100
+    assert metrics.step_errors(turned(true, 0.5), true)["rotation"] == pytest.approx(0.5, abs=0.01)
+    assert metrics.step_errors(turned(true, 3), true)["failed"] == 100
 
 
 def test_a_path_backwards_has_failed_at_every_step():
     true = Street(6).poses
     back = true.copy()
     back[:, :3, 3] *= -1
-    assert effects.step_errors(back, true)["failed"] == 100
+    assert metrics.step_errors(back, true)["failed"] == 100
 
 
 def test_boundaries_of_ids_close_together_are_lost_and_far_apart_found():

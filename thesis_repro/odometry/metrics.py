@@ -166,6 +166,39 @@ def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position")
             **{name: relative[name] for name in ("translation_percent", "rotation_deg_per_m")}}
 
 
+FAST_STEP = 0.25  # metres; in a shorter step the direction of motion is lost in noise
+FAILED_ROTATION = 2.0  # degrees: a step of FAST_STEP or more whose rotation is further off has failed
+TURN_RATE, STRAIGHT_RATE = 1.0, 0.3  # degrees a frame: a turn is more than the first, a straight less than the second
+
+
+def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """How far single steps of (n, 4, 4) camera-to-world paths are off, whatever came before them.
+
+    rotation: mean angle between estimated and true rotation, degrees a frame; in_turns, on_straights: of the steps
+    that turn by more than TURN_RATE and by less than STRAIGHT_RATE. The others are of steps of FAST_STEP or more:
+    direction, the median angle between estimated and true direction of motion, degrees; across, down, the medians of
+    its parts to the right and downwards, degrees (audit row 30); failed, the share, percent, that turn wrong by more
+    than FAILED_ROTATION or go backwards.
+    """
+    steps, true_steps = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (estimated, true))
+    rotation_error, turn = angles(np.linalg.inv(true_steps) @ steps), angles(true_steps)
+    fast = np.linalg.norm(true_steps[:, :3, 3], axis=1) >= FAST_STEP
+    heading, true_heading = (motions[fast, :3, 3] / np.maximum(np.linalg.norm(motions[fast, :3, 3], axis=1,
+                                                                              keepdims=True), 1e-12)
+                             for motions in (steps, true_steps))
+    cosine = np.clip((heading * true_heading).sum(axis=1), -1, 1)
+    offset = np.degrees(np.median(heading - true_heading, axis=0)) if fast.any() else np.full(3, np.nan)
+    return {"rotation": rotation_error.mean(), "in_turns": _mean(rotation_error[turn > TURN_RATE]),
+            "on_straights": _mean(rotation_error[turn < STRAIGHT_RATE]),
+            "direction": np.degrees(np.median(np.arccos(cosine))) if fast.any() else np.nan,
+            "across": offset[0], "down": offset[1],
+            "failed": 100 * _mean((rotation_error[fast] > FAILED_ROTATION) | (cosine < 0)), "steps": int(fast.sum())}
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else np.nan
+
+
 def travelled(poses: np.ndarray) -> np.ndarray:
     """Metres along a path (n, 4, 4) up to each of its poses, (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])

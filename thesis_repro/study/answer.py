@@ -30,7 +30,6 @@ from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.study import results
-from thesis_repro.study.effects import step_errors
 from thesis_repro.study.jobs import Job
 
 METRICS = {"turned": "RMSE without the angle", "rotation": "rotation error a frame"}  # that judge
@@ -40,7 +39,7 @@ METHODS = {"baseline": "all keypoints", **results.CONTROLS}
 
 
 def with_relative(summary: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None) -> pd.DataFrame:
-    """The summary of `runner.run` with the columns of `effects.step_errors`, from the runs' own files, and
+    """The summary of `runner.run` with the columns of `metrics.step_errors`, from the runs' own files, and
     `turned`, the RMSE in metres with the angle of `angles` taken out.
 
     folder: where `runner.run` keeps them. frames: of each sequence, as there.
@@ -50,7 +49,7 @@ def with_relative(summary: pd.DataFrame, kitti: Path, folder: Path, frames: int 
     for one in summary.itertuples():
         poses = poses_of(pd.read_csv(folder / one.sequence / f"{one.run}.csv"))
         true = paths[one.sequence][1]
-        rows.append(step_errors(poses, true)
+        rows.append(metrics.step_errors(poses, true)
                     | {"turned": metrics.rmse(boresight.turned(poses, angle[one.sequence]), true)})
     return summary.join(pd.DataFrame(rows, index=summary.index))
 

@@ -26,9 +26,6 @@ from thesis_repro.study.jobs import CONTROL_WIDTH
 
 ESTIMATORS = ("thesis", "inliers", "refined")
 FEW = (100, 200, 400)  # keypoints: a twentieth, a tenth and a fifth of the thesis's 2000
-WRONG = 2.0  # degrees: a step of FAST metres or more whose rotation is further off has failed
-FAST = 0.25
-TURN, STRAIGHT = 1.0, 0.3  # degrees a frame: a turn is more than the first, a straight stretch less than the second
 
 
 # Masks that differ from the thesis's in one thing
@@ -92,7 +89,7 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, plan:
     each sequence are kept; a stopped series goes on where it was.
 
     runs has a row for each sequence, method, estimator and repetition: errors (those of `metrics.errors`, sim3 in
-    metres, `step_errors`), mean_keypoints and flagged frames. prefixes has the RMSE of all keypoints over the first
+    metres, `metrics.step_errors`), mean_keypoints and flagged frames. prefixes has the RMSE of all keypoints over the first
     `frames` frames and `metres` of each sequence, a row an order, under the thesis's estimator.
     """
     calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, plan) for name in names]
@@ -157,34 +154,8 @@ def runs_of(sequence: Sequence, labels: Path, plan: Plan
 def _row(result: odometry.Result, sequence: Sequence) -> dict[str, Any]:
     poses, true = poses_of(result.frames), sequence.poses
     return {"frames": len(true), **metrics.errors(poses, true), "sim3": metrics.ate(poses, true, "sim3")["rmse"],
-            "mean_keypoints": result.frames["detected"].mean(), **step_errors(poses, true),
+            "mean_keypoints": result.frames["detected"].mean(), **metrics.step_errors(poses, true),
             "flagged": int(result.flagged.drop("stationary", errors="ignore").sum())}
-
-
-def step_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """How far single steps are off, whatever came before them; (n, 4, 4) camera-to-world paths.
-
-    rotation: mean angle, degrees a frame; in_turns and on_straights: of steps that turn by more than TURN and by less
-    than STRAIGHT degrees. direction: median angle of the motion of steps of FAST metres or more, degrees. across, down:
-    the median of its parts to the right and downwards, degrees (audit row 30). failed: share of those steps, percent,
-    that turn WRONG by WRONG degrees or go backwards.
-    """
-    steps, true_steps = (np.linalg.inv(some[:-1]) @ some[1:] for some in (poses, true))
-    off, turn = metrics.angles(np.linalg.inv(true_steps) @ steps), metrics.angles(true_steps)
-    length = np.linalg.norm(true_steps[:, :3, 3], axis=1)
-    fast = length >= FAST
-    way, true_way = (some[fast, :3, 3] / np.maximum(np.linalg.norm(some[fast, :3, 3], axis=1, keepdims=True), 1e-12)
-                     for some in (steps, true_steps))
-    along = np.clip((way * true_way).sum(axis=1), -1, 1)
-    aside = np.degrees(np.median(way - true_way, axis=0)) if fast.any() else np.full(3, np.nan)
-    return {"rotation": off.mean(), "in_turns": _mean(off[turn > TURN]), "on_straights": _mean(off[turn < STRAIGHT]),
-            "direction": np.degrees(np.median(np.arccos(along))) if fast.any() else np.nan,
-            "across": aside[0], "down": aside[1],
-            "failed": 100 * _mean((off[fast] > WRONG) | (along < 0)), "steps": int(fast.sum())}
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if len(values) else np.nan
 
 
 def _prefixes(poses: np.ndarray, true: np.ndarray, order: int) -> list[dict[str, Any]]:
@@ -212,7 +183,7 @@ def tracks(sequence: Sequence, chosen: dict[str, Masks | None], pairs: int = 6) 
     for index in np.unique(np.linspace(0, len(sequence) - 2, pairs).round().astype(int)):
         before, after = sequence.frame(index), sequence.frame(index + 1)
         motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
-        if np.linalg.norm(motion[:3, 3]) < FAST:
+        if np.linalg.norm(motion[:3, 3]) < metrics.FAST_STEP:
             continue
         for name, its_masks in chosen.items():
             points = keypoints.detect(before, THESIS, None if its_masks is None else its_masks[int(index)])
@@ -278,11 +249,11 @@ def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]
     there = np.zeros(nearest.shape, bool)
     for number in np.unique(bilinear):
         there |= (bilinear == number) & (cv2.dilate((nearest == number).astype(np.uint8), around) > 0)
-    found = {"lost": 100 * _mean(missed[exact]), "invented": 100 * float((~there).mean())}
+    found = {"lost": 100 * np.nanmean(missed[exact]), "invented": 100 * float((~there).mean())}
     right, below = np.roll(nearest, -1, axis=1), np.roll(nearest, -1, axis=0)
     other = np.where(nearest != right, right, below)
     for pair in PAIRS:
         ids = {ID[name] for name in pair}
         of_pair = exact & np.isin(nearest, list(ids)) & np.isin(other, list(ids))
-        found["/".join(pair)] = 100 * _mean(missed[of_pair]) if of_pair.sum() >= 20 else np.nan
+        found["/".join(pair)] = 100 * np.nanmean(missed[of_pair]) if of_pair.sum() >= 20 else np.nan
     return found

@@ -19,7 +19,8 @@ from thesis_repro.study.sources import Source
 # any run. (The code of appendix A.8 dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
 ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined estimator"}  # the second spreads far less
-UNMASKED = ("baseline", "reduced", "fewer", "spread")
+KEYPOINT_CONTROLS = ("fewer", "spread")  # as many keypoints as masks leave, without a mask
+UNMASKED = ("baseline", "reduced", *KEYPOINT_CONTROLS)
 PIECES = 4  # passes for each of several workers, at the least
 
 
@@ -28,7 +29,7 @@ class Job:
     """One run of the odometry over one sequence. What is None or left out is as in the thesis.
 
     method: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
-    dilation_width: pixels, of masks from label maps. source: name of where the masks come from, or those that a limit
+    dilation_width: pixels, of masks from label maps; of KEYPOINT_CONTROLS, of the masks that leave as many keypoints. source: name of where the masks come from, or those that a limit
     of keypoints was taken from; empty where there is only one. max_keypoints, min_distance: of the detector.
     estimator: "all" or "refined", see OdometrySettings.
     repetition: 0 takes the correspondences in the order in which they come, which is the thesis's single run; any
@@ -47,7 +48,8 @@ class Job:
     @property
     def name(self) -> str:
         """Unique in its sequence, and the stem of its file: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0."""
-        width = None if self.dilation_width is None else f"{self.dilation_width:02d}"
+        has_no_mask = self.dilation_width is None or self.method in UNMASKED
+        width = None if has_no_mask else f"{self.dilation_width:02d}"
         distance = None if self.min_distance is None else f"{self.min_distance:g}"
         estimator = None if self.estimator == "thesis" else self.estimator
         parts = (self.method, width, self.max_keypoints, distance, estimator, self.repetition)
@@ -138,23 +140,25 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
 
 
 def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: int | None = None,
-                          repetitions: int = 1, estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "") -> list[Job]:
+                          repetitions: int = 1, estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "",
+                          width: int | None = None) -> list[Job]:
     """As many keypoints as masks leave, {sequence: number}, without a mask: the strongest, or spread out.
 
-    "fewer" limits their number; "spread" keeps them farther apart.
+    "fewer" limits their number; "spread" keeps them farther apart. width: pixels, of those masks.
     """
     jobs = []
     for name, number in keypoints.items():
         distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
-        jobs += keypoint_controls(name, number, distance, repetitions, estimators, source)
+        jobs += keypoint_controls(name, number, distance, repetitions, estimators, source, width)
     return jobs
 
 
 def keypoint_controls(name: str, number: float, distance: float, repetitions: int,
-                      estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "") -> list[Job]:
+                      estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "", width: int | None = None
+                      ) -> list[Job]:
     """`keypoint_control_jobs` of one sequence; distance: pixels, that leaves `number` keypoints."""
-    return _repeated([Job(name, "fewer", max_keypoints=_whole(number), source=source),
-                      Job(name, "spread", min_distance=distance, source=source)], estimators, repetitions)
+    return _repeated([Job(name, "fewer", width, max_keypoints=_whole(number), source=source),
+                      Job(name, "spread", width, min_distance=distance, source=source)], estimators, repetitions)
 
 
 def _whole(number: float) -> int:

@@ -19,6 +19,7 @@ from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
+from thesis_repro.odometry.refined import boresight
 from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes, longest_first
 from thesis_repro.study.sources import Source
@@ -261,14 +262,41 @@ def _check_machine(folder: Path, digest: str) -> None:
 
 def _summarize(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
     frames = pd.read_csv(result, keep_default_na=False, na_values={"detected": "", "tracked": ""})
+    poses = poses_of(frames)
     return {
         "sequence": job.sequence, "run": job.name, "source": job.source, "method": job.method,
         "dilation_width": job.dilation_width, "max_keypoints": job.max_keypoints, "min_distance": job.min_distance,
         "estimator": job.estimator, "repetition": job.repetition, "frames": len(frames),
-        **metrics.errors(poses_of(frames), sequence.poses),
+        **metrics.errors(poses, sequence.poses), **metrics.step_errors(poses, sequence.poses),
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
     }
+
+
+def with_boresight_correction(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None) -> pd.DataFrame:
+    """The runs with a further column, rmse_boresight_corrected: the RMSE (m) with the mounting angle removed.
+
+    The angle between camera and ground truth is constant over a recording day. For each sequence it is estimated from
+    the refined runs with all keypoints of the *other* sequences of its day, and it is the same for every method. It is
+    taken as 0 where there are no others, or where they do not determine it.
+    folder, frames: as given to `run`. The column is missing (NaN) where all keypoints were not run under the refined
+    estimator.
+    """
+    references = refined_paths(runs, kitti, folder, frames)
+    angles = {name: boresight.angles_of_day(name, references) for name in references}
+    corrected = pd.Series(np.nan, runs.index)
+    for row in runs[runs["sequence"].isin(angles)].itertuples():
+        poses = poses_of(pd.read_csv(folder / row.sequence / f"{row.run}.csv"))
+        corrected[row.Index] = metrics.rmse(boresight.turned(poses, angles[row.sequence]), references[row.sequence][1])
+    return runs.assign(rmse_boresight_corrected=corrected)
+
+
+def refined_paths(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None
+                  ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """{sequence: (estimated, true)} of all keypoints under the refined estimator, poses (n, 4, 4), for `boresight`."""
+    chosen = runs[(runs["method"] == "baseline") & (runs["estimator"] == "refined") & (runs["repetition"] == 0)]
+    return {row.sequence: (poses_of(pd.read_csv(folder / row.sequence / f"{row.run}.csv")),
+                           Sequence(kitti, row.sequence).subset(frames).poses) for row in chosen.itertuples()}
 
 
 def paths(summary: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:

@@ -49,12 +49,16 @@ class Study:
         for source in self.sources if self.tested else ():
             if summary is None:
                 found += [job for name in self.sequences for job in jobs.keypoint_controls(
-                    name, 1, 1, self.repetitions, self.estimators, source.name)]
+                    name, 1, 1, self.repetitions, self.estimators, source.name, self.width_of(source))]
             else:
                 found += jobs.keypoint_control_jobs(
                     results.keypoints_left(results.of_source(summary, source.name)), self.kitti, self.frames,
-                    self.repetitions, self.estimators, source.name)
+                    self.repetitions, self.estimators, source.name, self.width_of(source))
         return found
+
+    def width_of(self, source: Source) -> int | None:
+        """The width (pixels) at which a source is put to the test; None for masks that come ready made."""
+        return None if source.kind == "masks" else self.tested
 
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
         """All runs, those that are kept in the folder left out; returns their summary, see `runner.run`.

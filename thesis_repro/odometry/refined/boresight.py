@@ -227,6 +227,12 @@ def explained(paths: Mapping[str, Paths]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def angles_of_day(name: str, paths: Mapping[str, Paths]) -> np.ndarray:
+    """Pitch, yaw and roll, degrees, (3,), that the other sequences of a sequence's recording day give; 0 where none."""
+    others = [paths[other] for other in same_day(name, paths)]
+    return estimate(others).usable if others else np.zeros(3)
+
+
 def same_day(name: str, names: Iterable[str]) -> list[str]:
     """Those of `names` that were recorded on the day of sequence `name`, itself left out."""
     return [other for other in names if other != name and name in DAYS and DAYS.get(other) == DAYS[name]]

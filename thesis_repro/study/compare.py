@@ -1,0 +1,260 @@
+"""The one place that compares runs: a tidy table of runs in, a tidy table of comparisons out.
+
+**Runs** (`runner.run`, one row a run): sequence, run, source, method, dilation_width, estimator, repetition, frames,
+mean_keypoints, flagged, and one column for each of METRICS.
+
+**Comparisons** (`comparisons`, one row for each method, reference, metric and estimator): the ratio of the method's
+error to the reference's, its interval, and the ratio of every sequence in a column of its own.
+
+How a ratio is formed:
+
+1. Within a sequence, the geometric mean of the errors over the repetitions, divided by that of the reference. Half
+   and double are then equally far from 1, which percentages do not give.
+2. Over sequences, the geometric mean of these ratios.
+3. The interval is a bootstrap: whole sequences are drawn anew, DRAWS times. It says how far the mean could be off had
+   other sequences of the same kind been driven. Few sequences make it too narrow.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from thesis_repro import InputError
+from thesis_repro.odometry.metrics import RELATIVE_LENGTH
+from thesis_repro.study.controls import MASKS
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
+
+# The errors that are compared, and what they are called. The first two decide (see `primary_comparison`): a constant
+# angle between camera and ground truth moves neither.
+JUDGING_METRICS = {"rmse_boresight_corrected": "RMSE, mounting angle removed", "rotation": "rotation error a frame"}
+SECONDARY_METRICS = {"rmse": "RMSE", "mae": "MAE", "se3": "aligned ATE",
+                     "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
+                     "rotation_deg_per_m": f"rotation error over {RELATIVE_LENGTH:g} m"}
+METRICS = {**JUDGING_METRICS, **SECONDARY_METRICS}
+UNITS = {"rmse_boresight_corrected": "m", "rotation": "degrees", "rmse": "m", "mae": "m", "se3": "m",
+         "translation_percent": "%", "rotation_deg_per_m": "degrees a metre"}
+
+METHODS = {  # in the order in which they are shown
+    "baseline": "all keypoints",
+    "masked": "segmentation mask",
+    "exact-boundaries": "exact class boundaries",
+    "corrected": "corrected mask",
+    "true-labels": "true label maps",
+    "other-frame": "mask of another frame",
+    "mirrored": "mirrored mask",
+    "random-lines": "random lines",
+    "image-edges": "edges of the image",
+    "fewer": "fewer keypoints",
+    "spread": "keypoints spread out",
+}
+SEGMENTATION_FREE_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", "fewer", "spread")
+
+MIN_FOR_INTERVAL = 3  # sequences; drawing anew from fewer says nothing
+# With fewer sequences all of them lie on one side of 1 by chance more often than one time in twenty (2 / 2**n).
+MIN_SEQUENCES = 6
+LEVEL = 95  # percent, of all intervals
+DRAWS = 10_000
+LOWER, HIGHER, NO_CLEAR_DIFFERENCE = VERDICTS = ("lower", "higher", "no clear difference")
+
+
+def verdict(low: float, high: float, count: int) -> str:
+    """What an interval of ratios over `count` sequences shows: LOWER, HIGHER or NO_CLEAR_DIFFERENCE."""
+    if count < MIN_SEQUENCES:
+        return NO_CLEAR_DIFFERENCE
+    return LOWER if high < 1 else HIGHER if low > 1 else NO_CLEAR_DIFFERENCE
+
+
+def mean_interval(values: ArrayLike) -> tuple[float, float]:
+    """Bootstrap interval (low, high) of the mean of one value a sequence; NaN values are left out.
+
+    (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
+    """
+    values = np.asarray(values, float)
+    values = values[~np.isnan(values)]
+    if len(values) < MIN_FOR_INTERVAL:
+        return np.nan, np.nan
+    drawn = np.random.default_rng(0).integers(0, len(values), (DRAWS, len(values)))
+    low, high = np.percentile(values[drawn].mean(axis=1), [(100 - LEVEL) / 2, (100 + LEVEL) / 2])
+    return float(low), float(high)
+
+
+def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
+    """{ratio, low, high, n, verdict} of one ratio a sequence: geometric mean and `mean_interval` of the logarithms."""
+    logarithms = np.log(np.asarray(ratios, float))
+    logarithms = logarithms[np.isfinite(logarithms)]
+    low, high = np.exp(mean_interval(logarithms))
+    ratio = float(np.exp(logarithms.mean())) if len(logarithms) else np.nan
+    return {"ratio": ratio, "low": float(low), "high": float(high), "n": len(logarithms),
+            "verdict": verdict(low, high, len(logarithms))}
+
+
+def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Series:
+    """The ratio of a metric in some rows of runs to that in the reference rows, by sequence.
+
+    Sequences that only one side has, or whose error is zero or missing, are left out.
+    """
+    def logarithms(runs: pd.DataFrame) -> pd.Series:
+        positive = runs.loc[runs[metric] > 0]
+        return np.log(positive.set_index("sequence")[metric].astype(float)).groupby(level=0).mean()
+
+    return np.exp((logarithms(rows) - logarithms(reference)).dropna())
+
+
+def compare(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> dict[str, Any]:
+    """{ratio, low, high, n, verdict} of a metric in some rows of runs over the reference rows."""
+    return geometric_mean(ratios(rows, reference, metric))
+
+
+def comparisons(runs: pd.DataFrame, metrics: Iterable[str] | None = None) -> pd.DataFrame:
+    """Every method against all keypoints, and masks against every control and every other source.
+
+    Columns: source, method, dilation_width (pixels), keypoints (mean number); reference_source, reference,
+    reference_keypoints; metric, estimator; tested (whether the width is the one put to the test, `tested_width`);
+    ratio, low, high, n, verdict; then the ratio of each sequence, in a column with its name.
+    metrics: of METRICS, by default all that the runs have.
+    """
+    names = [name for name in (metrics or METRICS) if name in runs and runs[name].notna().any()]
+    rows = []
+    for estimator in ESTIMATORS:
+        of_estimator = runs[runs["estimator"] == estimator]
+        arms = _arms(of_estimator)
+        for (own, own_rows), (other, other_rows) in _pairs(arms):
+            row = {**own, **{f"reference{key}": other[name] for key, name in
+                             (("_source", "source"), ("", "method"), ("_keypoints", "keypoints"))}}
+            for metric in names:
+                by_sequence = ratios(own_rows, other_rows, metric)
+                rows.append({**row, "metric": metric, "estimator": estimator, **geometric_mean(by_sequence),
+                             **by_sequence})
+    columns = ["source", "method", "dilation_width", "keypoints", "reference_source", "reference",
+               "reference_keypoints", "metric", "estimator", "tested", "ratio", "low", "high", "n", "verdict"]
+    return pd.DataFrame(rows, columns=[*columns, *sorted(runs["sequence"].unique())])
+
+
+def _arms(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
+    """What is compared: (source, method, dilation_width, keypoints, tested) with its rows; all keypoints first."""
+    arms = []
+    order = {name: place for place, name in enumerate(METHODS)}
+    known = runs[runs["method"].isin(order)]
+    widths = {source: tested_width(of_source(runs, source)) for source in known["source"].unique()}
+    for (source, method, width), rows in known.groupby(["source", "method", "dilation_width"], dropna=False,
+                                                       sort=False):
+        tested = pd.isna(width) or width == widths[source]
+        keypoints = rows.groupby("sequence")["mean_keypoints"].mean().mean()
+        arms.append(({"source": source, "method": method, "dilation_width": width, "keypoints": keypoints,
+                      "tested": bool(tested)}, rows))
+    return sorted(arms, key=lambda arm: order[arm[0]["method"]])
+
+
+def _pairs(arms: list) -> Iterable[tuple]:
+    """What is set against what: (arm, reference arm)."""
+    for arm in arms:
+        for other in arms:
+            is_all, masks_over = other[0]["method"] == "baseline", arm[0]["method"] == "masked" and arm[0]["tested"]
+            same = arm[0]["source"] == other[0]["source"]
+            if is_all or masks_over and other[0]["tested"] and other is not arm and (
+                    same or other[0]["method"] == "masked"):
+                yield arm, other
+
+
+def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
+    """The rows of `comparisons` that answer the question of this project: do masks from a segmentation help?
+
+    Masks of the tested width against all keypoints, under the refined estimator where it was run, by JUDGING_METRICS.
+    Under the thesis's estimator, shuffling the matched points moves errors by more than the effect in question.
+    Masks help where both verdicts are LOWER; the segmentation helps where masks are LOWER than each of
+    SEGMENTATION_FREE_CONTROLS too (`against_controls`).
+    """
+    rows = table[(table["method"] == "masked") & (table["reference"] == "baseline") & table["tested"]
+                 & table["metric"].isin(JUDGING_METRICS)]
+    rows = rows if source is None else rows[rows["source"] == source]
+    return rows[rows["estimator"] == judging_estimator(rows)]
+
+
+def against_controls(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
+    """The rows of `comparisons` that set masks against the controls without segmentation, as `primary_comparison`."""
+    rows = table[(table["method"] == "masked") & table["reference"].isin(SEGMENTATION_FREE_CONTROLS)
+                 & table["metric"].isin(JUDGING_METRICS)]
+    rows = rows if source is None else rows[rows["source"] == source]
+    return rows[rows["estimator"] == judging_estimator(rows)]
+
+
+def overall(verdicts: Iterable[str]) -> str:
+    """The verdict of several metrics together: LOWER or HIGHER where all of them say so."""
+    distinct = set(verdicts)
+    return distinct.pop() if len(distinct) == 1 else NO_CLEAR_DIFFERENCE
+
+
+def judging_estimator(table: pd.DataFrame) -> str:
+    """The estimator that decides: the refined one where the runs or comparisons have it."""
+    return "refined" if (table["estimator"] == "refined").any() else "thesis"
+
+
+def shuffle_spread(runs: pd.DataFrame, metric: str = "rmse") -> pd.DataFrame:
+    """How much shuffling the matched points before RANSAC changes an error, with all keypoints.
+
+    One row for each estimator and sequence: repetitions, lowest, highest, factor (highest over lowest).
+    """
+    rows = runs[runs["method"] == "baseline"].groupby(["estimator", "sequence"])[metric]
+    table = rows.agg(repetitions="size", lowest="min", highest="max").reset_index()
+    return table.assign(factor=table["highest"] / table["lowest"])
+
+
+# Parts of a table of runs
+
+
+def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None, width: int | None = None) -> pd.DataFrame:
+    """The rows of one method under one estimator, of one dilation width where it is given.
+
+    estimator: by default the one of the thesis's tables, which is the thesis's own where it was run.
+    """
+    if estimator is None:
+        estimator = next((name for name in ESTIMATORS if (runs["estimator"] == name).any()), "thesis")
+    rows = runs[(runs["method"] == method) & (runs["estimator"] == estimator)]
+    return rows if width is None else rows[rows["dilation_width"] == width]
+
+
+def of_source(runs: pd.DataFrame, source: str) -> pd.DataFrame:
+    """The runs of one source of masks, and those with all keypoints, which belong to every one."""
+    return runs[runs["source"].isin([source, ""])]
+
+
+def sources(runs: pd.DataFrame) -> list[str]:
+    """The names of the sources, in the order of their runs."""
+    return [name for name in runs["source"].unique() if name]
+
+
+def tested_width(runs: pd.DataFrame) -> int | None:
+    """The dilation width (pixels) at which masks are put to the test: that of the controls, or the only one there is.
+
+    CONTROL_WIDTH where neither says it; None for masks that came ready made. Raises InputError where the mask controls
+    of several widths leave it open.
+    """
+    masked = runs.loc[runs["method"] == "masked", "dilation_width"]
+    if len(masked) and masked.isna().all():
+        return None
+    widths = runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique()
+    if CONTROL_WIDTH in widths:
+        return CONTROL_WIDTH
+    if len(widths) > 1:
+        raise InputError(f"controls of the widths {', '.join(f'{width:g}' for width in sorted(widths))}; masks are put "
+                         "to the test at one width, so list the controls of one")
+    if not len(widths) and masked.nunique() == 1:
+        widths = masked.unique()
+    return int(widths[0]) if len(widths) else CONTROL_WIDTH
+
+
+def keypoints_left(runs: pd.DataFrame, width: int | None = None) -> pd.Series:
+    """The mean number of keypoints that masks of a width leave, by sequence; by default of `tested_width`."""
+    width = tested_width(runs) if width is None else width
+    rows = runs[runs["method"] == "masked"]
+    if width is not None:
+        rows = rows[rows["dilation_width"] == width]
+    return rows.groupby("sequence")["mean_keypoints"].mean()
+
+
+def spread(rows: pd.DataFrame, column: str, by: str = "sequence") -> pd.DataFrame:
+    """Mean, lowest and highest of a column over the repetitions: a table with one row for each value of `by`."""
+    return rows.groupby(by)[column].agg(mean="mean", lowest="min", highest="max")
