@@ -37,11 +37,16 @@ def test_poses_are_written_to_the_last_bit(tmp_path):
     assert np.array_equal(read_poses(tmp_path / "poses.txt"), poses)
 
 
+# of the excerpts in ../shared/data/kitti, as its README says
+REAL_FRAMES = {"00": 200, "01": 51, "02": 200, "05": 150, "06": 51, "07": 120}
+
+
 @pytest.mark.real
 def test_reads_real_sequences(kitti_real):
-    for name, frames in (("00", 200), ("02", 300), ("05", 200), ("06", 51)):
+    assert sequences(kitti_real) == list(REAL_FRAMES)
+    for name, count in REAL_FRAMES.items():
         sequence = Sequence(kitti_real, name)
-        assert len(sequence) == frames and sequence.frame(frames - 1).shape == sequence.size
+        assert len(sequence) == count and sequence.frame(count - 1).shape == sequence.size
     assert Sequence(kitti_real, "00").intrinsics[0, 0] == 718.856
 
 

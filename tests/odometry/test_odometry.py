@@ -66,15 +66,15 @@ def test_an_excerpt_starts_where_the_truth_does(kitti_real, tmp_path):
     whole = Sequence(kitti_real, "05")
     images = tmp_path / "sequences" / "05" / "image_0"
     images.mkdir(parents=True)
-    for path in whole.frame_paths[100:160]:
+    for path in whole.frame_paths[100:150]:
         (images / path.name).symlink_to(path)
     shutil.copy(whole.folder / "calib.txt", images.parent)
-    np.savetxt(images.parent / "times.txt", whole.times[100:160])
-    write_kitti_poses(tmp_path / "poses" / "05.txt", whole.poses[100:160])
+    np.savetxt(images.parent / "times.txt", whole.times[100:150])
+    write_kitti_poses(tmp_path / "poses" / "05.txt", whole.poses[100:150])
     kitti = Sequence(tmp_path, "05")
     result = odometry.run(kitti)
     np.testing.assert_array_equal(result.poses[0], kitti.poses[0])
-    assert metrics.rmse(result.poses, kitti.poses) == pytest.approx(0.1935, abs=5e-5)
+    assert metrics.rmse(result.poses, kitti.poses) == pytest.approx(0.1886, abs=5e-5)
 
 
 # Everywhere: a street of noise
