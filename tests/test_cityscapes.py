@@ -21,19 +21,20 @@ def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
             target = official / folder / "train" / "town" / f"{pair.name}_{end}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(source.read_bytes())
-    again = cityscapes.pairs(official, "train")
-    assert [pair.name for pair in again] == [pair.name for pair in flat] == [f"street_{i}" for i in range(4)]
-    for one, two in zip(cityscapes.load(flat, 16), cityscapes.load(again, 16)):
-        assert np.array_equal(one, two)
+    pairs = cityscapes.pairs(official, "train")
+    assert [pair.name for pair in pairs] == [pair.name for pair in flat] == [f"street_{i}" for i in range(4)]
+    np.testing.assert_equal(cityscapes.load(flat, 16), cityscapes.load(pairs, 16))
+    assert [pair.name for pair in cityscapes.pairs(official, "train", limit=2)] == ["street_0", "street_2"]
+    assert len(cityscapes.pairs(official, "train", limit=99)) == 4
 
 
 def test_colour_is_read_where_it_is_asked_for(tiny_cityscapes):
-    some = cityscapes.pairs(tiny_cityscapes, "train")
-    cv2.imwrite(str(some[0].image), np.full((16, 32, 3), (10, 100, 200), np.uint8))
-    images, labels = cityscapes.load(some, 16, channels=3)
+    pairs = cityscapes.pairs(tiny_cityscapes, "train")
+    cv2.imwrite(str(pairs[0].image), np.full((16, 32, 3), (10, 100, 200), np.uint8))
+    images, labels = cityscapes.load(pairs, 16, channels=3)
     assert images.shape == (4, 16, 16, 3) and images[0, 5, 5].tolist() == [200, 100, 10]
-    gray, same = cityscapes.load(some, 16)
-    assert gray.shape == (4, 16, 16, 1) and np.array_equal(labels, same)
+    gray, same_labels = cityscapes.load(pairs, 16)
+    assert gray.shape == (4, 16, 16, 1) and np.array_equal(labels, same_labels)
     assert np.array_equal(images[1, ..., :1], gray[1])  # a gray file has three equal channels
 
 
@@ -43,40 +44,27 @@ def test_resizing_invents_no_label(tiny_cityscapes):
     assert set(np.unique(labels)) == {7, 11, 23}
 
 
-def test_limit_is_spread_over_the_split(tiny_cityscapes):
-    assert [pair.name for pair in cityscapes.pairs(tiny_cityscapes, "train", limit=2)] == ["street_0", "street_2"]
-    assert len(cityscapes.pairs(tiny_cityscapes, "train", limit=99)) == 4
-
-
 def test_split_is_the_appendix_split():
     # numpy's legacy generator with seed 0 is what scikit-learn's random_state=0 stands for
     train, validation = cityscapes.split_train_validation(list(range(2975)))
     order = np.random.RandomState(0).permutation(2975)
     assert (len(train), len(validation)) == (2380, 595)
     assert validation == order[:595].tolist() and train == order[595:].tolist()
-
-
-def test_faults_are_named(tiny_cityscapes, tmp_path):
-    with pytest.raises(InputError, match="no such folder; CITYSCAPES must name"):
-        cityscapes.pairs(tmp_path / "nowhere", "train")
-    with pytest.raises(InputError, match="holds neither leftImg8bit/test nor test"):
-        cityscapes.pairs(tiny_cityscapes, "test")
-    (tiny_cityscapes / "trainannot" / "street_2.png").unlink()
-    with pytest.raises(InputError, match="train/street_2.png: has no label map"):
-        cityscapes.pairs(tiny_cityscapes, "train")
-    with pytest.raises(InputError, match="1 training image: at least 2"):
+    with pytest.raises(InputError):
         cityscapes.split_train_validation([0])
+
+
+def test_faults_are_named(tiny_cityscapes):
+    cv2.imwrite(str(tiny_cityscapes / "trainannot" / "street_0.png"), np.full((16, 32), 35, np.uint8))
+    with pytest.raises(InputError, match="trainannot/street_0.png: label id 35"):
+        cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 16)
+    (tiny_cityscapes / "trainannot" / "street_2.png").unlink()
     for path in (tiny_cityscapes / "val").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match="val: no PNG images"):
-        cityscapes.pairs(tiny_cityscapes, "val")
-
-
-def test_unknown_label_id_is_named(tiny_cityscapes):
-    path = tiny_cityscapes / "trainannot" / "street_1.png"
-    cv2.imwrite(str(path), np.full((16, 32), 35, np.uint8))
-    with pytest.raises(InputError, match="street_1.png: label id 35 is above 34"):
-        cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 16)
+    for root, split, named in ((tiny_cityscapes / "nowhere", "train", "nowhere"), (tiny_cityscapes, "test", "test"),
+                               (tiny_cityscapes, "train", "train/street_2.png"), (tiny_cityscapes, "val", "val")):
+        with pytest.raises(InputError, match=f"{named}: ") if split != "test" else pytest.raises(InputError):
+            cityscapes.pairs(root, split)
 
 
 @pytest.mark.real

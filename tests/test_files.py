@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thesis_repro import InputError
-from thesis_repro.files import atomic, glance, progress, read_gray, read_ids, write_png
+from thesis_repro.files import atomic, glance, progress, read_color, read_gray, read_ids, write_png
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
 
@@ -69,6 +69,16 @@ def test_harmless_kinds_of_png_have_the_right_pixels(tmp_path, data, ids):
     else:
         with pytest.raises(InputError, match="palette"):
             read_ids(path)
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_pixels_are_those_of_opencv(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    colours = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (101, 67, 3), np.uint8), (0, 0), 2)
+    for image in (colours, colours[..., 0]):
+        cv2.imwrite(str(path), image)
+        assert np.array_equal(read_gray(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        assert np.array_equal(read_color(path)[..., ::-1], cv2.imread(str(path)))
 
 
 def test_one_bit_is_black_and_white(tmp_path):

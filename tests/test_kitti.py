@@ -3,9 +3,18 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from evo.tools import file_interface
 
 from thesis_repro import InputError, odometry
-from thesis_repro.kitti import Sequence, read_poses, sequences, true_poses, without_truth, write_kitti_poses
+from thesis_repro.kitti import (
+    Sequence,
+    read_poses,
+    sequences,
+    true_poses,
+    without_truth,
+    write_kitti_poses,
+    write_tum,
+)
 
 
 def test_reads_a_sequence(tiny_kitti):
@@ -35,6 +44,18 @@ def test_poses_are_written_to_the_last_bit(tmp_path):
     poses[:, :3, :3] = [cv2.Rodrigues(pose[:3, 3])[0] for pose in poses]
     write_kitti_poses(tmp_path / "poses.txt", poses)
     assert np.array_equal(read_poses(tmp_path / "poses.txt"), poses)
+
+
+def test_tum_files_are_read_by_evo(tmp_path):
+    random = np.random.default_rng(0)
+    poses, times = np.tile(np.eye(4), (50, 1, 1)), np.sort(random.random(50))
+    poses[:, :3, 3] = random.normal(size=(50, 3))
+    poses[1:, :3, :3] = [cv2.Rodrigues(vector)[0] for vector in random.normal(size=(49, 3))]  # to beyond half a turn
+    write_tum(tmp_path / "path.tum", poses, times)
+    trajectory = file_interface.read_tum_trajectory_file(tmp_path / "path.tum")
+    assert np.array_equal(trajectory.timestamps, times) and np.array_equal(trajectory.positions_xyz, poses[:, :3, 3])
+    np.testing.assert_allclose(trajectory.poses_se3, poses, rtol=0, atol=1e-12)
+    assert (trajectory.orientations_quat_wxyz[:, 0] >= 0).all()
 
 
 # of the excerpts in ../shared/data/kitti, as its README says

@@ -101,14 +101,14 @@ def chained(inner, outer):
     (InputError("a.png: truncated"), "a.png: truncated"),
 ])
 def test_what_the_machine_lacks_is_one_line(error, says, capsys):
-    assert longrun.told(error) == 1
+    assert longrun.report_error(error) == 1
     line = capsys.readouterr().err
     assert line.startswith("error: ") and says in line and line.count("\n") == 1
 
 
 def test_errors_that_nobody_expects_are_raised():
     with pytest.raises(ZeroDivisionError):
-        longrun.told(ZeroDivisionError("1/0"))
+        longrun.report_error(ZeroDivisionError("1/0"))
 
 
 def test_a_full_disk_names_the_file_and_not_its_temporary_name(tmp_path):
@@ -133,7 +133,7 @@ def test_a_log_has_what_was_said_every_warning_and_the_error(tmp_path, capsys):
     lines = (tmp_path / "out" / longrun.LOG).read_text().splitlines()
     assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
     assert any("WARNING" in line and "odd" in line for line in lines)
-    assert not [one for one in logging.getLogger("thesis_repro").handlers if isinstance(one, longrun._File)]
+    assert not [one for one in logging.getLogger("thesis_repro").handlers if isinstance(one, longrun._LogFile)]
 
 
 def test_a_run_that_is_refused_leaves_no_log(tmp_path):

@@ -41,7 +41,7 @@ def read(function, path, text, *arguments):
 
 def sound_poses(poses):
     assert poses.shape[1:] == (4, 4) and len(poses) and np.isfinite(poses).all()
-    assert np.abs(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() <= kitti.RIGID
+    assert np.abs(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() <= kitti.ROTATION_TOLERANCE
     assert (np.linalg.det(poses[:, :3, :3]) > 0).all() and (poses[:, 3] == [0, 0, 0, 1]).all()
 
 
@@ -76,7 +76,7 @@ def test_a_camera_is_that_of_its_frames_or_refused(path, numbers, height, width)
     text = f"P0: {fx!r} 0 {u!r} 0 0 {fy!r} {v!r} 0 0 0 1 0\n"
     matrix = read(kitti.read_intrinsics, path, text)
     assert np.array_equal(matrix, [[fx, 0, u], [0, fy, v], [0, 0, 1]])  # to the last bit
-    fits = min(height, width) >= kitti.LEAST and u <= width and v <= height and all(
+    fits = min(height, width) >= kitti.MIN_FRAME_SIDE and u <= width and v <= height and all(
         width / 100 < focal < width * 100 for focal in (fx, fy))
     try:
         kitti.check_camera(path, matrix, path, (height, width))

@@ -4,33 +4,36 @@ import os
 import re
 import struct
 import sys
-import zlib
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image, ImageOps
 from tqdm import tqdm
 
 from thesis_repro import InputError, longrun
 
 BAR_DELAY = 1  # seconds before a bar shows: what is over sooner needs none
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-JPEG_START, JPEG_SCAN, JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
-IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
-MOST_PIXELS = 2**27  # of an image, twelve times those of a 4K one: a small file may claim to hold any number
-GLANCE = 4096  # bytes of both ends of a file
-JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of segments that say the size; those are tables
-GRAY, PALETTE = 0, 3  # PNG's types of colour; 2 and 6 are red, green, blue, 4 and 6 have transparency
+IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+END_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # the last bytes of a whole file
+TAIL = 4096  # bytes at the end of a file, where a quick look expects its end mark
 
 
 def read_gray(path):
     """Read one image as 8-bit gray, shape (height, width); colours become their luminance.
 
-    Raises InputError when the file is missing, empty, truncated, corrupt or no image, where it has 16 bits a channel,
-    and where it claims more than MOST_PIXELS. (What changed inside a JPEG cannot be noticed: it has no checksums.)
+    Raises InputError when the file is missing, empty, truncated, corrupt or no PNG or JPEG, where it has 16 bits a
+    channel, and where it claims more pixels than Pillow takes for harmless. (JPEG has no checksums, so a changed byte
+    inside one cannot be noticed.)
     """
-    return _read(path, cv2.IMREAD_GRAYSCALE)
+    return _read(path, "L", cv2.IMREAD_GRAYSCALE)
+
+
+def read_color(path):
+    """Read one image as 8-bit red, green, blue, shape (height, width, 3). Raises what `read_gray` raises."""
+    return _read(path, "RGB", cv2.IMREAD_COLOR_RGB)
 
 
 def read_ids(path):
@@ -39,77 +42,20 @@ def read_ids(path):
     Raises what `read_gray` raises, and InputError where reading as gray would change them: a palette, less than 8
     bits, colours (but for three equal channels), another format.
     """
-    data = _bytes(path)
-    if not data.startswith(PNG_SIGNATURE):
+    with _errors_named(path), open(path, "rb") as file:
+        image = _header(path, file)
+        stored = str(image.tile)  # with Pillow's name of the mode in the file: "L;4" is gray of 4 bits
+    if image.format != "PNG":
         raise InputError(f"{path}: is no PNG file; ids must be stored exactly, as an 8-bit gray PNG")
-    bits, colour = data[24:26]
-    if colour == PALETTE or bits < 8:
-        raise InputError(f"{path}: holds {'a palette' if colour == PALETTE else f'{bits} bits a pixel'}, so the ids "
-                         "would be read as colours; save them as an 8-bit gray PNG")
-    if colour == GRAY:
-        return _decoded(path, data, cv2.IMREAD_GRAYSCALE)
-    channels = _decoded(path, data, cv2.IMREAD_COLOR)
+    if image.mode in ("1", "P") or "L;" in stored:
+        raise InputError(f"{path}: holds {'a palette' if image.mode == 'P' else 'less than 8 bits a pixel'}, so the "
+                         "ids would be read as colours; save them as an 8-bit gray PNG")
+    if image.mode == "L":
+        return read_gray(path)
+    channels = read_color(path)
     if (channels != channels[..., :1]).any():
         raise InputError(f"{path}: holds colours where ids are expected; save the ids as an 8-bit gray PNG")
     return np.ascontiguousarray(channels[..., 0])
-
-
-def read_color(path):
-    """Read one image as 8-bit red, green, blue, shape (height, width, 3). Raises what `read_gray` raises."""
-    return cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-
-
-def _read(path, flag):
-    return _decoded(path, _bytes(path), flag)
-
-
-def _decoded(path, data, flag):
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
-    except cv2.error:
-        image = None
-    if image is None:
-        np.empty((*_size(data), 8), np.uint8)  # raises MemoryError where that is the reason, of which OpenCV is silent
-        raise InputError(f"{path}: not an image that OpenCV can read; copy or download it again")
-    return image
-
-
-def _bytes(path):
-    """The bytes of a PNG or JPEG file, which is whole and has 8 bits a channel (or less); else an InputError."""
-    data, _ = _ends(path, None)
-    _checked_size(path, data)
-    if not (_png_is_whole(data) if data.startswith(PNG_SIGNATURE) else _jpeg_is_whole(data)):
-        raise InputError(f"{path}: the image is truncated or corrupt; copy or download it again")
-    return data
-
-
-def _ends(path, count):
-    """The first `count` bytes of a file and the last ones, all of them for None; an InputError says why not."""
-    path = Path(path)
-    try:
-        with open(path, "rb") as file:
-            if count is None:
-                return (data := file.read()), data
-            head = file.read(count)
-            file.seek(-min(count, os.fstat(file.fileno()).st_size), os.SEEK_END)
-            return head, file.read()
-    except FileNotFoundError:
-        broken = f" (it is a link to {os.readlink(path)}, which does not exist)" if path.is_symlink() else ""
-        raise InputError(f"{path}: no such image{broken}; check the folder it should be in") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
-
-
-def _checked_size(path, head):
-    size = _size(head)
-    if size is None:
-        raise InputError(f"{path}: {'is empty' if not head else 'not a PNG or JPEG image'}; copy or download it again")
-    if not 0 < size[0] * size[1] <= MOST_PIXELS:
-        raise InputError(f"{path}: claims to hold {size[1]}x{size[0]} pixels, not 1 to {MOST_PIXELS:,}; it is damaged "
-                         "or made to exhaust memory, so take it away")
-    if head.startswith(PNG_SIGNATURE) and head[24] == 16:
-        raise InputError(f"{path}: has 16 bits a channel; convert it to 8 bits a channel")
-    return size
 
 
 def glance(path):
@@ -117,71 +63,59 @@ def glance(path):
 
     Raises InputError where `read_gray` would, but for damage in the middle.
     """
-    head, tail = _ends(path, GLANCE)
-    if _size(head) is None or (b"IEND" if head.startswith(PNG_SIGNATURE) else JPEG_END) not in tail:
-        head = _bytes(path)  # where a camera puts much before the size, or a tool something behind the end
-    return _checked_size(path, head), _is_colour(head)
+    with _errors_named(path), open(path, "rb") as file:
+        image = _header(path, file)
+        file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
+        if END_MARKS["PNG" if image.format == "PNG" else "JPEG"] not in file.read():
+            read_gray(path)  # some cameras and tools write behind the end
+        return image.size[::-1], image.mode not in ("1", "L", "LA")
 
 
-def _is_colour(head):
-    if head.startswith(PNG_SIGNATURE):
-        return head[25] not in (GRAY, 4)
-    return any(marker in JPEG_FRAMES and head[position + 9:position + 10] > b"\1"
-               for position, marker in _jpeg_segments(head))
+def _read(path, mode, flag):
+    with _errors_named(path):
+        data = Path(path).read_bytes()
+        image = _header(path, BytesIO(data))
+        if image.format != "PNG":
+            image.draft(mode, image.size)  # gray without converting colours first, as OpenCV does
+            return np.array(ImageOps.exif_transpose(image).convert(mode))
+        image.verify()  # the checksums, of which OpenCV and Pillow's own decoder take no notice
+        if END_MARKS["PNG"] not in data:
+            raise OSError
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)  # faster than Pillow's decoder
+        if pixels is None:
+            np.empty((*image.size, 8), np.uint8)  # OpenCV does not say where memory is too short; this does
+            raise OSError
+        return pixels
 
 
-def _size(head):
-    """(height, width) of an image from the first bytes of its file, PNG or JPEG; None where they do not say it."""
-    if head.startswith(PNG_SIGNATURE) and head[12:16] == b"IHDR" and len(head) >= 26:
-        return struct.unpack(">II", head[16:24])[::-1]
-    if not head.startswith(JPEG_START):
-        return None
-    for position, marker in _jpeg_segments(head):
-        if marker in JPEG_FRAMES:
-            return struct.unpack(">HH", head[position + 5:position + 9]) if position + 9 <= len(head) else None
-    return None
+def _header(path, file):
+    image = Image.open(file, formats=("PNG", "JPEG"))
+    if ";16" in str(image.tile):
+        raise InputError(f"{path}: has 16 bits a channel; convert it to 8 bits a channel")
+    return image
 
 
-def _png_is_whole(data):
-    # OpenCV fills the missing rows of a damaged PNG and says nothing, so the chunks' checksums are read here.
-    position, first = len(PNG_SIGNATURE), True
-    while position + 12 <= len(data):
-        (length,) = struct.unpack(">I", data[position:position + 4])
-        end = position + 12 + length
-        if end > len(data):
-            return False
-        body = data[position + 4:end - 4]
-        if zlib.crc32(body) != struct.unpack(">I", data[end - 4:end])[0]:
-            return False
-        if body[:4] == b"IEND":
-            return True
-        if body[:4] == b"IDAT" and first:  # what was packed wrongly has the right checksum
-            try:
-                first = not zlib.decompressobj().decompress(body[4:], 1)
-            except zlib.error:
-                return False
-        position = end
-    return False
-
-
-def _jpeg_is_whole(data):
-    # OpenCV fills the missing rows of a cut JPEG with gray. The end's marker cannot stand among the pixels' bytes, but
-    # may in a preview that a camera puts before them, so the segments before the first scan are stepped over.
-    return any(marker == JPEG_SCAN[1] and JPEG_END in data[position:] for position, marker in _jpeg_segments(data))
-
-
-def _jpeg_segments(data):
-    """(position, marker) of the segments of a JPEG up to the first scan."""
-    position = len(JPEG_START)
-    while position + 4 <= len(data) and data[position] == 0xFF:
-        if data[position + 1] == 0xFF:  # there may be any number of them before a marker
-            position += 1
-            continue
-        yield position, data[position + 1]
-        if data[position:position + 2] == JPEG_SCAN:
-            return
-        (length,) = struct.unpack(">H", data[position + 2:position + 4])
-        position += 2 + length
+@contextmanager
+def _errors_named(path):
+    """Raise an InputError that names the image and the remedy where the system, Pillow or OpenCV raise another."""
+    try:
+        yield
+    except InputError:
+        raise
+    except FileNotFoundError:
+        path = Path(path)
+        broken = f" (it is a link to {os.readlink(path)}, which does not exist)" if path.is_symlink() else ""
+        raise InputError(f"{path}: no such image{broken}; check the folder it should be in") from None
+    except Image.DecompressionBombError:
+        raise InputError(f"{path}: claims to hold more pixels than any camera takes; it is damaged or made to exhaust "
+                         "memory, so take it away") from None
+    except Image.UnidentifiedImageError:
+        what = "not a PNG or JPEG image" if Path(path).stat().st_size else "is empty"
+        raise InputError(f"{path}: {what}; copy or download it again") from None
+    except (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, cv2.error) as error:
+        if getattr(error, "strerror", None):
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
+        raise InputError(f"{path}: the image is truncated or corrupt; copy or download it again") from None
 
 
 def listed(folder, pattern="*.png"):
@@ -194,11 +128,11 @@ def images(folder):
 
     Hidden ones are left out. Raises InputError where there are both kinds.
     """
-    found = [path for path in listed(folder, "*") if path.suffix.lower() in IMAGES]
-    if len({IMAGES[path.suffix.lower()] for path in found}) > 1:
+    paths = [path for path in listed(folder, "*") if path.suffix.lower() in IMAGE_FORMATS]
+    if len({IMAGE_FORMATS[path.suffix.lower()] for path in paths}) > 1:
         raise InputError(f"{folder}: holds PNG and JPEG images; one folder must hold one kind, so move the others away")
-    numbers = numbers_of(found)
-    return found if numbers is None else [path for _, path in sorted(zip(numbers, found))]
+    numbers = numbers_of(paths)
+    return paths if numbers is None else [path for _, path in sorted(zip(numbers, paths))]
 
 
 def numbers_of(paths):
@@ -233,11 +167,10 @@ def check_output(path):
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file to write")
-    above = next(folder for folder in path.absolute().parents if folder.exists())
-    if not above.is_dir():
-        raise InputError(f"{path}: cannot be written, since {above} is a file; name another one")
-    if not os.access(above, os.W_OK):
-        raise InputError(f"{path}: cannot be written, since {above} may not be written to; name another one")
+    parent = next(folder for folder in path.absolute().parents if folder.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        reason = "may not be written to" if parent.is_dir() else "is a file"
+        raise InputError(f"{path}: cannot be written, since {parent} {reason}; name another one")
 
 
 def write_text(path, text):

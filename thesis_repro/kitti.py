@@ -8,8 +8,8 @@ from itertools import islice, pairwise
 from pathlib import Path
 from statistics import median_low
 
-import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesis_repro import InputError
 from thesis_repro.files import images, numbers_of, read_gray, write_text
@@ -38,11 +38,11 @@ FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 
 
 
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")  # left gray, left colour, then the right ones
-LEAST = 16  # pixels a side of a frame: on less no keypoint can be tracked
-MANY_MISSING = 10_000  # frames; more are not listed
-FASTEST = 10_000  # metres a second
-FAR = 1e9  # metres; no position is as far away
-RIGID = 1e-3  # what R R^T may differ from the identity: the digits of a file are few
+MIN_FRAME_SIDE = 16  # pixels: in smaller frames no keypoint can be tracked
+MAX_MISSING_NAMED = 10_000  # frames
+MAX_SPEED = 10_000  # metres a second
+MAX_POSITION = 1e9  # metres
+ROTATION_TOLERANCE = 1e-3  # of R R^T against the identity: a file has few digits
 FRAME_TIME = 0.1  # seconds between KITTI's frames, and between those of a sequence that has no times
 
 
@@ -142,8 +142,8 @@ class Sequence:
         if self.has_truth:
             raise InputError(f"speed: sequence {self.name} has true poses ({self.poses_path}), from which the length "
                              "of each step is taken; give none")
-        if not 0 < speed <= FASTEST:
-            raise InputError(f"speed: {speed} is none; give metres a second, above 0 and at most {FASTEST:,}")
+        if not 0 < speed <= MAX_SPEED:
+            raise InputError(f"speed: {speed} is none; give metres a second, above 0 and at most {MAX_SPEED:,}")
         if not self.has_times:
             raise InputError(f"{self.folder / 'times.txt'}: no such file; a speed needs the times of the frames, in "
                              "seconds, one a line")
@@ -178,7 +178,7 @@ class Sequence:
     def size(self) -> tuple[int, int]:
         """(height, width) of the first frame; every frame must have it.
 
-        Raises InputError where it is less than LEAST, and where the camera cannot be that of such frames.
+        Raises InputError where it is less than MIN_FRAME_SIDE, and where the camera cannot be that of such frames.
         """
         height, width = read_gray(self.frame_paths[0]).shape
         check_camera(self.folder / "calib.txt", self.intrinsics, self.frame_paths[0], (height, width))
@@ -187,9 +187,7 @@ class Sequence:
     def frame(self, index: int) -> np.ndarray:
         """Frame `index` as 8-bit gray, (height, width). Raises InputError when unreadable or of another size."""
         image = read_gray(self.frame_paths[index])
-        if image.shape != self.size:
-            raise InputError(f"{self.frame_paths[index]}: {_size(image.shape)} pixels, but the first frame of the "
-                             f"sequence has {_size(self.size)}; all frames must have one size")
+        check_size(self.frame_paths[index], image.shape, self.size)
         return image
 
     def frames(self) -> Iterator[np.ndarray]:
@@ -237,16 +235,16 @@ def check_numbering(paths: list[Path]) -> None:
 
     (Every fifth frame, say, or times are no count.)
     """
-    numbers = numbers_of(paths) or [0]
-    twice = next((index for index, (before, after) in enumerate(pairwise(numbers)) if before == after), None)
-    if twice is not None:
-        raise InputError(f"{paths[twice + 1]}: has the number of {paths[twice].name}; take one of them away")
+    numbers = numbers_of(paths) or []
+    for index, (before, after) in enumerate(pairwise(numbers), 1):
+        if before == after:
+            raise InputError(f"{paths[index]}: has the number of {paths[index - 1].name}; take one of them away")
     missing = missing_frames(paths)
     if missing:
-        before = max(index for index, path in enumerate(paths) if numbers[index] < _number(missing[0]))
-        count = f"{len(missing)}{' or more' * (len(missing) == MANY_MISSING)}"
+        index = next(index for index, (before, after) in enumerate(pairwise(numbers), 1) if after - before > 1)
+        count = f"{len(missing)}{' or more' * (len(missing) == MAX_MISSING_NAMED)}"
         more = f" ({count} are missing in all)" if len(missing) > 1 else ""
-        raise InputError(f"{missing[0]}: is missing between {paths[before].name} and {paths[before + 1].name}{more}; "
+        raise InputError(f"{missing[0]}: is missing between {paths[index - 1].name} and {paths[index].name}{more}; "
                          "copy it again, for the odometry needs every frame")
 
 
@@ -254,7 +252,7 @@ def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
     """The files that are not there of frames that count by one.
 
     count: of all frames, which then begin with 0 (KITTI's) or with 1, or else where the first of `paths` does: those
-    before the first and after the last are found too. No more than MANY_MISSING are named.
+    before the first and after the last are found too. No more than MAX_MISSING_NAMED are named.
     """
     numbers = numbers_of(paths)
     steps = [after - before for before, after in pairwise(numbers or [])]
@@ -269,11 +267,7 @@ def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
     there = set(numbers)
     names = (paths[0].with_name(f"{stem}{number:0{digits}d}{paths[0].suffix}") for number in range(first, last + 1)
              if number not in there)
-    return list(islice(names, MANY_MISSING))
-
-
-def _number(path):
-    return int(path.stem[len(path.stem.rstrip("0123456789")):])
+    return list(islice(names, MAX_MISSING_NAMED))
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
@@ -284,6 +278,13 @@ def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
     about = f" (the first without one: {missing[0].name})" if missing else ""
     raise InputError(f"{path}: {count} lines for {len(frame_paths)} frames in {frame_paths[0].parent}{about}; "
                      "one line a frame is needed")
+
+
+def check_size(path: Path, size: tuple[int, ...], first_size: tuple[int, int]) -> None:
+    """Raise InputError for a frame whose (height, width) is not that of the sequence's first one."""
+    if size != first_size:
+        raise InputError(f"{path}: {_size(size)} pixels, but the first frame of the sequence has {_size(first_size)}; "
+                         "all frames must have one size")
 
 
 def _size(shape):
@@ -344,8 +345,9 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
 def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[int, int]) -> None:
     """Raise InputError where a camera matrix cannot be that of frames of (height, width), or these are too small."""
     height, width = size
-    if min(size) < LEAST:
-        raise InputError(f"{frame}: {_size(size)} pixels are too few for an odometry; a side needs {LEAST} or more")
+    if min(size) < MIN_FRAME_SIDE:
+        raise InputError(f"{frame}: {_size(size)} pixels are too few for an odometry; a side needs {MIN_FRAME_SIDE} or "
+                         "more")
     (fx, _, u), (_, fy, v), _ = intrinsics
     if not (0 <= u <= width and 0 <= v <= height and all(width / 100 < focal < width * 100 for focal in (fx, fy))):
         raise InputError(f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} are not those of a camera with "
@@ -373,29 +375,27 @@ def read_poses(path: str | Path) -> np.ndarray:
     rotations = poses[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    for index in np.flatnonzero(~(error <= RIGID))[:1]:
+    for index in np.flatnonzero(~(error <= ROTATION_TOLERANCE))[:1]:
         raise InputError(f"{path}, line {index + 1}: is no rotation (off by {error[index]:.2g}); the file is damaged "
                          "or in another form than KITTI's")
     for index in np.flatnonzero(np.linalg.det(rotations) < 0)[:1]:
         raise InputError(f"{path}, line {index + 1}: is a mirrored rotation, of axes that are left-handed; KITTI's x "
                          "points to the right, y down and z ahead")
-    for index in np.flatnonzero(np.abs(poses[:, :3, 3]).max(axis=1) > FAR)[:1]:
+    for index in np.flatnonzero(np.abs(poses[:, :3, 3]).max(axis=1) > MAX_POSITION)[:1]:
         raise InputError(f"{path}, line {index + 1}: is no position in metres; the file is damaged")
     return poses
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
     """Write (n, 4, 4) poses as KITTI does: 12 numbers a line, row by row, all digits kept."""
-    lines = (" ".join(repr(float(value)) for value in pose[:3].ravel()) for pose in poses)
-    write_text(path, "".join(f"{line}\n" for line in lines))
+    _write_rows(path, np.asarray(poses)[:, :3].reshape(-1, 12))
 
 
 def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
     """Write (n, 4, 4) poses with their times (n,), seconds, in TUM form: time, position, quaternion (x, y, z, w)."""
-    lines = []
-    for time, pose in zip(times, poses, strict=True):
-        turn = cv2.Rodrigues(np.asarray(pose[:3, :3], np.float64))[0].ravel()
-        angle = np.linalg.norm(turn)
-        quaternion = [*(turn / angle * np.sin(angle / 2) if angle > 0 else turn / 2), np.cos(angle / 2)]
-        lines.append(" ".join(repr(float(value)) for value in (time, *pose[:3, 3], *quaternion)))
-    write_text(path, "".join(f"{line}\n" for line in lines))
+    quaternions = Rotation.from_matrix(np.asarray(poses)[:, :3, :3]).as_quat(canonical=True)
+    _write_rows(path, np.column_stack([times, np.asarray(poses)[:, :3, 3], quaternions]))
+
+
+def _write_rows(path, rows):
+    write_text(path, "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in rows))

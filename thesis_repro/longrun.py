@@ -1,4 +1,4 @@
-"""What a long run owes its user: a folder of its own, a log, a word at its end, one line where the machine fails it.
+"""Long runs: a folder for one run at a time, a log, a summary at the end, and one line for what the machine lacks.
 
 Nothing here needs another package, so that it works where the memory for one is lacking.
 """
@@ -11,7 +11,7 @@ import re
 import resource
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from thesis_repro import InputError, one_line
@@ -35,8 +35,8 @@ REMEDIES = {
 NO_MEMORY = f"memory ran out; free some, or work with fewer processes (--jobs, JOBS); {GOES_ON}"
 WORKER_KILLED = ("a process was killed, most likely because memory ran out; what was finished is kept, so start again, "
                  "with fewer processes (JOBS or --jobs)")
-# how libraries say so in errors of their own
-SAYS_NO_MEMORY = ("nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc", "ut of memory",
+# what libraries write in errors of their own
+NO_MEMORY_TEXTS = ("nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc", "ut of memory",
                   "failed to map segment", "can't start new thread")
 
 _log = logging.getLogger("thesis_repro")
@@ -45,21 +45,20 @@ _log.setLevel(logging.INFO)
 _log.propagate = False
 
 
-def explained(error):
+def explain(error):
     """One line for bad input, or for what the machine lacks: space, permission, memory; None for any other error.
 
-    It names the file, where there is one, and says what to do. What an error was raised for counts too.
+    It names the file, where there is one, and says what to do. The errors that led to this one count too.
     """
     if isinstance(error, InputError):
         return str(error)
     while error is not None:
-        number, text = number_of(error), str(error)
+        number, name, text = number_of(error), getattr(error, "filename", None), str(error)
         if (isinstance(error, MemoryError) or number == errno.ENOMEM or type(error).__name__ == "ResourceExhaustedError"
-                or any(words in text for words in SAYS_NO_MEMORY)):
+                or any(words in text for words in NO_MEMORY_TEXTS)):
             return NO_MEMORY
         if type(error).__name__ == "TerminatedWorkerError":  # of joblib
             return WORKER_KILLED
-        name = getattr(error, "filename", None)
         if number in REMEDIES:
             return f"{name or 'a file'}: {os.strerror(number)}; {REMEDIES[number]}"
         if isinstance(error, OSError) and name is not None and number is not None:
@@ -69,7 +68,7 @@ def explained(error):
 
 
 def number_of(error):
-    """The system's number of an error, or None: HDF5 and others have its words alone."""
+    """The system's number of an error, or None. HDF5 and others give the system's text alone."""
     if getattr(error, "errno", None) is not None:
         return error.errno
     return next((number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error)),
@@ -77,9 +76,9 @@ def number_of(error):
 
 
 def need_addresses(gigabytes):
-    """Raise InputError where `ulimit -v` leaves this process less than the libraries take before they do anything.
+    """Raise InputError where `ulimit -v` is less than the libraries take when they are loaded.
 
-    Some of them end the process by a signal then, without a word.
+    Some of them end the process by a signal then, without a message.
     """
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < gigabytes * 2**30:
@@ -88,16 +87,18 @@ def need_addresses(gigabytes):
 
 
 def remedy(text):
-    """What to do about an error of which only the words are known, to be put behind them; nothing for most."""
-    if "MemoryError" in text or any(words in text for words in SAYS_NO_MEMORY):
+    """What to do about an error of which only the text is known, to be put behind it; empty for most errors."""
+    if "MemoryError" in text or any(words in text for words in NO_MEMORY_TEXTS):
         return f"; {NO_MEMORY}"
-    return next((f"; {what}" for number, what in REMEDIES.items() if os.strerror(number) in text), "")
+    return next((f"; {REMEDIES[number]}" for number in REMEDIES if os.strerror(number) in text), "")
 
 
-def told(error):
-    """Say on standard error in one line why a command ends, and return its exit status; raises what is `explained` by
-    nothing."""
-    line = explained(error)
+def report_error(error):
+    """Print in one line on standard error why a command ends, and return its exit status.
+
+    Raises an error that `explain` does not know.
+    """
+    line = explain(error)
     if line is None:
         raise error
     print(f"error: {one_line(line)}", file=sys.stderr)
@@ -110,14 +111,14 @@ def temporary(path):
 
 
 def sweep(folder):
-    """Delete what killed runs left half written below a folder of results that no other run is at work in."""
+    """Delete half-written files of killed runs below a folder of results; no other run may be at work in it."""
     for where, _, names in os.walk(folder):
         for name in names:
             if TEMPORARY.fullmatch(name):
                 Path(where, name).unlink(missing_ok=True)
 
 
-_held: dict[tuple, int] = {}  # how often this process holds each folder, by device and number
+_held: dict[tuple, int] = {}  # how many times this process holds each folder, by device and inode
 
 
 @contextmanager
@@ -135,19 +136,17 @@ def claimed(folder):
         with locked(folder):
             yield
     finally:
-        for path in new:  # where nothing came of it, nothing is left
-            try:
+        for path in new:  # those that are still empty
+            with suppress(OSError):
                 path.rmdir()
-            except OSError:
-                break
 
 
 @contextmanager
 def locked(path):
     """Hold a folder or file that is there, as `claimed` does."""
-    descriptor = os.open(path, os.O_RDONLY)  # a lock on it ends with the process, so that none can be left behind
-    about = os.fstat(descriptor)
-    key = about.st_dev, about.st_ino
+    descriptor = os.open(path, os.O_RDONLY)  # its lock ends with the process, so a killed run leaves none
+    status = os.fstat(descriptor)
+    key = status.st_dev, status.st_ino
     try:
         if key not in _held:
             try:
@@ -168,11 +167,11 @@ def locked(path):
         os.close(descriptor)
 
 
-# The log and the word at the end
+# The log
 
 
-class _File(logging.FileHandler):
-    """Begins its file once the folder is one of results: where a run is refused, nothing is left."""
+class _LogFile(logging.FileHandler):
+    """Starts its file once the folder holds results, so that a run which is refused leaves nothing."""
 
     def __init__(self, folder, ours):
         super().__init__(folder / LOG, delay=True, encoding="utf-8")
@@ -187,23 +186,21 @@ class _File(logging.FileHandler):
             super().emit(self.waiting.pop(0))
 
     def close(self):
-        try:
+        with suppress(OSError):
             super().close()
-        except OSError:
-            pass
 
     def handleError(self, record):
-        pass  # a full disk is told of by what needs it more than a log
+        pass  # the results report a full disk; the log need not
 
 
 class Run:
-    """A long run with its log: how long it takes, and what it has to say."""
+    """A long run with its log."""
 
     def __init__(self, handler):
         self._handler, self._started = handler, time.monotonic()
 
     def end(self, text):
-        """Say what came of the run, how long it took, and where to read about it."""
+        """Print what came of the run, how long it took, how many warnings there were, and where the log is."""
         count = self._handler.warnings
         say(f"{text}\n{duration(time.monotonic() - self._started)}; {count or 'no'} warning{'s' * (count != 1)}; "
             f"log: {self._handler.folder / LOG}")
@@ -211,11 +208,11 @@ class Run:
 
 @contextmanager
 def logged(folder, what, ours=False):
-    """Append all that is said, every warning, and the error that ends the block to the log of a folder; yields a `Run`.
+    """Log what is printed, every warning, and the error that ends the block, in a folder; yields a `Run`.
 
-    what: the first line. ours: that the folder is one of results; otherwise the log begins with its record.
+    what: the first line. ours: the folder holds results already; otherwise the log starts with the folder's record.
     """
-    handler = _File(Path(folder), ours)
+    handler = _LogFile(Path(folder), ours)
     loggers = _log, logging.getLogger("py.warnings")
     for logger in loggers:
         logger.addHandler(handler)
@@ -224,7 +221,7 @@ def logged(folder, what, ours=False):
     try:
         yield Run(handler)
     except Exception as error:
-        reason = explained(error)
+        reason = explain(error)
         _log.error(reason or type(error).__name__, exc_info=reason is None)
         raise
     except BaseException as error:
@@ -238,13 +235,13 @@ def logged(folder, what, ours=False):
 
 
 def say(text, warning=False):
-    """Print a text, and put it into the log."""
+    """Print a text and log it."""
     print(text, flush=True)
     note(text, logging.WARNING if warning else logging.INFO)
 
 
 def note(text, level=logging.ERROR):
-    """Put a text into the log alone."""
+    """Log a text."""
     for line in text.splitlines():
         _log.log(level, line)
 

@@ -31,7 +31,7 @@ VARIABLES = {
     "EPOCHS": "most epochs of the training",
     "FRAMES": "frames from the start of each sequence, or all",
     "WIDTHS": "dilation widths in pixels, such as 5,10 or 1-15",
-    "REPETITIONS": "runs of each kind, with the correspondences in another order each time",
+    "REPETITIONS": "runs of each kind, each with the matched points shuffled in another way",
 }
 MOST_JOBS, MOST_REPETITIONS = 1024, 1000
 # the least and the most that each may be, and what it must be a multiple of
@@ -56,7 +56,7 @@ class Profile:
     frames: int | None  # frames taken from the start of each sequence
     timed_frames: int  # frames from the start of each sequence on which the cost of each width is timed
     widths: tuple  # dilation widths, pixels
-    repetitions: int  # of each run, with the correspondences in another order each time
+    repetitions: int  # of each run, each with the matched points shuffled in another way
     # the embedded world
     world_sequences: int
     world_frames: int | None  # of each sequence; None for as many as show all of its drive, 46 to 156
@@ -120,11 +120,11 @@ class Settings:
         """One line for captions: which data the numbers come from."""
         odometry = "embedded world (rendered)" if self.kitti_is_embedded else "the user's KITTI folder"
         training = "embedded world (rendered)" if self.cityscapes_is_embedded else "the user's Cityscapes folder"
-        if self.shipped:
-            odometry += ", label maps by the model in the package"
+        labels = ("label maps: by the model in the package, no training" if self.shipped else
+                  f"training: {training}")
         sizes = "".join(f", {name.replace('_', ' ')} {_short(value)}"
                         for name, value in _changed(self.profile, self.sizes).items())
-        return f"odometry: {odometry}; training: {training}; profile {self.profile}{sizes}"
+        return f"odometry: {odometry}; {labels}; profile {self.profile}{sizes}"
 
     def __str__(self):
         rows = {"run": self.run, "odometry data": self.kitti, "training data": self.cityscapes,
@@ -199,14 +199,14 @@ def _whole(text):
 
 def _numbers(text, most):
     """The numbers of "1-3, 7", sorted; none where it is something else, or holds one above `most`."""
-    found = set()
+    numbers = set()
     for word in text.replace(",", " ").split():
         first, dash, last = word.partition("-")
         begin, end = _whole(first), _whole(last if dash else first)
         if begin is None or end is None or not begin <= end <= most:
             return []
-        found |= set(range(begin, end + 1))
-    return sorted(found)
+        numbers |= set(range(begin, end + 1))
+    return sorted(numbers)
 
 
 def _changed(profile, sizes):

@@ -1,13 +1,12 @@
-"""Results on disk that know what they were made from, and going on after a stop: one mechanism for everything.
+"""Results on disk that know what they were made from, and going on after a stop.
 
 A *stage* is a folder with a record of what its results were made from (`stage`). A *state* is one file with what a long
-job needs to go on, written whole or not at all (`store`, `resume`). Digests say in a few letters what an input was.
+job needs to go on, written whole or not at all (`store`, `resume`). A digest names an input in twelve letters.
 """
 
 import ast
 import hashlib
 import json
-import re
 import zipfile
 from functools import lru_cache
 from pathlib import Path
@@ -32,28 +31,28 @@ def stage(folder, *, replace=True, **inputs):
     folder = Path(folder)
     with longrun.claimed(folder):
         wanted = json.loads(json.dumps(inputs, default=str))
-        found = record(folder)
-        if found is None and not all(_own(path) for path in folder.iterdir()):
+        earlier = record(folder)
+        if earlier is None and not all(_own(path) for path in folder.iterdir()):
             raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
-        if found is not None and found != wanted:
+        if earlier is not None and earlier != wanted:
             if not replace:
-                key = next(key for key in {**wanted, **found} if wanted.get(key) != found.get(key))
-                raise InputError(f"{folder}: holds results of other settings ({key} {found.get(key)!r}, not "
+                key = next(key for key in {**wanted, **earlier} if wanted.get(key) != earlier.get(key))
+                raise InputError(f"{folder}: holds results of other settings ({key} {earlier.get(key)!r}, not "
                                  f"{wanted.get(key)!r}); remove the folder or choose another")
-            if 2 * len(found.keys() & wanted.keys()) <= len(found.keys() | wanted.keys()):
-                raise InputError(f"{folder}: holds results of another kind (made from {', '.join(sorted(found))}), "
+            if 2 * len(earlier.keys() & wanted.keys()) <= len(earlier.keys() | wanted.keys()):
+                raise InputError(f"{folder}: holds results of another kind (made from {', '.join(sorted(earlier))}), "
                                  "which would be lost; choose another folder")
             _empty(folder)
         longrun.sweep(folder)
-        if found != wanted:
+        if earlier != wanted:
             write_text(folder / RECORD, json.dumps(wanted, indent=1, sort_keys=True))
     return folder
 
 
 def _own(path):
     """Whether a file may lie in a folder that is going to be a stage: the log, or a record that was half written."""
-    record = Path(RECORD)
-    return path.name == LOG or re.fullmatch(rf"\.{record.stem}\.\d+{record.suffix}", path.name) is not None
+    return path.name == LOG or (path.name.startswith(f".{Path(RECORD).stem}.")
+                                and longrun.TEMPORARY.fullmatch(path.name) is not None)
 
 
 def _empty(folder):
@@ -100,9 +99,9 @@ def resume(path, arrays=True):
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as kept:
-            names = [name for name in kept.files if name != "job"] if arrays else []
-            return json.loads(str(kept["job"])), {name.removeprefix("array "): kept[name] for name in names}
+        with np.load(path, allow_pickle=False) as state:
+            names = [name for name in state.files if name != "job"] if arrays else []
+            return json.loads(str(state["job"])), {name.removeprefix("array "): state[name] for name in names}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         raise InputError(f"{path}: is damaged; delete it to start from the beginning") from None
 
@@ -116,13 +115,13 @@ def code(*places):
 
     Everything of the package that they import counts with them. Comments and docstrings do not.
     """
-    waiting = [path for place in places for path in _modules(place)]
+    paths = [path for place in places for path in _modules(place)]
     trees = {}
-    while waiting:
-        path = waiting.pop()
+    while paths:
+        path = paths.pop()
         if path not in trees:
             trees[path] = ast.parse(path.read_text(encoding="utf-8"))
-            waiting += _imported(trees[path])
+            paths += _imported(trees[path])
     digest = hashlib.sha256()
     for path in sorted(trees):
         for node in ast.walk(trees[path]):
@@ -134,10 +133,10 @@ def code(*places):
 
 def _modules(place):
     folder, module = _PACKAGE / place, _PACKAGE / f"{place}.py"
-    found = sorted(folder.glob("*.py")) if folder.is_dir() else [module] * module.is_file()
-    if not found:
+    paths = sorted(folder.glob("*.py")) if folder.is_dir() else [module] * module.is_file()
+    if not paths:
         raise ValueError(f"{place}: no folder or module of the package")
-    return found
+    return paths
 
 
 def _imported(tree):

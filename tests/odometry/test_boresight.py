@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thesis_repro import InputError
-from thesis_repro.__main__ import main
+from thesis_repro.cli import main
 from thesis_repro.kitti import read_poses
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.refined import boresight

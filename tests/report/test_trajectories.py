@@ -11,7 +11,7 @@ import pytest
 from evo.cli import entry_points
 
 from thesis_repro import InputError
-from thesis_repro.__main__ import main
+from thesis_repro.cli import main
 from thesis_repro.kitti import write_kitti_poses, write_tum
 from thesis_repro.odometry import metrics
 from thesis_repro.report import trajectories

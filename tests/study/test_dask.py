@@ -162,8 +162,8 @@ def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, sm
 
 
 def test_label_maps_of_workers_have_the_bits_of_one_process(workers, scheduler, small_world, tmp_path, monkeypatch):
-    from thesis_repro.__main__ import main
     from thesis_repro.cityscapes import N_CLASSES
+    from thesis_repro.cli import main
     from thesis_repro.segmentation import prediction
     from thesis_repro.segmentation.unet import build_unet
 

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro.__main__ import main
+from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks
 from thesis_repro.study import results, runner, series

@@ -18,4 +18,4 @@ if __name__ == "__main__":
         folder = stages.stage(sys.argv[1], **training.made_from(*test_training.prepared()))
         test_training.train(folder, int(sys.argv[2]))
     except Exception as error:
-        sys.exit(longrun.told(error))
+        sys.exit(longrun.report_error(error))

@@ -111,7 +111,7 @@ def test_a_full_disk_while_masks_are_written(ledger, command, disk, small_world,
 
 @pytest.mark.parametrize("option, name", [
     pytest.param("--output", "poses.txt", marks=pytest.mark.short), ("--tum", "path.tum"), ("--plot", "path.svg"),
-    ("--plot", "path.png"), ("--video", "seen.mp4"), ("--frames-csv", "frames.csv")])
+    ("--plot", "path.png"), ("--video", "seen.mp4")])
 def test_a_full_disk_at_the_end_of_a_run(ledger, command, disk, tiny_kitti, tmp_path, option, name):
     with ledger("faults", f"disk full: {option} {name}"):
         fill(disk(4), 4)

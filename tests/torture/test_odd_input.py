@@ -57,7 +57,7 @@ def commands(root, name):
     where, out, labels = ["--kitti", root / "kitti", "--sequence", name], root / 'out %d "x"', root / "labels <i>&"
     return [
         ["odometry", *where, "--labels", labels, "--dilation", 3, "--output", out / "p'$_$.txt", "--tum",
-         out / "%s.tum", "--plot", out / "%d.svg", "--video", out / "%03d é.mp4", "--frames-csv", out / "f\n.csv"],
+         out / "%s.tum", "--plot", out / "%d.svg", "--video", out / "%03d é.mp4"],
         ["masks", *where, "--labels", labels, "--dilation", 3, "--output", out / "masks\n&"],
         ["odometry", *where, "--masks", out / "masks\n&", "--output", out / "q<script>.txt", "--plot", out / "$_$.png"],
         ["evaluate", *where, out / "p'$_$.txt", out / "q<script>.txt", "--plot", out / "both.svg"],
@@ -80,7 +80,7 @@ def test_names_of_every_kind_work_and_data_is_only_read(tmp_path, command, ledge
             trials.lost_unless(digests(*data) == before, f"{words[0]} has changed its data")
     out = root / 'out %d "x"'
     assert {path.name for path in out.iterdir()} == {
-        "p'$_$.txt", "%s.tum", "%d.svg", "%03d é.mp4", "f\n.csv", "masks\n&", "q<script>.txt", "$_$.png", "both.svg",
+        "p'$_$.txt", "%s.tum", "%d.svg", "%03d é.mp4", "masks\n&", "q<script>.txt", "$_$.png", "both.svg",
         "study"}
     for path in out.rglob("*.svg"):
         assert not any("script" in str(part.tag) or part.tag == "b" for part in ElementTree.parse(path).iter()

@@ -170,7 +170,7 @@ def main(arguments=None):
                           repetitions=options.repetitions, processes=options.jobs)
             run.end(f"{options.folder}: {len(files)} files, {sum(path.stat().st_size for path in files):,} bytes")
     except Exception as error:
-        return longrun.told(error)
+        return longrun.report_error(error)
     return 0
 
 

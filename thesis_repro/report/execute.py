@@ -150,10 +150,10 @@ def _explained(error):
 def _in_one_line(folder, kind, error, trace):
     if isinstance(error, OSError) and error.filename is None:
         error.filename = str(folder)
-    if longrun.explained(error) is None:
+    if longrun.explain(error) is None:
         sys.__excepthook__(kind, error, trace)
     else:
-        longrun.told(error)
+        longrun.report_error(error)
 
 
 def _short(path):

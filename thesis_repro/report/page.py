@@ -330,7 +330,7 @@ def main():
     try:
         update(read_settings())
     except Exception as error:
-        return longrun.told(error)
+        return longrun.report_error(error)
     return 0
 
 

@@ -177,7 +177,7 @@ def _write_part(model_files, weights, folder, record, batches):
             raise InputError("this worker has another version of thesis_repro; install the same on all")
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # whatever it is, the other parts go on and the reason is reported
-        return longrun.explained(error) or f"{type(error).__name__}: {error}"
+        return longrun.explain(error) or f"{type(error).__name__}: {error}"
     return None
 
 

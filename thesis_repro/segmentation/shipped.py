@@ -423,7 +423,7 @@ def main(arguments=None):
             write_shipped(options.camvid, options.kitti_semantic, options.build, options.output)
             run.end(f"{options.output}: the model that ships, and its card")
     except Exception as error:
-        return longrun.told(error)
+        return longrun.report_error(error)
     return 0
 
 

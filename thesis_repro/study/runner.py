@@ -242,7 +242,7 @@ def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict
                 write_text(study.result(job), results.pop(job.name).frames.to_csv(index=False))
         state.unlink(missing_ok=True)
     except Exception as error:  # whatever it is, the others go on and the reason is reported
-        reason = longrun.explained(error)
+        reason = longrun.explain(error)
         if reason is None:
             reason = f"{type(error).__name__}: {error}"
         elif not isinstance(error, InputError):

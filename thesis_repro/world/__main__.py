@@ -11,4 +11,4 @@ if __name__ == "__main__":
         world.write(settings.world, **settings.sizes.world, seed=settings.seed, jobs=settings.jobs, only="kitti",
                     replace=not settings.cityscapes_is_embedded)
     except (InputError, OSError) as error:
-        sys.exit(longrun.told(error))
+        sys.exit(longrun.report_error(error))
