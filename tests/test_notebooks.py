@@ -16,7 +16,7 @@ TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
 OWN_TABLES = ["answer", "audit", "budget", "controls", "domain_gap", "masks", "widths"]
 TIMINGS = ["budget", "overlapped", "seconds"]  # what was measured, in a folder of its own
 OWN_FIGURES = ["answer", "answer_sequences", "budget", "controls", "domain_gap", "masks"]
-OWN_TEXTS = ["answer_in_words", "claims", "findings"]
+OWN_TEXTS = ["answer_in_words", "findings"]
 FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" for n in range(1, 7)),
            *(f"figure_4_{n:02d}" for n in range(1, 18)), "figure_a_01"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}

@@ -14,13 +14,13 @@ GPUS = "/dev/nvidiactl", "/dev/dxg"  # with NVIDIA's driver, and with that of WS
 
 @contextmanager
 def quietly():
-    """Loads TensorFlow and what needs it without their greetings, which no setting silences: they come from C++.
+    """Hide what TensorFlow prints while it loads; its C++ code prints that past every setting.
 
-    So does the complaint that there is no GPU, where there is none. What goes wrong is raised as ever.
+    It also complains where there is no GPU, which is hidden too. Errors are raised as usual.
     """
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = os.dup(1), os.dup(2)
+    originals = os.dup(1), os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         for stream in (1, 2):
@@ -30,7 +30,7 @@ def quietly():
             sys.modules["tensorflow"].config.list_physical_devices()
     finally:
         sys.stdout.flush()
-        for stream, own in enumerate(kept, 1):
-            os.dup2(own, stream)
-        for descriptor in (*kept, nowhere):
+        for stream, original in enumerate(originals, 1):
+            os.dup2(original, stream)
+        for descriptor in (*originals, nowhere):
             os.close(descriptor)

@@ -49,8 +49,8 @@ def _config(path):
 def _check_classes(path, config):
     """Raise InputError where a model's description names a Lambda layer or what is not part of Keras."""
     if isinstance(config, list):
-        for one in config:
-            _check_classes(path, one)
+        for entry in config:
+            _check_classes(path, entry)
     elif isinstance(config, dict):
         name, module = config.get("class_name"), config.get("module")
         if name in ("Lambda", "__lambda__"):
@@ -59,5 +59,5 @@ def _check_classes(path, config):
         if module is not None and str(module).partition(".")[0] not in KERAS:
             raise InputError(f"{path}: asks for {name} of {module}, which is not part of Keras, so it is not loaded; "
                              "build the network of Keras' own layers")
-        for one in config.values():
-            _check_classes(path, one)
+        for entry in config.values():
+            _check_classes(path, entry)

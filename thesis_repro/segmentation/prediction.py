@@ -12,6 +12,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("TF_FORCE_GPU_ALLOW_GROWTH", "true")  # take of a GPU's memory what is needed, not all of it
 
 import cv2
+import keras
 import numpy as np
 import tensorflow as tf
 
@@ -113,8 +114,8 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
     """Write the label maps of many sequences on many workers: on processors of one kind `write_label_maps`' bits.
 
     run: function of (function, argument tuples) that calls it with each on some worker and yields (index, what it
-    returned, or for a lost worker the reason), as a pool of `study.cluster` has it. model_files: of one model, or of
-    several for the mean of their probabilities (`backbones.ensemble`). sequences: (image paths, folder) for each.
+    returned, or for a lost worker the reason), like the pools of `study.cluster`. model_files: of one model, or of
+    several for the mean of their probabilities (`ensemble`). sequences: (image paths, folder) for each.
     Workers need this package and see all files under the same paths; each reads the model once. Finished batches are
     not predicted again after a stop.
 
@@ -152,15 +153,29 @@ def _spread(run, model_files, sequences, batch_size):
 
 @lru_cache(maxsize=1)
 def load(model_files):
-    """The model of one file, or the ensemble of several (a tuple of paths); kept, for the next call in this process."""
-    from thesis_repro.segmentation import backbones  # takes seconds
+    """The model of one file, or the ensemble of several (a tuple of paths); cached for the next call in this process.
 
+    Raises InputError for models of different input shapes.
+    """
     models = [training.load_model(path) for path in model_files]
     for path, model in zip(model_files, models):
         if model.input_shape != models[0].input_shape:
             raise InputError(f"{path}: takes images of {model.input_shape[1:]}, {model_files[0]} of "
                              f"{models[0].input_shape[1:]}; the models of an ensemble need one size")
-    return models[0] if len(models) == 1 else backbones.ensemble(models)
+    return models[0] if len(models) == 1 else ensemble(models)
+
+
+def ensemble(models):
+    """One model whose probabilities are the mean of those of several models of one input and output shape."""
+    inputs = keras.Input(models[0].input_shape[1:])
+    outputs = []
+    for number, model in enumerate(models):
+        # a copy, for the same model twice or two of one name must not collide; without the loss, which has no copy
+        member = keras.models.clone_model(keras.Model(model.input, model.output))
+        member.set_weights(model.get_weights())
+        member.name = f"member_{number}"
+        outputs.append(member(inputs))
+    return keras.Model(inputs, keras.layers.Average()(outputs), name="ensemble")
 
 
 def _write_part(model_files, weights, folder, record, batches):

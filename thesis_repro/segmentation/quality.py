@@ -12,7 +12,9 @@ import tensorflow as tf
 from thesis_repro import InputError, files
 from thesis_repro.cityscapes import LABELS, N_CLASSES
 from thesis_repro.segmentation import memory, training
-from thesis_repro.segmentation.errors import EVALUATED
+
+# The ids that the Cityscapes benchmark evaluates; pixels of all others are left out of its confusion matrix.
+EVALUATED = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class Quality:
 
     iou_score: float  # segmentation-models: mean over 35 classes, absent ones scoring 1, then over batches as in Keras
     f1_score: float
-    mean_iou: float  # Cityscapes: one confusion matrix over the set, mean over the classes present
+    mean_iou: float  # Cityscapes: one confusion matrix over the set, mean over the classes present (len(classes))
     accuracy: float  # share of evaluated pixels that are right
     classes: pd.DataFrame  # a row for each class present: id, pixels, iou, precision, recall
     confusion: np.ndarray  # (35, 35) pixels: true class, predicted class
@@ -42,9 +44,9 @@ def quality(model, images, labels, batch_size=16):
     scores = training.metrics()
 
     @tf.function(reduce_retracing=True)
-    def run(some_images, some_labels):
-        probabilities = model(tf.cast(some_images, tf.float32), training=False)
-        true = tf.one_hot(some_labels, N_CLASSES)
+    def run(batch_images, batch_labels):
+        probabilities = model(tf.cast(batch_images, tf.float32), training=False)
+        true = tf.one_hot(batch_labels, N_CLASSES)
         predicted = tf.argmax(probabilities, axis=-1, output_type=tf.int32)
         return [score(true, probabilities) for score in scores], predicted
 

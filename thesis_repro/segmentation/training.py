@@ -30,11 +30,11 @@ def total_loss():
     return sm.losses.DiceLoss(class_weights=CLASS_WEIGHTS) + sm.losses.CategoricalFocalLoss()
 
 
-def one_pass(loss):
-    """The same loss (true masks, probabilities), but its gradient comes with its value, in one pass over the memory.
+def fused_loss(loss):
+    """The same loss (true masks, probabilities), compiled together with its gradient.
 
-    The library's loss is many operations, each of which reads and writes 35 values a pixel. Compiled together they read
-    and write them once, which saves time on a CPU, and round otherwise. A GPU has them as they are.
+    The library's loss is many operations, and each reads and writes 35 values a pixel. Compiled together they read and
+    write these once. That saves time on a CPU; the sums round in another order. On a GPU nothing is compiled.
     """
     @tf.function(jit_compile=not tf.config.list_physical_devices("GPU"))
     def value_and_gradient(true, predicted):
@@ -146,26 +146,26 @@ def made_from(model, batches, validation):
         "first_weights": weights.hexdigest()[:12], "optimizer": optimizer,
         "loss": float(np.asarray(model.loss(true, predicted)).mean()),
         "images": [len(images) for images, _ in (*batches.sets, *validation.sets)],
-        "pixels": [zlib.crc32(np.ascontiguousarray(array)) for some in (batches, validation) for one in some.sets
-                   for array in one],
+        "pixels": [zlib.crc32(np.ascontiguousarray(array)) for source in (batches, validation) for pair in source.sets
+                   for array in pair],
         "batch_size": batches.batch_size, "seed": batches.seed,
         "fresh_augmentation": batches.augmenter.to_dict() if batches.augmenter else None,
     }
 
 
-class GoingOn(keras.callbacks.Callback):
-    """Lets a killed training go on in the epoch in which it was killed, and end with what an undisturbed run ends with.
+class ResumableTraining(keras.callbacks.Callback):
+    """A callback that resumes a killed training, which then ends with the weights of an undisturbed one.
 
-    Keras' own callbacks forget what they waited for when a process ends. After every epoch this one keeps the weights,
-    the optimizer's variables, the history and the counters of `others` (early stopping, the best model's checkpoint)
-    in one file of the folder, written last: a kill before that repeats the epoch, and writes the same model again. So
-    it has to be the last of the callbacks. It also tells the batches which epoch it is, and shows a progress bar.
+    Keras' BackupAndRestore keeps weights and optimizer, but not what early stopping and the best model's checkpoint
+    have counted. After every epoch this callback writes all of it, and the history, to one file of the folder. Give it
+    last: a kill before that file is written repeats the epoch, which writes the same model again. It also tells the
+    batches which epoch it is, and shows a progress bar.
     """
 
     COUNTERS = ("wait", "best", "best_epoch", "stopped_epoch")
 
     def __init__(self, folder, model, batches, others=()):
-        """model: compiled, its optimizer built.
+        """model: compiled, its optimizer built. others: EarlyStopping and ModelCheckpoint, as given to `fit`.
 
         Raises InputError where the folder holds the state of another network, or a damaged one.
         """
@@ -173,10 +173,10 @@ class GoingOn(keras.callbacks.Callback):
         self.folder, self.batches, self.others = Path(folder), batches, others
         self.rows, self._counters, self._bar, self._claim = [], [], None, ExitStack()
         self._variables = model.variables + model.optimizer.variables
-        kept = stages.resume(self.folder / STATE)
-        if kept is None:
+        state = stages.resume(self.folder / STATE)
+        if state is None:
             return
-        job, arrays = kept
+        job, arrays = state
         if [arrays[name].shape for name in arrays] != [tuple(variable.shape) for variable in self._variables]:
             raise InputError(f"{self.folder}: holds the training of another network; delete it or choose another one")
         for variable, value in zip(self._variables, arrays.values(), strict=True):
@@ -252,8 +252,8 @@ def load_model(path):
 
 def check_shape(model, name):
     """Raise InputError unless a model takes square images, gray or in colour, and gives 35 probabilities a pixel."""
-    taken, given = getattr(model, "input_shape", ()), getattr(model, "output_shape", ())
-    square = len(taken) == 4 and taken[1] is not None and taken[1] == taken[2] and taken[3] in (1, 3)
-    if not square or given != (*taken[:3], N_CLASSES):
-        raise InputError(f"{name}: a model from {taken} to {given}; expected (None, size, size, 1 or 3) to "
+    inputs, outputs = getattr(model, "input_shape", ()), getattr(model, "output_shape", ())
+    square = len(inputs) == 4 and inputs[1] is not None and inputs[1] == inputs[2] and inputs[3] in (1, 3)
+    if not square or outputs != (*inputs[:3], N_CLASSES):
+        raise InputError(f"{name}: a model from {inputs} to {outputs}; expected (None, size, size, 1 or 3) to "
                          f"(None, size, size, {N_CLASSES}), so name another model")

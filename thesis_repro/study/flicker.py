@@ -1,63 +1,16 @@
-"""How much label maps flicker from frame to frame: the thesis blames its errors on it (Section 5.1)."""
+"""How masked keypoints jump from frame to frame, on which the thesis blames its errors (Sections 4.2 and 5.1)."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-import pandas as pd
 
-from thesis_repro import InputError, files, masks
+from thesis_repro import masks
 from thesis_repro.cityscapes import ID
 from thesis_repro.odometry import THESIS, keypoints
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom, pixels; the last two just outside
-
-EXACT = "exact label maps"  # what the flicker of those of a world is called; it is the floor of the measure
-CONSISTENT = 1.0  # pixels; forward and backward flow must cancel to this, or the pixel is left out
-
-
-def flicker(label_maps: Sequence[np.ndarray], frames: Sequence[np.ndarray]) -> pd.DataFrame:
-    """The share of pixels whose class changes between consecutive frames, after the motion has been taken out.
-
-    label_maps: (h, w) uint8 each, any size; frames: (height, width) uint8 each, as many. Returns a DataFrame with a
-    row for each pair of frames: `frame` (the later one), `changed` and `compared`, both shares from 0 to 1.
-
-    The embedded world knows its camera's motion, but the displacement of a pixel needs its depth too, and that of a
-    moving car its speed. So the displacement is measured: dense optical flow both ways, and only pixels whose two
-    flows cancel are compared, which drops what is occluded, enters or leaves. Run on the exact label maps of the
-    embedded world it gives the floor of the measure: flow that is off by a pixel at a boundary.
-
-    Raises InputError for fewer than two frames or another number of label maps.
-    """
-    if len(frames) != len(label_maps) or len(frames) < 2:
-        raise InputError(f"flicker: {len(label_maps)} label maps for {len(frames)} frames; it needs at least two "
-                         "frames and a label map for each")
-    flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    rows = []
-    for number in files.progress(range(1, len(frames)), "flicker"):
-        before, after = (np.ascontiguousarray(frame) for frame in frames[number - 1:number + 1])
-        old, new = (cv2.resize(label_map, after.shape[::-1], interpolation=cv2.INTER_NEAREST)
-                    for label_map in label_maps[number - 1:number + 1])
-        forward, backward = flow.calc(before, after, None), flow.calc(after, before, None)
-        changed, compared = _compare(old, new, forward, backward)
-        rows.append({"frame": number, "changed": changed, "compared": compared})
-    return pd.DataFrame(rows)
-
-
-def _compare(old: np.ndarray, new: np.ndarray, forward: np.ndarray, backward: np.ndarray) -> tuple[float, float]:
-    """(share of the compared pixels that changed, share of all pixels that could be compared)."""
-    height, width = new.shape
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    came_from = columns + backward[..., 0], rows + backward[..., 1]
-    there = cv2.remap(forward, *came_from, cv2.INTER_LINEAR, borderValue=(np.inf, np.inf))
-    with np.errstate(invalid="ignore"):
-        compared = np.linalg.norm(there + backward, axis=-1) <= CONSISTENT
-    warped = cv2.remap(old, *came_from, cv2.INTER_NEAREST)
-    changed = (warped != new) & compared
-    return changed.sum() / max(compared.sum(), 1), compared.mean()
-
 
 OBJECTS = [ID[name] for name in ("pole", "traffic light", "traffic sign", "vegetation", "person", "rider", "car",
                                  "truck", "bus", "motorcycle", "bicycle")]
@@ -79,47 +32,55 @@ class View:
 
 def follow(frames: Sequence[np.ndarray], label_maps: Sequence[np.ndarray], dilation_width: int,
            first: int = 0) -> list[View]:
-    """How the masked keypoints of one object jump between consecutive frames (Section 4.2): a list of Views.
+    """How the masked keypoints of one object jump between consecutive frames (Figure 4.8): a View of each frame.
 
     frames: (height, width) uint8 each; label_maps: (h, w) uint8 each, any size, as many; first: number of the first
     frame. The object is the connected patch of a label, away from the image's border, from which most keypoints jump
-    from the first to the second frame; the window follows the median motion of its keypoints. Where no label map holds
-    such a patch, the window is the middle of the frame.
+    between the first two frames. A window follows the median motion of its keypoints. Where the first label map has no
+    such patch, the window starts in the middle of the frame.
     """
     shape = frames[0].shape
     edge_images = [masks.edges(label_map, shape) for label_map in label_maps]
     points = [keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
               for frame, edge_image in zip(frames, edge_images, strict=True)]
-    moved = [keypoints.track(before, after, some) if len(some) else (some, np.zeros(0, bool))
-             for before, after, some in zip(frames, frames[1:], points)]  # where to, and whether they were found
-    boxes = [box for box in _boxes(label_maps[0], shape) if _inside(points[0], box).sum() >= FEW]
-    tracked, found = moved[0]
-    half, jumping = min(shape) // 8, _far(tracked, points[1]) & found
-    center = np.array(shape[::-1]) / 2
-    if boxes:
-        left, top, right, bottom = max(boxes, key=lambda box: (_inside(points[0], box) & jumping).sum())
-        center = np.array([left + right, top + bottom]) / 2
-        half = int(np.clip(0.65 * max(right - left, bottom - top), half, min(shape) // 2))
+    tracks = [_track(before, after, corners) for before, after, corners in zip(frames, frames[1:], points)]
+    center, half = _window(label_maps[0], shape, points[0], tracks[0], points[1])
     views: list[View] = []
     expected = None  # where the keypoints in the window of the frame before are now
-    for index, frame in enumerate(frames):
+    for index, (frame, edge_image) in enumerate(zip(frames, edge_images, strict=True)):
         corner = np.clip(np.round(center - half).astype(int), 0, np.array(shape[::-1]) - 2 * half)
         left, top, right, bottom = box = (*corner, *(corner + 2 * half))
-        window = np.s_[top:bottom, left:right]
-        inside = _inside(points[index], box)
+        window, inside = np.s_[top:bottom, left:right], _inside(points[index], box)
         if expected is not None:
             expected = expected[_inside(expected, box)]
-        views.append(View(
-            first + index, frame[window], edge_images[index][window], points[index][inside] - corner,
-            None if expected is None else expected - corner,
-            0 if expected is None else int(_far(expected, points[index]).sum())))
-        if index < len(moved):
-            tracked, found = moved[index]
-            used = inside & found
+        jumped = 0 if expected is None else int(_far(expected, points[index]).sum())
+        views.append(View(first + index, frame[window], edge_image[window], points[index][inside] - corner,
+                          None if expected is None else expected - corner, jumped))
+        if index < len(tracks):
+            tracked, followed = tracks[index]
+            used = inside & followed
             expected = tracked[used]
             if used.any():
                 center = center + np.median(expected - points[index][used], axis=0)
     return views
+
+
+def _track(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the keypoints of a frame are in the next one, and which of them were found there."""
+    return keypoints.track(before, after, corners) if len(corners) else (corners, np.zeros(0, bool))
+
+
+def _window(label_map: np.ndarray, shape: tuple[int, ...], points: np.ndarray, tracks: tuple[np.ndarray, np.ndarray],
+            later: np.ndarray) -> tuple[np.ndarray, int]:
+    """The middle (x, y) and half the side of the window on the object whose keypoints jump most."""
+    half, (tracked, followed) = min(shape) // 8, tracks
+    boxes = [box for box in _boxes(label_map, shape) if _inside(points, box).sum() >= FEW]
+    if not boxes:
+        return np.array(shape[::-1]) / 2, half
+    jumping = _far(tracked, later) & followed
+    left, top, right, bottom = max(boxes, key=lambda box: (_inside(points, box) & jumping).sum())
+    half = int(np.clip(0.65 * max(right - left, bottom - top), half, min(shape) // 2))
+    return np.array([left + right, top + bottom]) / 2, half
 
 
 def _boxes(label_map: np.ndarray, shape: tuple[int, ...]) -> Iterator[Box]:
@@ -154,8 +115,6 @@ def found_again(first: np.ndarray, second: np.ndarray, first_mask: np.ndarray | 
     keypoint of the second frame. The masks are for the detector, (height, width) uint8.
     """
     before, after = keypoints.detect(first, THESIS, first_mask), keypoints.detect(second, THESIS, second_mask)
-    if not len(before):
-        return before, before, before, after
-    tracked, found = keypoints.track(first, second, before)
-    kept = found & ~_far(tracked, after)
-    return before[kept], tracked[kept], before[~kept], after[_far(after, tracked[kept])]
+    tracked, followed = _track(first, second, before)
+    again = followed & ~_far(tracked, after)
+    return before[again], tracked[again], before[~again], after[_far(after, tracked[again])]

@@ -1,0 +1,83 @@
+"""Where label maps are wrong: on pictures whose answer is known."""
+
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro import InputError
+from thesis_repro.segmentation import domain_gap
+
+pytestmark = pytest.mark.slow
+
+ROAD, BUILDING, SKY, CAR, EGO = 7, 11, 23, 26, 1
+
+
+def halves(column, size=320):
+    """Sky to the left of a column, road to the right."""
+    label_map = np.full((1, size, size), SKY, np.uint8)
+    label_map[:, :, column:] = ROAD
+    return label_map
+
+
+@pytest.mark.parametrize("size, column, share", [(320, 100, 1), (320, 102, 1), (320, 103, 0), (320, 98, 1),
+                                                 (320, 97, 0), (160, 51, 1), (160, 52, 0)])
+def test_a_boundary_is_found_within_two_pixels_of_320(size, column, share):
+    scores = domain_gap.boundary_scores(halves(size * 100 // 320, size), halves(column, size))
+    assert scores["found"] == scores["right"] == share
+    if size == 320:
+        assert scores["chance"] == pytest.approx(5 / 320)  # the band around the predicted line
+
+
+def test_boundaries_of_no_evaluated_class_do_not_count():
+    true, predicted = halves(100), halves(100)
+    true[:, 200:] = EGO  # the own car, which no benchmark asks for
+    predicted[:, 250:, 50:] = CAR
+    expected = {"found": 1, "right": 1, "chance": 5 / 320}
+    assert domain_gap.boundary_scores(true, predicted) == pytest.approx(expected)
+    scores = domain_gap.boundary_scores(np.full_like(true, EGO), predicted)
+    assert scores == {"found": 0, "right": 0, "chance": 0}
+
+
+def test_errors_in_shadow_are_told_from_errors_in_light():
+    images, true = np.full((2, 100, 100, 1), 100, np.uint8), np.full((2, 100, 100), ROAD, np.uint8)
+    images[:, :20] = 50  # a fifth in shadow
+    predicted = true.copy()
+    predicted[0, :10] = CAR  # half of it wrong in the first image
+    predicted[:, 90:] = SKY  # and an eighth of the light in both
+    expected = {"dark": 0.2, "dark_wrong": 0.25, "lit_wrong": 1 / 8}
+    assert domain_gap.shadow_errors(images, true, predicted) == pytest.approx(expected)
+
+
+def test_dark_is_relative_to_the_class_and_other_things_do_not_count():
+    images, true = np.full((1, 100, 100, 1), 100, np.uint8), np.full((1, 100, 100), ROAD, np.uint8)
+    true[:, :, 50:] = CAR
+    images[:, :, 50:] = 10  # a black car makes no road dark
+    errors = domain_gap.shadow_errors(images, true, np.full_like(true, SKY))
+    assert errors["dark"] == 0 and errors["lit_wrong"] == 1 and np.isnan(errors["dark_wrong"])
+    images[:, :, :50] = 61  # all of it dark, so nothing is
+    assert domain_gap.shadow_errors(images, true, true)["dark"] == 0
+
+
+def test_what_lies_near_a_boundary_is_left_out_of_shadows():
+    images, true = np.full((1, 320, 320, 1), 100, np.uint8), halves(160)
+    assert domain_gap.shadow_errors(images, true, halves(160 + domain_gap.AWAY))["lit_wrong"] == 0
+    assert domain_gap.shadow_errors(images, true, halves(160 + 2 * domain_gap.AWAY))["lit_wrong"] > 0
+
+
+def test_flicker_of_a_moving_picture_with_and_without_noise():
+    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (160, 300), np.uint8), (0, 0), 2)
+    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
+    patches = np.random.default_rng(1).choice([ROAD, BUILDING, SKY], (4, 8))
+    classes = np.kron(patches, np.ones((40, 40))).astype(np.uint8)
+    frames = [texture[:, shift:shift + 240] for shift in (0, 3, 6)]
+    true = [classes[:, shift:shift + 240] for shift in (0, 3, 6)]
+    wrong = [label_map.copy() for label_map in true]
+    wrong[1][np.random.default_rng(2).random(wrong[1].shape) < 0.2] = CAR  # a fifth of one frame flips
+
+    steady = domain_gap.flicker(true, frames)
+    assert len(steady) == 2 and (steady < 0.01).all()
+    assert domain_gap.flicker(wrong, frames).tolist() == pytest.approx([0.2, 0.2], abs=0.02)
+    # without taking the motion out, the boundaries alone would change more
+    assert (true[1] != true[0]).mean() > 3 * steady.max()
+    with pytest.raises(InputError):
+        domain_gap.flicker(true[:1], frames[:1])

@@ -1,0 +1,172 @@
+"""The gap between domains (Section 4.1): label maps measured at boundaries, in shadows and from frame to frame."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from thesis_repro import InputError, cityscapes, files, kitti
+from thesis_repro.segmentation import prediction, quality
+from thesis_repro.segmentation.quality import EVALUATED
+
+SIZE = prediction.SIZE  # pixels, both ways, at which boundaries are compared
+NEAR = 2  # pixels of SIZE; a boundary this near to another one has found it
+GROUND = tuple(cityscapes.ID[name] for name in ("road", "sidewalk", "terrain"))  # where shadows fall
+DARK = 0.6  # of the median gray of its class in its image; ground below that counts as shadow
+AWAY = 4  # pixels of SIZE; nearer to a true boundary errors have other causes
+CONSISTENT = 1.0  # pixels; forward and backward flow must cancel to this, or the pixel is not compared
+
+IMAGES = 100  # of a domain at most, spread evenly
+DRIVES, FRAMES = 3, 12  # how much of the odometry's data the flicker is measured on
+EXACT = "exact label maps"  # whose flicker is the floor of that measure
+
+
+class Gap(NamedTuple):
+    """What `measure` returns."""
+
+    scores: pd.DataFrame  # a row for each model and domain; shares and IoU from 0 to 1
+    classes: pd.DataFrame  # a row for each of these and each class present: model, domain, class, id, share, iou
+    flicker: pd.Series  # by model: the share of pixels that change their class between frames; of EXACT too
+
+
+def measure(models, domains, drives):
+    """Measure models on domains, and their flicker on the first frames of drives; returns a Gap.
+
+    models: Keras models by name; domains: lists of `cityscapes.Pair` by name; drives: `kitti.Sequence`s. Each model is
+    measured at its own size. A mean IoU is that of one confusion matrix over the domain (`quality.cityscapes_scores`);
+    `classes` and `images` say over how many of each.
+    """
+    scores, classes = [], []
+    for model_name, model in models.items():
+        for domain, pairs in domains.items():
+            images, true = cityscapes.load(pairs, *model.input_shape[2:])
+            predicted = prediction.predict(model, images)
+            mean_iou, accuracy, table = quality.cityscapes_scores(quality.confusion_matrix(true, predicted))
+            where = {"model": model_name, "domain": domain}
+            scores.append({**where, "images": len(pairs), "classes": len(table), "mean_iou": mean_iou,
+                           "accuracy": accuracy, "sky_recall": table["recall"].get("sky", np.nan),
+                           **boundary_scores(true, predicted), **shadow_errors(images, true, predicted)})
+            share = (table["pixels"] / table["pixels"].sum()).to_numpy()
+            classes.append(table.reset_index().assign(**where, share=share))
+    columns = ["model", "domain", "class", "id", "share", "iou"]
+    return Gap(pd.DataFrame(scores), pd.concat(classes, ignore_index=True)[columns], _flicker_of(models, drives))
+
+
+def labelled_frames(root, names, frames=None):
+    """Frames of an odometry root with their exact label maps (labels_0), spread evenly; none on real data."""
+    pairs = []
+    for name in names:
+        sequence = kitti.Sequence(root, name).subset(frames)
+        labels = sequence.folder / "labels_0"
+        if labels.is_dir():
+            count = min(len(sequence), max(1, IMAGES // len(names)))
+            for index in ((np.arange(count) + 0.5) * len(sequence) / count).astype(int):
+                path = sequence.frame_paths[index]
+                pairs.append(cityscapes.Pair(f"{name}_{path.stem}", path, labels / path.name))
+    return pairs
+
+
+def boundary_scores(true, predicted):
+    """How well boundaries between evaluated classes are met, label maps (n, h, w) uint8 of both stretched to SIZE.
+
+    Returns shares from 0 to 1. `found`: true boundary pixels with a predicted one within NEAR pixels. `right`:
+    predicted ones with a true one as near. `chance`: all pixels with a predicted boundary as near, which is what
+    boundaries drawn without looking at the image would find.
+    """
+    names, hits, totals = ("found", "right", "chance"), np.zeros(3), np.zeros(3)
+    for label_maps in zip(true, predicted, strict=True):
+        true_map, predicted_map = (cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
+                                   for label_map in label_maps)
+        counted = np.isin(true_map, EVALUATED)
+        true_edges, predicted_edges = _boundary(true_map, counted), _boundary(predicted_map, counted)
+        near_true, near_predicted = _widen(true_edges, NEAR), _widen(predicted_edges, NEAR)
+        hits += [(true_edges & near_predicted).sum(), (predicted_edges & near_true).sum(),
+                 (counted & near_predicted).sum()]
+        totals += [true_edges.sum(), predicted_edges.sum(), counted.sum()]
+    return dict(zip(names, (hits / np.maximum(totals, 1)).tolist()))
+
+
+def _boundary(label_map, counted):
+    """Pixels whose right or lower neighbour has another class, both of them counted."""
+    edges = np.zeros(label_map.shape, bool)
+    edges[:, :-1] |= (label_map[:, :-1] != label_map[:, 1:]) & counted[:, :-1] & counted[:, 1:]
+    edges[:-1] |= (label_map[:-1] != label_map[1:]) & counted[:-1] & counted[1:]
+    return edges
+
+
+def _widen(edges, reach):
+    return cv2.dilate(edges.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+
+
+def shadow_errors(images, true, predicted):
+    """Whether ground in shadow is taken for another class more often than ground in light (Section 4.1).
+
+    images: (n, h, w, channels) uint8; true, predicted: (n, h, w) uint8. No data set marks its shadows. So a pixel of
+    GROUND (by the true label map) counts as dark where its gray is below DARK times the median of its class in its
+    image, and as lit elsewhere. Pixels near a true boundary are left out.
+
+    Returns `dark`, the share of these pixels that are dark, and `dark_wrong` and `lit_wrong`, the shares of dark and
+    of lit ones that are given another class (NaN where there are none).
+    """
+    away = max(1, round(AWAY * true.shape[1] / SIZE))
+    pixels, wrong = np.zeros(2), np.zeros(2)  # lit, dark
+    for image, true_map, predicted_map in zip(images, true, predicted, strict=True):
+        gray = image.mean(axis=-1)
+        inside = ~_widen(_boundary(true_map, np.ones(true_map.shape, bool)), away)
+        for label in GROUND:
+            ground = (true_map == label) & inside
+            if ground.any():
+                dark = (gray[ground] < DARK * np.median(gray[true_map == label])).astype(int)
+                pixels += np.bincount(dark, minlength=2)
+                wrong += np.bincount(dark, weights=predicted_map[ground] != label, minlength=2)
+    with np.errstate(invalid="ignore"):
+        lit_wrong, dark_wrong = wrong / pixels
+    return {"dark": float(pixels[1] / max(pixels.sum(), 1)), "dark_wrong": dark_wrong, "lit_wrong": lit_wrong}
+
+
+def flicker(label_maps, frames):
+    """The share of pixels whose class changes between consecutive frames, motion taken out: (n - 1,), from 0 to 1.
+
+    label_maps: n of (h, w) uint8, any size; frames: n of (height, width) uint8. The motion is measured by dense optical
+    flow in both directions. Only pixels whose two flows cancel are compared, which leaves out what is occluded, enters
+    or leaves. Exact label maps show the floor of the measure: flow that is off by a pixel at a boundary.
+
+    Raises InputError for fewer than two frames or another number of label maps.
+    """
+    if len(frames) != len(label_maps) or len(frames) < 2:
+        raise InputError(f"flicker: {len(label_maps)} label maps for {len(frames)} frames; it needs at least two "
+                         "frames and a label map for each")
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    frames = [np.ascontiguousarray(frame) for frame in frames]
+    label_maps = [cv2.resize(label_map, frame.shape[::-1], interpolation=cv2.INTER_NEAREST)
+                  for label_map, frame in zip(label_maps, frames, strict=True)]
+    height, width = frames[0].shape
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    shares = []
+    for index in files.progress(range(1, len(frames)), "flicker"):
+        forward = flow.calc(frames[index - 1], frames[index], None)
+        backward = flow.calc(frames[index], frames[index - 1], None)
+        origin = columns + backward[..., 0], rows + backward[..., 1]  # where each pixel was in the frame before
+        there = cv2.remap(forward, *origin, cv2.INTER_LINEAR, borderValue=(np.inf, np.inf))
+        with np.errstate(invalid="ignore"):
+            compared = np.linalg.norm(there + backward, axis=-1) <= CONSISTENT
+        changed = (cv2.remap(label_maps[index - 1], *origin, cv2.INTER_NEAREST) != label_maps[index]) & compared
+        shares.append(changed.sum() / max(compared.sum(), 1))
+    return np.array(shares)
+
+
+def _flicker_of(models, drives):
+    """Mean flicker on the first frames of some drives, by model; of exact label maps too where there are some."""
+    shares = {}
+    for drive in list(drives)[:DRIVES]:
+        drive = drive.subset(FRAMES)
+        label_maps = {name: prediction.predict(model, np.stack([prediction.read_input(path, model.input_shape)
+                                                                for path in drive.frame_paths]))
+                      for name, model in models.items()}
+        exact = drive.folder / "labels_0"
+        if exact.is_dir():
+            label_maps[EXACT] = [cityscapes.read_label_map(exact / path.name) for path in drive.frame_paths]
+        for name, maps in label_maps.items():
+            shares.setdefault(name, []).append(flicker(maps, list(drive.frames())).mean())
+    return pd.Series({name: float(np.mean(values)) for name, values in shares.items()}, dtype=float)
