@@ -10,6 +10,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import LogLocator, MaxNLocator
 from PIL import ExifTags, Image
 
 from thesis_repro.cityscapes import colorize
@@ -79,6 +80,23 @@ def show_image(axes, image, title, **options):
     axes.imshow(image, cmap=options.pop("cmap", "gray"), **options)
     axes.set_title(title)
     axes.set_axis_off()
+
+
+def ratio_axis(axis, low, high):
+    """Make `axis`, as axes.yaxis, logarithmic, just wider than the values `low` to `high`, with a few round ticks.
+
+    Equal values get room around them. Values that are not positive and finite count as 1.
+    """
+    low, high = (value if np.isfinite(value) and value > 0 else 1.0 for value in (low, high))
+    low, high = min(low, high), max(low, high)
+    margin = max((high / low) ** 0.05, 1.1 if high < 1.1 * low else 1)
+    low, high = low / margin, high * margin
+    # within a factor of five, ticks at equal differences are rounder than ticks at equal ratios
+    locator = MaxNLocator(5) if high < 5 * low else LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,), numticks=6)
+    ticks = [tick for tick in locator.tick_values(low, high) if low <= tick <= high]
+    axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
+    axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+    axis.set_ticks([], minor=True)
 
 
 def save_figure(figure, folder, name, note):

@@ -1,0 +1,25 @@
+"""Axes, files and tables that every figure shares."""
+
+import matplotlib
+import numpy as np
+import pytest
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+
+from thesis_repro.report import style
+
+
+@pytest.mark.parametrize("low, high", [(1, 1), (1.01, 1.02), (0.97, 1.3), (0.3, 4), (2, 90), (1, 130), (1e-3, 1e5),
+                                       (300, 2000), (1.5, 0.7), (np.nan, 1.2), (0, np.inf)])
+def test_a_ratio_axis_has_a_few_round_ticks_within_it(low, high):
+    axis = plt.figure().add_subplot().yaxis
+    style.ratio_axis(axis, low, high)
+    ticks, (bottom, top) = axis.get_ticklocs(), axis.get_view_interval()
+    assert axis.get_scale() == "log" and 2 <= len(ticks) <= 8 and all((bottom <= ticks) & (ticks <= top))
+    assert all(bottom <= value <= top for value in (low, high) if 0 < value < np.inf)
+    assert not len(axis.get_ticklocs(minor=True))
+    for tick, label in zip(ticks, axis.get_ticklabels(), strict=True):
+        assert float(label.get_text()) == pytest.approx(tick, rel=1e-9)
+    plt.close("all")
