@@ -9,7 +9,6 @@ from pathlib import Path
 from statistics import median_low
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thesis_repro import InputError
 from thesis_repro.files import images, numbers_of, read_gray, write_text
@@ -393,6 +392,8 @@ def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
 
 def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
     """Write (n, 4, 4) poses with their times (n,), seconds, in TUM form: time, position, quaternion (x, y, z, w)."""
+    from scipy.spatial.transform import Rotation  # loads in 0.4 s, and every command loads this module
+
     quaternions = Rotation.from_matrix(np.asarray(poses)[:, :3, :3]).as_quat(canonical=True)
     _write_rows(path, np.column_stack([times, np.asarray(poses)[:, :3, 3], quaternions]))
 

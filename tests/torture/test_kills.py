@@ -11,13 +11,13 @@ import cv2
 import nbformat
 import numpy as np
 import pytest
-from trials import ROOT, TIMEOUT, contents, finish, kill, lost_unless, nothing_stray, same, snapshot, spawn
+import trials
+from trials import ROOT, TIMEOUT, contents, finish, kill, nothing_stray, same, snapshot, start, succeed, thesis
 
 from thesis_repro import longrun
 from thesis_repro.settings import read_settings
 
 HERE = Path(__file__).parent
-COMMAND = [sys.executable, "-m", "thesis_repro"]
 DRAWING = """
 import numpy as np
 from thesis_repro.report import style
@@ -36,11 +36,6 @@ for number in range(6):
 def look(folder):
     """The files below a folder with their versions, the log left out."""
     return {path: about for path, about in snapshot(folder).items() if path.name != longrun.LOG}
-
-
-def to_the_end(command, where, **environment):
-    result = finish(spawn(command, where, **environment), timeout=2 * TIMEOUT)
-    lost_unless(result.returncode == 0, f"does not go on: {result.stdout}\n{result.stderr}")
 
 
 def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: None, **environment):
@@ -66,7 +61,7 @@ def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: 
         return False
 
     anew()
-    process = spawn(command, where, **environment)
+    process = start(command, where, **environment)
     assert begun(process), f"writes nothing: {process.communicate()}"
     started = time.monotonic()
     assert finish(process).returncode == 0
@@ -79,7 +74,7 @@ def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: 
         tries = 0
         while moments:
             tries += 1
-            process = spawn(command, where, **environment)
+            process = start(command, where, **environment)
             if begun(process):
                 time.sleep(moments[0] if tries < 3 * kills else 0)
             if process.poll() is None:
@@ -87,17 +82,17 @@ def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: 
                 moments.pop(0)
                 continue
             result = finish(process)
-            lost_unless(result.returncode == 0, f"does not go on: {result.stdout}\n{result.stderr}")
+            trials.lost_unless(result.returncode == 0, f"does not go on: {result.stdout}\n{result.stderr}")
             same(contents(results), wanted)
             moments[0] /= 2  # a resumed run is shorter
             anew()
-        to_the_end(command, where, **environment)
+        succeed(command, where, timeout=2 * TIMEOUT, **environment)
         same(contents(results), wanted)
         nothing_stray(where)
 
 
 def test_the_embedded_world(ledger, tmp_path):
-    torture(ledger, "synthesize", [*COMMAND, "synthesize", "world", "--profile", "smoke"], tmp_path, "world", 3, 0)
+    torture(ledger, "synthesize", thesis("synthesize", "world", "--profile", "smoke"), tmp_path, "world", 3, 0)
 
 
 def test_a_small_embedded_world(ledger, tmp_path):
@@ -110,21 +105,17 @@ def test_training(ledger, tmp_path):
     torture(ledger, "training", [sys.executable, HERE / "small_training.py", "model", 6], tmp_path, "model", 5, 2)
 
 
-def test_label_maps(ledger, tmp_path):
-    from thesis_repro.cityscapes import N_CLASSES
-    from thesis_repro.segmentation.unet import build_unet
-
-    build_unet((64, 64, 1), N_CLASSES, 4).save(tmp_path / "model.keras")
+def test_label_maps(ledger, tmp_path, small_model):
     (tmp_path / "images").mkdir()
     for index, image in enumerate(np.random.default_rng(0).integers(0, 256, (400, 64, 96), np.uint8)):
         cv2.imwrite(str(tmp_path / "images" / f"{index:06d}.png"), image)
-    torture(ledger, "predict", [*COMMAND, "predict", "--images", "images", "--model", "model.keras", "--output",
-                                "labels"], tmp_path, "labels", 5, 3)
+    torture(ledger, "predict", thesis("predict", "--images", "images", "--model", small_model, "--output",
+                                      "labels"), tmp_path, "labels", 5, 3)
 
 
 def study(small_world, small_labels):
-    return [*COMMAND, "study", "--kitti", small_world / "kitti", "--labels", small_labels, "--widths", 5,
-            "--controls", 5, "--repetitions", 1, "--estimator", "thesis", "refined", "--output", "study"]
+    return thesis("study", "--kitti", small_world / "kitti", "--labels", small_labels, "--widths", 5, "--controls", 5,
+                  "--repetitions", 1, "--estimator", "thesis", "refined", "--output", "study")
 
 
 def test_a_study(ledger, tmp_path, small_world, small_labels):
@@ -133,7 +124,7 @@ def test_a_study(ledger, tmp_path, small_world, small_labels):
 
 def test_the_drawing_of_a_study(ledger, tmp_path, small_world, small_labels):
     command = study(small_world, small_labels)
-    to_the_end(command, tmp_path)
+    succeed(command, tmp_path)
     shutil.copytree(tmp_path / "study", tmp_path / "runs")
 
     def prepare():

@@ -1,4 +1,4 @@
-"""Trials by the real command line: start a command as a process, and demand that it fails in one clear line."""
+"""Trials by the real command line: start a command as a process, and demand that it fails as it should."""
 
 import fnmatch
 import io
@@ -8,13 +8,10 @@ import signal
 import subprocess
 import sys
 import zipfile
-from collections import Counter
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
-import pytest
 
 from thesis_repro import longrun
 
@@ -26,7 +23,7 @@ NOT_THE_USERS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDA
 
 
 class Lost(AssertionError):
-    """Worse than an unclear word: results are lost or wrong, or a command takes bad input for good or hangs."""
+    """Worse than an unclear error: results are lost or wrong, or bad input is accepted."""
 
 
 def lost_unless(condition, what):
@@ -35,52 +32,17 @@ def lost_unless(condition, what):
 
 
 @dataclass
-class Ledger:
-    """What was tried and how it came out: rows of (kind, what, outcome)."""
-
-    rows: list = field(default_factory=list)
-
-    def record(self, kind, what, outcome):
-        assert kind in KINDS and outcome in OUTCOMES, (kind, outcome)
-        self.rows.append((kind, what, outcome))
-
-    @contextmanager
-    def __call__(self, kind, what, times=1):
-        """One trial, or `times` of them: "clear" where the block ends well, "lost" where it raises `Lost`, or else
-        "unclear". What it raises fails the test as well."""
-        outcome = "unclear"
-        try:
-            yield
-            outcome = "clear"
-        except (Lost, subprocess.TimeoutExpired):
-            outcome = "lost"
-            raise
-        except pytest.skip.Exception:
-            times = 0
-            raise
-        finally:
-            for _ in range(times):
-                self.record(kind, what, outcome)
-
-    def text(self):
-        """The counts by kind as a table, and the names of all that was not clear."""
-        counts = Counter((kind, outcome) for kind, _, outcome in self.rows)
-        lines = [f"{'':12}{'tried':>8}" + "".join(f"{outcome:>9}" for outcome in OUTCOMES)]
-        for kind in KINDS:
-            row = [counts[kind, outcome] for outcome in OUTCOMES]
-            lines.append(f"{kind:12}{sum(row):8}" + "".join(f"{count:9}" for count in row))
-        return "\n".join(lines + [f"{outcome}: {kind}: {what}" for kind, what, outcome in self.rows
-                                  if outcome != "clear"])
-
-
-@dataclass
 class Result:
-    """How a command ended."""
+    """How a command ended. left: files and folders below its working folder that are new, changed or gone."""
 
     returncode: int
     stdout: str
     stderr: str
-    left: list  # files and folders below `where` that are new or changed, as texts relative to it
+    left: list
+
+
+def thesis(*words):
+    return [sys.executable, "-m", "thesis_repro", *map(str, words)]
 
 
 def environment(**changes):
@@ -91,29 +53,37 @@ def environment(**changes):
     return {name: str(value) for name, value in own.items() if value is not None}
 
 
-def start(*words, where, before=None, **changes):
-    """Start `thesis-repro WORDS` as the leader of a process group of its own; returns the Popen.
+def start(command, where, before=None, **changes):
+    """Start a command in a folder, as the leader of a process group of its own; returns the Popen.
 
-    where: the folder it is started in. before: called in the new process just before, to take something from it.
+    before: called in the new process first, to take something from it. changes: of the environment.
     """
-    return spawn([sys.executable, "-m", "thesis_repro", *words], where, before, **changes)
-
-
-def spawn(command, where, before=None, **changes):
-    """Start any command as `start` does."""
     return subprocess.Popen(list(map(str, command)), cwd=where, env=environment(**changes), preexec_fn=before,
                             start_new_session=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def finish(process, where=None, seen=None, timeout=TIMEOUT):
+def finish(process, timeout=TIMEOUT):
     """Wait for what `start` started; a command that hangs is killed with all its processes."""
     try:
         stdout, stderr = process.communicate(timeout=timeout)
     except subprocess.TimeoutExpired:
         kill(process)
         raise
-    left = [] if seen is None else sorted(str(path) for path in changed(seen, snapshot(where)))
-    return Result(process.returncode, stdout, stderr, left)
+    return Result(process.returncode, stdout, stderr, [])
+
+
+def run(command, where, timeout=TIMEOUT, **options):
+    """Start a command and wait for it; see `start`."""
+    before = snapshot(where)
+    result = finish(start(command, where, **options), timeout)
+    result.left = sorted(map(str, changed(before, snapshot(where))))
+    return result
+
+
+def succeed(command, where, **options):
+    result = run(command, where, **options)
+    lost_unless(result.returncode == 0, f"fails: {result.stdout}\n{result.stderr}")
+    return result
 
 
 def kill(process):
@@ -126,20 +96,16 @@ def kill(process):
 
 
 def snapshot(where):
-    """What lies below a folder, {relative path: what tells it from another version}; folders have none.
-
-    The folder may be in use: what is renamed away between its listing and its reading is left out.
-    """
-    found = {}
+    """What lies below a folder, {relative path: size and date}; None for folders. It may be in use meanwhile."""
+    versions = {}
     for folder, folders, names in os.walk(where):
-        for name in (*folders, *names):
-            path = Path(folder, name)
+        for path in (Path(folder, name) for name in (*folders, *names)):
             try:
-                about = path.lstat()
+                status = path.lstat()
             except FileNotFoundError:
                 continue
-            found[path.relative_to(where)] = None if path.is_dir() else (about.st_size, about.st_mtime_ns)
-    return found
+            versions[path.relative_to(where)] = None if path.is_dir() else (status.st_size, status.st_mtime_ns)
+    return versions
 
 
 def changed(before, after):
@@ -148,23 +114,18 @@ def changed(before, after):
             if (path in before, before.get(path)) != (path in after, after.get(path))}
 
 
-def clear(result, *says, left=()):
-    """Demand of a command that it failed as it should; an AssertionError says what is missing.
+def refused(result, named, code=1, left=()):
+    """Demand of a command that it ended with `code` and one line of error that has the text `named`.
 
-    A non-zero exit and no traceback; exactly one line on standard error, which has all of the texts `says`: the name of
-    the file or setting, and a word of the remedy. Nothing new or changed in the folder that it was started in but what
-    the patterns `left` allow ("out/*").
+    Nothing in its folder may be new or changed but what the patterns `left` allow ("out/*").
     """
-    told = f"exit {result.returncode}\n{result.stdout}\n{result.stderr}"
-    lost_unless(result.returncode != 0, f"bad input or a fault was taken for good: {told}")
-    assert result.returncode > 0, f"ended by a signal: {told}"
-    assert "Traceback" not in result.stdout + result.stderr, told
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1, f"not one line: {told}"
-    for text in says:
-        assert str(text) in lines[0], f"{text!r} is not named: {told}"
+    output = f"exit {result.returncode}\n{result.stdout}\n{result.stderr}"
+    lost_unless(result.returncode != 0, f"bad input or a fault is accepted: {output}")
+    assert result.returncode == code and "Traceback" not in result.stdout + result.stderr, output
+    lines = [line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))]
+    assert len(lines) == 1 and str(named) in lines[0], f"not one line that names {named}: {output}"
     more = [path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)]
-    assert not more, f"left behind: {', '.join(more)}\n{told}"
+    assert not more, f"left behind: {', '.join(more)}\n{output}"
 
 
 def contents(folder):
@@ -187,8 +148,8 @@ def _content(path):
     return path.read_bytes()
 
 
-def same(found, wanted):
-    other = sorted(path for path in found.keys() | wanted.keys() if found.get(path) != wanted.get(path))
+def same(results, wanted):
+    other = sorted(path for path in results.keys() | wanted.keys() if results.get(path) != wanted.get(path))
     lost_unless(not other, f"not what an undisturbed run leaves: {', '.join(other)}")
 
 

@@ -194,7 +194,7 @@ STUDY = {
     ("text", "findings"): ("What the runs show", ""),
     ("table", "sources"): ("The masks side by side", "Mean changes in percent from all keypoints under the same "
                            "estimator (Equation 4.1; negative is better), every source of masks and width."),
-    ("figure", "keypoints-all"): ("Error against keypoints, thesis's estimator", "Above, the mean change of RMSE over "
+    ("figure", "keypoints-thesis"): ("Error against keypoints, thesis's estimator", "Above, the mean change of RMSE over "
                                   "the sequences and its interval against the part of the keypoints that the masks "
                                   "leave, one line a source. Below, each sequence by itself; bars go from the lowest "
                                   "to the highest repetition, the diamond is all keypoints."),
