@@ -123,7 +123,7 @@ def odometry(options):
     masks = _masks(options, sequence)
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.boresight:
-        result = boresight.apply(result, options.boresight)
+        result = result.with_poses(boresight.corrected(result.poses, options.boresight))
     record = terminal.run(result, sequence, settings.alignment)
     if options.output:
         write_kitti_poses(options.output, result.poses)

@@ -6,24 +6,24 @@ from pathlib import Path
 
 import numba
 
-MADE_FROM = "compiled-from"  # beside what Numba keeps
+DIGEST_NAME = "compiled-from"  # the file beside Numba's
 
 
 def forget_stale(folder):
-    """Delete what Numba keeps of a folder's modules where one of them has changed since, by its bytes.
+    """Delete Numba's files of the modules in and below a folder where one of these has changed since, by its bytes.
 
-    Numba itself notices a change of a function's own file alone, and that by its date and size; not of a function that
-    it calls from another one. A clock can jump, so dates say nothing here.
+    Numba itself only notices a change of a function's own file, by its date and size. It does not notice a change of a
+    function that is called from another file. A clock can jump, so dates cannot be relied on.
     """
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))).hexdigest()
-    record = folder / "__pycache__" / MADE_FROM
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.rglob("*.py")))).hexdigest()
+    record = folder / "__pycache__" / DIGEST_NAME
     try:
         if record.is_file() and record.read_text() == digest:
             return
-        for index in folder.glob("__pycache__/*.nbi"):
+        for index in folder.rglob("__pycache__/*.nbi"):
             index.unlink(missing_ok=True)
         record.parent.mkdir(exist_ok=True)
-        temporary = record.with_name(f"{MADE_FROM}.{os.getpid()}")
+        temporary = record.with_name(f"{DIGEST_NAME}.{os.getpid()}")
         temporary.write_text(digest)
         os.replace(temporary, record)
     except OSError:  # nothing may be written here, so that nothing can be stale
@@ -37,8 +37,12 @@ for _folder in (path.parent for path in Path(__file__).parent.glob("*/__init__.p
 def fast(function, **options):
     """Compile a function of numbers and arrays; kept on disk where possible, free to run beside other threads.
 
-    Compiled functions call only what lies in their own folder. Division by zero gives infinity or NaN, as in numpy and
-    OpenCV, not an exception.
+    Compiled functions call only what lies in their own folder of the package or below it. Division by zero gives
+    infinity or NaN, as in numpy and OpenCV, not an exception.
+
+    Numba compiles a function again for every combination of types and layouts, and every numpy call in it is compiled
+    as well. So callers pass C-contiguous arrays of one type, and loops over single numbers take less time to compile
+    than array expressions.
     """
     options = {"nogil": True, "error_model": "numpy", **options}
     try:
@@ -48,9 +52,8 @@ def fast(function, **options):
 
 
 def inner(function):
-    """Compile a small function, as `fast` does, into the compiled ones that call it.
+    """Compile a function, as `fast` does, into the compiled ones that call it. Python cannot call it.
 
-    Python cannot call it: without a way in from there it takes less time to compile, and as part of its callers, less
-    to run.
+    Without an entry from Python it takes less time to compile, and as part of its callers, less to run.
     """
     return fast(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

@@ -17,7 +17,7 @@ from thesis_repro.kitti import Sequence
 
 CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
 BOUNDARIES = ("canny", "exact")
-NEAR = 5  # pixels a side: a Canny edge within two pixels of a change of class is taken to be that change
+CLASS_EDGE_WINDOW = 5  # pixels a side: a Canny edge within two pixels of a change of class belongs to that change
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked ones too
 
 
@@ -28,9 +28,9 @@ class MaskSettings:
     boundaries: "canny" finds edges in label ids, "exact" every change of class (see `edges`).
     symmetric: the mask of a mirrored label map is the mirrored mask: no half pixel to one side (see `edges`, `dilate`).
     classes: names of labels; boundaries of these alone, with whatever they touch. Empty: of all classes.
-    movable: pixels; nothing is kept on people and vehicles, whose areas grow by so many pixels first. None: kept.
-    margin: pixels along the frame's rim where nothing is kept: there, points are lost in the next frame, and networks
-    that pad with zeros see boundaries that are none.
+    movable: no keypoints on people and vehicles, whose areas are first widened by so many pixels. None: allowed.
+    margin: no keypoints within so many pixels of the frame's border. Points there are lost in the next frame, and
+    networks that pad with zeros predict boundaries there that do not exist.
     Raises InputError for an unknown name and a negative number.
     """
 
@@ -67,22 +67,24 @@ def edges(label_map: np.ndarray, size: tuple[int, int], boundaries: str = "canny
     enlarge with nearest neighbour and mark every pixel whose right or lower neighbour has another class.
     symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary. OpenCV's plain nearest
     neighbour looks half a pixel to the upper left, and a mark on one side lies half a pixel beside the boundary.
-    classes: names of labels; only boundaries of these. A Canny edge, which knows no classes, is one of theirs where it
-    lies within two pixels of it.
+    classes: names of labels; only boundaries of these. Canny knows no classes, so a Canny edge belongs to them where it
+    lies within two pixels of such a boundary.
     """
     MaskSettings(boundaries, classes=classes)  # refuses what is unknown
     height, width = size
     if boundaries == "canny":
-        found = cv2.Canny(cv2.resize(label_map, (width, height)), CANNY_LOW, CANNY_HIGH)
-        return found & dilate(edges(label_map, size, "exact", True, classes), NEAR, True) if classes else found
+        canny = cv2.Canny(cv2.resize(label_map, (width, height)), CANNY_LOW, CANNY_HIGH)
+        if not classes:
+            return canny
+        return canny & dilate(edges(label_map, size, "exact", True, classes), CLASS_EDGE_WINDOW, True)
     enlarged = _enlarged(label_map, size, symmetric)
     chosen = np.isin(enlarged, [ID[name] for name in classes]) if classes else np.ones(size, bool)
     different = np.zeros(size, bool)
-    for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        change = (enlarged[one] != enlarged[other]) & (chosen[one] | chosen[other])
-        different[one] |= change
+    for pixel, neighbour in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        change = (enlarged[pixel] != enlarged[neighbour]) & (chosen[pixel] | chosen[neighbour])
+        different[pixel] |= change
         if symmetric:
-            different[other] |= change
+            different[neighbour] |= change
     return different.astype(np.uint8) * 255
 
 
@@ -130,17 +132,17 @@ def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: 
     settings: a string stands for `MaskSettings(boundaries=...)`.
     """
     settings = MaskSettings.of(settings)
-    return _mask(_parts(label_map, size, settings), dilation_width, settings)
+    return _widened(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
 
 
-def _parts(label_map, size, settings):
-    """What of a mask does not depend on its width: edges, and where nothing may lie (None: no such place)."""
-    found = edges(label_map, size, settings.boundaries, settings.symmetric, settings.classes)
-    plain = settings.movable is None and not settings.margin
-    return found, None if plain else forbidden(label_map, size, settings)
+def _edges_and_forbidden(label_map, size, settings):
+    """The parts of a mask that do not depend on its width; None where nothing is forbidden."""
+    everywhere = settings.movable is None and not settings.margin
+    return (edges(label_map, size, settings.boundaries, settings.symmetric, settings.classes),
+            None if everywhere else forbidden(label_map, size, settings))
 
 
-def _mask(parts, dilation_width, settings):
+def _widened(parts, dilation_width, settings):
     edge_image, never = parts
     mask = dilate(edge_image, dilation_width, settings.symmetric)
     if never is not None:
@@ -187,12 +189,12 @@ class LabelMasks:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return _mask(_parts_of_file(self.paths[index], self.size, self.settings), self.dilation_width, self.settings)
+        return _widened(_parts_of_file(self.paths[index], self.size, self.settings), self.dilation_width, self.settings)
 
 
-@lru_cache(maxsize=8)  # the variants of one frame differ in their dilation alone
+@lru_cache(maxsize=8)  # a frame's masks of several widths have these parts in common
 def _parts_of_file(path, size, settings):
-    return _parts(read_label_map(path), size, settings)
+    return _edges_and_forbidden(read_label_map(path), size, settings)
 
 
 def forget_edges() -> None:
@@ -243,11 +245,11 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
     return mask
 
 
-def check_mask_size(path: str | Path, found: tuple[int, ...], size: tuple[int, int]) -> None:
+def check_mask_size(path: str | Path, mask_size: tuple[int, ...], size: tuple[int, int]) -> None:
     """Raise InputError where a mask's (height, width) is not that of the frames."""
-    if found != size:
-        raise InputError(f"{path}: {found[1]}x{found[0]} pixels, but the frames have {size[1]}x{size[0]}; masks must "
-                         "have the size of the frames")
+    if mask_size != size:
+        raise InputError(f"{path}: {mask_size[1]}x{mask_size[0]} pixels, but the frames have {size[1]}x{size[0]}; "
+                         "masks must have the size of the frames")
 
 
 def _files_of_frames(folder, sequence, what):

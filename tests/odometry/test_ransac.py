@@ -9,7 +9,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, pose
-from thesis_repro.odometry.opencv_exact import five_point, ransac
+from thesis_repro.odometry.opencv_exact import five_point, ransac, rounding
 
 
 def opencv(current, previous, threshold):
@@ -31,7 +31,7 @@ def scene(random, count, outliers=0.3, noise=2e-4, motion=1.0, depth=(4, 40), tu
 
 def assert_same_bits(current, previous, threshold=THESIS.threshold):
     expected, expected_mask = opencv(current, previous, threshold)
-    matrix, mask = ransac.find(current, previous, threshold, pose.PROBABILITY)
+    matrix, mask = ransac.find_essential_matrix(current, previous, threshold, pose.PROBABILITY)
     if expected is None:
         assert matrix is None
         return False
@@ -82,10 +82,10 @@ def test_other_thresholds_and_probabilities():
     for probability in (0.5, 0.99, 0.999999):
         expected, _ = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC,
                                            prob=probability, threshold=3e-4)
-        np.testing.assert_array_equal(ransac.find(current, previous, 3e-4, probability)[0], expected)
+        np.testing.assert_array_equal(ransac.find_essential_matrix(current, previous, 3e-4, probability)[0], expected)
 
 
-def test_few_samples_are_solved_by_opencv(monkeypatch):
+def test_few_samples_are_opencv_solution_by_opencv(monkeypatch):
     """What makes it fast: OpenCV is asked about a few samples of five, and never about everything."""
     real, asked = cv2.findEssentialMat, []
 
@@ -96,7 +96,7 @@ def test_few_samples_are_solved_by_opencv(monkeypatch):
     current, previous = scene(np.random.default_rng(1), 1000, outliers=0.5)
     expected, _ = opencv(current, previous, THESIS.threshold)
     monkeypatch.setattr(cv2, "findEssentialMat", counting)
-    matrix, _ = ransac.find(current, previous, THESIS.threshold, pose.PROBABILITY)
+    matrix, _ = ransac.find_essential_matrix(current, previous, THESIS.threshold, pose.PROBABILITY)
     np.testing.assert_array_equal(matrix, expected)
     assert 0 < len(asked) < 60 and set(asked) == {5}  # of some 200 samples
 
@@ -104,8 +104,8 @@ def test_few_samples_are_solved_by_opencv(monkeypatch):
 def test_a_wrong_forecast_leaves_everything_to_opencv(monkeypatch):
     current, previous = scene(np.random.default_rng(2), 500)
     expected, expected_mask = opencv(current, previous, THESIS.threshold)
-    monkeypatch.setattr(ransac, "_solved", lambda *arguments: (1, None, None))
-    matrix, mask = ransac.find(current, previous, THESIS.threshold, pose.PROBABILITY)
+    monkeypatch.setattr(ransac, "_opencv_solution", lambda *arguments: (1, None, None))
+    matrix, mask = ransac.find_essential_matrix(current, previous, THESIS.threshold, pose.PROBABILITY)
     np.testing.assert_array_equal(matrix, expected)
     np.testing.assert_array_equal(mask, expected_mask)
 
@@ -117,7 +117,7 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
     random, shares, unsure = np.random.default_rng(3), [], 0
     for _ in range(300):
         current, previous = scene(random, 5, outliers=0.0, **options)
-        sure, solutions, margins = five_point.solve(np.hstack([current, previous]))
+        sure, solutions, margins = rounding.solve(np.hstack([current, previous]))
         if not sure:
             unsure += 1
             continue
@@ -137,12 +137,12 @@ def test_a_look_in_single_precision_rules_out_no_better_solution():
         current, previous = scene(random, 300)
         columns, limit = np.ascontiguousarray(np.hstack([current, previous]).T), np.float32(threshold**2)
         for _ in range(50):
-            _, solutions, _ = five_point.solve(columns[:, random.choice(np.arange(90, 300), 5, replace=False)].T.copy())
+            _, solutions, _ = rounding.solve(columns[:, random.choice(np.arange(90, 300), 5, replace=False)].T.copy())
             for e in solutions:
                 moved = (e + random.choice([-1, 1], 9) * 1e-6 / 3).reshape(3, 3)
-                inliers = int(ransac._agree(moved, *columns, limit).sum())
-                assert inliers == 0 or ransac._may_beat(e, 1e-6, ransac._rough(columns), float(limit), inliers - 1)
-                ruled_out += not ransac._may_beat(e, 1e-6, ransac._rough(columns), float(limit), inliers + 20)
+                inliers = int(ransac._inlier_mask(moved, columns, limit).sum())
+                assert inliers == 0 or ransac._may_beat(e, 1e-6, ransac._single_precision(columns), float(limit), inliers - 1)
+                ruled_out += not ransac._may_beat(e, 1e-6, ransac._single_precision(columns), float(limit), inliers + 20)
                 kept += 1
     assert ruled_out > 0.7 * kept
 
@@ -162,7 +162,7 @@ def test_same_bits_in_threads():
     scenes = [scene(np.random.default_rng(seed), 300) for seed in range(8)]
     expected = [opencv(*each, THESIS.threshold)[0] for each in scenes]
     with ThreadPoolExecutor(4) as pool:
-        found = pool.map(lambda each: ransac.find(*each, THESIS.threshold, pose.PROBABILITY)[0], scenes)
+        found = pool.map(lambda each: ransac.find_essential_matrix(*each, THESIS.threshold, pose.PROBABILITY)[0], scenes)
     np.testing.assert_array_equal(list(found), expected)
 
 
@@ -176,13 +176,13 @@ def test_a_threshold_that_nothing_meets():
 @pytest.mark.parametrize("name", ["00", "05", "06"])
 def test_same_bits_on_real_frames(kitti_real, name, monkeypatch):
     odometry.odometry.warm_up()
-    seen, real = [], ransac.find
+    seen, real = [], ransac.find_essential_matrix
 
     def keeping(current, previous, *arguments):
         seen.append((current, previous))
         return real(current, previous, *arguments)
 
-    monkeypatch.setattr(ransac, "find", keeping)
+    monkeypatch.setattr(ransac, "find_essential_matrix", keeping)
     odometry.run(Sequence(kitti_real, name).subset(12))
     monkeypatch.undo()
     assert len(seen) == 11

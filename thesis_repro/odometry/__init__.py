@@ -3,25 +3,25 @@
 `run(sequence)` is the plain way in; `run_many` makes many runs over one sequence for little more than the cost of
 their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What PySLAM crashes on has a rule here:
 
-| frame                                       | flag and rule (the pose is kept, but for the second)                 |
+| frame                                       | flag and rule (the pose is kept, but for "no keypoints")             |
 |---------------------------------------------|----------------------------------------------------------------------|
-| black, blown out, no contrast               | "flat frame": skipped; the next frame is measured from the last good |
-|                                             | one, over the sum of their scales                                    |
-| no keypoint found (an all-zero mask, say)   | "no keypoints": the tracked points are tracked on                    |
+| black, blown out, no contrast               | "flat frame": skipped; the next motion is measured from the last     |
+|                                             | frame before it, over the sum of their scales                        |
+| no new keypoint (an all-zero mask, say)     | "no keypoints": the tracked points are tracked further               |
 | no point to track                           | "no points": starts again from this frame's keypoints                |
 | too few correspondences for a motion        | "fewer than five correspondences"                                    |
 | none or several essential matrices          | "no essential matrix", "several essential matrices"                  |
 | agreement no better than chance (scene cut) | "no agreement"                                                       |
 | moved less than the gate (PySLAM's rule)    | "stationary"                                                         |
 
-With estimator="refined" two more, in which the pose moves on (see continuity):
+With estimator="refined" there are two more, and the pose moves on (see refined.motion_prior):
 
-| motion                                      | flag and rule                                                        |
-|---------------------------------------------|----------------------------------------------------------------------|
-| unlike the step before                      | "ambiguous motion": the best of those that go on from the step       |
-|                                             | before, if nearly as many points are near it; if not, as estimated   |
-| left open by its points (on one line, say)  | the same, or "motion not determined" where that is left open too:    |
-|                                             | the motion before again, over this step's length                     |
+| motion                                        | flag and rule                                                      |
+|-----------------------------------------------|--------------------------------------------------------------------|
+| not consistent with the step before           | "ambiguous motion": the best consistent motion, if nearly as many  |
+|                                               | points are near it; if not, the estimated one                      |
+| not determined by its points (all on a line)  | the same, or "motion not determined" where that is not determined  |
+|                                               | either: the motion of the step before, over this step's length     |
 """
 
 from thesis_repro.odometry.odometry import Odometry, Step

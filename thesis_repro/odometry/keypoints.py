@@ -50,7 +50,7 @@ def _orb(max_keypoints):
 
 
 def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: found."""
+    """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: success."""
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(previous, current, points, None, **TRACKER)
     return tracked, status.ravel() == 1
 
@@ -65,7 +65,7 @@ class Keypoints:
         """Nothing is shared, so nothing is prepared."""
 
 
-OWN = Keypoints()  # nothing in it changes, so one is enough
+NOT_SHARED = Keypoints()
 
 
 class _Tracks(NamedTuple):
@@ -75,7 +75,7 @@ class _Tracks(NamedTuple):
     current: np.ndarray
     keys: np.ndarray
     tracked: np.ndarray
-    found: np.ndarray
+    success: np.ndarray
 
 
 class _Corners(NamedTuple):
@@ -99,10 +99,10 @@ class SharedKeypoints:
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
         """Track to `frame` the points of all runs that come from the same previous frame (nearly always all)."""
-        known = [(previous, points) for previous, points in starts if previous is not None and len(points)]
-        if known:
-            first, _ = known[0]
-            keys = np.unique(np.concatenate([_key(points) for previous, points in known if previous is first]))
+        with_points = [(previous, points) for previous, points in starts if previous is not None and len(points)]
+        if with_points:
+            first, _ = with_points[0]
+            keys = np.unique(np.concatenate([_key(points) for previous, points in with_points if previous is first]))
             self._tracks = _Tracks(first, frame, keys, *track(first, frame, keys.view(np.float32).reshape(-1, 2)))
 
     def track(self, previous: np.ndarray, current: np.ndarray,
@@ -111,7 +111,7 @@ class SharedKeypoints:
         if tracks is None or previous is not tracks.previous or current is not tracks.current:  # resumed, say
             return track(previous, current, points)
         where = np.searchsorted(tracks.keys, _key(points))
-        return tracks.tracked[where], tracks.found[where]
+        return tracks.tracked[where], tracks.success[where]
 
     def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
         if settings.detector != "shi-tomasi" or settings.min_distance < 1:
@@ -152,7 +152,8 @@ def _spread(rows, columns, values, limit, mask, max_keypoints, min_distance, hei
     """
     cell = int(np.rint(min_distance))
     grid_rows, grid_columns = height // cell + 1, width // cell + 1
-    head = np.full((grid_rows, grid_columns), -1, np.int32)  # last corner taken in a cell
+    head = np.empty((grid_rows, grid_columns), np.int32)  # last corner taken in a cell
+    head[:] = -1
     below = np.empty(len(rows), np.int32)  # the one taken before it in the same cell
     taken = np.empty((len(rows) if max_keypoints <= 0 else min(len(rows), max_keypoints), 2), np.float32)
     count = 0

@@ -2,13 +2,12 @@
 
 from typing import Any
 
-import cv2
 import evo
 import numpy as np
-import pandas as pd
 from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 from evo.core.units import Unit
+from scipy.spatial.transform import Rotation
 
 from thesis_repro import InputError
 
@@ -114,7 +113,7 @@ def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
 def _evo_paths(estimated, true):
     checked(estimated, true)
-    return tuple(PosePath3D(poses_se3=list(np.array(some, np.float64))) for some in (true, estimated))
+    return tuple(PosePath3D(poses_se3=list(np.array(poses, np.float64))) for poses in (true, estimated))
 
 
 def _statistics(error):
@@ -126,12 +125,12 @@ RELATIVE_LENGTH = 20.0  # metres: several of them in every path at hand
 
 
 def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = RELATIVE_LENGTH) -> dict[str, Any]:
-    """Mean errors over stretches of one length that no constant rotation between both frames and no start can change:
-    {translation_percent, rotation_deg_per_m, segments, note}.
+    """Mean errors over stretches of one length: {translation_percent, rotation_deg_per_m, segments, note}.
 
-    From every frame to the first one `length` metres of true path away; the motion M of the camera against that of the
-    truth, both as in `kitti_segments`, after the one rotation B that brings all stretches nearest (B M B^T; Kabsch's
-    solution for their translations and rotation vectors). KITTI's own measure contains that rotation.
+    Neither a constant rotation between both frames nor the path's start can change them. A stretch goes from each frame
+    to the first one `length` metres of true path away. The camera's motion M over it is compared with the true one
+    after the one rotation B that brings all stretches nearest (B M B^T; Kabsch's solution for their translations and
+    rotation vectors). KITTI's own measure contains that rotation.
     NaN, with a note, where the path is shorter than `length`.
     """
     estimated, true = checked(estimated, true)
@@ -141,24 +140,24 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
     if not len(first):
         return {"translation_percent": np.nan, "rotation_deg_per_m": np.nan, "segments": 0,
                 "note": f"too short: {along[-1]:.1f} m, stretches of {length:g} m are compared"}
-    motion, given = (np.linalg.inv(some[first]) @ some[last[first]] for some in (estimated, true))
-    vectors, goals = (np.concatenate([some[:, :3, 3], length * np.array([rotation_vector(one) for one in some])])
-                      for some in (motion, given))
+    motion, given = (np.linalg.inv(poses[first]) @ poses[last[first]] for poses in (estimated, true))
+    vectors, goals = (np.concatenate([steps[:, :3, 3], length * _rotation_vectors(steps[:, :3, :3])])
+                      for steps in (motion, given))
     moments = goals.T @ vectors
-    # a little of the identity: what a straight path leaves open stays as it is
+    # a little of the identity: a direction that a straight path leaves undetermined stays as it is
     left, _, right = np.linalg.svd(moments + 1e-6 * np.trace(goals.T @ goals) * np.eye(3))
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     offsets = np.linalg.norm(given[:, :3, 3] - motion[:, :3, 3] @ turn.T, axis=1)
-    off = [np.linalg.norm(rotation_vector(one[:3, :3].T @ turn @ other[:3, :3] @ turn.T))
-           for one, other in zip(given, motion, strict=True)]
+    differences = given[:, :3, :3].swapaxes(1, 2) @ turn @ motion[:, :3, :3] @ turn.T
+    angle = np.linalg.norm(_rotation_vectors(differences), axis=1)
     return {"translation_percent": float(offsets.mean() / length * 100),
-            "rotation_deg_per_m": float(np.degrees(np.mean(off)) / length), "segments": len(first), "note": ""}
+            "rotation_deg_per_m": float(np.degrees(angle.mean()) / length), "segments": len(first), "note": ""}
 
 
 def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> dict[str, float]:
-    """What stands side by side wherever runs are compared: rmse and mae (metres; alignment as in `rmse`), se3, the RMSE
-    in metres after the rotation and shift that fit best, and translation_percent and rotation_deg_per_m of
-    `relative_errors`. NaN where a path is too short or too straight for one.
+    """The errors of a table of runs: rmse and mae (metres; alignment as in `rmse`), se3, the RMSE in metres after the
+    rotation and shift that fit best, and translation_percent and rotation_deg_per_m of `relative_errors`. NaN where a
+    path is too short or too straight for one.
     """
     relative = relative_errors(estimated, true)
     return {"rmse": rmse(estimated, true, alignment), "mae": mae(estimated, true, alignment),
@@ -166,8 +165,8 @@ def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position")
             **{name: relative[name] for name in ("translation_percent", "rotation_deg_per_m")}}
 
 
-FAST_STEP = 0.25  # metres; in a shorter step the direction of motion is lost in noise
-FAILED_ROTATION = 2.0  # degrees: a step of FAST_STEP or more whose rotation is further off has failed
+MIN_DIRECTED_STEP = 0.25  # metres; in a shorter step the direction of motion is lost in noise
+FAILED_ROTATION = 2.0  # degrees: such a step has failed if its rotation is further off
 TURN_RATE, STRAIGHT_RATE = 1.0, 0.3  # degrees a frame: a turn is more than the first, a straight less than the second
 
 
@@ -175,24 +174,25 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """How far single steps of (n, 4, 4) camera-to-world paths are off, whatever came before them.
 
     rotation: mean angle between estimated and true rotation, degrees a frame; in_turns, on_straights: of the steps
-    that turn by more than TURN_RATE and by less than STRAIGHT_RATE. The others are of steps of FAST_STEP or more:
-    direction, the median angle between estimated and true direction of motion, degrees; across, down, the medians of
-    its parts to the right and downwards, degrees (audit row 30); failed, the share, percent, that turn wrong by more
-    than FAILED_ROTATION or go backwards.
+    that turn by more than TURN_RATE and by less than STRAIGHT_RATE. The others are of steps of MIN_DIRECTED_STEP or
+    more: direction, the median angle between estimated and true direction of motion, degrees; across, down, the
+    medians of its parts to the right and downwards, degrees (audit row 30); failed, the share, percent, that turn wrong
+    by more than FAILED_ROTATION or go backwards.
     """
     steps, true_steps = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (estimated, true))
     rotation_error, turn = angles(np.linalg.inv(true_steps) @ steps), angles(true_steps)
-    fast = np.linalg.norm(true_steps[:, :3, 3], axis=1) >= FAST_STEP
-    heading, true_heading = (motions[fast, :3, 3] / np.maximum(np.linalg.norm(motions[fast, :3, 3], axis=1,
-                                                                              keepdims=True), 1e-12)
-                             for motions in (steps, true_steps))
+    directed = np.linalg.norm(true_steps[:, :3, 3], axis=1) >= MIN_DIRECTED_STEP
+    shifts = steps[directed, :3, 3], true_steps[directed, :3, 3]
+    heading, true_heading = (shift / np.maximum(np.linalg.norm(shift, axis=1, keepdims=True), 1e-12)
+                             for shift in shifts)
     cosine = np.clip((heading * true_heading).sum(axis=1), -1, 1)
-    offset = np.degrees(np.median(heading - true_heading, axis=0)) if fast.any() else np.full(3, np.nan)
+    offset = np.degrees(np.median(heading - true_heading, axis=0)) if directed.any() else np.full(3, np.nan)
     return {"rotation": rotation_error.mean(), "in_turns": _mean(rotation_error[turn > TURN_RATE]),
             "on_straights": _mean(rotation_error[turn < STRAIGHT_RATE]),
-            "direction": np.degrees(np.median(np.arccos(cosine))) if fast.any() else np.nan,
+            "direction": np.degrees(np.median(np.arccos(cosine))) if directed.any() else np.nan,
             "across": offset[0], "down": offset[1],
-            "failed": 100 * _mean((rotation_error[fast] > FAILED_ROTATION) | (cosine < 0)), "steps": int(fast.sum())}
+            "failed": 100 * _mean((rotation_error[directed] > FAILED_ROTATION) | (cosine < 0)),
+            "steps": int(directed.sum())}
 
 
 def _mean(values: np.ndarray) -> float:
@@ -204,9 +204,9 @@ def travelled(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
 
-def rotation_vector(pose: np.ndarray) -> np.ndarray:
-    """Axis times angle in radians of a pose's rotation, (3,); pose: 3x3 or larger."""
-    return cv2.Rodrigues(np.ascontiguousarray(pose[:3, :3]))[0].ravel()
+def _rotation_vectors(rotations: np.ndarray) -> np.ndarray:
+    """Axis times angle in radians, (n, 3), of rotations (n, 3, 3)."""
+    return Rotation.from_matrix(rotations).as_rotvec()
 
 
 def angles(rotations: np.ndarray) -> np.ndarray:
@@ -219,11 +219,12 @@ KITTI_LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)  # metres
 KITTI_EVERY = 10  # frames between the starts of segments
 
 
-def kitti_segments(estimated: np.ndarray, true: np.ndarray) -> pd.DataFrame:
-    """The KITTI odometry benchmark's segments: a data frame of first, last, length, translation and rotation error.
+def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
+    """The KITTI odometry benchmark's errors: {translation_percent, rotation_deg_per_m, segments, note}.
 
-    From every tenth frame, for each length, up to the first frame more than that many metres of true path away. The
-    translation error is in metres a metre, the rotation error in degrees a metre.
+    Means over segments: from every tenth frame, for each of KITTI_LENGTHS, up to the first frame more than that many
+    metres of true path away. NaN, with a note, where the path is too short for a single one; a zero would look like a
+    perfect result.
     """
     estimated, true = checked(estimated, true)
     along = travelled(true)
@@ -236,20 +237,8 @@ def kitti_segments(estimated: np.ndarray, true: np.ndarray) -> pd.DataFrame:
             true_motion = np.linalg.inv(true[first]) @ true[last]
             motion = np.linalg.inv(estimated[first]) @ estimated[last]
             error = np.linalg.inv(motion) @ true_motion
-            rows.append((first, last, length, np.linalg.norm(error[:3, 3]) / length, angles(error) / length))
-    return pd.DataFrame(rows, columns=["first", "last", "length", "translation", "rotation"])
-
-
-def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """The KITTI benchmark's errors, means over `kitti_segments`:
-    {translation_percent, rotation_deg_per_m, segments, note}.
-
-    NaN, with a note, where the path is too short for a single segment; a zero would look like a perfect result.
-    """
-    segments = kitti_segments(estimated, true)
-    note = ""
-    if not len(segments):
-        path = np.linalg.norm(np.diff(np.asarray(true)[:, :3, 3], axis=0), axis=1).sum()
-        note = f"too short: {path:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m"
-    return {"translation_percent": float(segments["translation"].mean() * 100),
-            "rotation_deg_per_m": float(segments["rotation"].mean()), "segments": len(segments), "note": note}
+            rows.append((np.linalg.norm(error[:3, 3]) / length, angles(error) / length))
+    note = "" if rows else f"too short: {along[-1]:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m"
+    translation, rotation = np.mean(rows, axis=0) if rows else (np.nan, np.nan)
+    return {"translation_percent": float(translation * 100), "rotation_deg_per_m": float(rotation),
+            "segments": len(rows), "note": note}

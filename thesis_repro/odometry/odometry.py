@@ -10,14 +10,14 @@ import numpy as np
 from thesis_repro import InputError
 from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refined import guided
-from thesis_repro.odometry.refined import motion_prior as continuity
-from thesis_repro.odometry.refined.fit import fit
+from thesis_repro.odometry.refined.fit import fit, smaller_rotation
+from thesis_repro.odometry.refined.guided import ransac_with_prior
+from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
-SECONDS = ("detect", "track", "essential", "pose")
-ROTATION = [f"r{i}{j}" for i in range(3) for j in range(3)]
-FLAT = 4.0  # gray levels: a standard deviation below it is no picture of a street (real frames: above 50)
+TIMED_PARTS = ("detect", "track", "essential", "pose")
+ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
+MIN_CONTRAST = 4.0  # gray levels: a standard deviation below it is no picture of a street (real frames: above 50)
 
 
 @dataclass
@@ -35,7 +35,7 @@ class Step:
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres; see compose
     updated: bool = False
     flags: list[str] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(SECONDS, 0.0))
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
     def inliers(self) -> np.ndarray:
@@ -53,11 +53,11 @@ class Step:
                "pose_inliers": None if tracked is None else self.motion.pose_inliers,
                "scale": self.scale, "updated": self.updated, "flag": "; ".join(self.flags),
                **dict(zip("xyz", self.pose[:3, 3].tolist(), strict=True)),
-               **dict(zip(ROTATION, self.pose[:3, :3].ravel().tolist(), strict=True)),
+               **dict(zip(ROTATION_COLUMNS, self.pose[:3, :3].ravel().tolist(), strict=True)),
                **{f"{name}_seconds": value for name, value in self.seconds.items()}}
 
 
-COLUMNS = tuple(Step(0).row())
+FRAME_COLUMNS = tuple(Step(0).row())
 
 
 class Odometry:
@@ -69,12 +69,12 @@ class Odometry:
     """
 
     def __init__(self, intrinsics: np.ndarray, settings: OdometrySettings = THESIS, start: np.ndarray | None = None,
-                 features: keypoints.Features = keypoints.OWN):
+                 features: keypoints.Features = keypoints.NOT_SHARED):
         """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. features: a shared keypoints source."""
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
-        self.course = continuity.Course()  # of refined poses alone
+        self.prior = MotionPrior()  # of the refined estimator alone
         self.features = features
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame that self.points belong to
@@ -94,7 +94,7 @@ class Odometry:
         self.count += 1
         if self.previous is not None:
             step.scale += self._gap
-        if frame[::8, ::8].std() < FLAT:
+        if frame[::8, ::8].std() < MIN_CONTRAST:
             step.flags.append("flat frame")
             self._gap = step.scale
             return step
@@ -102,8 +102,8 @@ class Odometry:
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
             step.points = len(self.points)
-            tracked, found = self.features.track(self.previous, frame, self.points)
-            step.previous, step.current = self.points[found], tracked[found]
+            tracked, was_tracked = self.features.track(self.previous, frame, self.points)
+            step.previous, step.current = self.points[was_tracked], tracked[was_tracked]
             tracked = step.current
         elif self.previous is not None or step.frame > 0:
             step.points = 0
@@ -125,64 +125,64 @@ class Odometry:
     def estimate(self, step: Step, essential: "Essential | None" = None) -> "Essential | None":
         """The motion from the step's correspondences; returns the essential matrix with what it was made from.
 
-        essential: what another Odometry with the same settings but for `estimator` returned for the same correspondences.
-        Safe in threads: reads nothing that later steps change.
+        essential: what another Odometry with the same settings but for `estimator` returned for the same
+        correspondences. Safe in threads: reads nothing that later steps change.
         """
         if not step.points:
             return None
-        chosen = self.settings
-        found = essential or _essential(step, chosen, self.intrinsics)
-        step.seconds["essential"] = found.seconds
-        if found.matrix is None:
-            step.motion = Motion(problem=found.problem)
-            return found
+        settings = self.settings
+        essential = essential or _essential(step, settings, self.intrinsics)
+        step.seconds["essential"] = essential.seconds
+        if essential.matrix is None:
+            step.motion = Motion(problem=essential.problem)
+            return essential
         started = time.perf_counter()
-        current, previous, inliers = found.current, found.previous, found.inliers
-        if chosen.estimator == "refined":
-            motion = fit(*pose.smaller_rotation(found.matrix), current, previous, inliers, chosen.threshold)
-            step.motion = replace(motion, inliers=found.in_order())
+        current, previous, inliers = essential.current, essential.previous, essential.inliers
+        if settings.estimator == "refined":
+            motion = fit(*smaller_rotation(essential.matrix), current, previous, inliers, settings.threshold)
+            step.motion = replace(motion, inliers=essential.in_order())
         else:
-            voters = inliers if chosen.estimator == "inliers" else slice(None)
-            votes, rotation, translation = pose.recover_pose(found.matrix, current[voters], previous[voters])
-            step.motion = Motion(rotation, translation, found.in_order(), votes)
+            voters = inliers if settings.estimator == "inliers" else slice(None)
+            votes, rotation, translation = pose.recover_pose(essential.matrix, current[voters], previous[voters])
+            step.motion = Motion(rotation, translation, essential.in_order(), votes)
         step.seconds["pose"] = time.perf_counter() - started
-        return found
+        return essential
 
     def compose(self, step: Step) -> Step:
-        """Move the pose by the step's motion, where it has one that can be believed."""
-        motion, chosen = step.motion, self.settings
+        """Move the pose by the step's motion, unless a rule keeps it; see the package's table."""
+        motion, settings = step.motion, self.settings
         if step.points:
             if motion.rotation is None:
                 step.flags.append(motion.problem)
             elif _by_chance(motion.inliers):
                 step.flags.append("no agreement")
-            elif (step.scale <= chosen.scale_gate
-                  or chosen.shift_gate and _mean_shift(step) < chosen.shift_gate):
+            elif (step.scale <= settings.scale_gate
+                  or settings.shift_gate and _mean_shift(step) < settings.shift_gate):
                 step.flags.append("stationary")
             else:
-                if chosen.estimator == "refined":
-                    self._believe(step)
+                if settings.estimator == "refined":
+                    self._check_consistency(step)
                 self.pose = self._moved(step.motion, step.scale)
                 step.updated = True
         step.pose = self.pose
         return step
 
-    def _believe(self, step):
+    def _check_consistency(self, step):
         started = time.perf_counter()
         current, previous = (pose.normalise(points, self.intrinsics) for points in (step.current, step.previous))
-        step.motion, self.course, flag = continuity.believe(step.motion, current, previous, step.scale,
-                                                            self.settings.threshold, self.course)
+        step.motion, self.prior, flag = check_consistency(step.motion, current, previous, step.scale,
+                                                            self.settings.threshold, self.prior)
         if flag:
             step.flags.append(flag)
         step.seconds["pose"] += time.perf_counter() - started
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to go on from here, and nothing that belongs to the settings."""
-        return {"pose": self.pose, "course": self.course, "count": self.count, "previous": self.previous,
+        return {"pose": self.pose, "prior": self.prior, "count": self.count, "previous": self.previous,
                 "points": self.points, "gap": self._gap}
 
     def restore(self, state: dict[str, Any]) -> None:
-        self.pose, self.course, self.count = state["pose"], state["course"], state["count"]
+        self.pose, self.prior, self.count = state["pose"], state["prior"], state["count"]
         self.previous, self.points, self._gap = state["previous"], state["points"], state["gap"]
 
     def _moved(self, motion, scale):
@@ -235,8 +235,8 @@ def _essential(step, settings, intrinsics):
     if settings.shuffle_seed is not None:
         order = np.random.default_rng((settings.shuffle_seed, step.frame)).permutation(len(current))
         current, previous = current[order], previous[order]
-    found = pose.essential_matrix(current, previous, settings.threshold, settings.essential_method)
-    return Essential(current, previous, order, *found, time.perf_counter() - started)
+    result = pose.essential_matrix(current, previous, settings.threshold, settings.essential_method)
+    return Essential(current, previous, order, *result, time.perf_counter() - started)
 
 
 def _by_chance(inliers):
@@ -257,4 +257,4 @@ def warm_up() -> None:
     pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
     ahead = np.array([0.0, 0.0, 1.0])
     fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)
-    guided.find(points, points[::-1], 1.0, np.eye(3), ahead, 180.0, 180.0)
+    ransac_with_prior(points, points[::-1], 1.0, np.eye(3), ahead, 180.0, 180.0)

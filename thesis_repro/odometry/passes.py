@@ -1,10 +1,10 @@
-"""Passes of the odometry over a sequence: one run, or many for little more than the cost of their estimators."""
+"""Passes of the odometry over a sequence: a single run, or many for little more than the cost of their estimators."""
 
 import hashlib
 import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,15 +16,15 @@ from thesis_repro import InputError, stages
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
-from thesis_repro.odometry.odometry import COLUMNS, ROTATION, Odometry, Step
-from thesis_repro.odometry.refined.motion_prior import Course
+from thesis_repro.odometry.odometry import FRAME_COLUMNS, ROTATION_COLUMNS, Odometry, Step
+from thesis_repro.odometry.refined.motion_prior import MotionPrior
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 CHECKPOINT = 300  # frames
-# What the observed points depend on, and what the essential matrix depends on besides: runs that agree share the work
-OBSERVED = ("detector", "max_keypoints", "min_distance", "mask_mode", "redetect_below")
-ESTIMATED = ("essential_method", "threshold", "shuffle_seed")
-NUMBERS = [*(column for column in COLUMNS if column != "flag"), "mask_seconds"]
+# What the keypoints depend on, and what the essential matrix depends on besides. Runs that agree in these share them.
+KEYPOINT_SETTINGS = ("detector", "max_keypoints", "min_distance", "mask_mode", "redetect_below")
+ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
+NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "mask_seconds"]
 
 
 class Masks(Protocol):
@@ -45,6 +45,12 @@ class Result:
     def flagged(self) -> pd.Series:
         """Frames by flag: a Series of counts, empty where nothing was remarkable."""
         return self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
+
+    def with_poses(self, poses: np.ndarray) -> "Result":
+        """The same run with other poses (n, 4, 4), in the table of frames as well."""
+        columns = dict(zip("xyz", poses[:, :3, 3].T, strict=True)) | dict(
+            zip(ROTATION_COLUMNS, poses[:, :3, :3].reshape(-1, 9).T, strict=True))
+        return replace(self, poses=poses, frames=self.frames.assign(**columns))
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:
@@ -85,7 +91,8 @@ def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Mask
 
     Frames are decoded, corner strengths computed and points tracked once for all runs, so the times of detection and
     tracking belong to no run and are blank. Runs with the same masks (one object) and settings that differ only after
-    the tracking also share their masks and keypoints, and those that differ only in `estimator` their essential matrices.
+    the tracking also share their masks and keypoints. Those that differ only in `estimator` share their essential
+    matrices.
     workers: threads for the estimators, which are most of what remains.
     checkpoint: a file to keep the state in, every CHECKPOINT frames; a killed run that is started again with the same
     file, sequence and settings goes on from there. Whoever names the file deletes it once the results are stored,
@@ -118,25 +125,25 @@ class _Estimate:
 
     def work(self) -> None:
         essential = None
-        for one, step in zip(self.runs, self.steps, strict=True):
-            essential = one.odometry.estimate(step, essential)
+        for run, step in zip(self.runs, self.steps, strict=True):
+            essential = run.odometry.estimate(step, essential)
 
     def finish(self) -> None:
         if self.future is not None:
             self.future.result()  # raises what the thread raised
-        for one, step in zip(self.runs, self.steps, strict=True):
-            row = one.odometry.compose(step).row()
+        for run, step in zip(self.runs, self.steps, strict=True):
+            row = run.odometry.compose(step).row()
             flag = row.pop("flag")
-            one.numbers[step.frame] = [np.nan if value is None else value
+            run.numbers[step.frame] = [np.nan if value is None else value
                                        for value in (*row.values(), self.mask_seconds)]
             if flag:
-                one.flags[step.frame] = flag
+                run.flags[step.frame] = flag
 
 
 def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]], features: keypoints.Features,
          description: str | None, checkpoint: Path | None, workers: int) -> dict[str, Result]:
     members = {name: _Run(Odometry(sequence.intrinsics, settings, start_pose(sequence), features), masks,
-                          np.full((len(sequence), len(NUMBERS)), np.nan))
+                          np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan))
                for name, (settings, masks) in runs.items()}
     groups = _groups(members.values())
     leaders = [alike[0][0] for alike in groups]  # the first of those with the same keypoints finds them for all
@@ -169,17 +176,17 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
                 waiting = []
                 _store(checkpoint, job, index + 1, members, leaders)
         _finish(waiting)
-    return {name: _result(one) for name, one in members.items()}
+    return {name: _result(member) for name, member in members.items()}
 
 
 def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
     """A list for each set of keypoints, in it a list of runs for each essential matrix."""
     groups: dict[tuple, dict[tuple, list[_Run]]] = {}
-    for one in members:
-        settings = one.odometry.settings
-        seen = (id(one.masks), *(getattr(settings, key) for key in OBSERVED))
-        estimated = tuple(getattr(settings, key) for key in ESTIMATED)
-        groups.setdefault(seen, {}).setdefault(estimated, []).append(one)
+    for member in members:
+        settings = member.odometry.settings
+        observed = (id(member.masks), *(getattr(settings, key) for key in KEYPOINT_SETTINGS))
+        estimated = tuple(getattr(settings, key) for key in ESSENTIAL_SETTINGS)
+        groups.setdefault(observed, {}).setdefault(estimated, []).append(member)
     return [list(group.values()) for group in groups.values()]
 
 
@@ -200,56 +207,57 @@ def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
     arrays = (sequence.intrinsics, start_pose(sequence), scales(sequence))
     numbers = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     return {"sequence": sequence.name, "frames": len(sequence), "numbers": numbers, "opencv": cv2.__version__,
-            "columns": NUMBERS, "runs": {name: asdict(one.odometry.settings) for name, one in members.items()}}
+            "columns": NUMBER_COLUMNS,
+            "runs": {name: asdict(member.odometry.settings) for name, member in members.items()}}
 
 
 def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: list[_Run]) -> None:
     last = leaders[0].odometry.state()  # which frame was the last to be tracked to, all runs agree
-    arrays = {"numbers": np.array([one.numbers[:done] for one in members.values()]),
-              "poses": np.array([one.odometry.pose for one in members.values()]),
-              **{f"course {part}": np.array([getattr(one.odometry.course, part) for one in members.values()])
-                 for part in Course._fields},
+    arrays = {"numbers": np.array([member.numbers[:done] for member in members.values()]),
+              "poses": np.array([member.odometry.pose for member in members.values()]),
+              **{f"prior {part}": np.array([getattr(member.odometry.prior, part) for member in members.values()])
+                 for part in MotionPrior._fields},
               **{f"points {index}": leader.odometry.points for index, leader in enumerate(leaders)}}
     if last["previous"] is not None:
         arrays["previous"] = last["previous"]
-    flags = {name: one.flags for name, one in members.items()}
+    flags = {name: member.flags for name, member in members.items()}
     stages.store(checkpoint, {"job": job, "done": done, "gap": last["gap"], "flags": flags}, arrays)
 
 
 def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
     """Number of frames done according to the checkpoint, 0 where there is none of this job."""
     try:
-        kept = stages.resume(checkpoint) if checkpoint else None
-    except InputError:  # nothing that is needed: start from the beginning
-        kept = None
-    if kept is None or kept[0].get("job") != job:
+        stored = stages.resume(checkpoint) if checkpoint else None
+    except InputError:  # damaged: start from the beginning
+        stored = None
+    if stored is None or stored[0].get("job") != job:
         return 0
-    state, arrays = kept
+    state, arrays = stored
     done = int(state["done"])
-    courses = zip(*(arrays[f"course {part}"] for part in Course._fields), strict=True)
-    for (name, one), numbers, pose, course in zip(members.items(), arrays["numbers"], arrays["poses"], courses,
-                                                  strict=True):
-        one.numbers[:done] = numbers
-        one.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
-        one.odometry.pose, one.odometry.course = pose, Course(*course)
+    priors = zip(*(arrays[f"prior {part}"] for part in MotionPrior._fields), strict=True)
+    for (name, member), numbers, pose, prior in zip(members.items(), arrays["numbers"], arrays["poses"], priors,
+                                                    strict=True):
+        member.numbers[:done] = numbers
+        member.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
+        member.odometry.pose, member.odometry.prior = pose, MotionPrior(*prior)
     for index, leader in enumerate(leaders):
         leader.odometry.restore({**leader.odometry.state(), "count": done, "previous": arrays.get("previous"),
                                  "points": arrays[f"points {index}"], "gap": state["gap"]})
     return done
 
 
-def _result(one: _Run) -> Result:
-    frames = pd.DataFrame(one.numbers, columns=NUMBERS)
-    flags = [one.flags.get(index, "") for index in range(len(frames))]
-    frames.insert(list(COLUMNS).index("flag"), "flag", flags)
+def _result(member: _Run) -> Result:
+    frames = pd.DataFrame(member.numbers, columns=NUMBER_COLUMNS)
+    flags = [member.flags.get(index, "") for index in range(len(frames))]
+    frames.insert(FRAME_COLUMNS.index("flag"), "flag", flags)
     counts = ["points", "detected", "tracked", "inliers", "pose_inliers"]
     frames = frames.astype({"frame": int, "updated": bool, **dict.fromkeys(counts, "Int64")})
-    return Result(poses_of(frames), frames, one.odometry.settings)
+    return Result(poses_of(frames), frames, member.odometry.settings)
 
 
 def poses_of(frames: pd.DataFrame) -> np.ndarray:
     """The poses (n, 4, 4) in a table of one row a frame."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
-    poses[:, :3, :3] = frames[ROTATION].to_numpy().reshape(-1, 3, 3)
+    poses[:, :3, :3] = frames[ROTATION_COLUMNS].to_numpy().reshape(-1, 3, 3)
     poses[:, :3, 3] = frames[["x", "y", "z"]]
     return poses

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thesis_repro.compiled import fast
+from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import ransac
 
 PROBABILITY = 0.999  # of RANSAC
 MAX_DEPTH = 50.0  # in units of the translation: recoverPose lets no point beyond it vote
+LIMIT_MARGIN = 1e-7  # of a unit-norm homogeneous point: nearer to a limit, OpenCV decides
 MIN_CORRESPONDENCES = 5
 
 ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
@@ -28,10 +29,6 @@ class Motion:
     inliers: np.ndarray | None = None  # N booleans: correspondences that agree with the essential matrix
     pose_inliers: int = 0  # correspondences that lie in front of both cameras and not too far away
     problem: str = ""
-    # Of refined motions alone:
-    support: int = 0  # correspondences near the motion
-    turn_sd: float = 0.0  # standard deviation of the rotation in its least certain direction, degrees
-    swing_sd: float = 0.0  # the same of the translation's direction
 
 
 def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -56,10 +53,11 @@ def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float
         return None, none, "fewer than five correspondences"
     try:
         if method == "ransac":
-            matrix, inliers = ransac.find(current, previous, threshold, PROBABILITY)
+            matrix, inliers = ransac.find_essential_matrix(current, previous, threshold, PROBABILITY)
         else:
             matrix, inliers = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0),
-                                                   method=ESSENTIAL_METHODS[method], prob=PROBABILITY, threshold=threshold)
+                                                   method=ESSENTIAL_METHODS[method], prob=PROBABILITY,
+                                                   threshold=threshold)
     except cv2.error:  # the USAC estimators raise on degenerate points
         matrix = None
     if matrix is None or inliers is None or not np.isfinite(matrix).all():
@@ -74,9 +72,9 @@ def recover_pose(matrix: np.ndarray, current: np.ndarray,
     """cv2.recoverPose(matrix, current, previous) without its inlier mask, to the last bit: (votes, R, t).
 
     An essential matrix allows four motions; the one that puts most points in front of both cameras, and nearer than
-    MAX_DEPTH, wins. OpenCV triangulates every point four times with a singular value decomposition. Only the side of
-    a few limits counts, so a few steps of inverse iteration decide nearly all points, one of them for both signs of
-    the translation; the few points too close to a limit are triangulated by OpenCV itself.
+    MAX_DEPTH, wins. OpenCV triangulates every point four times with a singular value decomposition. But a vote only
+    depends on which side of a few limits a point lies. A few steps of inverse iteration decide that for nearly all
+    points, and for both signs of the translation at once. OpenCV itself triangulates the few points close to a limit.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     direction = translation.ravel()
@@ -92,43 +90,6 @@ def recover_pose(matrix: np.ndarray, current: np.ndarray,
     return int(votes[best]), *candidates[best]
 
 
-def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An essential matrix's smaller rotation (3x3), and the translation (3, unit length) up to its sign.
-
-    The other rotation is the twisted pair's: turned by 180 degrees about the translation, as no car is from frame to
-    frame.
-    """
-    first, second, translation = cv2.decomposeEssentialMat(matrix)
-    return (first if np.trace(first) >= np.trace(second) else second), translation.ravel()
-
-
-@fast
-def sides(rotation, t, current, previous, parallax):
-    """How many correspondences (N, 2) lie in front of both cameras under (rotation, t), and under (rotation, -t).
-
-    Points whose rays meet at less than `parallax` (the sine of an angle) say nothing about the sign and do not vote. So
-    that is what limits their depth, and not 50 translations, which in a slow step are a few metres.
-    """
-    forward, backward = 0, 0
-    for k in range(len(current)):
-        x, y = current[k, 0], current[k, 1]
-        # The rays a, turned into the previous camera's coordinates, and b; they meet where depth a + t = other b.
-        a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
-        a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
-        a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
-        b0, b1 = previous[k, 0], previous[k, 1]
-        n0, n1, n2 = a1 - a2 * b1, a2 * b0 - a0, a0 * b1 - a1 * b0  # a x b
-        if n0 * n0 + n1 * n1 + n2 * n2 <= parallax * parallax * (x * x + y * y + 1) * (b0 * b0 + b1 * b1 + 1):
-            continue
-        depth = n0 * (b1 * t[2] - t[1]) + n1 * (t[0] - b0 * t[2]) + n2 * (b0 * t[1] - b1 * t[0])  # n (b x t)
-        other = n0 * (a1 * t[2] - a2 * t[1]) + n1 * (a2 * t[0] - a0 * t[2]) + n2 * (a0 * t[1] - a1 * t[0])  # n (a x t)
-        if depth > 0 and other > 0:
-            forward += 1
-        elif depth < 0 and other < 0:
-            backward += 1
-    return forward, backward
-
-
 def _triangulate_and_count(current, previous, rotation, translation):
     projection = np.hstack([rotation, translation])
     points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T.copy(), previous.T.copy())
@@ -142,11 +103,8 @@ def _triangulate_and_count(current, previous, rotation, translation):
 @fast
 def _count_in_front(current, previous, rotation, t):
     """Votes for (rotation, t), for (rotation, -t), and the indices of points too close to a limit to be sure."""
-    margin = 1e-7
-    forward = 0
-    backward = 0
+    forward, backward, doubts = 0, 0, 0
     doubtful = np.empty(len(current), np.int64)
-    doubts = 0
     a = np.zeros((4, 4))
     b = np.empty((4, 4))
     for index in range(len(current)):
@@ -168,9 +126,9 @@ def _count_in_front(current, previous, rotation, t):
         depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + t[2] * w
         if w < 0:
             z, w, depth = -z, -w, -depth
-        if (not sure or w < margin or abs(z) < margin or abs(depth) < margin
-                or abs(abs(z) - MAX_DEPTH * w) < MAX_DEPTH * margin
-                or abs(abs(depth) - MAX_DEPTH * w) < MAX_DEPTH * margin):
+        if (not sure or w < LIMIT_MARGIN or abs(z) < LIMIT_MARGIN or abs(depth) < LIMIT_MARGIN
+                or abs(abs(z) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN
+                or abs(abs(depth) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN):
             doubtful[doubts] = index
             doubts += 1
         elif 0 < z < MAX_DEPTH * w and 0 < depth < MAX_DEPTH * w:
@@ -180,7 +138,7 @@ def _count_in_front(current, previous, rotation, t):
     return forward, backward, doubtful[:doubts]
 
 
-@fast
+@inner
 def _least_eigenvector(b):
     """Unit eigenvector of the least eigenvalue of b (lower triangle; overwritten) and whether it is sure."""
     for j in range(4):  # Cholesky

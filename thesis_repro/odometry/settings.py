@@ -1,4 +1,4 @@
-"""What the odometry is asked to do: the thesis's way, PySLAM's later one, and choices beside them."""
+"""Settings of the odometry: the thesis's, those of a later PySLAM, and alternatives to try."""
 
 import math
 from dataclasses import dataclass
@@ -16,13 +16,14 @@ class OdometrySettings:
     detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
     max_keypoints: limit of the detector, 0 for none. min_distance: between keypoints, pixels (Shi-Tomasi only).
     mask_mode: "detect" gives the mask to the detector, which fills its quota inside; "filter" drops what lies outside.
-    redetect_below: detect again on a frame to which fewer points were tracked; all points are replaced then.
+    redetect_below: new keypoints replace all points on a frame to which fewer than this were tracked.
     essential_method: how the essential matrix is searched for: "ransac", or OpenCV's "usac", "usac-magsac".
     threshold: of that search, in normalised coordinates.
-    shuffle_seed: seed that shuffles the correspondences before the estimator, whose own seed is fixed; None: not shuffled.
-    estimator: how the motion follows from it. "thesis" (all points, as PySLAM) and "inliers": RANSAC's motion, on whose sign and rotation these points vote (audit rows 13,
-    29); or "refined": fitted to the points near it, with the smaller of the two rotations, and held against the steps
-    before (see continuity).
+    shuffle_seed: seed that shuffles the matched points before RANSAC, whose own seed is fixed; None: not shuffled.
+    estimator: how the motion follows from the essential matrix. "thesis": all points vote on which of its four motions
+    is the right one, as in PySLAM. "inliers": the inliers alone vote (audit rows 13, 29). "refined": RANSAC's motion is
+    refitted by least squares to all points near it, the rotation is the smaller of the two possible ones, and a motion
+    that no car can make from one frame to the next is searched again (refined.motion_prior).
     scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
     points, pixels.
     rotate_first: turn the pose before moving it.
@@ -45,8 +46,7 @@ class OdometrySettings:
 
     def __post_init__(self) -> None:
         for name, known in (("detector", ("shi-tomasi", "orb")), ("mask_mode", ("detect", "filter")),
-                            ("essential_method", tuple(pose.ESSENTIAL_METHODS)),
-                            ("estimator", ESTIMATORS),
+                            ("essential_method", tuple(pose.ESSENTIAL_METHODS)), ("estimator", ESTIMATORS),
                             ("alignment", ("position", "pose"))):
             if getattr(self, name) not in known:
                 raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "

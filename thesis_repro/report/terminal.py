@@ -56,7 +56,7 @@ def angles_text(found, table):
         "RMSE in metres: as it is, with the sequence's own angles, with those of the others of its recording day;\n"
         "and what is left where rotations alone, or directions of motion alone, are the odometry's. ATE: aligned.\n"
         "Degrees: how much the sideways direction of motion sways on straight steps, to the camera and in the\n"
-        f"truth, and by how much the rotations of both part over the first {boresight.START} steps.")
+        f"truth, and by how much the rotations of both part over the first {boresight.FIRST_STEPS} steps.")
     for row in table.to_dict("records"):
         its_angles = (f"{angle} {_degrees(row[angle], row[f'{angle}_low'], row[f'{angle}_high'])}"
                       for angle in boresight.ANGLES)

@@ -50,7 +50,7 @@ def with_relative(summary: pd.DataFrame, kitti: Path, folder: Path, frames: int 
         poses = poses_of(pd.read_csv(folder / one.sequence / f"{one.run}.csv"))
         true = paths[one.sequence][1]
         rows.append(metrics.step_errors(poses, true)
-                    | {"turned": metrics.rmse(boresight.turned(poses, angle[one.sequence]), true)})
+                    | {"turned": metrics.rmse(boresight.corrected(poses, angle[one.sequence]), true)})
     return summary.join(pd.DataFrame(rows, index=summary.index))
 
 

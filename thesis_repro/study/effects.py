@@ -183,13 +183,13 @@ def tracks(sequence: Sequence, chosen: dict[str, Masks | None], pairs: int = 6) 
     for index in np.unique(np.linspace(0, len(sequence) - 2, pairs).round().astype(int)):
         before, after = sequence.frame(index), sequence.frame(index + 1)
         motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
-        if np.linalg.norm(motion[:3, 3]) < metrics.FAST_STEP:
+        if np.linalg.norm(motion[:3, 3]) < metrics.MIN_DIRECTED_STEP:
             continue
         for name, its_masks in chosen.items():
             points = keypoints.detect(before, THESIS, None if its_masks is None else its_masks[int(index)])
             if len(points) < 10:
                 continue
-            moved, found = keypoints.OWN.track(before, after, points)
+            moved, found = keypoints.NOT_SHARED.track(before, after, points)
             distance, heading = _against_truth(points[found], moved[found], motion, sequence.intrinsics)
             residual = float(np.median(np.abs(distance)))
             fields = (points // [sequence.size[1] / 16, sequence.size[0] / 5]).astype(int)

@@ -332,7 +332,7 @@ def make(work: Work, frames: dict[str, int], calibration: Calibration, cores: It
 
     def room(some: list[jobs.Job]) -> float:
         """Of one pass: its rows as numbers, and once more as a table."""
-        return worker_bytes + 2 * 8 * len(passes.NUMBERS) * frames[some[0].sequence] * len(some)
+        return worker_bytes + 2 * 8 * len(passes.NUMBER_COLUMNS) * frames[some[0].sequence] * len(some)
 
     timing = [calibration.timing * min(count, sizes.timed_frames) for count in frames.values()] if sizes else [0.0]
     doubled = 2 * min(training_images, sizes.training_images or training_images) if sizes else 0

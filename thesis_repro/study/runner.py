@@ -287,7 +287,8 @@ def with_boresight_correction(runs: pd.DataFrame, kitti: Path, folder: Path, fra
     corrected = pd.Series(np.nan, runs.index)
     for row in runs[runs["sequence"].isin(angles)].itertuples():
         poses = poses_of(pd.read_csv(folder / row.sequence / f"{row.run}.csv"))
-        corrected[row.Index] = metrics.rmse(boresight.turned(poses, angles[row.sequence]), references[row.sequence][1])
+        poses = boresight.corrected(poses, angles[row.sequence])
+        corrected[row.Index] = metrics.rmse(poses, references[row.sequence][1])
     return runs.assign(rmse_boresight_corrected=corrected)
 
 

@@ -1,1 +1,1 @@
-"""OpenCV's essential-matrix estimator repeated to the bit, in a third of its time."""
+"""OpenCV's essential-matrix estimator repeated to the bit, in less than half of its time."""

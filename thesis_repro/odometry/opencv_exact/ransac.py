@@ -1,13 +1,17 @@
 """cv2.findEssentialMat with RANSAC to the last bit, several times faster.
 
-Nearly all of OpenCV's time goes into the five-point solver (Nister 2004: An efficient solution to the five-point
-relative pose problem), most of it into finding all ten complex roots of a polynomial by Durand and Kerner's iteration,
-which runs to its last round although the roots settled long before. Of all these solutions RANSAC keeps one. So
-five_point.solve, not the same to the last bit but with a margin for the difference, says of each sample of five how
-many correspondences agree with its best solution, which a look in single precision shows to be too few of most; OpenCV
-itself solves those samples for which the margin leaves open whether they are better than the best so far, and the
-winner. Should the winner's inliers not be as many as foretold, OpenCV does everything. Samples are drawn with OpenCV's
-generator of random numbers. The margin is an estimate with room to spare, not a proof; the tests compare.
+Nearly all of OpenCV's time goes into the five-point solver, most of it into finding all ten complex roots of a
+polynomial by an iteration that runs to its last round although the roots settled long before. Of all these solutions
+RANSAC keeps one. So the search goes like this:
+
+1. Samples of five correspondences are drawn with OpenCV's generator of random numbers.
+2. `rounding.solve` solves a sample quickly. Its solutions are not OpenCV's to the last bit, but it gives a margin for
+   the difference, and with it bounds of the number of inliers. A look in single precision rules out most solutions.
+3. OpenCV itself solves the samples for which the bounds leave open whether they are better than the best so far, and
+   the winner.
+4. If the winner's inliers are not as many as the bounds say, OpenCV does everything.
+
+The margin is an estimate with room to spare, not a proof; the tests compare with OpenCV.
 """
 
 import math
@@ -15,18 +19,19 @@ import math
 import cv2
 import numpy as np
 
-from thesis_repro.compiled import fast
+from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.opencv_exact.five_point import SAMPLE, solve
+from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
+from thesis_repro.odometry.opencv_exact.rounding import solve
 
 MAX_SAMPLES = 1000
-FEWEST = 8  # correspondences: below, the few samples there are go to OpenCV
-SEED = 2**64 - 1  # of OpenCV's RANSAC
-BLOCK = 128  # correspondences scored between two looks at whether the best can still be beaten
+MIN_FOR_SHORTCUT = 8  # correspondences; with fewer there are so few samples that OpenCV solves them all
+OPENCV_SEED = 2**64 - 1  # of its RANSAC
+SCORING_BLOCK = 128  # correspondences scored between two looks at whether the best can still be beaten
 
 
-def find(current: np.ndarray, previous: np.ndarray, threshold: float,
-         probability: float) -> tuple[np.ndarray | None, np.ndarray | None]:
+def find_essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float,
+                          probability: float) -> tuple[np.ndarray | None, np.ndarray | None]:
     """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability, threshold): (E, mask).
 
     Correspondences are (N, 2) float64 in normalised coordinates. E is 3x3, or OpenCV's stack of solutions for N = 5,
@@ -34,36 +39,36 @@ def find(current: np.ndarray, previous: np.ndarray, threshold: float,
     """
     count = len(current)
     current, previous = np.ascontiguousarray(current, float), np.ascontiguousarray(previous, float)
-    if count < FEWEST or not (np.isfinite(current).all() and np.isfinite(previous).all()):
+    if count < MIN_FOR_SHORTCUT or not (np.isfinite(current).all() and np.isfinite(previous).all()):
         return _opencv(current, previous, threshold, probability)
     columns = np.ascontiguousarray(np.hstack([current, previous]).T)
     limit = np.float32(threshold * threshold)
-    rough = _rough(columns)
+    rough = _single_precision(columns)
 
-    def solve_now(winner):
-        return _solved(columns, winner, threshold, probability, limit)
+    def solve_exactly(sample):
+        return _opencv_solution(columns, sample, threshold, probability, limit)
 
     # The best so far has between `low` and `high` inliers; which of them matters only when another comes near it, or
-    # when it decides whether the search ends.
-    state, sample, low, high, winner, solution = SEED, 0, SAMPLE - 1, SAMPLE - 1, None, None
+    # when it decides whether the search ends. `solution` is OpenCV's for the sample `winner`, once it was asked.
+    state, drawn, low, high, winner, solution = OPENCV_SEED, 0, SAMPLE_SIZE - 1, SAMPLE_SIZE - 1, None, None
     while True:
         enough = MAX_SAMPLES if winner is None else _samples_needed(probability, (count - high) / count)
-        state, sample, chosen, fewest, most = _next_better(columns, rough, float(limit), np.uint64(state), sample,
-                                                           enough, low)
+        state, drawn, sample, fewest, most = _next_better(columns, rough, float(limit), np.uint64(state), drawn,
+                                                          enough, low)
         if most > low and fewest > high:
-            low, high, winner, solution = fewest, most, chosen, None
+            low, high, winner, solution = fewest, most, sample, None
             continue
         if winner is not None and solution is None and (most == 0 or low < high):
-            solution = solve_now(winner)
+            solution = solve_exactly(winner)
             if not low <= solution[0] <= high:
                 return _opencv(current, previous, threshold, probability)
             low = high = solution[0]
         elif most == 0:
             break
         if most > low:
-            new = solve_now(chosen)
-            if new[0] > low:
-                low, high, winner, solution = new[0], new[0], chosen, new
+            challenger = solve_exactly(sample)
+            if challenger[0] > low:
+                low, high, winner, solution = challenger[0], challenger[0], sample, challenger
     return _opencv(current, previous, threshold, probability) if solution is None else solution[1:]
 
 
@@ -72,59 +77,29 @@ def _opencv(current, previous, threshold, probability):
                                 threshold=threshold)
 
 
-def _solved(columns, chosen, threshold, probability, limit):
+def _opencv_solution(columns, sample, threshold, probability, limit):
     """OpenCV's first best solution for five correspondences: its inliers among all, the matrix, the mask."""
-    five = np.ascontiguousarray(columns[:, chosen].T)
+    five = np.ascontiguousarray(columns[:, sample].T)
     stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
     best = 0, None, None
     for start in range(0, 0 if stack is None else len(stack), 3):
-        mask = _agree(stack[start:start + 3], columns[0], columns[1], columns[2], columns[3], limit)
-        found = int(mask.sum())
-        if found > best[0]:
-            best = found, stack[start:start + 3].copy(), mask.reshape(-1, 1)
+        mask = _inlier_mask(stack[start:start + 3], columns, limit)
+        inliers = int(mask.sum())
+        if inliers > best[0]:
+            best = inliers, stack[start:start + 3].copy(), mask.reshape(-1, 1)
     return best
 
 
 def _samples_needed(probability, outliers):
     """Samples of five for one without outliers to be among them with that probability."""
-    missed = 1.0 - math.pow(1.0 - outliers, SAMPLE)
+    missed = 1.0 - math.pow(1.0 - outliers, SAMPLE_SIZE)
     if missed < np.finfo(float).tiny:
         return 0
     needed, missed = math.log(max(1.0 - probability, np.finfo(float).tiny)), math.log(missed)
     return MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
 
 
-@fast
-def _agree(e, x, y, u, v, limit):
-    """N times 0 or 1: whether the squared Sampson distance, rounded to float32, is within the limit."""
-    mask = np.empty(len(x), np.uint8)
-    matrix = epipolar.entries(e)
-    for k in range(len(x)):
-        algebraic, l0, l1, m0, m1 = epipolar.lines(matrix, x[k], y[k], u[k], v[k])
-        distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
-        mask[k] = np.float32(distance) <= limit
-    return mask
-
-
-@fast
-def draw(state, columns, chosen, five):
-    """Write SAMPLE correspondences, drawn as OpenCV does: indices and rows; returns the generator's state."""
-    count, taken = columns.shape[1], 0
-    while taken < SAMPLE:
-        state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
-        index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
-        new = True
-        for k in range(taken):
-            new = new and chosen[k] != index
-        if new:
-            chosen[taken] = index
-            for j in range(4):
-                five[taken, j] = columns[j, index]
-            taken += 1
-    return state
-
-
-def _rough(columns):
+def _single_precision(columns):
     """Correspondences in single precision, and how much an error of a matrix's entries may matter to each: (5, N)."""
     x, y, u, v = np.abs(columns)
     with np.errstate(over="ignore"):
@@ -132,21 +107,52 @@ def _rough(columns):
 
 
 @fast
-def _next_better(columns, rough, limit, state, sample, samples, best):
+def _inlier_mask(e, columns, limit):
+    """N times 0 or 1: whether the squared Sampson distance, rounded to float32, is within the limit."""
+    mask = np.empty(columns.shape[1], np.uint8)
+    matrix = epipolar.entries(e)
+    for k in range(len(mask)):
+        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, columns[0, k], columns[1, k], columns[2, k],
+                                                           columns[3, k])
+        distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        mask[k] = np.float32(distance) <= limit
+    return mask
+
+
+@fast
+def draw(state, columns, sample, five):
+    """Write five correspondences, drawn as OpenCV does: indices and rows; returns the generator's state."""
+    count, taken = columns.shape[1], 0
+    while taken < SAMPLE_SIZE:
+        state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
+        index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
+        new = True
+        for k in range(taken):
+            new = new and sample[k] != index
+        if new:
+            sample[taken] = index
+            for j in range(4):
+                five[taken, j] = columns[j, index]
+            taken += 1
+    return state
+
+
+@fast
+def _next_better(columns, rough, limit, state, drawn, samples, best):
     """Draw samples until one may have more than `best` inliers, or until there are `samples` of them.
 
     Returns the generator's state, the number of samples drawn, the five indices, and the bounds between which the
     number of inliers of the sample's best solution lies, 0 and 0 where there is none that may be better.
     """
     count = columns.shape[1]
-    chosen = np.empty(SAMPLE, np.int64)
-    five = np.empty((SAMPLE, 4))
-    while sample < samples:
-        sample += 1
-        state = draw(state, columns, chosen, five)
+    sample = np.empty(SAMPLE_SIZE, np.int64)
+    five = np.empty((SAMPLE_SIZE, 4))
+    while drawn < samples:
+        drawn += 1
+        state = draw(state, columns, sample, five)
         sure, solutions, margins = solve(five)
         if not sure:
-            return state, sample, chosen, 0, count
+            return state, drawn, sample, 0, count
         low, high = 0, 0
         for k in range(len(solutions)):
             if not _may_beat(solutions[k], margins[k], rough, limit, max(best, low)):
@@ -154,8 +160,8 @@ def _next_better(columns, rough, limit, state, sample, samples, best):
             fewest, most = _bounds(solutions[k], margins[k], columns, limit, max(best, low))
             low, high = max(low, fewest), max(high, most)
         if high > best:
-            return state, sample, chosen, low, high
-    return state, sample, chosen, 0, 0
+            return state, drawn, sample, low, high
+    return state, drawn, sample, 0, 0
 
 
 @fast
@@ -170,8 +176,8 @@ def _may_beat(e, margin, rough, limit, best):
     matrix = (np.float32(e[0]), np.float32(e[1]), np.float32(e[2]), np.float32(e[3]), np.float32(e[4]),
               np.float32(e[5]), np.float32(e[6]), np.float32(e[7]), np.float32(e[8]))
     outliers = 0
-    for start in range(0, count, BLOCK):
-        stop = min(start + BLOCK, count)
+    for start in range(0, count, SCORING_BLOCK):
+        stop = min(start + SCORING_BLOCK, count)
         outliers += _surely_out(matrix, doubt, wide, rough[0, start:stop], rough[1, start:stop], rough[2, start:stop],
                                 rough[3, start:stop], rough[4, start:stop])
         if outliers >= allowed:
@@ -179,23 +185,23 @@ def _may_beat(e, margin, rough, limit, best):
     return True
 
 
-@fast
+@inner
 def _surely_out(matrix, doubt, limit, x, y, u, v, reach):
     outliers = np.int32(0)  # as wide as the numbers, so that several are counted at once
     for k in range(len(x)):
-        algebraic, l0, l1, m0, m1 = epipolar.lines(matrix, x[k], y[k], u[k], v[k])
+        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
         least = max(abs(algebraic) - doubt * reach[k], np.float32(0))
         outliers = np.int32(outliers + np.int32(least * least > limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)))
     return outliers
 
 
-@fast
+@inner
 def _bounds(e, margin, columns, limit, best):
     """Inliers that any matrix within the margin of e has at least and at most; 0 and 0 where not above `best`."""
     count = columns.shape[1]
     low, high = 0, 0
-    for start in range(0, count, BLOCK):
-        stop = min(start + BLOCK, count)
+    for start in range(0, count, SCORING_BLOCK):
+        stop = min(start + SCORING_BLOCK, count)
         few, many = _bounds_of_block(e, margin, columns[0, start:stop], columns[1, start:stop], columns[2, start:stop],
                                      columns[3, start:stop], limit)
         low += few
@@ -205,13 +211,13 @@ def _bounds(e, margin, columns, limit, best):
     return low, high
 
 
-@fast
+@inner
 def _bounds_of_block(e, margin, x, y, u, v, limit):
     root = np.sqrt(limit)
     matrix = e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
     low, high = 0, 0
     for k in range(len(x)):
-        algebraic, l0, l1, m0, m1 = epipolar.lines(matrix, x[k], y[k], u[k], v[k])
+        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
         excess = algebraic * algebraic - limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
         # Both |algebraic| and the root of the other term change by less than `change`.
         change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))

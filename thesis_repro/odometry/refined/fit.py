@@ -4,34 +4,58 @@ The essential matrix is E = [t]x R (Equation 2.5, without its factor). The resid
 is its signed Sampson distance: to first order, how far it is from meeting (u, v, 1) E (x, y, 1)^T = 0.
 """
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
+from scipy.linalg import lapack
 
-from thesis_repro.compiled import fast
+from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion, sides
+from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
 
-REFINE_STEPS = 10
+MAX_ITERATIONS = 10
 REFINE_ROUNDS = 3
-NEAR = 2  # thresholds within which a correspondence supports a motion
-WIDE = (4, 1)  # thresholds: scales of the second start
-ELSEWHERE = np.cos(np.radians(15.0))  # of the angle between two directions of motion
-BLOCK = 64  # points that are looked at together
-BETTER = 0.99  # of the first start's cost: more than what rounding makes of one and the same minimum
+SUPPORT_THRESHOLDS = 2  # thresholds within which a correspondence supports a motion
+RESTART_SCALES = (4, 1)  # thresholds: scales of the second start
+SAME_MOTION_COSINE = np.cos(np.radians(15.0))  # of the angle between two directions of motion
+LOWER_COST = 0.99  # of the first start's cost: below it, the difference is more than rounding
+POINTS_PER_BLOCK = 64
+DIAGONAL = np.diag_indices(5)
+
+
+@dataclass(frozen=True)
+class RefinedMotion(Motion):
+    """A fitted motion, and how far its points determine it."""
+
+    support: int = 0  # correspondences near the motion
+    rotation_std_deg: float = 0.0  # standard deviation of the rotation in its least certain direction, degrees
+    heading_std_deg: float = 0.0  # the same of the translation's direction
+
+
+def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """An essential matrix's smaller rotation (3x3), and the translation (3, unit length) up to its sign.
+
+    The other rotation is the twisted pair's: turned by 180 degrees about the translation, as no car is from frame to
+    frame.
+    """
+    first, second, translation = cv2.decomposeEssentialMat(matrix)
+    return (first if np.trace(first) >= np.trace(second) else second), translation.ravel()
 
 
 def fit(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
-        inliers: np.ndarray, threshold: float) -> Motion:
-    """The motion that `refine` makes of a start whose translation (unit) has any sign, with all that a Motion tells.
+        inliers: np.ndarray, threshold: float) -> RefinedMotion:
+    """The motion that `refine` makes of a start whose translation (unit) has any sign.
 
-    The points near it vote on the sign: see pose.sides.
+    The points near it vote on the sign: see `cheirality_votes`.
     """
-    turned, direction = refine(rotation, translation, current, previous, inliers, threshold)
-    support = near(turned, direction, current, previous, NEAR * threshold)
+    rotation, heading = refine(rotation, translation, current, previous, inliers, threshold)
+    support = near(rotation, heading, current, previous, SUPPORT_THRESHOLDS * threshold)
     current, previous = current[support], previous[support]
-    forward, backward = sides(turned, direction, current, previous, threshold)
-    turn_sd, swing_sd = _deviations(turned, direction, current, previous, threshold / 2)
-    return Motion(turned, direction if forward >= backward else -direction, inliers, max(forward, backward),
-                  support=len(current), turn_sd=turn_sd, swing_sd=swing_sd)
+    forward, backward = cheirality_votes(rotation, heading, current, previous, threshold)
+    rotation_std_deg, heading_std_deg = _deviations(rotation, heading, current, previous, threshold / 2)
+    return RefinedMotion(rotation, heading if forward >= backward else -heading, inliers, max(forward, backward),
+                         support=len(current), rotation_std_deg=rotation_std_deg, heading_std_deg=heading_std_deg)
 
 
 def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
@@ -39,32 +63,36 @@ def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, p
     """The motion (rotation 3x3, unit translation) fitted to all its inliers among correspondences (N, 2).
 
     Levenberg-Marquardt over the rotation and the two angles of the translation's direction, on Sampson distances with
-    Cauchy weights at half the estimator's threshold: RANSAC's answer goes through five points, this one uses them all.
-    It starts from `inliers` (N booleans), and twice fits again to what lies within two thresholds, so that the chance
-    by which RANSAC chose its inliers is gone as well. So narrow a scale has many minima; therefore it starts a second
-    time from the motion found, on all correspondences at wider scales first, and keeps the better of both. What lies
-    farther away than ELSEWHERE is another motion, between which the fit does not choose. An essential matrix does not
-    know the sign of the translation, so the sign that was given is kept.
+    Cauchy weights at half the estimator's threshold. It starts from `inliers` (N booleans), and fits twice again to
+    what lies within SUPPORT_THRESHOLDS. So the result does not depend on which inliers RANSAC happened to choose.
+
+    So narrow a scale has many minima. Therefore a second start goes from the motion found, on all correspondences at
+    wider scales first, and the better of both is the result. A motion farther away than SAME_MOTION_COSINE is another
+    one, between which the fit does not choose. An essential matrix does not know the sign of the translation, so the
+    sign that was given is kept.
     """
-    turned, direction = _rounds(np.ascontiguousarray(rotation), np.ascontiguousarray(translation), current, previous,
-                                inliers, threshold)
-    again = turned, direction
-    for scale in WIDE:
-        again = _refine(*again, current, previous, scale * threshold)
-    again = _rounds(*again, current, previous, near(*again, current, previous, NEAR * threshold), threshold)
-    if (abs(again[1] @ direction) > ELSEWHERE and _normal_equations(*again, current, previous, threshold / 2)[0]
-            < BETTER * _normal_equations(turned, direction, current, previous, threshold / 2)[0]):
-        turned, direction = again
-    return turned, direction if direction @ translation >= 0 else -direction
+    first = _rounds((np.ascontiguousarray(rotation), np.ascontiguousarray(translation)), current, previous, inliers,
+                    threshold)
+    second = first
+    for scale in RESTART_SCALES:
+        second = _minimise(second, current, previous, scale * threshold)
+    near_second = near(*second, current, previous, SUPPORT_THRESHOLDS * threshold)
+    second = _rounds(second, current, previous, near_second, threshold)
+    first_cost, second_cost = (_normal_equations(*motion, current, previous, threshold / 2)[0]
+                               for motion in (first, second))
+    better = abs(second[1] @ first[1]) > SAME_MOTION_COSINE and second_cost < LOWER_COST * first_cost
+    rotation, heading = second if better else first
+    return rotation, heading if heading @ translation >= 0 else -heading
 
 
-def _rounds(rotation, translation, current, previous, chosen, threshold):
+def _rounds(motion, current, previous, chosen, threshold):
+    """A motion (rotation, translation) fitted to the chosen correspondences, and again to those near the result."""
     for _ in range(REFINE_ROUNDS):
         if chosen.sum() < MIN_CORRESPONDENCES:
             break
-        rotation, translation = _refine(rotation, translation, current[chosen], previous[chosen], threshold / 2)
-        chosen = near(rotation, translation, current, previous, NEAR * threshold)
-    return rotation, translation
+        motion = _minimise(motion, current[chosen], previous[chosen], threshold / 2)
+        chosen = near(*motion, current, previous, SUPPORT_THRESHOLDS * threshold)
+    return motion
 
 
 def _deviations(rotation, translation, current, previous, scale):
@@ -85,27 +113,27 @@ def _deviations(rotation, translation, current, previous, scale):
 @fast
 def near(r, t, current, previous, limit):
     """N booleans: the correspondences whose Sampson distance from the motion is below the limit."""
-    essential = epipolar.entries(np.dot(_skew(t), r))
+    cross, matrix = np.empty((3, 3)), np.empty((3, 3))
+    _skew(t, cross)
+    np.dot(cross, r, matrix)
+    essential = epipolar.entries(matrix)
     mask = np.empty(len(current), np.bool_)
     for index in range(len(current)):
         x, y = current[index, 0], current[index, 1]
         u, v = previous[index, 0], previous[index, 1]
-        algebraic, l0, l1, m0, m1 = epipolar.lines(essential, x, y, u, v)
+        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(essential, x, y, u, v)
         mask[index] = algebraic * algebraic < limit * limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
     return mask
 
 
-@fast
-def _refine(rotation, translation, current, previous, scale):
+def _minimise(motion, current, previous, scale):
     """Levenberg and Marquardt's iteration: steps of (H + damping diag H) change = -gradient, while the cost falls."""
-    damping = 1e-4
-    r, t = rotation.copy(), translation.copy()
+    (r, t), damping = motion, 1e-4
     cost, hessian, gradient = _normal_equations(r, t, current, previous, scale)
-    for _ in range(REFINE_STEPS):
+    for _ in range(MAX_ITERATIONS):
         damped = hessian.copy()
-        for k in range(5):
-            damped[k, k] += damping * hessian[k, k] + 1e-12
-        change = np.linalg.solve(damped, -gradient)
+        damped[DIAGONAL] += damping * hessian[DIAGONAL] + 1e-12
+        change = lapack.dgesv(damped, -gradient)[2]
         r_new, t_new = _moved(r, t, change)
         cost_new, hessian_new, gradient_new = _normal_equations(r_new, t_new, current, previous, scale)
         if cost_new < cost:
@@ -122,35 +150,106 @@ def _refine(rotation, translation, current, previous, scale):
 
 
 @fast
+def cheirality_votes(rotation, t, current, previous, parallax):
+    """How many correspondences (N, 2) lie in front of both cameras under (rotation, t), and under (rotation, -t).
+
+    Points whose rays meet at less than `parallax` (the sine of an angle) say nothing about the sign and do not vote. So
+    that is what limits their depth, and not 50 translations, which in a slow step are a few metres.
+    """
+    forward, backward = 0, 0
+    for k in range(len(current)):
+        x, y = current[k, 0], current[k, 1]
+        # The rays a, turned into the previous camera's coordinates, and b; they meet where depth a + t = other b.
+        a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
+        a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
+        a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
+        b0, b1 = previous[k, 0], previous[k, 1]
+        n0, n1, n2 = a1 - a2 * b1, a2 * b0 - a0, a0 * b1 - a1 * b0  # a x b
+        if n0 * n0 + n1 * n1 + n2 * n2 <= parallax * parallax * (x * x + y * y + 1) * (b0 * b0 + b1 * b1 + 1):
+            continue
+        depth = n0 * (b1 * t[2] - t[1]) + n1 * (t[0] - b0 * t[2]) + n2 * (b0 * t[1] - b1 * t[0])  # n (b x t)
+        other = n0 * (a1 * t[2] - a2 * t[1]) + n1 * (a2 * t[0] - a0 * t[2]) + n2 * (a0 * t[1] - a1 * t[0])  # n (a x t)
+        if depth > 0 and other > 0:
+            forward += 1
+        elif depth < 0 and other < 0:
+            backward += 1
+    return forward, backward
+
+
+@inner
+def _cross(a, b, out):
+    """Write the cross product of two vectors."""
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inner
+def _skew(v, out):
+    """Write the matrix [v]x of the cross product with v (Equation 2.5)."""
+    out[0, 0], out[0, 1], out[0, 2] = 0.0, -v[2], v[1]
+    out[1, 0], out[1, 1], out[1, 2] = v[2], 0.0, -v[0]
+    out[2, 0], out[2, 1], out[2, 2] = -v[1], v[0], 0.0
+
+
+@inner
 def _tangents(t):
-    """Two unit vectors that are perpendicular to the unit vector t and to each other."""
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(t))] = 1.0
-    first = np.cross(t, axis)
-    first /= np.sqrt((first * first).sum())
-    return first, np.cross(t, first)
-
-
-@fast
-def _skew(v):
-    """The matrix [v]x of the cross product with v (Equation 2.5)."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    """Two unit vectors (2, 3) that are perpendicular to the unit vector t and to each other."""
+    axis, tangents = np.zeros(3), np.empty((2, 3))
+    least = 0
+    for k in range(1, 3):
+        if abs(t[k]) < abs(t[least]):
+            least = k
+    axis[least] = 1.0
+    first = tangents[0]
+    _cross(t, axis, first)
+    norm = np.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
+    for k in range(3):
+        first[k] /= norm
+    _cross(t, first, tangents[1])
+    return tangents
 
 
 @fast
 def _moved(r, t, change):
     """The motion after a change of five parameters: exp([turn]x) R (Rodrigues' formula), t moved along its tangents."""
-    turn = change[:3].copy()
-    angle = np.sqrt((turn * turn).sum())
-    cross = _skew(turn)
-    if angle > 1e-12:
-        rodrigues = (np.eye(3) + np.sin(angle) / angle * cross
-                     + (1 - np.cos(angle)) / (angle * angle) * np.dot(cross, cross))
-    else:
-        rodrigues = np.eye(3) + cross
-    first, second = _tangents(t)
-    t_new = t + change[3] * first + change[4] * second
-    return np.dot(rodrigues, r), t_new / np.sqrt((t_new * t_new).sum())
+    angle = np.sqrt(change[0] * change[0] + change[1] * change[1] + change[2] * change[2])
+    cross, square, rodrigues, r_new = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    _skew(change, cross)
+    np.dot(cross, cross, square)
+    for i in range(3):
+        for j in range(3):
+            rodrigues[i, j] = 1.0 if i == j else 0.0
+            if angle > 1e-12:
+                rodrigues[i, j] = (rodrigues[i, j] + np.sin(angle) / angle * cross[i, j]
+                                   + (1 - np.cos(angle)) / (angle * angle) * square[i, j])
+            else:
+                rodrigues[i, j] += cross[i, j]
+    np.dot(rodrigues, r, r_new)
+    tangents, t_new = _tangents(t), np.empty(3)
+    for k in range(3):
+        t_new[k] = t[k] + change[3] * tangents[0, k] + change[4] * tangents[1, k]
+    norm = np.sqrt(t_new[0] * t_new[0] + t_new[1] * t_new[1] + t_new[2] * t_new[2])
+    for k in range(3):
+        t_new[k] /= norm
+    return r_new, t_new
+
+
+@inner
+def _essential_and_derivatives(r, t):
+    """E (6, 3, 3) and its derivatives: [t]x [unit]x R by the rotation's three, [tangent]x R by t's two parameters."""
+    matrices, tangents = np.empty((6, 3, 3)), _tangents(t)
+    cross_t, cross, product, unit = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    _skew(t, cross_t)
+    np.dot(cross_t, r, matrices[0])
+    for k in range(3):
+        for i in range(3):
+            unit[i] = 1.0 if i == k else 0.0
+        _skew(unit, cross)
+        np.dot(cross, r, product)
+        np.dot(cross_t, product, matrices[1 + k])
+    for k in range(2):
+        _skew(tangents[k], cross)
+        np.dot(cross, r, matrices[4 + k])
+    return matrices
 
 
 @fast
@@ -159,30 +258,24 @@ def _normal_equations(r, t, current, previous, scale):
 
     With residual s and weight w = 1 / (1 + (s / scale)^2): sum of log(1 + (s / scale)^2), of w J^T J, and of w s J.
     """
-    essential = epipolar.entries(np.dot(_skew(t), r))
-    first, second = _tangents(t)
-    derivatives = np.empty((5, 3, 3))  # of E: [t]x [unit]x R by the rotation's three, [tangent]x R by t's two
-    for k in range(3):
-        unit = np.zeros(3)
-        unit[k] = 1.0
-        derivatives[k] = np.dot(_skew(t), np.dot(_skew(unit), r))
-    derivatives[3] = np.dot(_skew(first), r)
-    derivatives[4] = np.dot(_skew(second), r)
+    matrices = _essential_and_derivatives(r, t)
+    essential = epipolar.entries(matrices[0])
     hessian, gradient = np.zeros((5, 5)), np.zeros(5)
     cost = 0.0
     # In blocks, each quantity of all points at once, which the processor does several at a time; the sums go point by
     # point, so the bits are those of one loop over all points.
-    x, y, u, v = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-    l0, l1, m0, m1 = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-    inverse, residual, rarity, weight = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-    jacobian = np.empty((5, BLOCK))
-    for start in range(0, len(current), BLOCK):
-        count = min(BLOCK, len(current) - start)
+    size = POINTS_PER_BLOCK
+    x, y, u, v = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    l0, l1, m0, m1 = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    inverse, residual, rarity, weight = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    jacobian = np.empty((5, size))
+    for start in range(0, len(current), size):
+        count = min(size, len(current) - start)
         for i in range(count):
             x[i], y[i] = current[start + i, 0], current[start + i, 1]
             u[i], v[i] = previous[start + i, 0], previous[start + i, 1]
         for i in range(count):
-            algebraic, l0[i], l1[i], m0[i], m1[i] = epipolar.lines(essential, x[i], y[i], u[i], v[i])
+            algebraic, l0[i], l1[i], m0[i], m1[i] = epipolar.sampson_terms(essential, x[i], y[i], u[i], v[i])
             square = l0[i] * l0[i] + l1[i] * l1[i] + m0[i] * m0[i] + m1[i] * m1[i]
             inverse[i] = 1 / np.sqrt(square) if square >= 1e-18 else 0.0  # at the epipoles a point says nothing
             residual[i] = algebraic * inverse[i]  # the Sampson distance, with its sign
@@ -190,9 +283,9 @@ def _normal_equations(r, t, current, previous, scale):
             rarity[i] = 1 + ratio * ratio
             weight[i] = 1 / rarity[i]
         for k in range(5):
-            derivative, column = epipolar.entries(derivatives[k]), jacobian[k]
+            derivative, column = epipolar.entries(matrices[1 + k]), jacobian[k]
             for i in range(count):
-                change, d0, d1, c0, c1 = epipolar.lines(derivative, x[i], y[i], u[i], v[i])
+                change, d0, d1, c0, c1 = epipolar.sampson_terms(derivative, x[i], y[i], u[i], v[i])
                 # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2 + m1^2
                 slope = l0[i] * d0 + l1[i] * d1 + m0[i] * c0 + m1[i] * c1
                 column[i] = (change - residual[i] * inverse[i] * slope) * inverse[i]

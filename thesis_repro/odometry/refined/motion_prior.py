@@ -1,9 +1,10 @@
-"""Whether a step's motion can be believed, given the step before: what makes the refined pose reliable.
+"""Whether a step's motion is consistent with the step before: what makes the refined estimator reliable.
 
-A camera on a car keeps its way from frame to frame. Of KITTI's 22,437 true pairs of steps of more than 0.25 m, 7 have
-rotations that differ by more than TURN (after the first is stretched to the second's length) and 4 have directions of
-motion that differ by more than SWING. A motion estimated from few points, from points far away or from points along
-one line can differ by far more: a turn looks like a shift to the side, and both explain the correspondences.
+A camera on a car moves nearly the same way from frame to frame. KITTI has 22,437 true pairs of steps of more than
+0.25 m. In 7 of them the rotations differ by more than MAX_ROTATION_CHANGE (after the first is stretched to the second's
+length), and in 4 the directions of motion differ by more than MAX_HEADING_CHANGE. A motion estimated from few points,
+from points far away or from points along one line can differ by far more: a turn looks like a shift to the side, and
+both explain the correspondences.
 """
 
 from dataclasses import replace
@@ -12,22 +13,22 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refined import guided
-from thesis_repro.odometry.refined.fit import fit, near
+from thesis_repro.odometry.refined.fit import RefinedMotion, fit, near
+from thesis_repro.odometry.refined.guided import ransac_with_prior
 
-TURN, SWING = 1.5, 20.0  # degrees
-FIRST_TURN = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
-WITHIN = 4  # thresholds: where the fit from the expected motion looks first
-ALIKE = 0.97  # of the correspondences near the estimated motion: as good as that one
-SUPPORT = 0.6  # of the correspondences near the estimated motion: what explains fewer than that is refuted by them
-UNSURE_TURN, UNSURE_SWING = 0.5, 5.0  # degrees: standard deviations from which on a motion is not determined
+MAX_ROTATION_CHANGE, MAX_HEADING_CHANGE = 1.5, 20.0  # degrees
+MAX_FIRST_ROTATION = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
+PRIOR_FIT_THRESHOLDS = 4  # how near the expected motion the correspondences of the second fit lie
+SAME_SUPPORT = 0.97  # a fit with this share of the estimated motion's support is as good
+MIN_SUPPORT = 0.6  # a motion with less than this share of the estimated motion's support is wrong
+MAX_ROTATION_STD, MAX_HEADING_STD = 0.5, 5.0  # degrees: with more, a motion is not determined by its points
 
-AMBIGUOUS, NOT_DETERMINED = "ambiguous motion", "motion not determined"
+AMBIGUOUS, NOT_DETERMINED = "ambiguous motion", "motion not determined"  # flags
 
 
-class Course(NamedTuple):
-    """How the camera went last: `rotation` (3x3) and unit `translation` of its last believed step of `scale` metres.
+class MotionPrior(NamedTuple):
+    """The last consistent step: `rotation` (3x3), unit `translation` and `scale` (metres). The next one is expected to
+    be like it.
 
     Before the first step, `scale` is 0 and a camera is expected to look where it goes.
     """
@@ -36,54 +37,56 @@ class Course(NamedTuple):
     translation: np.ndarray = np.array([0.0, 0.0, 1.0])
     scale: float = 0.0
 
-    def after(self, scale: float) -> np.ndarray:
+    def expected_rotation(self, scale: float) -> np.ndarray:
         """The rotation to expect of a step of `scale` metres, 3x3: the same curve."""
         if not self.scale:
             return self.rotation
         return cv2.Rodrigues(cv2.Rodrigues(self.rotation)[0] * (scale / self.scale))[0]
 
 
-def believe(motion: Motion, current: np.ndarray, previous: np.ndarray, scale: float, threshold: float,
-            course: Course) -> tuple[Motion, Course, str]:
-    """The motion to go on with, the course after it, and a flag, "" where the refined `motion` is simply believed.
+def check_consistency(motion: RefinedMotion, current: np.ndarray, previous: np.ndarray, scale: float, threshold: float,
+                      prior: MotionPrior) -> tuple[RefinedMotion, MotionPrior, str]:
+    """The motion to use, the prior of the next step, and a flag: "" where the refined `motion` is consistent.
 
     current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers. scale: metres.
 
-    A motion that its points determine and that goes on from the course, by no more than TURN and SWING, is believed; so
-    that little of RANSAC's chance is left in it, it is fitted once more from the expected motion, where all orders of
-    the correspondences start alike. Otherwise the best motion is looked for among those that do go on. In a scene that
-    stands still the true motion has nearly as many correspondences near it as any other, so that one is taken if it has
-    at least SUPPORT times as many; if not, the camera has left its course, and the estimated motion is taken. Either
-    way the step is AMBIGUOUS. Where neither is determined the step is NOT_DETERMINED: the camera goes on along its
-    course.
-    """
-    rotation, translation = course.after(scale), course.translation
-    turn = TURN if course.scale else FIRST_TURN
+    A motion is consistent if its points determine it and if it differs from the prior by at most MAX_ROTATION_CHANGE
+    and MAX_HEADING_CHANGE. It is then fitted once more from the expected motion. All shuffles of the correspondences
+    start alike there, so little of RANSAC's chance is left.
 
-    def goes_on(one):
-        return (_determined(one) and _degrees((np.trace(rotation.T @ one.rotation) - 1) / 2) <= turn
-                and _degrees(translation @ one.translation) <= SWING)
+    Otherwise the best consistent motion is searched for. In a scene that stands still the true motion has nearly as
+    many correspondences near it as any other. So this motion is used if it has at least MIN_SUPPORT times as many; if
+    not, the camera did move another way, and the estimated motion is used. Either way the step is AMBIGUOUS. Where
+    neither is determined, the step is NOT_DETERMINED and repeats the motion of the prior.
+    """
+    rotation, translation = prior.expected_rotation(scale), prior.translation
+    max_rotation = MAX_ROTATION_CHANGE if prior.scale else MAX_FIRST_ROTATION
+
+    def consistent(candidate):
+        return (_determined(candidate) and _degrees((np.trace(rotation.T @ candidate.rotation) - 1) / 2) <= max_rotation
+                and _degrees(translation @ candidate.translation) <= MAX_HEADING_CHANGE)
 
     flag = ""
-    if goes_on(motion):
-        first = near(rotation, translation, current, previous, WITHIN * threshold)
-        again = fit(rotation, translation, current, previous, first, threshold)
-        if goes_on(again) and again.support >= ALIKE * motion.support:
+    if consistent(motion):
+        near_prior = near(rotation, translation, current, previous, PRIOR_FIT_THRESHOLDS * threshold)
+        again = fit(rotation, translation, current, previous, near_prior, threshold)
+        if consistent(again) and again.support >= SAME_SUPPORT * motion.support:
             motion = replace(again, inliers=motion.inliers)
     else:
         flag = AMBIGUOUS
-        found = guided.find(current, previous, threshold, rotation, translation, turn, SWING)
-        other = found and fit(*found, current, previous, near(*found, current, previous, threshold), threshold)
-        if other and goes_on(other) and (other.support >= SUPPORT * motion.support or not _determined(motion)):
-            motion = other
+        start = ransac_with_prior(current, previous, threshold, rotation, translation, max_rotation, MAX_HEADING_CHANGE)
+        if start:
+            other = fit(*start, current, previous, near(*start, current, previous, threshold), threshold)
+            if consistent(other) and (other.support >= MIN_SUPPORT * motion.support or not _determined(motion)):
+                motion = other
     if _determined(motion):
         assert motion.rotation is not None and motion.translation is not None  # a fitted motion has both
-        return motion, Course(motion.rotation, motion.translation, scale), flag
-    return replace(motion, rotation=rotation, translation=translation), course, NOT_DETERMINED
+        return motion, MotionPrior(motion.rotation, motion.translation, scale), flag
+    return replace(motion, rotation=rotation, translation=translation), prior, NOT_DETERMINED
 
 
 def _determined(motion):
-    return motion.turn_sd < UNSURE_TURN and motion.swing_sd < UNSURE_SWING
+    return motion.rotation_std_deg < MAX_ROTATION_STD and motion.heading_std_deg < MAX_HEADING_STD
 
 
 def _degrees(cosine):

@@ -11,9 +11,9 @@ from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, metrics, pose
 from thesis_repro.odometry.refined import fit as refine
-from thesis_repro.odometry.refined import guided
-from thesis_repro.odometry.refined import motion_prior as continuity
-from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED, Course
+from thesis_repro.odometry.refined.guided import ransac_with_prior
+from thesis_repro.odometry.refined import motion_prior
+from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED, MotionPrior, check_consistency
 
 AHEAD = np.array([0.0, 0.0, 1.0])
 REFINED = replace(THESIS, estimator="refined")
@@ -37,7 +37,7 @@ def street(count=300, seed=0):
 
 
 def essential(rotation, translation):
-    return refine._skew(translation) @ rotation
+    return np.cross(np.eye(3), translation) @ rotation
 
 
 def fitted(rotation, translation, current, previous):
@@ -54,7 +54,7 @@ def degrees_apart(rotation, other):
 def test_of_the_twisted_pair_the_smaller_rotation_is_taken():
     for translation in (AHEAD, np.array([0.6, 0.0, 0.8])):
         for sign in (1, -1):
-            rotation, direction = pose.smaller_rotation(sign * essential(turn(3), translation))
+            rotation, direction = refine.smaller_rotation(sign * essential(turn(3), translation))
             np.testing.assert_allclose(rotation, turn(3), atol=1e-12)
             np.testing.assert_allclose(abs(direction @ translation), 1)
 
@@ -68,11 +68,11 @@ def test_the_sign_survives_a_slow_step():
         motion = fitted(turn(0.2), start, current, previous)
         assert motion.translation @ AHEAD > 0.999
         assert motion.pose_inliers > 150
-    assert pose.sides(turn(0.2), AHEAD, current, previous, 1.0) == (0, 0)  # no ray meets another at such an angle
+    assert refine.cheirality_votes(turn(0.2), AHEAD, current, previous, 1.0) == (0, 0)  # no ray meets another at such an angle
 
 
 def test_the_normal_equations_of_all_points_are_the_sums_of_those_of_some():
-    points = np.random.default_rng(0).uniform(-0.6, 0.6, (2 * refine.BLOCK + 7, 4))
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (2 * refine.POINTS_PER_BLOCK + 7, 4))
     rotation, ahead, scale = cv2.Rodrigues(np.array([0.01, 0.02, -0.01]))[0], np.array([0.0, 0.6, 0.8]), 0.1
     whole = refine._normal_equations(rotation, ahead, points[:, :2], points[:, 2:], scale)
     one_by_one = [refine._normal_equations(rotation, ahead, one[None, :2], one[None, 2:], scale) for one in points]
@@ -96,10 +96,10 @@ def test_points_on_one_line_leave_the_motion_open():
     current, previous = seen(hedge, turn(1), AHEAD, noise=1e-4)
     open_motion = fitted(turn(1), AHEAD, current, previous)
     known = fitted(turn(1), AHEAD, *seen(street(), turn(1), AHEAD))
-    assert open_motion.turn_sd > continuity.UNSURE_TURN or open_motion.swing_sd > continuity.UNSURE_SWING
-    assert known.turn_sd < 0.02 and known.swing_sd < 0.3
+    assert open_motion.rotation_std_deg > motion_prior.MAX_ROTATION_STD or open_motion.heading_std_deg > motion_prior.MAX_HEADING_STD
+    assert known.rotation_std_deg < 0.02 and known.heading_std_deg < 0.3
     few = seen(street(4), turn(1), AHEAD)
-    assert np.isinf(fitted(turn(1), AHEAD, *few).turn_sd)
+    assert np.isinf(fitted(turn(1), AHEAD, *few).rotation_std_deg)
 
 
 # One step after others
@@ -112,16 +112,16 @@ def test_the_search_near_an_expected_motion_finds_it_in_a_minority():
     current, previous = (np.concatenate(some) for some in zip(*sides, strict=True))
     for rotation, translation in (true, other):
         expected = turn(0.5) @ rotation
-        found = guided.find(current, previous, THESIS.threshold, expected, translation, 1.5, 20)
+        found = ransac_with_prior(current, previous, THESIS.threshold, expected, translation, 1.5, 20)
         assert degrees_apart(rotation, found[0]) < 0.3 and abs(found[1] @ translation) > 0.99
-    assert guided.find(current, previous, THESIS.threshold, turn(60), AHEAD, 1.5, 20) is None
+    assert ransac_with_prior(current, previous, THESIS.threshold, turn(60), AHEAD, 1.5, 20) is None
 
 
 def test_a_motion_that_goes_on_is_believed_as_it_is():
     current, previous = seen(street(), turn(1), AHEAD)
     motion = fitted(turn(1), AHEAD, current, previous)
-    believed, course, flag = continuity.believe(motion, current, previous, 0.5, THESIS.threshold,
-                                                Course(turn(2), AHEAD, 1.0))
+    believed, course, flag = check_consistency(motion, current, previous, 0.5, THESIS.threshold,
+                                                MotionPrior(turn(2), AHEAD, 1.0))
     assert flag == "" and course.scale == 0.5 and believed.inliers is motion.inliers
     assert degrees_apart(motion.rotation, believed.rotation) < 1e-3 and believed.translation @ AHEAD > 0.9999
     np.testing.assert_array_equal(course.rotation, believed.rotation)
@@ -130,10 +130,10 @@ def test_a_motion_that_goes_on_is_believed_as_it_is():
 def test_orders_that_end_in_several_minima_meet_again():
     current, previous = seen(street(60), turn(1), 0.15 * AHEAD, noise=1e-4)
     start = fitted(turn(1), AHEAD, current, previous)
-    course = Course(turn(1), AHEAD, 0.15)
+    course = MotionPrior(turn(1), AHEAD, 0.15)
     for turned in (0.1, -0.1):  # as if RANSAC had led elsewhere
         motion = replace(start, rotation=turn(turned) @ start.rotation, support=start.support - 2)
-        believed, _, flag = continuity.believe(motion, current, previous, 0.15, THESIS.threshold, course)
+        believed, _, flag = check_consistency(motion, current, previous, 0.15, THESIS.threshold, course)
         assert flag == "" and degrees_apart(start.rotation, believed.rotation) < 0.01
 
 
@@ -143,8 +143,8 @@ def test_of_two_motions_the_one_that_goes_on_is_taken_and_said():
     current, previous = (np.concatenate(some) for some in zip(*sides, strict=True))
     wrong = fitted(*other, current, previous)
     assert degrees_apart(turn(-1), wrong.rotation) < 0.1
-    believed, course, flag = continuity.believe(wrong, current, previous, 1.0, THESIS.threshold,
-                                                Course(turn(2.4), AHEAD, 1.0))
+    believed, course, flag = check_consistency(wrong, current, previous, 1.0, THESIS.threshold,
+                                                MotionPrior(turn(2.4), AHEAD, 1.0))
     assert flag == AMBIGUOUS and degrees_apart(turn(2), believed.rotation) < 0.1 and believed.translation[2] > 0.99
     assert believed.inliers[:150].mean() > 0.9 and believed.inliers[150:].mean() < 0.3
     np.testing.assert_array_equal(course.rotation, believed.rotation)
@@ -154,10 +154,10 @@ def test_of_two_motions_the_one_that_goes_on_is_taken_and_said():
 def test_a_camera_that_leaves_its_course_is_believed_and_said(motion):
     """A sharp turn at a low rate of frames, and reversing after a stop: nothing else explains what is seen."""
     current, previous = seen(street() + [0, 0, 5], *motion, noise=5e-5)
-    fit, course = fitted(*motion, current, previous), Course(turn(1), AHEAD, 0.5)
+    fit, course = fitted(*motion, current, previous), MotionPrior(turn(1), AHEAD, 0.5)
     flags = []
     for _ in range(3):
-        believed, course, flag = continuity.believe(fit, current, previous, 0.5, THESIS.threshold, course)
+        believed, course, flag = check_consistency(fit, current, previous, 0.5, THESIS.threshold, course)
         assert degrees_apart(fit.rotation, believed.rotation) < 0.05 and believed.translation @ fit.translation > 0.999
         flags.append(flag)
     assert flags == [AMBIGUOUS, "", ""]
@@ -167,8 +167,8 @@ def test_what_no_point_determines_goes_on_along_the_course():
     along = np.linspace(0, 1, 200)[:, None]
     hedge = np.array([-3.0, 0.5, 5.0]) + along * [0.5, -0.2, 25.0]
     current, previous = seen(hedge, turn(1), AHEAD, noise=1e-4)
-    course = Course(turn(1), AHEAD, 1.0)
-    believed, after, flag = continuity.believe(fitted(turn(7), np.array([1.0, 0.0, 0.0]), current, previous), current,
+    course = MotionPrior(turn(1), AHEAD, 1.0)
+    believed, after, flag = check_consistency(fitted(turn(7), np.array([1.0, 0.0, 0.0]), current, previous), current,
                                                previous, 0.5, THESIS.threshold, course)
     assert flag == NOT_DETERMINED and after is course
     np.testing.assert_allclose(believed.rotation, turn(0.5), atol=1e-12)  # the same curve over half the way
@@ -179,9 +179,9 @@ def test_the_first_step_is_believed_where_the_camera_looks_elsewhere():
     sideways = np.array([1.0, 0.0, 0.0])
     current, previous = seen(street(), turn(0.5), sideways)
     fit = fitted(turn(0.5), sideways, current, previous)
-    believed, course, flag = continuity.believe(fit, current, previous, 1.0, THESIS.threshold, Course())
+    believed, course, flag = check_consistency(fit, current, previous, 1.0, THESIS.threshold, MotionPrior())
     assert believed is fit and flag == AMBIGUOUS
-    assert continuity.believe(fit, current, previous, 1.0, THESIS.threshold, course)[2] == ""
+    assert check_consistency(fit, current, previous, 1.0, THESIS.threshold, course)[2] == ""
 
 
 # Whole runs

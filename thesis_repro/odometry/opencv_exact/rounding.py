@@ -1,0 +1,176 @@
+"""Essential matrices through five correspondences, and how far OpenCV's own may lie from them by rounding alone.
+
+OpenCV takes the same steps in another order of operations, so its solutions differ in their last digits. `ransac` needs
+a bound of that difference. It is an estimate to the first order from the conditioning of each step, in units of
+rounding (ROUNDING, for a number of the size of 1), with room to spare.
+"""
+
+import numpy as np
+
+from thesis_repro.compiled import fast, inner
+from thesis_repro.odometry.opencv_exact.five_point import (
+    MIN_INDEPENDENCE,
+    constraints,
+    determinant,
+    eliminate,
+    essential,
+    null_space,
+    real_roots,
+    row_values,
+    value,
+)
+
+ROUNDING = 2.0**-52
+# OpenCV's solution may lie this many times the estimate away: of 200,000 solutions, of real and of degenerate scenes,
+# none needed more than 1.4 times.
+SAFETY_FACTOR = 3.0
+# How much of the errors of B(z) arrives in det B(z). They largely move its rows alike, which cancels. Measured.
+DETERMINANT_SHARE = 0.1
+MIN_MARGIN, MAX_MARGIN = 1e-9, 1e-3  # of a unit-norm essential matrix
+
+
+@fast
+def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
+    """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the previous one).
+
+    Returns whether these are surely all that OpenCV computes, the matrices (K, 9) of unit norm, and K margins within
+    which (Frobenius norm, up to sign) OpenCV's rounding leaves its own.
+    """
+    solutions, margins, b = np.empty((10, 9)), np.empty(10), np.zeros((3, 13))
+    unsure = False, solutions[:0], margins[:0]
+    independence, basis = null_space(five)  # step 1
+    if not independence > MIN_INDEPENDENCE:
+        return unsure
+    equations = constraints(basis)  # step 2
+    if not eliminate(equations, b):  # step 3
+        return unsure
+    errors = _elimination_errors(equations)
+    polynomial = determinant(b)  # step 4
+    solved, roots, extrema = real_roots(polynomial)  # step 5
+    if not solved:
+        return unsure
+    work = np.empty((4, 3, 3))
+    for k in range(len(extrema)):  # one as small as rounding may be a double root or none at all
+        error = _determinant_error(b, errors, extrema[k], work)
+        if not abs(value(polynomial, 10, extrema[k])) > SAFETY_FACTOR * ROUNDING * error:
+            return unsure
+    for k in range(len(roots)):
+        essential(b, basis, roots[k], solutions[k])  # step 6
+        change = 1 / independence + _solution_error(b, errors, roots[k], polynomial, work)
+        margins[k] = MIN_MARGIN + SAFETY_FACTOR * ROUNDING * change
+        if not margins[k] < MAX_MARGIN:
+            return unsure
+    return True, solutions[:len(roots)], margins[:len(roots)]
+
+
+@inner
+def _elimination_errors(a):
+    """By how many units of rounding the six rows (6) from which B(z) is made may be wrong, OpenCV's among them.
+
+    a: what elimination leaves of the equations (10, 20): the triangle U (6, 6) of the last six unknowns, beside it the
+    result. Equations that are wrong by a unit make the result wrong by |U^-1| times its size. Besides, OpenCV inverts
+    the matrix and multiplies, where elimination would do, which adds |U^-1| |U| |U^-1|: with ill-conditioned equations
+    far more. Of their products with what is of the size of 1 only sums of rows are needed.
+    """
+    largest = 1.0
+    for k in range(4, 10):
+        for j in range(10, 20):
+            largest = max(largest, abs(a[k, j]))
+    inverse, sums, total = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    for i in range(5, -1, -1):
+        inverse[i, i] = 1 / a[4 + i, 4 + i]
+        for j in range(i + 1, 6):
+            for k in range(i + 1, j + 1):
+                inverse[i, j] -= a[4 + i, 4 + k] * inverse[k, j]
+            inverse[i, j] /= a[4 + i, 4 + i]
+        for j in range(i, 6):
+            sums[i] += abs(inverse[i, j])
+    for j in range(6):
+        error = largest
+        for k in range(j, 6):
+            error += abs(a[4 + j, 4 + k]) * sums[k]
+        for i in range(j + 1):
+            total[i] += abs(inverse[i, j]) * error
+    return total
+
+
+@fast
+def _determinant_error(b, errors, z, work):
+    """By how many units of rounding det B(z) may be wrong, after Wilkinson: the sizes of all terms, whatever cancels.
+
+    errors: see _elimination_errors. Written to work (4, 3, 3): B(z), the sizes of its terms, by how many units it may
+    be wrong, its cofactors.
+    """
+    values, sizes, wrong, cofactors = work[0], work[1], work[2], work[3]
+    size = abs(z)
+    powers = 1 + size + size * size
+    for i in range(3):
+        values[i, 0], values[i, 1], values[i, 2] = row_values(b[i], z)
+        sizes[i, 0], sizes[i, 1], sizes[i, 2] = _row_sizes(b[i], size)
+        error = errors[2 * i] + size * errors[2 * i + 1]
+        wrong[i, 0], wrong[i, 1] = error * powers + sizes[i, 0], error * powers + sizes[i, 1]
+        wrong[i, 2] = error * (1 + size * powers) + sizes[i, 2]
+    error = 0.0
+    for i in range(3):
+        p, q = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            m, n = (j + 1) % 3, (j + 2) % 3
+            cofactors[i, j] = values[p, m] * values[q, n] - values[p, n] * values[q, m]
+            error += DETERMINANT_SHARE * abs(cofactors[i, j]) * wrong[i, j]
+        error += sizes[i, 0] * (sizes[p, 1] * sizes[q, 2] + sizes[p, 2] * sizes[q, 1])
+    return error
+
+
+@inner
+def _solution_error(b, errors, z, polynomial, work):
+    """By how many units of rounding the essential matrix (unit norm) of a root z may be wrong, to the first order.
+
+    As coordinates in the orthonormal basis it is (x, y, w z, w), (x, y, w) normal to B(z). It changes as z does, by the
+    error of det B(z) over its slope, and as the plane of B(z)'s rows does, by their errors over its second singular
+    value, which is about the norm of the cofactors over that of B(z).
+    """
+    error = _determinant_error(b, errors, z, work)
+    values, wrong, cofactors = work[0], work[2], work[3]
+    best, largest, cofactor_norm, norm = 0, -1.0, 0.0, 0.0
+    for i in range(3):
+        square = 0.0
+        for j in range(3):
+            square += cofactors[i, j] * cofactors[i, j]
+            norm += values[i, j] * values[i, j]
+        cofactor_norm += square
+        if square > largest:
+            best, largest = i, square
+    p, q = values[(best + 1) % 3], values[(best + 2) % 3]
+    x, y, w = cofactors[best, 0], cofactors[best, 1], cofactors[best, 2]
+    p0, p1, p2 = _row_slopes(b[(best + 1) % 3], z)
+    q0, q1, q2 = _row_slopes(b[(best + 2) % 3], z)
+    dx = p1 * q[2] - p2 * q[1] + p[1] * q2 - p[2] * q1
+    dy = p2 * q[0] - p0 * q[2] + p[2] * q0 - p[0] * q2
+    dw = p0 * q[1] - p1 * q[0] + p[0] * q1 - p[1] * q0
+    dwz = dw * z + w
+    square = x * x + y * y + w * w * (1 + z * z)
+    along = (x * dx + y * dy + w * dw + w * z * dwz) / square  # what a unit norm undoes
+    speed = (dx - along * x)**2 + (dy - along * y)**2 + (dw - along * w)**2 + (dwz - along * w * z)**2
+    tilt = 0.0
+    for i in range(3):
+        tilt += (abs(x) * wrong[i, 0] + abs(y) * wrong[i, 1] + abs(w) * wrong[i, 2])**2
+    tilt *= norm / cofactor_norm * (1 + z * z)
+    height, slope = polynomial[0], 0.0
+    for k in range(1, 11):
+        slope = slope * z + height
+        height = height * z + polynomial[k]
+    return (error / abs(slope) * np.sqrt(speed) + np.sqrt(tilt)) / np.sqrt(square)
+
+
+@inner
+def _row_sizes(c, size):
+    """The sizes of all terms of one row of B(z), where z has that size."""
+    return (((abs(c[0]) * size + abs(c[1])) * size + abs(c[2])) * size + abs(c[3]),
+            ((abs(c[4]) * size + abs(c[5])) * size + abs(c[6])) * size + abs(c[7]),
+            (((abs(c[8]) * size + abs(c[9])) * size + abs(c[10])) * size + abs(c[11])) * size + abs(c[12]))
+
+
+@inner
+def _row_slopes(c, z):
+    return ((3 * c[0] * z + 2 * c[1]) * z + c[2], (3 * c[4] * z + 2 * c[5]) * z + c[6],
+            ((4 * c[8] * z + 3 * c[9]) * z + 2 * c[10]) * z + c[11])
