@@ -1,6 +1,8 @@
 """Fixtures that several test modules share."""
 
+import fcntl
 import os
+from contextlib import contextmanager
 from pathlib import Path
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -12,8 +14,6 @@ import numpy as np
 import pytest
 
 SHARED = Path(__file__).resolve().parent.parent.parent / "shared"
-
-
 # what these make or read takes seconds
 SLOW_FIXTURES = {"small_world", "small_labels", "kitti_real", "camvid_real", "reference"}
 
@@ -35,33 +35,43 @@ def _shared(*parts):
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def kitti_real():
     """Excerpts of real KITTI sequences in the official layout."""
     return _shared("data", "kitti")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def camvid_real():
     """Real street images with label maps in the flat layout."""
     return _shared("data", "camvid")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def reference():
     """What PySLAM itself did on the real frames."""
     return _shared("reference")
 
 
+@contextmanager
+def _held(tmp_path_factory, name):
+    """A folder that all processes of a test run share (pytest -n), held by one of them while it is filled."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+    with open(root / f"{name}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield root / name
+
+
 @pytest.fixture(scope="session")
 def small_world(tmp_path_factory):
-    """A small embedded world: two sequences of 12 frames and a few street images."""
+    """A small embedded world: two sequences of 12 frames and a few street images. It must not be changed."""
     from thesis_repro.settings import PROFILES
     from thesis_repro.world import dataset
 
-    folder = tmp_path_factory.mktemp("world")
-    dataset.write(folder / "world", **PROFILES["smoke"].world, seed=0)
-    return folder / "world"
+    with _held(tmp_path_factory, "small_world") as folder:  # what another process has rendered is left as it is
+        dataset.write(folder, **PROFILES["smoke"].world, seed=0)
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -69,12 +79,12 @@ def small_labels(small_world, tmp_path_factory):
     """Label maps of the small world as notebook 5 leaves them, one folder a sequence: here the true ones, 320x320."""
     from thesis_repro import stages
 
-    root = tmp_path_factory.mktemp("labels")
-    for name in ("00", "01"):
-        stages.stage(root / name, model="none")
-        for path in (small_world / "kitti" / "sequences" / name / "labels_0").glob("*.png"):
-            true = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            cv2.imwrite(str(root / name / path.name), cv2.resize(true, (320, 320), interpolation=cv2.INTER_NEAREST))
+    with _held(tmp_path_factory, "small_labels") as root:
+        for path in small_world.glob("kitti/sequences/*/labels_0/*.png") if not root.exists() else ():
+            folder = root / path.parent.parent.name
+            stages.stage(folder, model="none")
+            label_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            cv2.imwrite(str(folder / path.name), cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST))
     return root
 
 
