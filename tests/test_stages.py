@@ -17,23 +17,23 @@ def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
 
 def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
-    with pytest.raises(InputError, match="did not make; choose an empty or new folder"):
+    with pytest.raises(InputError, match=str(tmp_path)):
         stages.stage(tmp_path, data="one")
-    with pytest.raises(InputError, match="letter.txt: is a file"):
+    with pytest.raises(InputError, match="letter.txt: "):
         stages.stage(tmp_path / "letter.txt", data="one")
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
 
 def test_results_of_other_settings_are_refused_where_they_must_not_be_deleted(tmp_path):
     (stages.stage(tmp_path / "a", size=3) / "result").write_text("kept")
-    with pytest.raises(InputError, match="a: holds results of other settings .size 3, not 4."):
+    with pytest.raises(InputError, match="a: .*size"):
         stages.stage(tmp_path / "a", replace=False, size=4)
     assert (tmp_path / "a" / "result").exists()
 
 
 def test_a_damaged_record_is_one_clear_line(tmp_path):
     (tmp_path / stages.RECORD).write_text("[1, 2")
-    with pytest.raises(InputError, match="made-from.json: is damaged"):
+    with pytest.raises(InputError, match="made-from.json: "):
         stages.stage(tmp_path, data="one")
 
 
@@ -45,11 +45,11 @@ def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):
     assert job == {"epoch": 3} and np.array_equal(arrays["0"], np.eye(2)) and np.array_equal(arrays["job"], [0, 1, 2])
     assert stages.resume(file, arrays=False) == ({"epoch": 3}, {})
     np.savez(file, job="{}", **{"array 0": np.array([object()])})  # a pickle
-    with pytest.raises(InputError, match="state.npz: is damaged; delete it"):
+    with pytest.raises(InputError, match="state.npz: "):
         stages.resume(file)
     stages.store(file, {}, {"0": np.zeros(1000)})
     file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(InputError, match="state.npz: is damaged; delete it"):
+    with pytest.raises(InputError, match="state.npz: "):
         stages.resume(file)
 
 
@@ -76,25 +76,21 @@ def test_code_ignores_comments_and_docstrings_and_follows_imports(tmp_path, monk
     assert version(room__chair="from package import house\nx = 2\n") != first
     assert version(garden="x = 2\n") == first
     assert version("room/table", house="def f():\n    return 2\n") != version("room/table")
-    with pytest.raises(ValueError, match="attic: no folder or module"):
+    with pytest.raises(ValueError, match="attic"):
         version("attic")
     stages.code.cache_clear()
 
 
 def test_what_a_run_depends_on_is_found():
-    def modules(*places):
-        found, waiting = set(), [path for place in places for path in stages._modules(place)]
-        while waiting:
-            path = waiting.pop()
-            if path not in found:
-                found.add(path)
-                waiting += stages._imported(ast.parse(path.read_text()))
-        return {str(path.relative_to(stages._PACKAGE).with_suffix("")) for path in found}
-
-    found = modules("odometry", "study/jobs")
-    assert {"kitti", "masks", "odometry/opencv_exact/five_point", "study/controls", "cityscapes"} <= found
-    assert not {name for name in found if name.startswith(("report", "segmentation", "world"))}
-    assert not {"study/results", "study/runner"} & found
+    paths, waiting = set(), [path for place in ("odometry", "study/jobs") for path in stages._modules(place)]
+    while waiting:
+        path = waiting.pop()
+        if path not in paths:
+            paths.add(path)
+            waiting += stages._imported(ast.parse(path.read_text()))
+    names = {str(path.relative_to(stages._PACKAGE).with_suffix("")) for path in paths}
+    assert {"kitti", "masks", "odometry/opencv_exact/five_point", "study/controls", "cityscapes"} <= names
+    assert not {name for name in names if name.startswith(("report", "segmentation", "world", "study/runner"))}
 
 
 def test_listing_notices_other_files(tmp_path):
