@@ -56,9 +56,7 @@ def inside(folder, monkeypatch, capfd):
             code = main(words)
         except SystemExit as ended:
             code = ended.code
-        output = capfd.readouterr()
-        return trials.Result(code, output.out, output.err,
-                             sorted(map(str, trials.changed(before, trials.snapshot(folder)))))
+        return trials.Result(code, *capfd.readouterr(), trials.changes(before, trials.snapshot(folder)))
 
     return run
 
@@ -153,25 +151,18 @@ BROKEN = [
 # (command, what the error names): the folder is sound
 REFUSED = [line.split(" -> ") for line in f"""
 {ODOMETRY} --labels labels --dilation 0 -> width 0
-{ODOMETRY} --labels labels --dilation 1000000000 -> width 1000000000
 {ODOMETRY} --labels labels -> --labels
 {ODOMETRY} --dilation 3 -> --dilation
 {ODOMETRY} --margin 3 -> --margin
-{ODOMETRY} --labels nowhere --dilation 3 -> nowhere
 {ODOMETRY} --masks nowhere -> nowhere
-{LABELLED} --margin 24 -> margin=24
-{LABELLED} --without-movable 1000000 -> movable=1000000
 {LABELLED} --classes motorway -> 'motorway'
 {ODOMETRY} --max-keypoints -1 -> max_keypoints: -1
 {ODOMETRY} --estimator best -> 'best'
-{ODOMETRY} --detector sift -> 'sift'
 {ODOMETRY} --camera image_9 -> 'image_9'
-{ODOMETRY} --camera image_3 -> image_3
 {ODOMETRY} --speed 5 -> speed
 {ODOMETRY} --plot out/path.doc -> path.doc
 {ODOMETRY} --video out/path.avi -> path.avi
 {ODOMETRY} --tum out/path.txt -> --tum out/path.txt
-{ODOMETRY} --tum mine -> mine
 {ODOMETRY} --tum path.txt/path.tum -> path.txt
 {ODOMETRY} --tum {POSES} -> --tum {POSES}
 {ODOMETRY} --plot {FRAMES}/path.png -> --plot
@@ -181,28 +172,16 @@ odometry --sequence mine -> mine
 {MASKS[:-3]}labels -> --output labels
 {MASKS[:-3]}kitti -> --output kitti
 {MASKS[:-3]}mine -> mine
-{MASKS[:-3]}path.txt -> path.txt
 {STUDY} --widths 5000 -> --widths 5000
-{STUDY} --controls 0 -> --controls 0
-{STUDY} --repetitions 99999999 -> --repetitions 99999999
-{STUDY} --frames 0 -> --frames 0
 {STUDY} --jobs 0 -> --jobs 0
 {STUDY} --sequences 00 00 -> --sequences
-{STUDY} --sequences ../../00 -> '../../00'
-{STUDY} --name a/b -> --name a/b
 {STUDY} --dask nonsense -> nonsense
 {STUDY[:-3]}mine -> mine
 {STUDY_ALL} -> --labels
-{STUDY_ALL} --labels nowhere -> nowhere
-{STUDY_ALL} --masks masks --widths 3 -> --widths
-{EVALUATE} --plot path.doc -> path.doc
 boresight --kitti nowhere --sequences 00 -> nowhere
-plan --kitti kitti -> kitti
 plan --kitti kitti --cityscapes nowhere -> nowhere
 synthesize mine --profile smoke -> mine
-synthesize path.txt -> path.txt
 check-data -> --kitti
-check-data --cityscapes nowhere -> nowhere
 predict --images nowhere --output out -> nowhere
 predict --images mine --output out -> mine
 predict --images labels mine/../labels --output out -> --images

@@ -183,7 +183,7 @@ def test_too_little_memory_for_the_work(ledger, words, tmp_path, small_world, sm
     (tmp_path / "kitti/poses").mkdir()
     (tmp_path / "kitti/poses/00.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {n}\n" for n in range(3)))
     moved = {str(small_world / "kitti"): "kitti", str(small_labels): "labels", str(small_labels / "00"): "labels/00"}
-    with ledger("faults", f"{name} of large frames with 1050 MB of address space"):
+    with ledger("faults", f"{name} of large frames with 1150 MB of address space"):
         command = [moved.get(str(word), word) for word in words(name)]
-        refused(run(command, tmp_path, **with_memory(1050)), "memory", left=["out", "out/*"])
+        refused(run(command, tmp_path, **with_memory(1150)), "memory", left=["out", "out/*"])
         nothing_stray(tmp_path)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import zipfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +77,7 @@ def run(command, where, timeout=TIMEOUT, **options):
     """Start a command and wait for it; see `start`."""
     before = snapshot(where)
     result = finish(start(command, where, **options), timeout)
-    result.left = sorted(map(str, changed(before, snapshot(where))))
+    result.left = changes(before, snapshot(where))
     return result
 
 
@@ -88,30 +89,24 @@ def succeed(command, where, **options):
 
 def kill(process):
     """SIGKILL a process that `start` started, and all that it started."""
-    try:
+    with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
     process.communicate()
 
 
 def snapshot(where):
     """What lies below a folder, {relative path: size and date}; None for folders. It may be in use meanwhile."""
     versions = {}
-    for folder, folders, names in os.walk(where):
-        for path in (Path(folder, name) for name in (*folders, *names)):
-            try:
-                status = path.lstat()
-            except FileNotFoundError:
-                continue
+    for path in (Path(folder, name) for folder, folders, names in os.walk(where) for name in (*folders, *names)):
+        with suppress(FileNotFoundError):
+            status = path.lstat()
             versions[path.relative_to(where)] = None if path.is_dir() else (status.st_size, status.st_mtime_ns)
     return versions
 
 
-def changed(before, after):
-    """Paths that are new, changed or gone."""
-    return {path for path in before.keys() | after.keys()
-            if (path in before, before.get(path)) != (path in after, after.get(path))}
+def changes(before, after):
+    """Paths that are new, changed or gone between two snapshots."""
+    return sorted({str(path) for path, _ in before.items() ^ after.items()})
 
 
 def refused(result, named, code=1, left=()):
