@@ -63,9 +63,9 @@ def test_every_number_of_a_result_stands_in_what_a_command_writes(heading, folde
     written = " ".join((ROOT / folder / name).read_text() for name in ("findings.md", "answer_in_words.md"))
     written = re.sub(r"\[(\S+), (\S+)\]", r"(\1 to \2)", written)  # as the answer writes intervals
     number = r"\d+\.\d+"
-    told = re.findall(rf"({number})[^()]{{0,40}}? (\({number} to {number}\))", section)
-    assert told
-    for ratio, interval in told:
+    ratios = re.findall(rf"({number})[^()]{{0,40}}? (\({number} to {number}\))", section)
+    assert ratios
+    for ratio, interval in ratios:
         assert f"{ratio} {interval}" in written, (ratio, interval)
     card = (ROOT / "thesis_repro" / "segmentation" / "weights" / "README.md").read_text()  # of the label maps
     rounded = {f"{float(value):.2f}" for value in re.findall(rf"mean IoU \*\*({number})", card)}

@@ -100,7 +100,7 @@ def unsafe(tree):
 
 
 def test_nothing_that_a_file_carries_is_executed():
-    assert {name: found for name, path in MODULES.items() if (found := unsafe(tree_of(path)))} == {}
+    assert {name: names for name, path in MODULES.items() if (names := unsafe(tree_of(path)))} == {}
 
 
 @pytest.mark.parametrize("line", [

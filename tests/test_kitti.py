@@ -6,15 +6,7 @@ import pytest
 from evo.tools import file_interface
 
 from thesis_repro import InputError, odometry
-from thesis_repro.kitti import (
-    Sequence,
-    read_poses,
-    sequences,
-    true_poses,
-    without_truth,
-    write_kitti_poses,
-    write_tum,
-)
+from thesis_repro.kitti import Sequence, sequences, true_poses, without_truth, write_tum
 
 
 def test_reads_a_sequence(tiny_kitti):
@@ -36,14 +28,6 @@ def test_subset_is_the_start_and_never_longer(tiny_kitti):
     short = sequence.subset(2)
     assert len(short) == len(short.poses) == len(short.times) == 2
     assert len(sequence.subset(99)) == len(sequence.subset(None)) == 4
-
-
-def test_poses_are_written_to_the_last_bit(tmp_path):
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, :3] = np.random.default_rng(0).normal(size=(3, 3, 4)) / 3
-    poses[:, :3, :3] = [cv2.Rodrigues(pose[:3, 3])[0] for pose in poses]
-    write_kitti_poses(tmp_path / "poses.txt", poses)
-    assert np.array_equal(read_poses(tmp_path / "poses.txt"), poses)
 
 
 def test_tum_files_are_read_by_evo(tmp_path):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as some
+from hypothesis import strategies as st
 
 from thesis_repro import InputError, files, kitti
 from thesis_repro.settings import LIMITS, MOST_JOBS, PROFILES, read_settings
@@ -17,11 +17,11 @@ settings.register_profile("repeatable", derandomize=True, deadline=None, max_exa
                           suppress_health_check=[HealthCheck.function_scoped_fixture])
 settings.load_profile("repeatable")
 
-NUMBERS = some.floats(allow_nan=True, allow_infinity=True) | some.integers(-10**400, 10**400).map(str)
-WORDS = NUMBERS.map(str) | some.sampled_from(["nan", "inf", "1e999", "-0", "1_0", "0x1", "٣", "½", "", "#", "P0:"])
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True) | st.integers(-10**400, 10**400).map(str)
+WORDS = NUMBERS.map(str) | st.sampled_from(["nan", "inf", "1e999", "-0", "1_0", "0x1", "٣", "½", "", "#", "P0:"])
 # anything, and what looks like the files that are meant
-TEXTS = some.text() | some.text(string.digits + " .-+eE\n\r\t\x0b\x1c\x85\u2028nanif") | some.lists(
-    some.lists(WORDS, max_size=13).map(" ".join), max_size=5).map("\n".join)
+TEXTS = st.text() | st.text(string.digits + " .-+eE\n\r\t\x0b\x1c\x85\u2028nanif") | st.lists(
+    st.lists(WORDS, max_size=13).map(" ".join), max_size=5).map("\n".join)
 
 
 @pytest.fixture(scope="module")
@@ -45,22 +45,22 @@ def sound_poses(poses):
     assert (np.linalg.det(poses[:, :3, :3]) > 0).all() and (poses[:, 3] == [0, 0, 0, 1]).all()
 
 
-@given(TEXTS | some.binary() | some.lists(WORDS, min_size=12, max_size=12).map(" ".join))
+@given(TEXTS | st.binary() | st.lists(WORDS, min_size=12, max_size=12).map(" ".join))
 def test_any_text_as_poses(path, text):
     poses = read(kitti.read_poses, path, text)
     if poses is not None:
         sound_poses(poses)
 
 
-@given(TEXTS | some.binary())
+@given(TEXTS | st.binary())
 def test_any_text_as_times(path, text):
     times = read(kitti.read_times, path, text)
     if times is not None:
         assert times.ndim == 1 and len(times) and np.isfinite(times).all() and (np.diff(times) > 0).all()
 
 
-@given(TEXTS | some.binary() | some.lists(WORDS, min_size=11, max_size=13).map(" ".join), some.booleans(),
-       some.sampled_from(["image_0", "image_2", "drive"]))
+@given(TEXTS | st.binary() | st.lists(WORDS, min_size=11, max_size=13).map(" ".join), st.booleans(),
+       st.sampled_from(["image_0", "image_2", "drive"]))
 def test_any_text_as_calibration(path, text, with_key, camera):
     if with_key and isinstance(text, str):
         text = f"P2: {text}\nP0: {text}"
@@ -70,7 +70,7 @@ def test_any_text_as_calibration(path, text, with_key, camera):
         assert np.array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
 
 
-@given(some.lists(some.floats(1, 1e5), min_size=4, max_size=4), some.integers(1, 4000), some.integers(1, 4000))
+@given(st.lists(st.floats(1, 1e5), min_size=4, max_size=4), st.integers(1, 4000), st.integers(1, 4000))
 def test_a_camera_is_that_of_its_frames_or_refused(path, numbers, height, width):
     fx, fy, u, v = numbers
     text = f"P0: {fx!r} 0 {u!r} 0 0 {fy!r} {v!r} 0 0 0 1 0\n"
@@ -85,7 +85,7 @@ def test_a_camera_is_that_of_its_frames_or_refused(path, numbers, height, width)
         assert not fits and str(path) in str(error)
 
 
-@given(some.lists(some.tuples(*[some.floats(-3, 3)] * 3, *[some.floats(-1e6, 1e6)] * 3), min_size=1, max_size=20))
+@given(st.lists(st.tuples(*[st.floats(-3, 3)] * 3, *[st.floats(-1e6, 1e6)] * 3), min_size=1, max_size=20))
 def test_written_trajectories_come_back_to_the_last_bit(path, motions):
     poses = np.tile(np.eye(4), (len(motions), 1, 1))
     for pose, motion in zip(poses, np.array(motions)):
@@ -99,7 +99,7 @@ def test_written_trajectories_come_back_to_the_last_bit(path, motions):
     np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, rtol=1e-12)
 
 
-@given(some.sets(some.integers(0, 300), min_size=3, max_size=300), some.integers(1, 6), some.sampled_from(["", "a_"]))
+@given(st.sets(st.integers(0, 300), min_size=3, max_size=300), st.integers(1, 6), st.sampled_from(["", "a_"]))
 def test_every_missing_frame_is_named_or_the_numbers_are_no_count(path, numbers, digits, prefix):
     ordered = sorted(numbers)
     paths = [path.with_name(f"{prefix}{number:0{digits}d}.png") for number in ordered]
@@ -107,7 +107,7 @@ def test_every_missing_frame_is_named_or_the_numbers_are_no_count(path, numbers,
     steps = sorted(np.diff(ordered))
     counts = steps[(len(steps) - 1) // 2] == 1
     expected = sorted(set(range(ordered[0], ordered[-1])) - numbers) if counts else []
-    assert [int(re.search(r"\d+$", found.stem)[0]) for found in missing] == expected
+    assert [int(re.search(r"\d+$", frame.stem)[0]) for frame in missing] == expected
     if missing:
         with pytest.raises(InputError, match=re.escape(f"{missing[0]}: is missing between")):
             kitti.check_numbering(paths)
@@ -115,27 +115,27 @@ def test_every_missing_frame_is_named_or_the_numbers_are_no_count(path, numbers,
         kitti.check_numbering(paths)
 
 
-VALUES = some.text(max_size=30) | some.integers(-10**30, 10**30).map(str) | some.sampled_from(
+VALUES = st.text(max_size=30) | st.integers(-10**30, 10**30).map(str) | st.sampled_from(
     ["all", "1-15", "5,10", "1-", "-", ",", "²", "٣", "1e3", "0x10", "1-99999999999", "9" * 5000, " 7 ", "7\n", "demo"])
 
 
-@given(some.dictionaries(some.sampled_from([*LIMITS, "JOBS", "PROFILE"]), VALUES, max_size=4))
+@given(st.dictionaries(st.sampled_from([*LIMITS, "JOBS", "PROFILE"]), VALUES, max_size=4))
 def test_any_settings(given):
     environment = {f"THESIS_REPRO_{name}": value for name, value in given.items()}
     try:
-        found = read_settings(environment)
+        chosen = read_settings(environment)
     except InputError as error:
         assert str(error).split("=")[0] in given and str(error).isprintable()
         return
-    assert found.profile in PROFILES and 1 <= found.jobs <= MOST_JOBS
+    assert chosen.profile in PROFILES and 1 <= chosen.jobs <= MOST_JOBS
     for name, (least, most, step) in LIMITS.items():
-        value = getattr(found.sizes, name.lower())
+        value = getattr(chosen.sizes, name.lower())
         for number in value if isinstance(value, tuple) else () if value is None else (value,):
             assert least <= number <= most and number % step == 0
-    assert re.fullmatch(r"[\w.+-]+", found.run) and found.build.name == found.run
+    assert re.fullmatch(r"[\w.+-]+", chosen.run) and chosen.build.name == chosen.run
 
 
-@given(some.text(min_size=1, max_size=40).filter(lambda text: "/" not in text and "\0" not in text
+@given(st.text(min_size=1, max_size=40).filter(lambda text: "/" not in text and "\0" not in text
                                                   and text not in (".", "..")))
 def test_a_run_is_named_in_letters_that_make_knows(tmp_path_factory, name):
     try:
@@ -143,12 +143,12 @@ def test_a_run_is_named_in_letters_that_make_knows(tmp_path_factory, name):
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, UnicodeEncodeError):  # the file system knows no such name
         return
-    found = read_settings({"THESIS_REPRO_KITTI": str(folder)})
-    assert re.fullmatch(r"[\w.+-]+", found.run) and found.kitti == folder
+    chosen = read_settings({"THESIS_REPRO_KITTI": str(folder)})
+    assert re.fullmatch(r"[\w.+-]+", chosen.run) and chosen.kitti == folder
 
 
-@given(some.binary(max_size=300) | some.binary(max_size=300).map(lambda data: b"\x89PNG\r\n\x1a\n" + data)
-       | some.binary(max_size=300).map(lambda data: b"\xff\xd8\xff" + data))
+@given(st.binary(max_size=300) | st.binary(max_size=300).map(lambda data: b"\x89PNG\r\n\x1a\n" + data)
+       | st.binary(max_size=300).map(lambda data: b"\xff\xd8\xff" + data))
 def test_any_bytes_as_an_image(path, data):
     for reader in (files.read_gray, files.read_ids):
         image = read(reader, path, data)
@@ -160,7 +160,7 @@ def test_any_bytes_as_an_image(path, data):
 PICTURE = cv2.imencode(".png", np.random.default_rng(0).integers(0, 35, (20, 30), np.uint8))[1].tobytes()
 
 
-@given(some.integers(0, len(PICTURE) - 1), some.integers(1, 255))
+@given(st.integers(0, len(PICTURE) - 1), st.integers(1, 255))
 def test_no_changed_byte_of_a_png_goes_unnoticed(path, place, change):
     data = bytearray(PICTURE)
     data[place] ^= change

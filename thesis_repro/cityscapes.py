@@ -148,23 +148,23 @@ def read_label_map(path):
     return label_map
 
 
-def load(some_pairs, size, channels=1, description="reading images"):
+def load(image_pairs, size, channels=1, description="reading images"):
     """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size), both uint8 (A.2).
 
     Label maps are resized with nearest neighbour, so that no id is invented.
     """
-    images = np.empty((len(some_pairs), size, size, channels), np.uint8)
-    labels = np.empty((len(some_pairs), size, size), np.uint8)
-    for index, pair in enumerate(progress(some_pairs, description, unit="image")):
+    images = np.empty((len(image_pairs), size, size, channels), np.uint8)
+    labels = np.empty((len(image_pairs), size, size), np.uint8)
+    for index, pair in enumerate(progress(image_pairs, description, unit="image")):
         images[index] = read_image(pair.image, size, size, channels)
         labels[index] = cv2.resize(read_label_map(pair.label), (size, size), interpolation=cv2.INTER_NEAREST)
     return images, labels
 
 
-def split_train_validation(some_pairs):
+def split_train_validation(image_pairs):
     """The appendix's split of the training folder: 80 % and 20 %, random state 0 (A.2.3)."""
     from sklearn.model_selection import train_test_split  # a second to load, and every command loads this module
 
-    if len(some_pairs) < 2:
-        raise InputError(f"{len(some_pairs)} training image: at least 2 are needed to split off a validation set")
-    return train_test_split(some_pairs, test_size=VALIDATION_FRACTION, random_state=SPLIT_RANDOM_STATE)
+    if len(image_pairs) < 2:
+        raise InputError(f"{len(image_pairs)} training image: at least 2 are needed to split off a validation set")
+    return train_test_split(image_pairs, test_size=VALIDATION_FRACTION, random_state=SPLIT_RANDOM_STATE)

@@ -119,9 +119,9 @@ class Settings:
     def data_note(self):
         """One line for captions: which data the numbers come from."""
         odometry = "embedded world (rendered)" if self.kitti_is_embedded else "the user's KITTI folder"
-        training = "embedded world (rendered)" if self.cityscapes_is_embedded else "the user's Cityscapes folder"
         labels = ("label maps: by the model in the package, no training" if self.shipped else
-                  f"training: {training}")
+                  "training: embedded world (rendered)" if self.cityscapes_is_embedded else
+                  "training: the user's Cityscapes folder")
         sizes = "".join(f", {name.replace('_', ' ')} {_short(value)}"
                         for name, value in _changed(self.profile, self.sizes).items())
         return f"odometry: {odometry}; {labels}; profile {self.profile}{sizes}"
@@ -158,7 +158,7 @@ def read_settings(environment=None):
     kitti, cityscapes, kitti_semantic = (_data_folder(name, given.get(name))
                                          for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC"))
     data = "_".join(_short_name(name, path) for name, path in (("kitti", kitti), ("cityscapes", cityscapes)) if path)
-    sizes = own_sizes(profile, given)
+    sizes = replace(PROFILES[profile], **{name.lower(): _size(name, given[name]) for name in LIMITS if name in given})
     judged = f"_{_short_name('semantic', kitti_semantic)}" if kitti_semantic else ""
     run = "-".join([f"{data or 'embedded'}{judged}", profile, *(f"{name.replace('_', '-')}-{_in_a_name(value)}"
                                                                 for name, value in _changed(profile, sizes).items())])
@@ -172,15 +172,8 @@ def read_settings(environment=None):
         kitti_semantic=kitti_semantic)
 
 
-def own_sizes(profile, given):
-    """The sizes of a profile with those that are given as text, {"EPOCHS": "3", "FRAMES": "all", "WIDTHS": "1-15"}.
-
-    Raises InputError, naming the first that it cannot be.
-    """
-    return replace(PROFILES[profile], **{name.lower(): _size(name, given[name]) for name in LIMITS if name in given})
-
-
 def _size(name, text):
+    """The value of one size that is given as text: "3", "all" for FRAMES, "1-15" for WIDTHS; InputError if none."""
     if name == "FRAMES" and text == "all":
         return None
     least, most, step = LIMITS[name]
