@@ -13,12 +13,9 @@ import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
 
 from thesis_repro import InputError, kitti, longrun, stages
-from thesis_repro.cityscapes import ID
 from thesis_repro.files import progress, write_png, write_text
-from thesis_repro.world import drives, layout, textures
-from thesis_repro.world.render import compile_for_all
-from thesis_repro.world.street import Street
-from thesis_repro.world.track import Track
+from thesis_repro.world import drives, street, textures
+from thesis_repro.world.raster import compile_for_all
 
 SEQUENCES = tuple(drives.DRIVES)
 FRAME_TIME = 0.1  # seconds; KITTI records at 10 Hz
@@ -32,7 +29,7 @@ CITIES = {"train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfe
 class Scene:
     """A street with the camera's way along it: scene poses, and the way driven (metres) at each frame."""
 
-    street: Street
+    street: street.Street
     poses: np.ndarray
     driven: np.ndarray
     intrinsics: np.ndarray
@@ -45,8 +42,9 @@ def drive(name, frames, scale, seed):
     track, poses, driven = drives.way(name, frames, seed)
     size, intrinsics = drives.scaled_camera(name, scale)
     rng = drives.generator(seed, drives.STREET, int(name))
-    street = layout.build(rng, textures.build(seed), track, drives.DRIVES[name].style)
-    return Scene(street, poses, driven, intrinsics, size)
+    crossing = drives.crossing(track, drives.DRIVES[name].style)
+    scenery = street.build(rng, textures.build(seed), track, drives.DRIVES[name].style, crossing)
+    return Scene(scenery, poses, driven, intrinsics, size)
 
 
 def render_frame(name, index, frames=None, scale=0.5, seed=0):
@@ -65,25 +63,22 @@ def render_image(split, index, scale=0.5, seed=0):
     plan = drives.DRIVES[SEQUENCES[int(rng.integers(0, len(SEQUENCES)))]]
     bend = rng.uniform(-70, 70)
     pieces = ((float(rng.uniform(8, 40)), 0.0), (float(rng.uniform(15, 40)), bend if rng.random() < 0.6 else 0.0),
-              (60.0, 0.0))
+              (300.0, 0.0))
     sky = (rng.uniform(120, 190), rng.uniform(175, 235), rng.uniform(0.1, 0.9))
     style = dataclasses.replace(
         plan.style, leaders=(), crossing=None, sky=sky, sunny=bool(rng.random() < 0.65),
         sun=(rng.uniform(-np.pi, np.pi), rng.uniform(0.45, 1.0)), persons=rng.uniform(0.05, 0.25),
-        traffic=rng.uniform(0.01, 0.05), parked=rng.uniform(0.3, 0.8), trees=rng.uniform(0.1, 0.9))
-    track = Track(pieces, -drives.BEHIND, drives.AHEAD, repeat=False)
-    street = layout.build(rng, textures.build(seed), track, style)
+        traffic=rng.uniform(0.01, 0.05), trees=rng.uniform(0.1, 0.9))
+    track = drives.Track(pieces, -drives.BEHIND, drives.AHEAD)
+    scenery = street.build(rng, textures.build(seed), track, style)
     x, z, heading = track.at(rng.uniform(0, 12), plan.lane * rng.uniform(-0.3, 1.2))
     camera = drives.pose(x, -rng.uniform(1.2, 1.9), z, heading + np.radians(rng.uniform(-14, 14)),
                          np.radians(rng.uniform(-2.5, 2)), np.radians(rng.uniform(-1, 1)))
     height, width = round(IMAGE_SIZE[0] * scale), round(IMAGE_SIZE[1] * scale)
     focal = width * rng.uniform(0.6, 1.0)
     intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
-    image, labels = street.view(camera, intrinsics, (height, width), int(rng.integers(0, 30)))
-    picture = _expose(rng, image, rng.uniform(88, 122), rng.uniform(1.2, 3.0))
-    if rng.random() < 0.6:
-        _bonnet(rng, picture, labels)
-    return picture, labels
+    image, labels = scenery.view(camera, intrinsics, (height, width), int(rng.integers(0, 30)))
+    return _expose(rng, image, rng.uniform(88, 122), rng.uniform(1.2, 3.0)), labels
 
 
 def _expose(rng, image, level, noise):
@@ -101,20 +96,6 @@ def _expose(rng, image, level, noise):
     sigma = np.float32(noise) * np.sqrt(np.float32(0.25) + np.maximum(picture, 0) / np.float32(160))
     picture = picture + sigma * rng.standard_normal(image.shape, dtype=np.float32)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
-
-
-def _bonnet(rng, picture, labels):
-    """Draw the own car's bonnet at the lower edge, as in Cityscapes."""
-    height, width = picture.shape
-    first = int(0.88 * height)  # nothing of it lies above this row
-    y, x = np.arange(first, height, dtype=np.float32)[:, None], np.arange(width, dtype=np.float32)[None]
-    across = (x - width / 2) / (width / 2)
-    top = height * (rng.uniform(0.88, 0.94) + 0.09 * across ** 4)
-    inside = y > top
-    shine = 150 - 90 * (y - top) / (height - top + 1e-3) + 25 * np.cos(across * 5)
-    shine = shine + rng.uniform(-50, 20) + 2 * rng.standard_normal(picture.shape, dtype=np.float32)[first:]
-    picture[first:][inside] = np.clip(shine, 12, 250).astype(np.uint8)[inside]
-    labels[first:][inside] = ID["ego vehicle"]
 
 
 def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100, validation_images=20, seed=0, jobs=-1,

@@ -1,4 +1,7 @@
-"""The drives of the embedded world: eleven sequences, their cameras, and how a car is driven along them."""
+"""The drives of the embedded world: eleven sequences, their roads and cameras, and how a car is driven along them.
+
+A place on a street is (s, d): metres along the road's middle and metres to the right of it.
+"""
 
 from dataclasses import dataclass
 
@@ -6,13 +9,60 @@ import numpy as np
 
 from thesis_repro import kitti
 from thesis_repro.world.street import Style
-from thesis_repro.world.track import STEP, Track
 
+STEP = 0.25  # metres between the stored points of a track
+SMOOTHING = 3.0  # metres; a driver turns the wheel, the curvature does not jump
 BEHIND, AHEAD = 30.0, 170.0  # metres of street behind the first and ahead of the last camera
 CAMERA_HEIGHT = 1.65
 TURN_RATE = np.radians(4.4)  # a driver slows down for more than this a frame
 ACCELERATION = 0.03  # metres a frame, a frame: 3 m/s^2
 BRAKING, WAITING, STARTING, ROUND = 16, 12, 18, 150  # frames at a stop, and from one to the next
+
+
+class Track:
+    """The middle line of a road, its points stored every STEP metres.
+
+    s, x, z, heading, curvature: (n,), metres, radians to the right of z, and 1/m, positive to the right.
+    closed: whether it ends where it starts, so that s goes on round it.
+    """
+
+    def __init__(self, pieces, start, stop, origin=(0.0, 0.0), heading=0.0, closed=False):
+        """pieces: (metres, degrees to the right) each, from s = 0, repeated up to `stop`.
+
+        start, stop: s of both ends, start <= 0; before s = 0 the road is straight. origin, heading: at s = 0.
+        """
+        self.s = start + STEP * np.arange(int(np.ceil((stop - start) / STEP)) + 1)
+        self.closed = closed
+        curvature = np.zeros(len(self.s))
+        where = 0.0
+        while pieces and where < stop:
+            for length, degrees in pieces:
+                curvature[(self.s >= where) & (self.s < where + length)] = np.radians(degrees) / length
+                where += length
+        window = int(SMOOTHING / STEP)
+        padded = np.pad(curvature, (window // 2, window - 1 - window // 2), mode="edge")
+        total = np.concatenate([[0.0], np.cumsum(padded)])
+        self.curvature = (total[window:] - total[:-window]) / window
+        # The heading is the integral of the curvature, the place that of the heading's direction (both by trapezia).
+        first = int(round(-start / STEP))
+        turn = np.concatenate([[0.0], np.cumsum(0.5 * (self.curvature[1:] + self.curvature[:-1])) * STEP])
+        self.heading = heading + turn - turn[first]
+        middle = 0.5 * (self.heading[1:] + self.heading[:-1])
+        x = np.concatenate([[0.0], np.cumsum(np.sin(middle)) * STEP])
+        z = np.concatenate([[0.0], np.cumsum(np.cos(middle)) * STEP])
+        self.x, self.z = origin[0] + x - x[first], origin[1] + z - z[first]
+
+    def along(self, s):
+        """s itself, or on a closed track the same place between both ends."""
+        return s % self.s[-1] if self.closed else s
+
+    def at(self, s, d=0.0):
+        """(x, z, heading) of places (s, d), numbers or arrays of one shape."""
+        s = self.along(s)
+        heading = np.interp(s, self.s, self.heading)
+        x = np.interp(s, self.s, self.x) + d * np.cos(heading)
+        z = np.interp(s, self.s, self.z) - d * np.sin(heading)
+        return x, z, heading
 
 
 @dataclass(frozen=True)
@@ -30,54 +80,50 @@ class Drive:
     level: float = 104.0  # the mean gray that the exposure aims at
 
 
-_CITY = ("blocks", "houses", "park", "wall")
-_GREEN = ("houses", "park", "wall", "field")
-_OPEN = ("field", "park", "houses")
+# Shares of ZONES: houses in a row, gardens, parks, walls.
+_CITY, _SUBURB, _GREEN = (0.55, 0.2, 0.15, 0.1), (0.2, 0.55, 0.15, 0.1), (0.0, 0.3, 0.65, 0.05)
 
 DRIVES = {
     # City with right-angled turns both ways.
     "00": Drive(((14, 0), (16, 90), (13, 0), (16, -90), (40, 0)), 1.32, 71,
-                Style(sun=(0.7, 0.75), sky=(140, 190, 0.25))),
+                Style(parked=(0, 0.6), sun=(0.7, 0.75), sky=(140, 190, 0.25))),
     # Highway: fast, wide, little texture, cars that overtake.
     "01": Drive(((120, 0), (90, 14), (60, 0), (80, -18)), 2.24, 41,
-                Style(half=7.5, road="highway", parking=(0, 0), zones=("field", "park"), weights=(0.8, 0.2),
-                      sun=(-1.0, 0.9), sky=(170, 225, 0.5), haze=0.004, bridge=95.0), lane=0.0, noise=1.6, level=122),
+                Style(half=7.5, road="highway", sidewalk=0.0, zones=_GREEN, sun=(-1.0, 0.9), sky=(170, 225, 0.5),
+                      haze=0.004), lane=0.0, noise=1.6, level=122),
     # Suburb: an S.
     "02": Drive(((8, 0), (28, 65), (6, 0), (34, -85), (15, 0), (26, 45)), 1.32, 54,
-                Style(half=3.6, road="lane", parking=(0, 0), zones=_GREEN, weights=(0.5, 0.3, 0.1, 0.1), trees=0.7,
-                      sun=(2.4, 0.7), sky=(150, 200, 0.6)), noise=2.2),
+                Style(half=3.6, zones=_SUBURB, trees=0.7, sun=(2.4, 0.7), sky=(150, 200, 0.6)), noise=2.2),
     # Lane between fields and gardens in long bends.
     "03": Drive(((8, 0), (40, -38), (30, 22), (45, 40), (30, -28)), 1.38, 48,
-                Style(half=3.3, parking=(0, 0), sidewalk=1.6, zones=_OPEN, weights=(0.35, 0.4, 0.25), trees=0.3,
-                      sunny=False, sky=(185, 228, 0.8), haze=0.006, persons=0.02), lane=1.6, noise=2.6),
+                Style(half=3.3, sidewalk=1.6, zones=_GREEN, trees=0.3, sunny=False, sky=(185, 228, 0.8), haze=0.006,
+                      persons=0.02), lane=1.6, noise=2.6),
     # Straight on in much traffic: two cars ahead, many that come towards it.
-    "04": Drive(((200, 0),), 1.49, 44, Style(half=4.2, parking=(2.2, 0), zones=_CITY, weights=(0.4, 0.2, 0.3, 0.1),
-                                             leaders=(12.0, 26.0), traffic=0.08, sun=(-0.6, 0.6),
-                                            sky=(135, 180, 0.3)), noise=1.8),
+    "04": Drive(((200, 0),), 1.49, 44,
+                Style(parked=(0.6, 0), zones=(0.4, 0.2, 0.3, 0.1), leaders=(12.0, 26.0), traffic=0.08, sun=(-0.6, 0.6),
+                      sky=(135, 180, 0.3)), noise=1.8),
     # Old town with one turn to the left and one to the right.
     "05": Drive(((12, 0), (16, -90), (34, 0), (15, 90), (25, 0), (24, 50)), 1.21, 61,
-                Style(half=3.6, sidewalk=2.2, parking=(2.2, 0), zones=_CITY, weights=(0.75, 0.1, 0.1, 0.05), trees=0.2,
-                      persons=0.1, sunny=False, sky=(175, 222, 0.7)), noise=2.4),
+                Style(half=5.0, sidewalk=2.2, parked=(0.6, 0), zones=(0.75, 0.1, 0.1, 0.05), trees=0.2, persons=0.1,
+                      sunny=False, sky=(175, 222, 0.7)), noise=2.4),
     # Up a wide street, round its end and back beside it.
     "06": Drive(((20, 0), (12, -90), (5, 0), (12, -90), (60, 0), (12, -90), (5, 0), (12, -90), (40, 0)), 1.38, 78,
-                Style(half=4.0, parking=(0, 0), zones=("park", "houses", "field"), weights=(0.6, 0.25, 0.15), trees=0.8,
-                      sun=(0.2, 0.55), sky=(120, 165, 0.2)), noise=1.6),
+                Style(half=4.0, zones=(0.1, 0.25, 0.6, 0.05), trees=0.8, sun=(0.2, 0.55), sky=(120, 165, 0.2)),
+                noise=1.6),
     # Waits at a light while others cross.
     "07": Drive(((75, 0), (15, 90), (40, 0), (15, 90)), 1.44, 76,
-                Style(parking=(2.2, 2.2), sun=(1.9, 0.8), sky=(150, 205, 0.5), crossing=38.0, parked=0.45,
-                      traffic=0.004), stop=26, noise=2.0),
+                Style(parked=(0.45, 0.45), sun=(1.9, 0.8), sky=(150, 205, 0.5), crossing=38.0, traffic=0.004), stop=26),
     # Residential streets: a gentle bend, then a sharp one.
     "08": Drive(((10, 0), (20, 30), (10, 0), (15, -90), (20, 0), (22, -35), (25, 0)), 1.21, 62,
-                Style(zones=_CITY, weights=(0.25, 0.55, 0.1, 0.1), parking=(2.2, 2.2), parked=0.7, sun=(-2.2, 0.85),
-                      sky=(155, 210, 0.6)), noise=2.2),
+                Style(zones=_SUBURB, parked=(0.7, 0.7), sun=(-2.2, 0.85), sky=(155, 210, 0.6)), noise=2.2),
     # Round a block, back to the start.
     "09": Drive(((8, 0), (15, -90), (8, 0), (15, -90), (14, 0), (15, -90), (8, 0), (15, -90), (6, 0)), 1.15, 132,
-                Style(half=3.4, road="lane", parking=(0, 0), zones=("blocks", "houses", "park"),
-                      weights=(0.5, 0.4, 0.1), sunny=False, sky=(165, 215, 0.9), haze=0.004), closed=True, noise=2.4),
+                Style(half=3.4, zones=(0.5, 0.4, 0.1, 0.0), sunny=False, sky=(165, 215, 0.9), haze=0.004), closed=True,
+                noise=2.4),
     # A long tightening bend through a narrow street.
     "10": Drive(((10, 0), (30, 35), (24, 50), (10, 0), (40, -60)), 1.38, 47,
-                Style(half=3.3, road="lane", sidewalk=1.8, parking=(0, 2.2), zones=_CITY, weights=(0.5, 0.2, 0.1, 0.2),
-                      sun=(1.2, 0.65), sky=(130, 175, 0.3)), lane=1.3, noise=2.8, level=96),
+                Style(half=4.4, sidewalk=1.8, parked=(0, 0.5), zones=_CITY, sun=(1.2, 0.65), sky=(130, 175, 0.3)),
+                lane=1.3, noise=2.8, level=96),
 }
 
 
@@ -153,6 +199,14 @@ def way(name, frames, seed):
     y = -CAMERA_HEIGHT + 0.008 * np.sin(driven / 1.3 + phase[5])
     poses = np.array([pose(*values) for values in zip(x, y, z, heading, pitch, roll)])
     return track, poses, driven
+
+
+def crossing(track, style):
+    """The road that crosses a street, a straight `Track`, or None."""
+    if style.crossing is None:
+        return None
+    x, z, heading = track.at(style.crossing)
+    return Track((), -75.0, 75.0, (x, z), heading - np.pi / 2)
 
 
 def relative_to_first(poses):

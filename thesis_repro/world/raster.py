@@ -1,4 +1,7 @@
-"""The compiled part of the renderer: what each sample of an image sees, and how bright that is.
+"""Rendering one view of a street: a gray image with a label map that is exact to the pixel.
+
+Both come from the same 2x2 samples a pixel: the image is their mean, the label is that of most of them (of the nearest
+surface where they are even). Coordinates are those of KITTI: x right, y down, z forward, metres.
 
 A face is a parallelogram or a triangle, the points corner + s edge_s + t edge_t. A sample's ray consists of the points
 p / w with p = (x, y, 1) in camera coordinates and the inverse depth w = 1 / z. Where they meet, Cramer's rule gives
@@ -31,10 +34,9 @@ U, U_S, U_T = 9, 10, 11  # u = f[U] + f[U_S] s + f[U_T] t, in repeats of the tex
 V, V_S, V_T = 12, 13, 14  # v likewise, downwards
 TEXTURE, LABEL, GAIN = 15, 16, 17
 TRIANGLE = 18  # 1: s + t <= 1; 0: parallelogram
-GROUND = 19  # which ground level the face is part of, 0 for none; only the ground receives shadows
-CASTS = 20  # 1: casts a shadow
-LIT = 21  # 1: shaded by its outward normal (edge_s x edge_t), 0: evenly, as leaves and grass
-COLUMNS = 22
+GROUND = 19  # which ground level the face is part of; only the ground receives shadows, only the rest (0) casts them
+LIT = 20  # 1: shaded by its outward normal (edge_s x edge_t), 0: evenly, as leaves and grass
+COLUMNS = 21
 
 ROAD, SIDEWALK = 1, 2  # ground levels
 GROUND_LEVELS = np.array([0.0, 0.0, -0.12])  # their y; the first entry is a filler
@@ -51,7 +53,7 @@ SUPERSAMPLING = 2  # samples a pixel, each way
 OPAQUE = 128
 COUNTED = -2  # a sample that is dealt with; -1 is the background
 SHARPNESS = 0.75  # part of a pixel that a texture is averaged over; the rest is contrast against a little aliasing
-SKY, TERRAIN = ID["sky"], ID["terrain"]
+SKY, TERRAIN, VEGETATION = ID["sky"], ID["terrain"], ID["vegetation"]
 
 
 class Textures(NamedTuple):
@@ -87,7 +89,6 @@ class Environment(NamedTuple):
     clouds: float  # weight of their texture
     haze: float  # extinction, 1/m
     skyline: np.ndarray  # (n,) elevation (tangent) over the azimuth, from -pi to pi
-    skyline_labels: np.ndarray  # (n,) uint8
 
 
 # Textures
@@ -342,7 +343,7 @@ def _shadows(faces, textures, view, sun, nearest, shadow):
     coefficients = np.empty((faces.shape[0], 9))
     for index in range(faces.shape[0]):
         face, c = faces[index], coefficients[index]
-        if face[CASTS] == 0:
+        if face[GROUND] > 0:
             continue
         if math.hypot(face[CORNER + X] - position[X], face[CORNER + Z] - position[Z]) > SHADOW_FAR:
             continue
@@ -390,7 +391,7 @@ def _surface_value(faces, coefficients, index, row, column, w, spread, data, gra
 
 
 @inner
-def _background(x, y, rotation, environment, skyline, skyline_labels, data, clouds, leaves):
+def _background(x, y, rotation, environment, skyline, data, clouds, leaves):
     """Value and label where no face is, in direction (x, y, 1): sky and clouds, the skyline, the ground far away.
 
     clouds, leaves: the levels of these textures.
@@ -409,17 +410,17 @@ def _background(x, y, rotation, environment, skyline, skyline_labels, data, clou
         blue = math.sqrt(min(1.0, elevation / 0.6))
         return sky + (environment.zenith - sky) * blue + cloud * environment.clouds, SKY
     if elevation > -0.01:
-        return 0.35 * _sample(data, leaves, azimuth * 3.0, -elevation * 3.0) + 0.42 * sky, skyline_labels[first]
+        return 0.35 * _sample(data, leaves, azimuth * 3.0, -elevation * 3.0) + 0.42 * sky, VEGETATION
     return 0.75 * sky, TERRAIN
 
 
 @inner
-def _most(labels, counts, depths, found):
+def _most(labels, counts, depths, surfaces):
     """The label of most samples; where two have as many, that of the nearer surface."""
     best, best_count, best_depth = labels[0], 0.0, -1.0
-    for k in range(found):
+    for k in range(surfaces):
         count, closest = 0.0, 0.0
-        for m in range(found):
+        for m in range(surfaces):
             if labels[m] == labels[k]:
                 count += counts[m]
                 closest = max(closest, depths[m])
@@ -428,19 +429,48 @@ def _most(labels, counts, depths, found):
     return best
 
 
-def draw(faces, brightness, textures, view, environment):
-    """Draw faces: image float32 (height, width) and label map uint8 of the same shape, each pixel of 2x2 samples.
+def render(faces, textures, pose, intrinsics, size, environment):
+    """Render one view: image float32 (height, width) before exposure and noise, and label map uint8 of that shape.
 
-    faces: (n, COLUMNS) float64, from near to far, so that most of what is hidden costs one comparison; brightness:
-    (n,), what each face's texture is multiplied by; textures: `Textures`; view: `View`; environment: `Environment`.
+    faces: (n, COLUMNS) float64; textures: `Textures`; pose: 4x4 camera-to-world; intrinsics: 3x3 in pixels whose
+    centres have whole coordinates; size: (height, width); environment: `Environment`.
     """
+    middle = (faces[:, CORNER:CORNER + 3] + 0.5 * (faces[:, EDGE_S:EDGE_S + 3] + faces[:, EDGE_T:EDGE_T + 3])
+              - pose[:3, 3])
+    # From near to far, so that most of what is hidden costs one comparison.
+    faces = faces[np.argsort((middle * middle).sum(axis=1), kind="stable")]
+    view = View(
+        rotation=np.ascontiguousarray(pose[:3, :3].T), position=np.ascontiguousarray(pose[:3, 3]),
+        focal=np.array([intrinsics[0, 0], intrinsics[1, 1]]) * SUPERSAMPLING,
+        # Sample 0 of pixel 0 lies a quarter pixel before its centre.
+        centre=(np.array([intrinsics[0, 2], intrinsics[1, 2]]) + 0.5) * SUPERSAMPLING - 0.5,
+        size=(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING))
     depth = np.full(view.size, 1.0 / FAR, np.float32)
     nearest = np.full(view.size, -1, np.int32)
     shadow = np.zeros(view.size, np.bool_)
     coefficients = np.empty((faces.shape[0], 9))
     _surfaces(faces, textures, view, coefficients, depth, nearest)
     _shadows(faces, textures, view, environment.sun, nearest, shadow)
-    return _pixels(faces, brightness, textures, view, environment, coefficients, nearest, shadow)
+    return _pixels(faces, _brightness(faces, environment), textures, view, environment, coefficients, nearest, shadow)
+
+
+def _brightness(faces, environment):
+    """What each face's texture is multiplied by, (n,): ambient light, and the sun by the cosine of its angle."""
+    normal = np.cross(faces[:, EDGE_S:EDGE_S + 3], faces[:, EDGE_T:EDGE_T + 3])
+    length = np.sqrt(normal[:, X] ** 2 + normal[:, Y] ** 2 + normal[:, Z] ** 2)
+    sun = environment.sun
+    cosine = -(normal[:, X] * sun[X] + normal[:, Y] * sun[Y] + normal[:, Z] * sun[Z]) / np.maximum(length, 1e-12)
+    direct = np.where(faces[:, LIT] > 0, np.maximum(cosine, 0.0), 0.6)
+    return faces[:, GAIN] * (environment.ambient + environment.direct * direct)
+
+
+def compile_for_all():
+    """Compile once and keep it on disk where possible, so that the processes started afterwards need not."""
+    textures = Textures(
+        data=np.zeros(1, np.uint8), gray=np.zeros((1, LEVELS, LEVELS), np.int64),
+        alpha=np.full((1, LEVELS, LEVELS), -1), sides=np.zeros((1, 2), np.int64), clouds=0, leaves=0)
+    environment = Environment(np.ones(3), *[1.0] * 7, skyline=np.zeros(2))
+    render(np.zeros((0, COLUMNS)), textures, np.eye(4), np.eye(3), (1, 1), environment)
 
 
 @fast
@@ -453,34 +483,17 @@ def _pixels(faces, brightness, textures, view, environment, coefficients, neares
     data, gray, sides = textures.data, textures.gray, textures.sides
     clouds, leaves = _whole(textures, textures.clouds), _whole(textures, textures.leaves)
     rotation, focal, centre = view.rotation, view.focal, view.centre
-    skyline, skyline_labels = environment.skyline, environment.skyline_labels
+    skyline = environment.skyline
     dark, haze, horizon = 1.0 - environment.shadow, environment.haze, environment.horizon
     for i in range(height):
         for j in range(width):
-            index = nearest[2 * i, 2 * j]
-            if index == nearest[2 * i, 2 * j + 1] and index == nearest[2 * i + 1, 2 * j] and (
-                    index == nearest[2 * i + 1, 2 * j + 1]):  # most pixels show one surface
-                y, x = 2 * i + 0.5, 2 * j + 0.5
-                if index >= 0:
-                    w = coefficients[index, W] + coefficients[index, W_Y] * y + coefficients[index, W_X] * x
-                    value = _surface_value(faces, coefficients, index, y, x, w, 2 * SHARPNESS, data, gray, sides)
-                    shaded = (shadow[2 * i, 2 * j] + shadow[2 * i, 2 * j + 1] + shadow[2 * i + 1, 2 * j]
-                              + shadow[2 * i + 1, 2 * j + 1])
-                    clear = math.exp(-haze / w)
-                    image[i, j] = value * brightness[index] * (1.0 - dark * shaded / 4) * clear + horizon * (1 - clear)
-                    label_map[i, j] = int(faces[index, LABEL])
-                else:
-                    image[i, j], label_map[i, j] = _background(
-                        (x - centre[0]) / focal[0], (y - centre[1]) / focal[1], rotation, environment, skyline,
-                        skyline_labels, data, clouds, leaves)
-                continue
             # The texture of each face in the pixel is read once, in the middle of its samples.
-            found, total = 0, 0.0
+            surfaces, total = 0, 0.0
             for k in range(4):
                 hits[k] = nearest[2 * i + (k >> 1), 2 * j + (k & 1)]
             for k in range(4):
                 index = hits[k]
-                if index == COUNTED:
+                if index == COUNTED:  # most pixels show one surface
                     continue
                 count, row, column, shaded = 0, 0, 0, 0
                 for m in range(k, 4):
@@ -501,11 +514,11 @@ def _pixels(faces, brightness, textures, view, environment, coefficients, neares
                     label = int(faces[index, LABEL])
                 else:
                     value, label = _background((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], rotation,
-                                               environment, skyline, skyline_labels, data, clouds, leaves)
+                                               environment, skyline, data, clouds, leaves)
                     w = 0.0
                 total += count * value
-                labels[found], counts[found], depths[found] = label, count, w
-                found += 1
+                labels[surfaces], counts[surfaces], depths[surfaces] = label, count, w
+                surfaces += 1
             image[i, j] = total * 0.25
-            label_map[i, j] = _most(labels, counts, depths, found)
+            label_map[i, j] = _most(labels, counts, depths, surfaces)
     return image, label_map
