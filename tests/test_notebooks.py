@@ -1,4 +1,4 @@
-"""Every notebook, executed through `make figures` on the smallest profile."""
+"""Notebooks as they are in git, and as they run: on the smallest profile, executed once for all that looks at them."""
 
 import json
 import os
@@ -12,79 +12,81 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
+SECTIONS = {"01": "A.2", "02": "A.3", "03": "A.4", "04": "A.5 and A.6", "05": "A.7", "06": "A.8", "07": "3.7"}
 TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
-OWN_TABLES = ["answer", "audit", "budget", "controls", "domain_gap", "masks", "widths"]
-TIMINGS = ["budget", "overlapped", "seconds"]  # what was measured, in a folder of its own
-OWN_FIGURES = ["answer", "answer_sequences", "budget", "controls", "domain_gap", "masks"]
-OWN_TEXTS = ["answer_in_words", "findings"]
 FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" for n in range(1, 7)),
            *(f"figure_4_{n:02d}" for n in range(1, 18)), "figure_a_01"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
+JUPYTER = ROOT / ".venv" / "bin" / "jupyter-nbconvert"
+
+
+def cells(name, kind):
+    read = json.loads((ROOT / "notebooks" / name).read_text())["cells"]
+    return ["".join(cell["source"]) for cell in read if cell["cell_type"] == kind]
+
+
+def execute(name, build, output):
+    """Plain nbconvert, with nothing in the environment that the Makefile sets but the profile."""
+    environment = {key: os.environ[key] for key in ("PATH", "HOME", "LANG") if key in os.environ}
+    environment |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROFILE": "smoke", "THESIS_REPRO_BUILD": str(build),
+                    "THESIS_REPRO_FIGURES": str(build.parent / "figures")}
+    return subprocess.run([JUPYTER, "--to", "notebook", "--execute", "--ExecutePreprocessor.kernel_name=python3",
+                           "--output-dir", output, ROOT / "notebooks" / name],
+                          env=environment, capture_output=True, text=True)
 
 
 def make_figures(tmp_path, *options, root=ROOT):
     # make's own variables would hand the outer make's options on to this one
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(("MAKE", "MFLAGS", "THESIS_REPRO_"))}
-    if root != ROOT:
-        environment["PYTHONPATH"] = str(root)
     return subprocess.run(["make", "figures", "PROFILE=smoke", f"BUILD={tmp_path / 'build'}",
-                           f"FIGURES={tmp_path / 'figures'}", *options],
-                          cwd=root, env=environment, capture_output=True, text=True)
+                           f"FIGURES={tmp_path / 'figures'}", "-o", ".venv/ready", *options],
+                          cwd=root, env=environment | {"PYTHONPATH": str(root)}, capture_output=True, text=True)
 
 
-def names(folder, suffix):
-    return sorted(path.stem for path in folder.rglob(f"*{suffix}"))
+@pytest.fixture(scope="module")
+def executed(tmp_path_factory):
+    """The folder of a run in which every notebook was executed: build and figures."""
+    folder = tmp_path_factory.mktemp("run")
+    run = folder / "build" / "embedded-smoke"
+    run.mkdir(parents=True)
+    for name in ("checked", "drives"):  # what `make figures` would otherwise do before a notebook
+        (run / name).touch()
+    for name in NOTEBOOKS:
+        done = execute(name, folder / "build", run / "notebooks")
+        assert done.returncode == 0, done.stderr[-3000:]
+    return folder
 
 
 @pytest.mark.notebooks
-def test_all_notebooks_run_and_leave_every_artefact(tmp_path):
-    first = make_figures(tmp_path)
-    assert first.returncode == 0, first.stdout + first.stderr
-    executed = tmp_path / "build" / "embedded-smoke" / "notebooks"
-    assert sorted(path.name for path in executed.glob("*.ipynb")) == NOTEBOOKS
-    figures = tmp_path / "figures" / "embedded-smoke"
-    assert sorted(names(figures, ".svg") + names(figures, ".webp")) == sorted(FIGURES + OWN_FIGURES)
-    assert names(figures, ".csv") == sorted(TABLES + OWN_TABLES + TIMINGS)
-    assert names(figures, ".md") == sorted(TABLES + OWN_TABLES + OWN_TEXTS)
-    texts = [f"{name}.md" for name in (*TABLES[2:], *OWN_TABLES, *OWN_TEXTS)]
-    texts += [path.name for path in figures.iterdir() if path.suffix in (".svg", ".webp")
-              and path.stem not in WITHOUT_DATA]
-    assert [name for name in texts if b"embedded world" not in (figures / name).read_bytes()] == []
-    page = (figures / "index.html").read_text()
-    assert "41 of 41" in page and "embedded world" in page
-    outputs = "".join(json.dumps(cell.get("outputs", [])) for path in executed.glob("*.ipynb")
-                      for cell in json.loads(path.read_text())["cells"])
+def test_every_artefact_is_there_and_says_where_its_data_come_from(executed):
+    figures = executed / "figures" / "embedded-smoke"
+    written = {path.stem: path for path in figures.iterdir() if path.suffix in (".svg", ".webp")}
+    assert set(FIGURES) <= written.keys() and len(FIGURES) == 36
+    assert all((figures / f"{name}{suffix}").is_file() for name in TABLES for suffix in (".csv", ".md"))
+    texts = [written[name] for name in FIGURES if name not in WITHOUT_DATA]
+    texts += [figures / f"{name}.md" for name in TABLES[2:]]
+    assert [path.name for path in texts if b"embedded world" not in path.read_bytes()] == []
+
+
+@pytest.mark.notebooks
+def test_the_cells_do_what_the_package_does(executed):
+    outputs = "".join(json.dumps(cell.get("outputs", [])) for name in NOTEBOOKS for cell in
+                      json.loads((executed / "build/embedded-smoke/notebooks" / name).read_text())["cells"])
     assert outputs.count("to the bit: True") >= 10 and "to the bit: False" not in outputs and "EDITED" not in outputs
-    assert "Segmentation Models: using" not in outputs and "oneDNN" not in outputs and "frame/s]" not in outputs
-    assert len(list(executed.glob("*.html"))) == len(NOTEBOOKS)
-    again = make_figures(tmp_path)
-    assert again.returncode == 0 and "load_images" not in again.stdout, again.stdout
 
 
 @pytest.mark.notebooks
-@pytest.mark.parametrize(("name", "first"), [("02_augmentation", "01_load_images_and_labels"),
-                                             ("07_visual_odometry", "06_keypoint_masks")])
-def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path, name, first):
-    environment = os.environ | {"THESIS_REPRO_PROFILE": "smoke", "THESIS_REPRO_BUILD": str(tmp_path / "build")}
-    done = subprocess.run(
-        [ROOT / ".venv/bin/jupyter", "nbconvert", "--to", "notebook", "--execute", "--log-level=CRITICAL",
-         "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
-         f"--Execution.log_file={tmp_path / 'log'}", "--output-dir", tmp_path, ROOT / "notebooks" / f"{name}.ipynb"],
-        env=environment, capture_output=True, text=True)
-    assert done.returncode != 0
-    assert f"not there yet; run notebook {first} first" in done.stderr and "Traceback" not in done.stderr
+def test_make_figures_takes_executed_notebooks_as_they_are(executed):
+    done = make_figures(executed)
+    assert done.returncode == 0 and "load_images" not in done.stdout, done.stdout + done.stderr
+    assert "41 of 41" in (executed / "figures" / "embedded-smoke" / "index.html").read_text()
 
 
-def test_the_order_of_the_notebooks_has_what_each_of_them_asks_for():
-    listed = dict(re.findall(r"^NEEDS_(\d\d) :=(.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    before = {}
-    for number, needs in sorted(listed.items()):
-        before[number] = {*needs.split(), *(other for one in needs.split() for other in before[one])}
-    asked = {name[:2]: set(re.findall(r'\\"(\d\d)_\w+\\"', (ROOT / "notebooks" / name).read_text()))
-             for name in NOTEBOOKS}
-    assert listed.keys() == asked.keys() and sum(map(len, asked.values())) > 10
-    assert {number: some - before[number] for number, some in asked.items() if some - before[number]} == {}
+@pytest.mark.notebooks
+def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path):
+    done = execute("02_augmentation.ipynb", tmp_path / "build", tmp_path)
+    assert done.returncode != 0 and "01_load_images_and_labels" in done.stderr
 
 
 @pytest.mark.notebooks
@@ -101,14 +103,13 @@ def test_only_what_changed_is_made_again(tmp_path):
         nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(code)]), root / "notebooks" / name)
 
     def make():
-        done = make_figures(tmp_path, "-o", ".venv/ready", root=root)
+        done = make_figures(tmp_path, root=root)
         return done, [name for name in ("01_one", "02_two") if name in done.stdout.splitlines()]
 
     write("01_one.ipynb", "from thesis_repro.report import style\nprint('by hand')")
     write("02_two.ipynb", "from thesis_repro import InputError\nraise InputError('labels: missing; run notebook 5')")
-    failed, executed = make()
-    assert failed.returncode != 0 and executed == ["01_one", "02_two"]
-    assert "02_two failed: InputError: labels: missing; run notebook 5\nthe whole report: " in failed.stderr
+    failed, names = make()
+    assert failed.returncode != 0 and names == ["01_one", "02_two"] and "run notebook 5" in failed.stderr
     results = tmp_path / "build" / "embedded-smoke" / "notebooks"
     assert "raise InputError" in (results / "02_two.log").read_text()
     assert sorted(path.name for path in results.glob("*.ipynb")) == ["01_one.ipynb"]  # hidden ones included
@@ -118,11 +119,6 @@ def test_only_what_changed_is_made_again(tmp_path):
     page = tmp_path / "figures" / "embedded-smoke" / "index.html"
     first = page.stat().st_mtime_ns
     assert make()[1] == [] and page.stat().st_mtime_ns == first
-    template = root / "thesis_repro" / "report" / "template.html"
-    template.touch()
-    assert make()[1] == [] and page.stat().st_mtime_ns == first
-    template.write_text(template.read_text() + "<!-- another word -->\n")
-    assert make()[1] == [] and page.stat().st_mtime_ns > first
     (root / "thesis_repro" / "report" / "style.py").touch()
     assert make()[1] == ["01_one", "02_two"]
 
@@ -130,30 +126,50 @@ def test_only_what_changed_is_made_again(tmp_path):
 @pytest.mark.notebooks
 def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
     """On the small world's frames, given as if they were real; one size is not the profile's."""
-    kitti = small_world / "kitti"
-    done = make_figures(tmp_path, f"KITTI={kitti}", "WIDTHS=5,10", "REPETITIONS=1")
+    done = make_figures(tmp_path, f"KITTI={small_world / 'kitti'}", "WIDTHS=5,10", "REPETITIONS=1")
     assert done.returncode == 0, done.stdout + done.stderr
     (build,) = (tmp_path / "build").iterdir()  # no world beside it
     assert build.name.endswith("-smoke-widths-5_10-repetitions-1") and not (build / "model").exists()
-    assert [name[:2] for name in names(build / "notebooks", ".ipynb")] == ["03", "05", "06", "07", "08", "09"]
-    figures = tmp_path / "figures" / build.name
+    figures = {path.stem for path in (tmp_path / "figures" / build.name).iterdir() if path.suffix in (".svg", ".webp")}
     left_out = {"figure_4_01", "figure_4_02", *(f"figure_3_{n:02d}" for n in range(1, 6))}
-    assert set(names(figures, ".svg") + names(figures, ".webp")) == {*FIGURES, *OWN_FIGURES} - left_out
-    page = (figures / "index.html").read_text()
-    assert "Nothing was trained" in page and "Missing" not in page and page.count("Left out: it shows") == 9
+    assert set(FIGURES) - figures == left_out
 
 
 @pytest.mark.notebooks
-def test_bad_data_stops_before_the_notebooks_with_one_line(tmp_path, tiny_kitti):
+def test_bad_data_stops_before_the_notebooks(tmp_path, tiny_kitti):
     (tiny_kitti / "poses" / "00.txt").unlink()
     failed = make_figures(tmp_path, f"KITTI={tiny_kitti}")
-    assert failed.returncode != 0 and "poses/00.txt: no such file" in failed.stderr
+    assert failed.returncode != 0 and "poses/00.txt" in failed.stderr
     assert not list((tmp_path / "build").rglob("*.ipynb"))
-    assert "PROFILE=huge: unknown profile" in make_figures(tmp_path, "PROFILE=huge").stderr
+    assert "PROFILE=huge" in make_figures(tmp_path, "PROFILE=huge").stderr
     assert "PROFIL: unknown setting" in make_figures(tmp_path, "PROFIL=smoke").stderr
+
+
+def test_the_order_of_the_notebooks_has_what_each_of_them_asks_for():
+    listed = dict(re.findall(r"^NEEDS_(\d\d) :=(.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    before = {}
+    for number, needs in sorted(listed.items()):
+        before[number] = {*needs.split(), *(earlier for need in needs.split() for earlier in before[need])}
+    asked = {name[:2]: set(re.findall(r'"(\d\d)_\w+"', "\n".join(cells(name, "code")))) for name in NOTEBOOKS}
+    assert listed.keys() == asked.keys() and sum(map(len, asked.values())) > 10
+    assert {number: names - before[number] for number, names in asked.items() if names - before[number]} == {}
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_in_git_hold_no_outputs(name):
-    cells = json.loads((ROOT / "notebooks" / name).read_text())["cells"]
-    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
+    read = json.loads((ROOT / "notebooks" / name).read_text())["cells"]
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in read)
+
+
+@pytest.mark.parametrize("name", [name for name in NOTEBOOKS if name[:2] in SECTIONS])
+def test_a_notebook_says_what_it_mirrors_and_sets_what_libraries_read(name):
+    assert SECTIONS[name[:2]] in cells(name, "markdown")[0] and "**Written:**" in cells(name, "markdown")[-1]
+    first, *others = cells(name, "code")
+    assert "%env SM_FRAMEWORK=tf.keras" in first and "%env NO_ALBUMENTATIONS_UPDATE=1" in first
+
+
+def test_every_call_of_the_appendix_is_where_the_table_says():
+    table = (ROOT / "docs" / "appendix-calls.md").read_text()
+    rows = re.findall(r"^\|[^|]*\|(?: `[^|]*` \|)? (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
+    code = {name[:2]: "\n".join(cells(name, "code")) for name in NOTEBOOKS}
+    assert len(rows) > 70 and [row for row in rows if row[1] not in code[row[0]]] == []
