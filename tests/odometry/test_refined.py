@@ -1,19 +1,19 @@
-"""What makes a refined pose reliable: the smaller rotation, the sign of slow steps, and the course of the camera."""
+"""What makes the refined estimator reliable: the fit, the sign of slow steps, and the consistency of motions."""
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from street import Street
 
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, metrics, pose
 from thesis_repro.odometry.refined import fit as refine
-from thesis_repro.odometry.refined.guided import ransac_with_prior
 from thesis_repro.odometry.refined import motion_prior
-from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED, MotionPrior, check_consistency
+from thesis_repro.odometry.refined.guided import ransac_with_prior
+from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED, MotionPrior
 
 AHEAD = np.array([0.0, 0.0, 1.0])
 REFINED = replace(THESIS, estimator="refined")
@@ -21,13 +21,13 @@ REFINED = replace(THESIS, estimator="refined")
 
 def turn(degrees):
     """A rotation about the vertical."""
-    return cv2.Rodrigues(np.array([0, np.radians(degrees), 0]))[0]
+    return Rotation.from_euler("Y", degrees, degrees=True).as_matrix()
 
 
 def seen(world, rotation, translation, noise=0.0, seed=0):
     """Correspondences (current, previous) of points (N, 3) in the current camera under a motion to the previous one."""
     moved = world @ rotation.T + translation
-    current, previous = (some[:, :2] / some[:, 2:] for some in (world, moved))
+    current, previous = (points[:, :2] / points[:, 2:] for points in (world, moved))
     return current, previous + np.random.default_rng(seed).normal(0, noise, previous.shape)
 
 
@@ -36,16 +36,33 @@ def street(count=300, seed=0):
     return np.random.default_rng(seed).uniform([-8, -2, 5], [8, 1.6, 60], (count, 3))
 
 
+def hedge():
+    """Correspondences of points along one line, under 1 degree of turn and a step ahead."""
+    points = np.array([-3.0, 0.5, 5.0]) + np.linspace(0, 1, 200)[:, None] * [0.5, -0.2, 25.0]
+    return seen(points, turn(1), AHEAD, noise=1e-4)
+
+
+def two_motions(*motions, counts):
+    """Correspondences of which some have one motion and some another."""
+    sides = [seen(street(count, seed), *motion, noise=5e-5, seed=seed)
+             for seed, (count, motion) in enumerate(zip(counts, motions, strict=True))]
+    return tuple(np.concatenate(side) for side in zip(*sides, strict=True))
+
+
 def essential(rotation, translation):
-    return np.cross(np.eye(3), translation) @ rotation
+    return np.cross(np.eye(3), translation).T @ rotation
 
 
 def fitted(rotation, translation, current, previous):
     return refine.fit(rotation, translation, current, previous, np.ones(len(current), bool), THESIS.threshold)
 
 
+def checked(motion, current, previous, scale, prior):
+    return motion_prior.check_consistency(motion, current, previous, scale, THESIS.threshold, prior)
+
+
 def degrees_apart(rotation, other):
-    return np.degrees(np.linalg.norm(cv2.Rodrigues(rotation.T @ other)[0]))
+    return np.degrees(Rotation.from_matrix(rotation.T @ other).magnitude())
 
 
 # One step
@@ -68,38 +85,40 @@ def test_the_sign_survives_a_slow_step():
         motion = fitted(turn(0.2), start, current, previous)
         assert motion.translation @ AHEAD > 0.999
         assert motion.pose_inliers > 150
-    assert refine.cheirality_votes(turn(0.2), AHEAD, current, previous, 1.0) == (0, 0)  # no ray meets another at such an angle
+    # no ray meets another at such an angle
+    assert refine.cheirality_votes(turn(0.2), AHEAD, current, previous, 1.0) == (0, 0)
 
 
-def test_the_normal_equations_of_all_points_are_the_sums_of_those_of_some():
+def test_the_normal_equations_of_all_points_are_the_sums_of_those_of_each():
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (2 * refine.POINTS_PER_BLOCK + 7, 4))
-    rotation, ahead, scale = cv2.Rodrigues(np.array([0.01, 0.02, -0.01]))[0], np.array([0.0, 0.6, 0.8]), 0.1
-    whole = refine._normal_equations(rotation, ahead, points[:, :2], points[:, 2:], scale)
-    one_by_one = [refine._normal_equations(rotation, ahead, one[None, :2], one[None, 2:], scale) for one in points]
-    for total, parts in zip(whole, zip(*one_by_one, strict=True), strict=True):
-        np.testing.assert_allclose(total, sum(parts), rtol=1e-12, atol=1e-12)
-    residual = epipolar_distance(rotation, ahead, points)
+    rotation, ahead, scale = Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(), np.array([0.0, 0.6, 0.8]), 0.1
+    current, previous = points[:, :2].copy(), points[:, 2:].copy()
+    whole = refine._normal_equations(rotation, ahead, current, previous, scale)
+    parts = [refine._normal_equations(rotation, ahead, current[k:k + 1], previous[k:k + 1], scale)
+             for k in range(len(points))]
+    for total, of_each in zip(whole, zip(*parts, strict=True), strict=True):
+        np.testing.assert_allclose(total, sum(of_each), rtol=1e-12, atol=1e-12)
+    current, previous = (np.column_stack([side, np.ones(len(side))]) for side in (current, previous))
+    lines, back = current @ essential(rotation, ahead).T, previous @ essential(rotation, ahead)
+    residual = (previous * lines).sum(axis=1) / np.sqrt((lines[:, :2]**2).sum(axis=1) + (back[:, :2]**2).sum(axis=1))
     assert whole[0] == pytest.approx(np.log1p((residual / scale) ** 2).sum())
 
 
-def epipolar_distance(rotation, ahead, points):
-    """Sampson distances (N,) of correspondences (N, 4: x, y, u, v), by matrices."""
-    essential = np.cross(np.eye(3), ahead) @ rotation
-    one, other = (np.column_stack([some, np.ones(len(some))]) for some in (points[:, :2], points[:, 2:]))
-    lines, back = one @ essential.T, other @ essential
-    return (other * lines).sum(axis=1) / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
+def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
+    current, previous = seen(street(200), turn(1), AHEAD)
+    for sign in (1, -1):
+        direction = sign * np.array([0.05, -0.03, 1.0]) / np.linalg.norm([0.05, -0.03, 1.0])
+        rotation, translation = refine.refine(turn(1.2), direction, current, previous, np.arange(200) < 150,
+                                              THESIS.threshold)
+        np.testing.assert_allclose(rotation, turn(1), atol=1e-8)
+        np.testing.assert_allclose(translation, sign * AHEAD, atol=1e-7)
 
 
-def test_points_on_one_line_leave_the_motion_open():
-    along = np.linspace(0, 1, 200)[:, None]
-    hedge = np.array([-3.0, 0.5, 5.0]) + along * [0.5, -0.2, 25.0]
-    current, previous = seen(hedge, turn(1), AHEAD, noise=1e-4)
-    open_motion = fitted(turn(1), AHEAD, current, previous)
-    known = fitted(turn(1), AHEAD, *seen(street(), turn(1), AHEAD))
-    assert open_motion.rotation_std_deg > motion_prior.MAX_ROTATION_STD or open_motion.heading_std_deg > motion_prior.MAX_HEADING_STD
+def test_points_on_one_line_do_not_determine_the_motion():
+    line, known = fitted(turn(1), AHEAD, *hedge()), fitted(turn(1), AHEAD, *seen(street(), turn(1), AHEAD))
+    assert not motion_prior._determined(line)
     assert known.rotation_std_deg < 0.02 and known.heading_std_deg < 0.3
-    few = seen(street(4), turn(1), AHEAD)
-    assert np.isinf(fitted(turn(1), AHEAD, *few).rotation_std_deg)
+    assert np.isinf(fitted(turn(1), AHEAD, *seen(street(4), turn(1), AHEAD)).rotation_std_deg)
 
 
 # One step after others
@@ -107,81 +126,71 @@ def test_points_on_one_line_leave_the_motion_open():
 
 def test_the_search_near_an_expected_motion_finds_it_in_a_minority():
     true, other = (turn(2), AHEAD), (turn(-1), np.array([0.8, 0.0, 0.6]))
-    sides = [seen(street(count, seed), *motion, noise=5e-5, seed=seed) for seed, (count, motion) in
-             enumerate(((120, true), (180, other)))]
-    current, previous = (np.concatenate(some) for some in zip(*sides, strict=True))
+    points = two_motions(true, other, counts=(120, 180))
     for rotation, translation in (true, other):
-        expected = turn(0.5) @ rotation
-        found = ransac_with_prior(current, previous, THESIS.threshold, expected, translation, 1.5, 20)
-        assert degrees_apart(rotation, found[0]) < 0.3 and abs(found[1] @ translation) > 0.99
-    assert ransac_with_prior(current, previous, THESIS.threshold, turn(60), AHEAD, 1.5, 20) is None
+        motion = ransac_with_prior(*points, THESIS.threshold, turn(0.5) @ rotation, translation, 1.5, 20)
+        assert degrees_apart(rotation, motion[0]) < 0.3 and abs(motion[1] @ translation) > 0.99
+    assert ransac_with_prior(*points, THESIS.threshold, turn(60), AHEAD, 1.5, 20) is None
 
 
-def test_a_motion_that_goes_on_is_believed_as_it_is():
-    current, previous = seen(street(), turn(1), AHEAD)
-    motion = fitted(turn(1), AHEAD, current, previous)
-    believed, course, flag = check_consistency(motion, current, previous, 0.5, THESIS.threshold,
-                                                MotionPrior(turn(2), AHEAD, 1.0))
-    assert flag == "" and course.scale == 0.5 and believed.inliers is motion.inliers
-    assert degrees_apart(motion.rotation, believed.rotation) < 1e-3 and believed.translation @ AHEAD > 0.9999
-    np.testing.assert_array_equal(course.rotation, believed.rotation)
+def test_a_consistent_motion_is_used_as_it_is():
+    points = seen(street(), turn(1), AHEAD)
+    motion = fitted(turn(1), AHEAD, *points)
+    used, prior, flag = checked(motion, *points, 0.5, MotionPrior(turn(2), AHEAD, 1.0))
+    assert flag == "" and prior.scale == 0.5 and used.inliers is motion.inliers
+    assert degrees_apart(motion.rotation, used.rotation) < 1e-3 and used.translation @ AHEAD > 0.9999
+    np.testing.assert_array_equal(prior.rotation, used.rotation)
 
 
-def test_orders_that_end_in_several_minima_meet_again():
-    current, previous = seen(street(60), turn(1), 0.15 * AHEAD, noise=1e-4)
-    start = fitted(turn(1), AHEAD, current, previous)
-    course = MotionPrior(turn(1), AHEAD, 0.15)
-    for turned in (0.1, -0.1):  # as if RANSAC had led elsewhere
-        motion = replace(start, rotation=turn(turned) @ start.rotation, support=start.support - 2)
-        believed, _, flag = check_consistency(motion, current, previous, 0.15, THESIS.threshold, course)
-        assert flag == "" and degrees_apart(start.rotation, believed.rotation) < 0.01
+def test_shuffles_that_end_in_several_minima_meet_again():
+    points = seen(street(60), turn(1), 0.15 * AHEAD, noise=1e-4)
+    start = fitted(turn(1), AHEAD, *points)
+    for off in (0.1, -0.1):  # as if RANSAC had led elsewhere
+        motion = replace(start, rotation=turn(off) @ start.rotation, support=start.support - 2)
+        used, _, flag = checked(motion, *points, 0.15, MotionPrior(turn(1), AHEAD, 0.15))
+        assert flag == "" and degrees_apart(start.rotation, used.rotation) < 0.01
 
 
-def test_of_two_motions_the_one_that_goes_on_is_taken_and_said():
+def test_of_two_motions_the_consistent_one_is_used_and_flagged():
     true, other = (turn(2), AHEAD), (turn(-1), np.array([0.0, 0.8, 0.6]))
-    sides = [seen(street(150, seed), *motion, noise=5e-5, seed=seed) for seed, motion in enumerate((true, other))]
-    current, previous = (np.concatenate(some) for some in zip(*sides, strict=True))
-    wrong = fitted(*other, current, previous)
+    points = two_motions(true, other, counts=(150, 150))
+    wrong = fitted(*other, *points)
     assert degrees_apart(turn(-1), wrong.rotation) < 0.1
-    believed, course, flag = check_consistency(wrong, current, previous, 1.0, THESIS.threshold,
-                                                MotionPrior(turn(2.4), AHEAD, 1.0))
-    assert flag == AMBIGUOUS and degrees_apart(turn(2), believed.rotation) < 0.1 and believed.translation[2] > 0.99
-    assert believed.inliers[:150].mean() > 0.9 and believed.inliers[150:].mean() < 0.3
-    np.testing.assert_array_equal(course.rotation, believed.rotation)
+    used, prior, flag = checked(wrong, *points, 1.0, MotionPrior(turn(2.4), AHEAD, 1.0))
+    assert flag == AMBIGUOUS and degrees_apart(turn(2), used.rotation) < 0.1 and used.translation[2] > 0.99
+    assert used.inliers[:150].mean() > 0.9 and used.inliers[150:].mean() < 0.3
+    np.testing.assert_array_equal(prior.rotation, used.rotation)
 
 
 @pytest.mark.parametrize("motion", [(turn(8), AHEAD), (turn(0.5), -AHEAD), (turn(-4), np.array([0.8, 0, 0.6]))])
-def test_a_camera_that_leaves_its_course_is_believed_and_said(motion):
-    """A sharp turn at a low rate of frames, and reversing after a stop: nothing else explains what is seen."""
-    current, previous = seen(street() + [0, 0, 5], *motion, noise=5e-5)
-    fit, course = fitted(*motion, current, previous), MotionPrior(turn(1), AHEAD, 0.5)
-    flags = []
+def test_an_inconsistent_motion_that_nothing_else_explains_is_used_and_flagged_once(motion):
+    """A sharp turn at a low rate of frames, and reversing after a stop."""
+    points = seen(street() + [0, 0, 5], *motion, noise=5e-5)
+    estimated, prior, flags = fitted(*motion, *points), MotionPrior(turn(1), AHEAD, 0.5), []
     for _ in range(3):
-        believed, course, flag = check_consistency(fit, current, previous, 0.5, THESIS.threshold, course)
-        assert degrees_apart(fit.rotation, believed.rotation) < 0.05 and believed.translation @ fit.translation > 0.999
+        used, prior, flag = checked(estimated, *points, 0.5, prior)
+        assert degrees_apart(estimated.rotation, used.rotation) < 0.05
+        assert used.translation @ estimated.translation > 0.999
         flags.append(flag)
     assert flags == [AMBIGUOUS, "", ""]
 
 
-def test_what_no_point_determines_goes_on_along_the_course():
-    along = np.linspace(0, 1, 200)[:, None]
-    hedge = np.array([-3.0, 0.5, 5.0]) + along * [0.5, -0.2, 25.0]
-    current, previous = seen(hedge, turn(1), AHEAD, noise=1e-4)
-    course = MotionPrior(turn(1), AHEAD, 1.0)
-    believed, after, flag = check_consistency(fitted(turn(7), np.array([1.0, 0.0, 0.0]), current, previous), current,
-                                               previous, 0.5, THESIS.threshold, course)
-    assert flag == NOT_DETERMINED and after is course
-    np.testing.assert_allclose(believed.rotation, turn(0.5), atol=1e-12)  # the same curve over half the way
-    np.testing.assert_array_equal(believed.translation, AHEAD)
+def test_a_motion_that_no_point_determines_repeats_the_prior():
+    prior = MotionPrior(turn(1), AHEAD, 1.0)
+    motion = fitted(turn(7), np.array([1.0, 0.0, 0.0]), *hedge())
+    used, after, flag = checked(motion, *hedge(), 0.5, prior)
+    assert flag == NOT_DETERMINED and after is prior
+    np.testing.assert_allclose(used.rotation, turn(0.5), atol=1e-12)  # the same curve over half the way
+    np.testing.assert_array_equal(used.translation, AHEAD)
 
 
-def test_the_first_step_is_believed_where_the_camera_looks_elsewhere():
+def test_the_first_step_is_used_where_the_camera_looks_elsewhere():
     sideways = np.array([1.0, 0.0, 0.0])
-    current, previous = seen(street(), turn(0.5), sideways)
-    fit = fitted(turn(0.5), sideways, current, previous)
-    believed, course, flag = check_consistency(fit, current, previous, 1.0, THESIS.threshold, MotionPrior())
-    assert believed is fit and flag == AMBIGUOUS
-    assert check_consistency(fit, current, previous, 1.0, THESIS.threshold, course)[2] == ""
+    points = seen(street(), turn(0.5), sideways)
+    motion = fitted(turn(0.5), sideways, *points)
+    used, prior, flag = checked(motion, *points, 1.0, MotionPrior())
+    assert used is motion and flag == AMBIGUOUS
+    assert checked(motion, *points, 1.0, prior)[2] == ""
 
 
 # Whole runs
@@ -189,24 +198,23 @@ def test_the_first_step_is_believed_where_the_camera_looks_elsewhere():
 
 def column_at(drive, index):
     """Masks of a drive that leave everything, but in one frame nothing but a column of points."""
-    masks = {k: np.full(drive.frame(0).shape, 255, np.uint8) for k in range(len(drive))}
-    masks[index] = np.zeros_like(masks[0])
-    masks[index][:, 100:102] = 255
+    masks = np.full((len(drive), *drive.frame(0).shape), 255, np.uint8)
+    masks[index] = 0
+    masks[index, :, 100:102] = 255
     return masks
 
 
-@pytest.mark.parametrize("seed", [None, 1, 2])
+@pytest.mark.parametrize("seed", [None, 1])
 def test_a_line_beside_the_road_costs_one_flagged_step(seed):
     drive = Street(8)
     result = odometry.run(drive, replace(REFINED, shuffle_seed=seed), column_at(drive, 4))
-    flagged = result.frames.loc[result.frames["flag"] != "", ["frame", "flag"]].to_numpy().tolist()
-    assert flagged == [[5, NOT_DETERMINED]]
+    assert result.frames["flag"].tolist() == ["", "", "", "", "", NOT_DETERMINED, "", ""]
     assert result.frames["updated"][1:].all()
     assert metrics.rmse(result.poses, drive.poses) < 0.05
 
 
-def test_a_stopped_pass_knows_its_course(tmp_path, monkeypatch):
-    """The first frame after the checkpoint is one that goes on along the course."""
+def test_a_stopped_pass_knows_its_prior(tmp_path, monkeypatch):
+    """The first frame after the checkpoint is one that repeats the prior."""
     monkeypatch.setattr(odometry.passes, "CHECKPOINT", 5)
 
     class Stopped(Street):
@@ -224,18 +232,23 @@ def test_a_stopped_pass_knows_its_course(tmp_path, monkeypatch):
     np.testing.assert_array_equal(resumed.poses, odometry.run(drive, *runs["line"]).poses)
 
 
-def test_a_plain_drive_is_not_flagged():
-    drive = Street(6)
-    for way in ("thesis", "inliers", "refined"):
-        assert odometry.run(drive, replace(THESIS, estimator=way, max_keypoints=400)).flagged.empty
+def test_a_plain_drive_is_not_flagged_and_the_fit_is_closer_to_the_truth_and_varies_less():
+    drive, errors = Street(5), {}
+    for estimator in ("thesis", "inliers", "refined"):
+        results = [odometry.run(drive, replace(THESIS, estimator=estimator, shuffle_seed=seed)) for seed in range(3)]
+        assert all(result.flagged.empty for result in results)
+        errors[estimator] = [metrics.rmse(result.poses, drive.poses) for result in results]
+    assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
+    assert np.std(errors["refined"]) < 0.5 * np.std(errors["inliers"])
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("seed", [None, 1, 2, 4])
+@pytest.mark.parametrize("seed", [None, 2, 4])
 def test_few_keypoints_keep_their_way_through_a_turn(kitti_real, seed):
     """05, frames 128 to 149: a turn seen in points far away, where a shift to the side explains 500 points as well."""
     sequence = Sequence(kitti_real, "05")
-    follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=500, shuffle_seed=seed), sequence.poses[128])
+    settings = replace(REFINED, max_keypoints=500, shuffle_seed=seed)
+    follower = Odometry(sequence.intrinsics, settings, sequence.poses[128])
     follower.count = 128  # the frame's number is part of the order's seed
     metres = odometry.scales(sequence)
     flags = set()
@@ -257,4 +270,4 @@ def test_a_second_start_leaves_a_poor_minimum(kitti_real):
         follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=300, shuffle_seed=seed or None))
         follower.step(sequence.frame(0))
         directions.append(follower.step(sequence.frame(1), 1.0).motion.translation)
-    assert np.degrees(np.arccos(min(one @ other for one in directions for other in directions))) < 4
+    assert np.degrees(np.arccos(np.min(np.array(directions) @ np.transpose(directions)))) < 4
