@@ -1,7 +1,6 @@
 """One style for every figure and table, and the writing of both: SVG and PNG, CSV and Markdown.
 
-The functions that draw are in background (chapter 2), methods (chapter 3, training, prediction, masks) and outcome
-(the odometry of chapter 4). Each takes arrays or a table and returns a matplotlib figure.
+Each module of chapters 2 to 4 draws from arrays or a table and returns a matplotlib figure.
 """
 
 from pathlib import Path
@@ -10,10 +9,11 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 from PIL import ExifTags, Image
 
-from thesis_repro.cityscapes import colorize
+from thesis_repro.cityscapes import LABELS, colorize
 from thesis_repro.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
@@ -41,18 +41,17 @@ matplotlib.rcParams.update(STYLE)
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
     "#000000", "#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # what each colour stands for in all of chapter 4
-_LINES = [(color, style) for style in ("-", "--", ":") for color in (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK)]
-
 DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"  # the note where no data is shown
 
 
-def line_style(index):
-    """Colour and dash of the index-th line of a figure with many lines (up to 21 differ)."""
-    color, style = _LINES[index % len(_LINES)]
-    return {"color": color, "linestyle": style}
-
-
 KEYPOINT = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}  # how keypoints are drawn on a frame
+EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges drawn on a frame
+
+
+def line_style(index):
+    """Colour and dash of the index-th line of a figure: 28 differ, and neighbours differ without colours as well."""
+    colors, dashes = (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK), ("-", "--", "-.", ":")
+    return {"color": colors[index % len(colors)], "linestyle": dashes[index % len(dashes)]}
 
 
 def label_colors(label_map, frame):
@@ -62,16 +61,15 @@ def label_colors(label_map, frame):
     return colorize(label_map[np.ix_(rows, columns)])
 
 
-def new_figure(rows=1, columns=1, height=3.2, **options):
-    """A figure of page width with the project's style: (figure, axes)."""
-    return plt.subplots(rows, columns, figsize=(PAGE_WIDTH, height), layout="constrained", **options)
+def new_figure(rows=1, columns=1, height=3.2, width=PAGE_WIDTH, **options):
+    """A figure with the project's style, width and height in inches: (figure, axes)."""
+    return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
 
 
 def frame_panels(frame, rows=1, columns=1, width=PAGE_WIDTH):
     """A figure with panels of a frame's shape, titles above them and nothing wasted: (figure, list of axes)."""
     height, long = frame.shape[:2]
-    figure, axes = plt.subplots(rows, columns, layout="constrained", squeeze=False, figsize=(
-        width, rows * (width / columns * height / long + 0.27)))
+    figure, axes = new_figure(rows, columns, rows * (width / columns * height / long + 0.27), width, squeeze=False)
     return figure, list(axes.flat)
 
 
@@ -80,6 +78,17 @@ def show_image(axes, image, title, **options):
     axes.imshow(image, cmap=options.pop("cmap", "gray"), **options)
     axes.set_title(title)
     axes.set_axis_off()
+
+
+def class_legend(figure, *label_maps, also=()):
+    """Name the classes of label maps below a figure, which grows by the legend's height; `also`: further handles."""
+    names = {}  # Cityscapes gives several labels one colour
+    for index in np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps])):
+        names.setdefault(LABELS[index].color, []).append(LABELS[index].name)
+    handles = [Patch(color=np.array(color) / 255, label=", ".join(labels)) for color, labels in names.items()]
+    handles += also
+    figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * -(-len(handles) // 5))
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
 
 
 def ratio_axis(axis, low, high):
