@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import math
 import os
 import shlex
 import sys
@@ -326,13 +325,12 @@ class _Once(argparse.Action):
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse with errors of one line, options in full alone, no empty paths, and finite numbers alone."""
+    """argparse with errors of one line, options that count only in full, and no empty paths."""
 
     def __init__(self, **options):
         super().__init__(allow_abbrev=False, **options)
         self.register("action", None, _Once)
-        for kind, convert in ((Path, _path), (float, _finite), (int, _whole)):
-            self.register("type", kind, convert)
+        self.register("type", Path, _path)
 
     def error(self, message):
         self.exit(2, f"error: {one_line(message)}; see {self.prog} --help\n")
@@ -342,26 +340,6 @@ def _path(text):
     if not text.strip():
         raise argparse.ArgumentTypeError("is empty; name a file or a folder")
     return Path(text)
-
-
-def _finite(text):
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text[:60]!r} is no finite number")
-    return value
-
-
-def _whole(text):
-    try:
-        value = int(text)
-    except ValueError:
-        value = None
-    if value is None or abs(value) >= 2**63:
-        raise argparse.ArgumentTypeError(f"{text[:60]!r} is no whole number that could be meant")
-    return value
 
 
 def build_parser():
@@ -385,16 +363,13 @@ def build_parser():
                  "frames, and perhaps times.txt and poses.txt")
 
     def add_camera(add):
-        add("--camera", metavar="image_N",
-            help="folder of the frames (image_0; image_2, read as gray, where there is none)")
+        add("--camera", metavar="image_N", help="folder of the frames (image_0, or else image_2, read as gray)")
 
     def add_mask_settings(add):
         add("--boundaries", choices=("canny", "exact"), default="canny",
             help="Canny on enlarged label ids as in the thesis (canny), or every change of class (exact)")
-        add("--symmetric", action="store_true",
-            help="masks in the middle of the boundaries, not half a pixel beside them")
-        add("--classes", nargs="+", default=(), metavar="NAME",
-            help="boundaries of these classes alone, by their names in Cityscapes")
+        add("--symmetric", action="store_true", help="masks in the middle of the boundaries, not half a pixel aside")
+        add("--classes", nargs="+", default=(), metavar="NAME", help="boundaries of these Cityscapes classes alone")
         add("--without-movable", type=int, nargs="?", const=0, metavar="PIXELS",
             help="nothing on people and vehicles, nor so many pixels around them (0)")
         add("--margin", type=int, default=0, metavar="PIXELS", help="nothing along the frame's rim (0)")
@@ -428,8 +403,7 @@ def build_parser():
     add("--labels", type=Path, required=True, metavar="DIR", help="one label map a frame")
     add_sequence(add)
     add_camera(add)
-    add("--dilation", type=int, nargs="+", required=True, metavar="W",
-        help="dilation width in pixels; several get a folder each")
+    add("--dilation", type=int, nargs="+", required=True, metavar="W", help="width, pixels; several get a folder each")
     add("--output", type=Path, required=True, metavar="DIR", help="folder for the masks")
     add_mask_settings(add)
 
@@ -472,17 +446,14 @@ def build_parser():
                        ("masks", "the same with masks of the frames' size, 255 keep, 0 ignore")):
         add(f"--{kind}", dest="sources", action="append", metavar="DIR", help=what,
             type=lambda text, kind=kind: (kind, _path(text)))
-    add("--name", action="append", default=[], metavar="NAME",
-        help="of each --labels and --masks, in their order (the folder's)")
-    add("--widths", type=int, nargs="+", metavar="W",
-        help="dilation widths in pixels of masks from label maps (1 to 15)")
+    add("--name", action="append", default=[], metavar="NAME", help="of each --labels and --masks (the folder's)")
+    add("--widths", type=int, nargs="+", metavar="W", help="dilation widths of masks from label maps, pixels (1 to 15)")
     add_mask_settings(add)
     add("--controls", type=int, nargs="?", const=True, metavar="W",
         help="masks and limits without segmentation, beside masks of width W (10)")
     add("--repetitions", type=int, default=5, metavar="N",
         help="of every run, each with the matched points shuffled in another way (5)")
-    add("--estimator", nargs="+", choices=("thesis", "refined"), default=["thesis"],
-        help="the estimator: the thesis's (default), the refined one, or both")
+    add("--estimator", nargs="+", choices=("thesis", "refined"), default=["thesis"], help="one (thesis) or both")
     add("--frames", type=int, metavar="N", help="from the start of each sequence (all)")
     either("--jobs", type=int, metavar="N", help="processes at once (as many as there are cores)")
     either("--dask", metavar="ADDRESS", help="a Dask scheduler that the runs are sent to, tcp://host:8786")
@@ -501,8 +472,7 @@ def build_parser():
     add = command(plan).add_argument
     add_kitti(add, required=True)
     add("--cityscapes", type=Path, metavar="ROOT", help="count the training of a network on these images")
-    add("--complete", action="store_true",
-        help="plan for the complete benchmark, 23,201 frames, even where ROOT holds less")
+    add("--complete", action="store_true", help="plan for the complete benchmark, even where ROOT holds less")
     return parser
 
 

@@ -231,7 +231,7 @@ def misused_options():
                 continue
             option, values = action.option_strings[-1], ()
             if action.choices or action.type in (int, float, Path):
-                values = {int: ("many", "1.5"), float: ("fast", "nan"), Path: ("",)}.get(action.type, ("nonsense",))
+                values = {int: ("many", "1.5"), float: ("fast",), Path: ("",)}.get(action.type, ("nonsense",))
             yield from (([command, option, value], option) for value in values)
             if action.nargs != "?":
                 yield [command, f"{option}=yes" if action.nargs == 0 else option], option
