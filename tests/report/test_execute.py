@@ -5,12 +5,11 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import nbformat
 import pytest
 
-from thesis_repro.report.execute import LOGGED, shown_progress
+from thesis_repro.report.execute import LOGGED
 from thesis_repro.settings import ROOT
 
 pytestmark = pytest.mark.slow
@@ -92,23 +91,6 @@ def test_an_interrupted_notebook_leaves_no_kernel_running(start, tmp_path, sent)
     assert stderr.splitlines() == ["one was interrupted; the same command goes on from here"]
     assert (tmp_path / "tidied").is_file() and not is_alive((tmp_path / "pid").read_text())
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"one.log", "log.txt"}
-
-
-def test_progress_goes_to_a_terminal_by_its_name(monkeypatch):
-    here, terminal = os.openpty()
-    with os.fdopen(here), open(terminal, "w") as stream:
-        monkeypatch.setattr(sys, "stderr", stream)
-        with shown_progress() as path:
-            assert path == os.ttyname(terminal)
-
-
-def test_progress_reaches_a_standard_error_that_is_no_terminal(capfd):
-    with shown_progress() as path:
-        for line in ("one", "two"):  # opened anew for each bar
-            with open(path, "a") as file:
-                print(line, file=file)
-    assert capfd.readouterr().err == "one\ntwo\n"
-    assert not Path(path).exists()
 
 
 @pytest.mark.parametrize("line", [

@@ -7,14 +7,13 @@ import logging
 import os
 import re
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from threading import Thread
 
 from nbclient.exceptions import CellExecutionError, DeadKernelError
 from nbclient.util import run_sync
@@ -28,8 +27,7 @@ from thesis_repro.settings import PREFIX
 LOGGED = re.compile(r"""^(?:
     Segmentation\ Models:\ using\ .*\ framework\.
   | (?:WARNING:\ )?All\ log\ messages\ before\ absl::InitializeLog\(\)\ .*
-  | [IWEF]\d{4}\ \d\d:\d\d:[\d.]+\ +\d+\ \S+:\d+\]\ .*
-  | \d{4}-\d\d-\d\d\ \d\d:\d\d:[\d.]+:\ [IWEF]\ \S+:\d+\]\ .*
+  | (?:[IWEF]\d{4}|\d{4}-\d\d-\d\d)\ \d\d:\d\d:[\d.]+(?:\ +\d+|:\ [IWEF])\ \S+:\d+\]\ .*
   | To\ enable\ the\ following\ instructions:\ .*,\ rebuild\ TensorFlow\ with\ the\ appropriate\ compiler\ flags\.
 )$\n?""", re.MULTILINE | re.VERBOSE)
 COLORS = re.compile(r"\x1b\[[0-9;]*m")
@@ -43,48 +41,41 @@ class Execution(ExecutePreprocessor):
                        ).tag(config=True)
 
     def preprocess(self, nb, resources=None, km=None):
-        name, started = resources["metadata"]["name"], time.monotonic()
-        log = Path(self.log_file)
-        folder = log.parent  # of all executed notebooks of a run, of which two may be at work at once
-        sys.excepthook = partial(_in_one_line, folder)  # where the executed notebook itself cannot be written
-        folder.mkdir(parents=True, exist_ok=True)
+        name, log = resources["metadata"]["name"], Path(self.log_file)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
+        sys.excepthook = lambda kind, error, trace: _report(log.parent, error)  # where its result cannot be written
+        log.parent.mkdir(parents=True, exist_ok=True)
         log.touch()
-        with longrun.locked(log), longrun.logged(folder, f"make figures, {name}", ours=True):
+        with longrun.locked(log), longrun.logged(log.parent, f"make figures, {name}", ours=True), \
+                open(log, "w", encoding="utf-8") as self._log:
             longrun.say(name)
-            done = self._executed(name, nb, resources, km)
-            longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
-        return done
-
-    def _executed(self, name, nb, resources, km):
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
-        with open(self.log_file, "w", encoding="utf-8") as self._log:
+            started = time.monotonic()
             try:
-                return super().preprocess(nb, resources, km)
+                executed = super().preprocess(nb, resources, km)
             except KeyboardInterrupt:
                 print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
                 sys.exit(130)
             except Exception as error:
-                why, report = _explained(error)
-                self._log.write(report)
-                longrun.note(f"{name} failed: {why}")
-                print(f"{name} failed: {why}\nthe whole report: {_short(self.log_file)}; the same command goes on from "
-                      "here", file=sys.stderr)
+                self._log.write(COLORS.sub("", traceback.format_exc()))
+                reason = f"{name} failed: {_reason(error)}"
+                longrun.note(reason)
+                print(f"{reason}\nthe whole report: {os.path.relpath(log)}; the same command goes on from here",
+                      file=sys.stderr)
                 sys.exit(1)
-            finally:
-                signal.signal(signal.SIGTERM, before)
+            longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
+        return executed
 
     @contextmanager
     def setup_kernel(self, **options):
-        with shown_progress() as path:
-            environment = os.environ | {f"{PREFIX}PROGRESS": path}
-            with super().setup_kernel(env=environment, stdout=self._log, stderr=self._log, **options):
-                try:
-                    yield
-                except KeyboardInterrupt:
-                    logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
-                    run_sync(self.km.interrupt_kernel)()  # so that the cell tidies up before its kernel ends,
-                    time.sleep(1)  # for which it needs a moment
-                    raise
+        with _progress_path() as path, super().setup_kernel(env=os.environ | {f"{PREFIX}PROGRESS": path},
+                                                            stdout=self._log, stderr=self._log, **options):
+            try:
+                yield
+            except KeyboardInterrupt:
+                logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
+                run_sync(self.km.interrupt_kernel)()  # so that the cell tidies up before its kernel ends,
+                time.sleep(1)  # for which it needs a moment
+                raise
 
     def preprocess_cell(self, cell, resources, index):
         cell, resources = super().preprocess_cell(cell, resources, index)
@@ -97,65 +88,37 @@ class Execution(ExecutePreprocessor):
 
 
 @contextmanager
-def shown_progress():
-    """Yield the path that a kernel writes its progress to (`files.progress`), to be seen on this standard error.
+def _progress_path():
+    """The path that a kernel writes its progress to (`files.progress`), to be seen on this standard error.
 
-    A terminal has a path of its own. Anything else, such as a pipe or a file, is reached through a named pipe.
+    A terminal has a path of its own. Anything else, such as a file, is reached through a named pipe.
     """
-    if (terminal := _terminal()) is not None:
-        yield terminal
+    if os.isatty(2):
+        yield os.ttyname(2)
         return
     with tempfile.TemporaryDirectory() as folder:
         path = os.path.join(folder, "progress")
         os.mkfifo(path)
-        reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # does not wait for a writer
-        writer = os.open(path, os.O_WRONLY)  # held, as the last one to close would end the reading
-        os.set_blocking(reader, True)
-        thread = Thread(target=_copy, args=(reader,), daemon=True)
-        thread.start()
-        try:
-            yield path
-        finally:
-            os.close(writer)
-            thread.join(timeout=1)
+        with subprocess.Popen(["cat", path], stdout=2, start_new_session=True), open(path, "r+b", buffering=0):
+            yield path  # held open, since the last writer that closes it would end the copying
 
 
-def _copy(reader):
-    with open(reader, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            print(line, end="", file=sys.stderr, flush=True)
-
-
-def _terminal():
-    try:
-        path = os.ttyname(sys.stderr.fileno())
-    except OSError:  # none, or not one that has a name here
-        return None
-    return path if os.access(path, os.W_OK) else None
-
-
-def _explained(error):
-    """(why a notebook failed in one line, the whole report)."""
+def _reason(error):
+    """Why a notebook failed, in one line."""
+    reason = f"{type(error).__name__}: {error}"
     if isinstance(error, CellExecutionError):
-        why, report = f"{error.ename}: {error.evalue}".strip(), str(error)
-        why = why.partition("\n")[0] + longrun.remedy(why)
+        reason = f"{error.ename}: {error.evalue}"
+        reason = reason.partition("\n")[0] + longrun.remedy(reason)
     elif isinstance(error, DeadKernelError):
-        why = "the kernel died, as it does where there is not enough memory"
-        report = traceback.format_exc()
-    else:
-        why, report = f"{type(error).__name__}: {error}", traceback.format_exc()
-    return COLORS.sub("", why).strip().partition("\n")[0], COLORS.sub("", report)
+        reason = "the kernel died, as it does where there is not enough memory"
+    return COLORS.sub("", reason).strip().partition("\n")[0]
 
 
-def _in_one_line(folder, kind, error, trace):
+def _report(folder, error):
+    """Say in one line why the executed notebook itself could not be written."""
     if isinstance(error, OSError) and error.filename is None:
         error.filename = str(folder)
-    if longrun.explain(error) is None:
-        sys.__excepthook__(kind, error, trace)
-    else:
+    try:
         longrun.report_error(error)
-
-
-def _short(path):
-    path = Path(path).absolute()
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    except Exception:
+        traceback.print_exception(error)
