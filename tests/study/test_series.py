@@ -74,12 +74,11 @@ def test_a_study_leaves_tables_figures_words_and_a_page_that_shows_them(done):
     assert all((done / link).is_file() for link in links)
     assert {path.name for path in done.iterdir() if path.is_file()} - {
         "index.html", "made-from.json", "log.txt", "runs.csv", "runs.md", "findings.md"} <= {*links}
-    assert {"keypoints-all.svg", "controls-net.svg", "controls-by-hand.svg", "errors.csv",
-            "sources.md"} <= {*links}
+    assert {"comparison.svg", "comparison_keypoints.svg", "comparison_sequences.svg", "comparison.csv", "widths.md",
+            "errors.csv"} <= {*links}
     assert "embedded world" in page and "script" not in page
     words = (done / "findings.md").read_text()
-    assert "### net" in words and "### by-hand" in words and "One against the other" in words and "nan" not in words
-    assert "with net (width 7) RMSE cannot be told apart from that with by-hand" in words
+    assert "**net.**" in words and "**by-hand.**" in words and "by-hand over net" in words and "nan" not in words
 
 
 def test_masks_ready_made_are_what_label_maps_of_that_width_give(done, small_world):
@@ -92,9 +91,10 @@ def test_masks_ready_made_are_what_label_maps_of_that_width_give(done, small_wor
     methods = {name: set(runs.loc[runs["source"] == name, "method"]) for name in ("net", "by-hand")}
     assert methods["net"] - methods["by-hand"] == {"exact-boundaries", "corrected", "true-labels"}
     assert {"mirrored", "other-frame", "random-lines", "image-edges", "fewer", "spread"} < methods["by-hand"]
-    table = pd.read_csv(done / "sources.csv")
-    assert table["masks"].tolist() == ["all keypoints", "net", "net", "by-hand"]
-    assert table["kept (%)"].iloc[2] == table["kept (%)"].iloc[3] < 100
+    table = pd.read_csv(done / "comparison.csv")
+    table = table[(table["over"] == "all keypoints") & table["keypoints"].str.contains("segmentation mask")]
+    assert set(table["keypoints"]) == {"net: segmentation mask, width 7", "by-hand: segmentation mask"}
+    assert table.groupby("estimator")["RMSE"].nunique().eq(1).all()
 
 
 def test_the_same_again_runs_nothing_and_another_source_runs_only_its_own(done, small_world, small_labels, masks,
@@ -154,7 +154,7 @@ def test_one_estimator_is_enough(small_world, small_labels, tmp_path):
     words = (tmp_path / "out" / "findings.md").read_text()
     assert "refined estimator" in words and "(label maps; margin 30)" in words
     assert set(pd.read_csv(tmp_path / "out" / "runs.csv")["estimator"]) == {"refined"}
-    assert not (tmp_path / "out" / "keypoints-all.svg").exists()
+    assert not (tmp_path / "out" / "widths.csv").exists()
 
 
 @pytest.mark.parametrize("given, says", [

@@ -1,184 +1,239 @@
-"""The answer in a figure, a table and words: error against number of keypoints, by method (`study.answer`)."""
+"""Masks against all keypoints, controls and other sources, in figures and tables: `compare.comparisons`, for reading.
+
+A figure has one row of panels an estimator and one column an error: those that judge, and the RMSE as the thesis
+measures it. Several sources of masks are further rows.
+"""
 
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 
-from thesis_repro.report.findings import ENOUGH, UNAIDED
-from thesis_repro.report.style import BASELINE, BLACK, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, SKY, new_figure
-from thesis_repro.study import answer, results
+from thesis_repro.report import texts
+from thesis_repro.report.style import (
+    BASELINE,
+    BLACK,
+    GREEN,
+    MASKED,
+    ORANGE,
+    PAGE_WIDTH,
+    PINK,
+    SKY,
+    new_figure,
+    ratio_axis,
+)
+from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study.jobs import ESTIMATORS
 
+SHOWN = (*compare.JUDGING_METRICS, "rmse")
 MARKERS = "oDsh^v<>PpX"
-COLORS = (BASELINE, MASKED, GREEN, "#7fb800", ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b",
-          "#5d3a9b")  # in METHODS' order
+COLORS = (BASELINE, MASKED, GREEN, "#7fb800", ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b", "#5d3a9b")
+CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
+KEYS = ["source", "method", "dilation_width", "estimator"]
+
+
+def figure_comparison(table):
+    """Every method's ratio to all keypoints, a row each: sequences in grey, geometric mean, bootstrap interval."""
+    rows = _against_all_keypoints(table)
+    labels = _labels(rows)
+    order = list(dict.fromkeys(labels))
+    figure, panels = _panels(rows, height=0.9 + 0.21 * len(order), sharey=True)
+    for panel, of_panel in panels:
+        for index, row in of_panel.iterrows():
+            y, color = order.index(labels[index]), MASKED if row["method"] == "masked" else BASELINE
+            values = row[_sequences(table)].dropna().astype(float)
+            panel.plot(values, [y - 0.22] * len(values), "o", color="#555555", alpha=0.45, markersize=3,
+                       markeredgewidth=0)
+            panel.plot([row["low"], row["high"]], [y + 0.1] * 2, color=color, linewidth=2.2)
+            panel.plot(row["ratio"], y + 0.1, "D" if row["method"] == "masked" else "o", color=color, markersize=5,
+                       markeredgecolor="white")
+        panel.axvline(1, color="black", linewidth=0.8)
+        panel.grid(axis="y", visible=False)
+        panel.set_yticks(range(len(order)), order, fontsize=7)
+        panel.set_ylim(len(order) - 0.5, -0.6)
+        _ratio_axis(panel.xaxis)
+    for panel in figure.axes[-len(panels) // len(set(rows["estimator"])):]:
+        panel.set_xlabel("ratio to all keypoints\n(left of 1: lower)", fontsize=8)
+    return figure
+
+
+def figure_keypoints(table):
+    """Ratio to all keypoints against the mean number of keypoints; lines lead through the other widths."""
+    rows = table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
+    several = rows["source"].nunique() > 1
+    rows = rows[rows["method"] == "masked"] if several else rows
+    series = rows["source"] if several else rows["method"]
+    tested = set(_against_all_keypoints(table).index)
+    figure, panels = _panels(rows, height=2.3)
+    for panel, of_panel in panels:
+        for place, (name, line) in enumerate(of_panel.sort_values("keypoints").groupby(series, sort=False)):
+            style = {"color": COLORS[place % len(COLORS)], "marker": MARKERS[place % len(MARKERS)]} if several else \
+                _style(name)
+            at_width = line[line.index.isin(tested)]
+            panel.plot(line["keypoints"], line["ratio"], color=style["color"], linewidth=0.9, alpha=0.6)
+            for row in at_width.itertuples():
+                panel.plot([row.keypoints] * 2, [row.low, row.high], color=style["color"], linewidth=1.6)
+            panel.plot(at_width["keypoints"], at_width["ratio"], linestyle="none", markersize=6,
+                       markeredgecolor="white", markeredgewidth=0.5,
+                       label=name if several else compare.METHODS[name], **style)
+        panel.plot(of_panel["reference_keypoints"].iloc[0], 1, "k*", markersize=8, label=compare.METHODS["baseline"])
+        panel.axhline(1, color="black", linewidth=0.8)
+        panel.xaxis.set_major_locator(MaxNLocator(4))
+        _ratio_axis(panel.yaxis)
+    _legend(figure, figure.axes)
+    for panel in figure.axes[-len(panels) // len(set(rows["estimator"])):]:
+        panel.set_xlabel("mean number of keypoints", fontsize=8)
+    return figure
+
+
+def figure_sequences(table, runs, metric="rmse_boresight_corrected"):
+    """Ratio to all keypoints against keypoints, one panel a sequence, under the estimator that judges.
+
+    runs: those of the table, for the number of keypoints of each sequence.
+    """
+    metric = metric if (table["metric"] == metric).any() else "rmse"
+    estimator = compare.judging_estimator(table)
+    rows = table[(table["reference"] == "baseline") & (table["metric"] == metric) & (table["method"] != "baseline")
+                 & (table["estimator"] == estimator)]
+    several = rows["source"].nunique() > 1
+    rows = rows[rows["method"] == "masked"] if several else rows
+    keypoints = runs.groupby([*KEYS, "sequence"], dropna=False)["mean_keypoints"].mean().rename("own").reset_index()
+    points = rows.melt(KEYS, _sequences(table), "sequence", "its_ratio").merge(keypoints).dropna(subset=["its_ratio"])
+    names = sorted(points["sequence"].unique())
+    columns = min(4, len(names))
+    count = -(-len(names) // columns)
+    figure, axes = new_figure(count, columns, height=PAGE_WIDTH / columns * count * 0.85 + 0.9, squeeze=False)
+    for panel in axes.flat[len(names):]:
+        panel.set_axis_off()
+    for panel, name in zip(axes.flat, names):
+        own = points[points["sequence"] == name].sort_values("own")
+        for place, (key, line) in enumerate(own.groupby("source" if several else "method", sort=False)):
+            style = {"color": COLORS[place % len(COLORS)], "marker": MARKERS[place % len(MARKERS)]} if several else \
+                _style(key)
+            panel.plot(line["own"], line["its_ratio"], linewidth=0.9, markersize=4.5, markeredgewidth=0,
+                       label=key if several else compare.METHODS[key], **style)
+        panel.axhline(1, color="black", linewidth=0.8)
+        panel.set_title(name)
+        panel.tick_params(labelsize=7)
+        panel.xaxis.set_major_locator(MaxNLocator(3))
+        _ratio_axis(panel.yaxis)
+    _legend(figure, axes.flat[:len(names)])
+    figure.suptitle(f"{compare.METRICS[metric]}, {ESTIMATORS[estimator]}: ratio to all keypoints", fontsize=9)
+    for panel in axes.flat[max(0, len(names) - columns):len(names)]:
+        panel.set_xlabel("number of keypoints", fontsize=8)
+    return figure
+
+
+def _ratio_axis(axis):
+    """Make an axis logarithmic, with 1 in it, around what its panel's lines show."""
+    values = np.concatenate([line.get_data()[axis.axis_name == "y"] for line in axis.axes.lines]).astype(float)
+    values = [*values[np.isfinite(values) & (values > 0)], 1]
+    ratio_axis(axis, min(values), max(values))
 
 
 def _style(method):
-    index = list(answer.METHODS).index(method)
-    return {"color": COLORS[index], "marker": MARKERS[index], "label": answer.METHODS[method]}
+    place = list(compare.METHODS).index(method)
+    return {"color": COLORS[place], "marker": MARKERS[place]}
 
 
-def figure_answer(summary, every=None):
-    """Ratio of each method's error to that of all keypoints against its number of keypoints; log scales.
-
-    One row of panels an estimator, one column a metric. Markers are geometric means over sequences at the tested width,
-    bars their bootstrap intervals; lines lead through the other widths and limits of `every`, which holds `summary`.
-    """
-    every = summary if every is None else every
-    poses = [estimator for estimator in results.ESTIMATORS if len(results.of_method(summary, "baseline", estimator))]
-    figure, axes = new_figure(len(poses), len(answer.METRICS), height=1.0 + 2.5 * len(poses), squeeze=False)
-    for row, estimator in zip(axes, poses, strict=True):
-        for panel, (metric, name) in zip(row, answer.METRICS.items(), strict=True):
-            for method, line in _lines(every, metric, estimator).groupby("method", sort=False):
-                panel.plot(line["keypoints"], line["ratio"], color=_style(method)["color"], linewidth=0.9, alpha=0.6)
-            for one in answer.compared(summary, metric, estimator).itertuples():
-                if np.isfinite(one.low):
-                    panel.plot([one.keypoints] * 2, [one.low, one.high], color=_style(one.method)["color"],
-                               linewidth=1.6)
-                panel.plot(one.keypoints, one.ratio, linestyle="none", markersize=6.5, markeredgecolor="white",
-                           markeredgewidth=0.5, **_style(one.method))
-            panel.axhline(1, color="black", linewidth=0.8)
-            panel.set(xscale="log", yscale="log", title=f"{name}, {results.ESTIMATORS[estimator]}")
-            panel.minorticks_off()
-            _plain_ticks(panel)
-        row[0].set_ylabel("times the error of all keypoints")
-    for panel in axes[-1]:
-        panel.set_xlabel("mean number of keypoints")
-    figure.legend(*axes[-1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    return figure
+def _panels(rows, height, **options):
+    """(figure, (panel, its rows)), one row of panels an estimator and one column an error; height: inches a row."""
+    estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
+    metrics = [name for name in SHOWN if (rows["metric"] == name).any()]
+    figure, axes = new_figure(len(estimators), len(metrics), height=0.7 + height * len(estimators), squeeze=False,
+                              **options)
+    panels = []
+    for row, estimator in zip(axes, estimators):
+        row[0].set_ylabel(ESTIMATORS[estimator])
+        for panel, metric in zip(row, metrics):
+            panel.tick_params(labelsize=7)
+            panels.append((panel, rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]))
+    for panel, metric in zip(axes[0], metrics):
+        panel.set_title(compare.METRICS[metric].replace(", ", ",\n"))
+    return figure, panels
 
 
-def figure_by_sequence(summary, metric):
-    """The same errors themselves, one panel a sequence: bars from the lowest to the highest of the repetitions."""
-    lines = answer.lines(summary, metric)
-    names = list(dict.fromkeys(lines["sequence"]))
-    columns = min(4, len(names))
-    rows = -(-len(names) // columns)
-    figure, axes = new_figure(rows, columns, height=PAGE_WIDTH / columns * rows * 0.9 + 0.8, squeeze=False)
-    for panel in axes.flat[len(names):]:
-        panel.set_axis_off()
-    for panel, name in zip(axes.flat, names, strict=False):
-        for method, line in lines[lines["sequence"] == name].groupby("method", sort=False):
-            spread = [line["mean"] - line["lowest"], line["highest"] - line["mean"]]
-            panel.errorbar(line["keypoints"], line["mean"], yerr=np.maximum(spread, 0), linewidth=0.9, elinewidth=0.9,
-                           markersize=4, markeredgewidth=0, **_style(method))
-        panel.set(xscale="log", yscale="log", title=name)
-        panel.minorticks_off()
-        _plain_ticks(panel)
-        panel.tick_params(labelsize=7)
-    for panel in axes[:, 0]:
-        panel.set_ylabel({"rotation": "rotation error (degrees)"}.get(metric, "RMSE (m)"))
-    for panel in axes.flat[max(0, len(names) - columns):len(names)]:
-        panel.set_xlabel("mean number of keypoints", fontsize=8)
-    handles = {}
-    for panel in axes.flat[:len(names)]:
-        handles |= dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True))
+def _legend(figure, axes):
+    handles = {label: handle for panel in axes for handle, label in zip(*panel.get_legend_handles_labels())}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
-    return figure
 
 
-def _lines(summary, metric, estimator):
-    """Geometric means over sequences of the ratios to all keypoints, for methods run with several settings."""
-    every = answer.logs(results.of_method(summary, "baseline", estimator), metric)
-    found = answer.lines(summary, metric, estimator)
-    found["setting"] = found.groupby(["sequence", "method"]).cumcount()
-    counts = found.groupby("method")["setting"].transform("max")
-    found = found[(counts > 0) & (found["method"] != "baseline")]
-    found = found.assign(ratio=np.log(found["mean"]) - found["sequence"].map(every),
-                         keypoints=np.log(found["keypoints"]))
-    return np.exp(found.groupby(["method", "setting"], sort=False)[["keypoints", "ratio"]].mean()).reset_index()
+def _against_all_keypoints(table):
+    """Every method over all keypoints: at the tested width, or at every one where none of its source is tested."""
+    rows = table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
+    masked = rows[(rows["method"] == "masked") & rows["tested"]]
+    return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
 
 
-def _plain_ticks(panel):
-    """Few ticks at round numbers, however short or long a logarithmic axis is."""
-    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
-        for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 7, 8, 9),
-                      np.arange(1, 10, 0.1), np.arange(1, 10, 0.02)):
-            ticks = [step * 10.0**power for power in range(-6, 6) for step in steps]
-            ticks = [tick for tick in ticks if low <= tick <= high]
-            if len(ticks) >= 3:
-                break
-        ticks = ticks[::-(-len(ticks) // 6)]
-        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+def _labels(rows):
+    """What each row is called: source where there are several, method, width of masks."""
+    several = rows["source"].nunique() > 1
+    source = rows["source"] + ": " if several else ""
+    width = rows["dilation_width"].where(rows["method"] == "masked")
+    width = width.map(", width {:g}".format, na_action="ignore").fillna("")
+    return source + rows["method"].map(compare.METHODS) + width
 
 
-def table(summary):
-    """Every method under both estimators and metrics: keypoints, ratios to all keypoints and of masks to it."""
-    rows = []
-    for estimator, estimator in results.ESTIMATORS.items():
-        if not len(results.of_method(summary, "baseline", estimator)):
-            continue
-        for metric, name in answer.SHOWN.items():
-            if summary[metric].isna().all():  # paths too short for it
-                continue
-            for one in answer.compared(summary, metric, estimator).itertuples():
-                rows.append({"estimator": estimator, "error": name, "keypoints": answer.METHODS[one.method],
-                             "mean number": round(one.keypoints), "sequences": one.sequences,
-                             "times all keypoints": _number(one.ratio), "interval": _between(one.low, one.high),
-                             "thesis's mean of percentages (%)": round(one.percent, 1),
-                             "masks are times this": _number(one.masks),
-                             "masks, interval": _between(one.masks_low, one.masks_high)})
-    return pd.DataFrame(rows)
+def _sequences(table):
+    """The columns with the ratio of each sequence."""
+    return list(table.columns[table.columns.get_loc("verdict") + 1:])
 
 
-def _number(value):
-    return float(f"{value:.3g}")
+def table_comparison(table):
+    """Every method over all keypoints and masks over every control, a column an error: "1.09 (0.98-1.32)".
 
-
-def _between(low, high):
-    return pd.NA if np.isnan(low) else f"{low:.3g} to {high:.3g}"
-
-
-def words(summary, data, quality=None):
-    """The answer as one paragraph of Markdown, chosen by the numbers as `study.answer` has it.
-
-    quality: of the label maps, for the verdict (`gap.quality`).
+    The last column is the verdict of the errors that judge together (`compare.overall`).
     """
-    found = {metric: answer.compared(summary, metric).set_index("method") for metric in answer.METRICS}
-    first = found["turned"]
-    if "masked" not in first.index:
-        return ""
-    count = int(first.loc["masked", "sequences"])
-    parts = [f"the {name} is {_ratio(found[metric].loc['masked'])} times that of all keypoints"
-             for metric, name in answer.METRICS.items()]
-    text = (f"**Do masks help?** Data: {data}. Refined estimator, width {results.tested_width(summary)}, "
-            f"{first.loc['masked', 'keypoints']:.0f} keypoints instead of {first.loc['baseline', 'keypoints']:.0f}, "
-            f"geometric means over {count} sequence{'s' * (count != 1)}: with masks {' and '.join(parts)}"
-            f"{_beside(summary)}.")
-    if "corrected" in first.index:
-        text += " With all of the thesis's slips corrected: " + ", ".join(
-            f"{name} {_ratio(found[metric].loc['corrected'])}" for metric, name in answer.METRICS.items()) + "."
-    beaten, better, same = [], [], []
-    for method in UNAIDED:
-        signs = [_sign(found[metric].loc[method, "masks_low"], found[metric].loc[method, "masks_high"])
-                 for metric in answer.METRICS if method in found[metric].index]
-        if signs:
-            (beaten if set(signs) == {-1} else better if set(signs) == {1} else same).append(answer.METHODS[method])
-    for names, said in ((beaten, "worse than masks by both measures"), (better, "better than masks by both measures"),
-                        (same, "not told apart from masks by both measures")):
-        if names and count >= results.FEWEST:
-            text += f" Of what knows no class of the frame, {said}: {', '.join(names)}."
-    helps = {_sign(found[metric].loc["masked", "low"], found[metric].loc["masked", "high"]) for metric in found}
-    if count < ENOUGH:
-        return f"{text} **{count} sequences say nothing of sequences in general.**\n"
-    masks = f"Masks{f' from label maps of {quality}' if quality else ''}"
-    if helps == {-1}:
-        return f"{text} **{masks} help here, " + ("and the segmentation matters.**\n" if not better and not same
-                                                 else "but not for what the segmentation knows.**\n")
-    return f"{text} **{masks} {'do worse than all keypoints' if helps == {1} else 'are not shown to help'} here.**\n"
+    rows = pd.concat([_against_all_keypoints(table), table[table["reference"] != "baseline"]])
+    rows = rows.assign(what=_labels(rows), place=range(len(rows)))
+    shown = []
+    for _, of_pair in rows.groupby(["estimator", *KEYS[:3], "reference_source", "reference"], dropna=False, sort=False):
+        first, judging = of_pair.iloc[0], of_pair[of_pair["metric"].isin(compare.JUDGING_METRICS)]
+        reference = compare.METHODS[first["reference"]]
+        if first["reference_source"] not in ("", first["source"]):
+            reference = f"{first['reference_source']}: {reference}"
+        shown.append({
+            "estimator": ESTIMATORS[first["estimator"]], "keypoints": first["what"],
+            "number": round(first["keypoints"]), "over": reference, "sequences": of_pair["n"].max(),
+            **{compare.METRICS[row["metric"]]: _short(row) for _, row in of_pair.iterrows()},
+            "verdict": compare.overall(judging["verdict"]) if len(judging) else pd.NA})
+    columns = ["estimator", "keypoints", "number", "over", "sequences",
+               *(name for name in compare.METRICS.values() if any(name in row for row in shown)), "verdict"]
+    return pd.DataFrame(shown, columns=columns)
 
 
-def _beside(summary):
-    said = []
-    for metric, name in results.BESIDE.items():
-        if summary[metric].notna().any():
-            said.append(f"{name} {_ratio(answer.compared(summary, metric).set_index('method').loc['masked'])}")
-    return f" (beside them, {', '.join(said)})" if said else ""
+def _short(row):
+    return pd.NA if pd.isna(row["ratio"]) else texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
 
 
-def _ratio(one):
-    return f"{one['ratio']:.2f}" + ("" if np.isnan(one["low"]) else f" [{one['low']:.2f}, {one['high']:.2f}]")
+def table_widths(runs):
+    """What the best, the left-out and the fixed width give: ratios of errors to all keypoints, one row a sequence.
+
+    Below each source's sequences their geometric mean with its bootstrap interval, and in how many the error is lower.
+    """
+    tables = []
+    for source in compare.sources(runs) or [""]:
+        own = compare.of_source(runs, source)
+        if compare.of_method(own, "masked")["dilation_width"].nunique() > 1:
+            part = _widths(own)
+            tables.append(part.assign(masks=source)[["masks", *part]] if len(compare.sources(runs)) > 1 else part)
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
-def _sign(low, high):
-    """-1 where an interval of ratios lies below 1, 1 where above, 0 where neither."""
-    return -1 if high < 1 else 1 if low > 1 else 0
+def _widths(runs):
+    chosen, baseline = thesis_tables.chosen_widths(runs), compare.of_method(runs, "baseline")
+    metrics = [name for name in ("rmse", "rmse_boresight_corrected") if name in runs and runs[name].notna().any()]
+    shown, ratios = pd.DataFrame(index=chosen.index), {}
+    for choice, words in CHOICES.items():
+        shown[words] = chosen[choice]
+        for metric in metrics:
+            rows = thesis_tables.of_chosen_width(runs, chosen[choice])
+            ratios[f"{words}: {compare.METRICS[metric]}"] = compare.ratios(rows, baseline, metric)
+            shown[f"{words}: {compare.METRICS[metric]}"] = np.nan
+    again = thesis_tables.stability(runs)
+    ratios["best width of one repetition, in the others: RMSE"] = again["elsewhere"]
+    shown = shown.assign(**{name: values.map(texts.number, na_action="ignore") for name, values in ratios.items()},
+                         **{"same best width in two repetitions (%)": again["same_best"].round()})
+    below = {"geometric mean": {name: _short(compare.geometric_mean(values)) for name, values in ratios.items()},
+             "lower in": {name: f"{(values < 1).sum()} of {values.notna().sum()}" for name, values in ratios.items()}}
+    table = pd.concat([shown, pd.DataFrame(below).T]).reindex(columns=shown.columns)
+    return table.rename_axis("sequence").reset_index()

@@ -2,7 +2,7 @@
 
 `python -m thesis_repro.report.evidence KITTI FOLDER` (make evidence) takes the sequences in a KITTI folder, label maps
 of the model in the package, the thesis's masks and the controls of one width under both estimators, and the audit's
-switches. What is compared with what was decided beforehand (`study.answer`). A stopped run goes on where it was.
+switches. A stopped run goes on where it was.
 """
 
 import argparse
@@ -22,13 +22,13 @@ from thesis_repro import InputError, kitti, longrun, masks, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
-from thesis_repro.report import audit, comparison, findings, outcome, style, tables
-from thesis_repro.study import answer, controls, effects, jobs, results, runner
+from thesis_repro.report import audit, comparison, style, texts
+from thesis_repro.study import compare, controls, effects, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
 LARGEST = 3_000_000  # bytes, of everything together
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
-# Beside the tested width, for the lines of error against number of keypoints: under the estimator that judges alone.
+# Beside the tested width, for the lines of error against number of keypoints: under the refined estimator alone.
 OTHER_WIDTHS, OTHER_REPETITIONS = (5, 15), 3
 LINES = ("masked", "exact-boundaries", "corrected", "mirrored", "random-lines", "image-edges")  # that have a width
 LOOKED_AT = 12  # frames of each sequence whose boundaries and keypoints are looked at one by one
@@ -38,38 +38,36 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     """Run what is missing and write everything into a folder; returns its files.
 
     root: of KITTI. build: folder for label maps and runs. frames: of each sequence, None for all.
-    Raises InputError where the files are larger than LARGEST together, or where the folder holds anything else.
+    Raises InputError where the files are larger than LARGEST together.
     """
-    root, build = Path(root).absolute(), stages.stage(Path(build).absolute(), root=str(root), frames=frames)
-    names = kitti.sequences(root)
-    _predict(root, names, build / "labels", frames)
-    tested, every = _runs(root, names, build, frames, repetitions, processes)
+    root, build, folder = Path(root).absolute(), Path(build).absolute(), Path(folder)
+    stages.stage(build, root=str(root), frames=frames)
+    sequences = [kitti.Sequence(root, name).subset(frames) for name in kitti.sequences(root)]
+    names = [sequence.name for sequence in sequences]
+    _predict(sequences, build / "labels")
+    runs = _runs(root, names, build, frames, repetitions, processes)
+    tested = runs[~runs["dilation_width"].isin(OTHER_WIDTHS) | (runs["estimator"] == "thesis")]
     plan = effects.Plan(orders=repetitions, chance=max(10, repetitions), frames=frames)
     switches, prefixes = effects.measure(root, names, build / "labels", build / "audit", plan, processes)
-    sequences = [kitti.Sequence(root, name).subset(frames) for name in names]
-    length = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
-    note = f"odometry: real KITTI frames, {length}; label maps by the model in the package"
-    folder = Path(folder)
+    angles = boresight.explained(runner.refined_paths(runs, root, build / "odometry", frames))
+    measured = [*audit.arithmetic(), *audit.of_switches(switches), *audit.of_chance(prefixes), *audit.of_runs(tested),
+                *audit.of_boresight(angles), *audit.of_boundaries(_boundaries(sequences, build / "labels")),
+                *audit.of_tracks(_tracks(sequences, build / "labels"))]
+    lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
+    note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
+    table = compare.comparisons(runs)
     longrun.sweep(folder)
-    found = [*audit.arithmetic(), *audit.of_switches(switches), *audit.of_chance(prefixes), *audit.of_runs(tested),
-             *audit.of_boresight(boresight.explained(answer.refined_paths(names, root, build / "odometry", frames))),
-             *audit.of_boundaries(_boundaries(sequences, build / "labels")),
-             *audit.of_tracks(_tracks(sequences, build / "labels"))]
-    words = {"answer_in_words": comparison.words(tested, note), "findings": findings.words(tested, note)}
-    for name, table in {"answer": comparison.table(tested), "audit": audit.table(found, note),
-                        "controls": tables.table_controls(tested), "widths": tables.table_widths(tested),
-                        "runs": _short(every), "switches": _short(switches)}.items():
-        style.save_table(table, folder, name, note)
-    for name in ("runs", "switches"):  # thousands of rows are for programs
-        (folder / f"{name}.md").unlink()
-    for name, figure in {"answer": comparison.figure_answer(tested, every),
-                         "answer_sequences": comparison.figure_by_sequence(every, "turned"),
-                         "answer_rotation": comparison.figure_by_sequence(every, "rotation"),
-                         "controls": outcome.figure_controls(tested)}.items():
+    for name, content in {"comparison": comparison.table_comparison(table), "audit": audit.table(measured, note),
+                          "widths": comparison.table_widths(runs)}.items():
+        style.save_table(content, folder, name, note)
+    for name, content in {"runs": runs, "switches": switches}.items():
+        # six digits are more than shuffling the matched points leaves alone
+        write_text(folder / f"{name}.csv", content.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
+    for name, figure in {"comparison": comparison.figure_comparison(table),
+                         "comparison_keypoints": comparison.figure_keypoints(table),
+                         "comparison_sequences": comparison.figure_sequences(table, runs)}.items():
         style.save_figure(figure, folder, name, note)
-    for name, text in words.items():
-        write_text(folder / f"{name}.md", text)
-    write_text(folder / "README.md", _page(note, words))
+    write_text(folder / "README.md", texts.render("evidence.md.j2", findings=texts.findings(runs, table, note)))
     files = sorted(path for path in folder.iterdir() if path.is_file())
     size = sum(path.stat().st_size for path in files)
     if size > LARGEST:
@@ -77,35 +75,31 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     return files
 
 
-def _predict(root, names, labels, frames):
+def _predict(sequences, labels):
     from thesis_repro.segmentation import prediction  # TensorFlow takes seconds to load
 
     model = prediction.load_shipped()
-    for name in names:
-        prediction.write_label_maps(model, kitti.Sequence(root, name).subset(frames).frame_paths, labels / name)
+    for sequence in sequences:
+        prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
 
 
 def _runs(root, names, build, frames, repetitions, processes):
-    """(the runs of the comparison, these and those of other widths and limits), with relative errors."""
-    def run(some):
-        return runner.run(some, root, build / "labels", build / "odometry", frames=frames, processes=processes)
+    """The runs of the comparison, and those of other widths and limits under the refined estimator."""
+    def run():
+        return runner.run(listed, root, build / "labels", build / "odometry", frames=frames, processes=processes)
 
-    tested = jobs.first_jobs(names, WIDTHS, repetitions) + jobs.mask_control_jobs(root, names, repetitions)
     fewer = min(repetitions, OTHER_REPETITIONS)
-    other = [jobs.Job(name, method, width, estimator=answer.POSE, repetition=repetition) for name in names
-             for method in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
-    summary = run([*tested, *other])
-    first = summary[summary["run"].isin({job.name for job in tested})]
-    tested += jobs.reduced_jobs(results.best_widths(first), repetitions)
-    tested += jobs.keypoint_control_jobs(results.keypoints_left(first), root, frames, repetitions)
+    listed = jobs.first_jobs(names, WIDTHS, repetitions) + jobs.mask_control_jobs(root, names, repetitions)
+    listed += [jobs.Job(name, method, width, estimator="refined", repetition=repetition) for name in names
+               for method in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
+    runs = run()
+    listed += jobs.reduced_jobs(thesis_tables.best_widths(runs), repetitions)
+    listed += jobs.keypoint_control_jobs(compare.keypoints_left(runs), root, frames, repetitions,
+                                         width=jobs.CONTROL_WIDTH)
     for width in OTHER_WIDTHS:
-        left = summary[(summary["method"] == "masked") & (summary["dilation_width"] == width)]
-        limited = jobs.keypoint_control_jobs(left.groupby("sequence")["mean_keypoints"].mean(), root, frames, fewer)
-        other += [job for job in limited if job.estimator == answer.POSE]
-    keys = {(job.sequence, job.name) for job in tested}
-    every = answer.with_relative(run([*tested, *other]), root, build / "odometry", frames)
-    chosen = [key in keys for key in zip(every["sequence"], every["run"], strict=True)]
-    return every[chosen].reset_index(drop=True), every
+        listed += jobs.keypoint_control_jobs(compare.keypoints_left(runs, width), root, frames, fewer, ["refined"],
+                                             width=width)
+    return runner.with_boresight_correction(run(), root, build / "odometry", frames)
 
 
 def _boundaries(sequences, labels):
@@ -123,36 +117,6 @@ def _tracks(sequences, labels):
                  "random lines": controls.masks("random-lines", Source(labels), sequence, width)}
         rows.append(effects.tracks(sequence, kinds, LOOKED_AT))
     return pd.concat(rows, ignore_index=True)
-
-
-def _short(table):
-    """Six digits are more than any order of the correspondences leaves alone."""
-    numbers = table.select_dtypes("float").columns
-    return table.assign(**{name: [float(f"{value:.6g}") for value in table[name]] for name in numbers})
-
-
-def _page(note, words):
-    return f"""# On real frames
-
-{note}. `make evidence KITTI=/path/to/kitti` made this folder; no frame of KITTI is in it.
-
-{words["answer_in_words"]}
-![Error against number of keypoints](answer.svg)
-
-*How many times the error of all keypoints each method has, under both estimators: {"[in numbers](answer.md)"}.*
-
-![RMSE of each sequence](answer_sequences.svg)
-
-*Each sequence, refined estimator, RMSE without the constant angle; [single rotations](answer_rotation.svg).*
-
-![Masks and controls](controls.svg)
-
-*Changes in percent, as the thesis has them: [in numbers](controls.md), [in words](findings.md).*
-
-- [widths.md](widths.md): the best width of each sequence, and how far it is chance
-- [audit.md](audit.md): where the thesis contradicts itself, its code or its libraries, and what each of that does here
-- [runs.csv](runs.csv), [switches.csv](switches.csv): every run
-"""
 
 
 def main(arguments=None):

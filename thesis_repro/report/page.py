@@ -1,8 +1,8 @@
-"""One page with every table and figure of a run: index.html beside them, to be opened from disk.
+"""One page with every table and figure of a run or a study: index.html beside them, to be opened from disk.
 
 `python -m thesis_repro.report.page` turns the executed notebooks into HTML where they have changed, and writes the page
-where anything it shows has. Neither needs a network, a server or scripts to be read. This module says what is
-shown; template.html says how.
+where anything it shows has. Neither needs a network, a server or scripts to be read. This module says what is shown,
+templates/page.html.j2 says how.
 """
 
 import hashlib
@@ -18,26 +18,18 @@ from pathlib import Path
 
 import mistune
 import pandas as pd
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from PIL import Image
+from markupsafe import Markup
 
 from thesis_repro import longrun, stages
 from thesis_repro.files import write_text
-from thesis_repro.report import captions, gap, style
+from thesis_repro.report import captions, gap, texts
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
 EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 HERE = Path(__file__).parent
-THESIS = [name for artefacts in captions.CHAPTERS.values() for name in artefacts]
-ENDINGS = {"figure": (".svg", ".webp"), "table": (".csv", ".md"), "text": (".md",)}  # the first there is shown
-CSS_DPI = 96  # a browser's pixels an inch
+ENDINGS = {"figure": (".svg", ".webp"), "table": (".csv", ".md"), "text": (".md",)}
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # what numbers depend on most
-TEMPLATES = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-                        lstrip_blocks=True)
-NUMBER = re.compile(r"[+-]?\d+(\.\d+)?(e[+-]?\d+)?")
-RANGE = re.compile(rf"{NUMBER.pattern}( to {NUMBER.pattern})?")
-WHOLE = re.compile(r"[+-]?\d+(\.0+)?")
 
 
 def update(settings):
@@ -49,8 +41,8 @@ def update(settings):
         longrun.sweep(settings.build)
         if settings.figures.is_dir():
             longrun.sweep(settings.figures)
-        page, executed = settings.figures / PAGE, _executed(settings)
-        write_notebooks(executed, page)
+        page = settings.figures / PAGE
+        write_notebooks(_executed(settings), page)
         html = build(settings)
         if page.is_file() and page.read_bytes() == html.encode():
             return False
@@ -58,262 +50,163 @@ def update(settings):
     return True
 
 
-def _made_from(path):
-    """A comment at the end of a notebook's page that says what the notebook and this module hold.
-
-    Dates would not do: the clock of a machine can jump.
-    """
-    digest = hashlib.sha256()
-    for part in sorted([path, *HERE.iterdir()]):
-        if part.is_file():
-            digest.update(f"{part.name} {stages.content(part)}\n".encode())
-    return f"<!-- made from {digest.hexdigest()[:12]} -->\n"
-
-
-def _ends_with(path, text):
-    return path.is_file() and path.read_bytes().endswith(text.encode())
-
-
 def _executed(settings):
-    # in the order of the notebooks; a half-written one has a name that starts with a dot
+    """The executed notebooks in their order; a half-written one has a name that starts with a dot."""
     return sorted((settings.build / "notebooks").glob("[!.]*.ipynb"))
 
 
 def write_notebooks(paths, page):
-    """Write each executed notebook as HTML beside it, with a link back to the page, where that is not done yet."""
-    made_from = {path: _made_from(path) for path in paths}
-    paths = [path for path in paths if not _ends_with(path.with_suffix(".html"), made_from[path])]
-    if not paths:
-        return
-    from nbconvert import HTMLExporter  # slow to import, and seldom needed
+    """Write each executed notebook as HTML beside it, with a link back to the page, where that is not done yet.
 
-    # nbconvert's whole pages load scripts from the network; the bare content needs none
-    exporter = HTMLExporter(template_name="basic", embed_images=True, exclude_input_prompt=True,
-                            exclude_output_prompt=True, exclude_anchor_links=True)
+    The last line of the HTML says what it was made from: dates would not do, since a machine's clock can jump.
+    """
+    parts = [path for path in [*HERE.iterdir(), *(HERE / "templates").iterdir()] if path.is_file()]
     for path in paths:
-        content, resources = exporter.from_filename(str(path))
-        write_text(path.with_suffix(".html"), TEMPLATES.get_template("notebook.html").render(
-            title=path.stem, style="\n".join(resources["inlining"]["css"]), content=content,
-            page=os.path.relpath(page, path.parent)) + made_from[path])
+        digests = [f"{part.name} {stages.content(part)}\n" for part in sorted([*parts, path])]
+        made_from = f"<!-- made from {hashlib.sha256(''.join(digests).encode()).hexdigest()[:12]} -->\n"
+        html = path.with_suffix(".html")
+        if html.is_file() and html.read_bytes().endswith(made_from.encode()):
+            continue
+        from nbconvert import HTMLExporter  # slow to import, and seldom needed
+
+        # nbconvert's whole pages load scripts from the network; the bare content needs none
+        content, resources = HTMLExporter(
+            template_name="basic", embed_images=True, exclude_input_prompt=True, exclude_output_prompt=True,
+            exclude_anchor_links=True).from_filename(str(path))
+        write_text(html, texts.render("notebook.html.j2", title=path.stem, content=Markup(content),
+                                      style=Markup("\n".join(resources["inlining"]["css"])),
+                                      page=os.path.relpath(page, path.parent)) + made_from)
 
 
 def build(settings):
     """The page of a run as HTML, from the files in its folders."""
-    makers, here = _makers(), _here(settings)
-    chapters = [{"id": re.sub(r"\W+", "-", chapter.split(":")[0].lower()), "title": chapter, "artefacts": [
-        _artefact(settings, name.split("_")[0], name, title, caption, makers) | {"here": here.get(name)}
-        for name, (title, caption) in artefacts.items()]} for chapter, artefacts in captions.CHAPTERS.items()]
-    shown = sum(one["there"] for chapter in chapters for one in chapter["artefacts"])
-    chapters.append({"id": "added", "title": "Beyond the thesis", "artefacts": [
-        _artefact(settings, kind, name, title, caption, makers)
-        for (kind, name), (title, caption) in captions.ADDED.items()]})
+    makers, numbers = _makers(), _numbers_of(settings)
+    chapters = {title: [_shown(settings.figures, artefact, makers, settings, numbers) for artefact in artefacts]
+                for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()}
+    artefacts = [artefact for of_chapter in chapters.values() for artefact in of_chapter]
     notebooks = {}
     if not settings.figures_in_git:  # in a clone there is no build folder to link to
         notebooks = {path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
                      for path in _executed(settings)}
-    words = settings.figures / "findings.md"
-    return TEMPLATES.get_template("template.html").render(
-        short=_markdown(words.read_text(encoding="utf-8").split("\n\n")[0]) if words.is_file() else None,
-        evidence=EVIDENCE if (settings.figures / EVIDENCE).is_file() else None,
-        title=f"Tables and figures, {settings.run}", style="", settings=settings, facts=_facts(settings),
-        chapters=chapters, shown=shown, of=len(THESIS), notebooks=notebooks,
-        missing=[one for chapter in chapters for one in chapter["artefacts"] if not one["there"]
-                 and not one["left_out"]],
-        left_out=[one for chapter in chapters for one in chapter["artefacts"] if one["left_out"]], card=captions.CARD,
-        folder=os.path.relpath(settings.build / "notebooks", settings.figures))
+    lengths = _table(settings.figures / "table_4_1.csv")
+    return texts.render(
+        "page.html.j2", title=f"Tables and figures, {settings.run}", settings=settings, chapters=chapters,
+        shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
+        of=len(captions.THESIS), missing=[one for one in artefacts if not one["there"] and not one["left_out"]],
+        left_out=[one for one in artefacts if one["left_out"]], card=captions.CARD, notebooks=notebooks,
+        evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE, label_maps=gap.line(settings.build),
+        frames=dict(zip(lengths["sequence"], lengths["frames"])) if "frames" in lengths else {},
+        folder=os.path.relpath(settings.build / "notebooks", settings.figures),
+        made=_made(_executed(settings), settings.figures_in_git))
 
 
-def _facts(settings):
-    sizes = settings.sizes
-    # A page in git is that of its commit, made anywhere on any day.
-    made = {} if settings.figures_in_git else {
-        "results of": _when(settings),
-        "code": _commit(),
-        "Python": f"{platform.python_version()} on {platform.system()} {platform.machine()}, {settings.jobs} processes",
-    }
-    frames = "all frames" if sizes.frames is None else f"at most {sizes.frames} frames"
-    images = "all images" if sizes.training_images is None else f"at most {sizes.training_images} images"
-    network = (f"network {sizes.image_size}x{sizes.image_size} with {sizes.base_filters} filters in the first block, "
-               f"up to {sizes.epochs} epochs on {images}; ")
-    sequences = _read(settings.figures / "table_4_1.csv")
-    return {
-        "odometry data": "embedded world" if settings.kitti_is_embedded else f"KITTI folder “{settings.kitti.name}”",
-        "sequences": ", ".join(f"{row['sequence']} ({row['frames']} frames)"
-                               for row in sequences.to_dict("records") if row.get("frames")),
-        "label maps": f"by the model in the package; its card is {captions.CARD}" if settings.shipped else None,
-        "training data": None if settings.shipped else "embedded world" if settings.cityscapes_is_embedded
-                         else f"Cityscapes folder “{settings.cityscapes.name}”",
-        "KITTI's street scenes": settings.kitti_semantic and f"folder “{settings.kitti_semantic.name}”",
-        "quality of label maps": (said := gap.line(settings.build)) and said.removeprefix("label maps "),
-        "profile": f"{settings.profile}: {'' if settings.shipped else network}{frames} of each sequence, "
-                   f"{len(sizes.widths)} dilation widths, {sizes.repetitions} repetitions",
-        "seeds": f"{settings.seed} throughout; repetition 0 keeps the order of the correspondences, repetition n "
-                 "shuffles it with seed n",
-        **made,
-        "packages": _packages(),
-    }
+def build_study(folder, names, **facts):
+    """The page of a study as HTML, from the files in its folder. names: of what the study left. facts: for the page."""
+    shown = [_shown(folder, artefact, {}) for artefact in [*captions.ADDED, captions.OF_STUDIES]
+             if (artefact["kind"], artefact["name"]) in names]
+    return texts.render("study.html.j2", title="A study of masks", artefacts=shown, notebooks={}, made=_made(), **facts)
 
 
-def _packages():
-    return (", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
-            + "; environment.txt has them all")
-
-
-def _when(settings):
-    """The day on which the last cell of the notebooks ran."""
-    cells = [cell for path in _executed(settings) for cell in _cells(path)]
-    times = [time for cell in cells if (time := cell["metadata"].get("execution", {}).get("iopub.execute_input"))]
-    return f"{datetime.fromisoformat(max(times)).astimezone(UTC):%d %B %Y}" if times else None
-
-
-def _commit():
-    def git(*arguments):
-        command = ["git", "--git-dir", ROOT / ".git", "--work-tree", ROOT, *arguments]  # of no checkout around this one
-        return subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout.strip()
-
-    try:
-        commit, changed = git("rev-parse", "--short=12", "HEAD"), git("status", "--porcelain", "--", ".", ":!figures")
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return f"commit {commit}{' with uncommitted changes' if changed else ''}"
-
-
-def _artefact(settings, kind, name, title, caption, makers):
-    """What the template needs to show a table, a figure or a text, or to say that it is missing."""
-    number, shown = None, _shown(settings.figures, kind, name)
-    if name in THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
+def _shown(folder, artefact, makers, settings=None, numbers=None):
+    """What the template needs to show a table, a figure or a text of a folder, or to say that it is missing."""
+    kind, name = artefact["kind"], artefact["name"]
+    files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
+    content = None
+    if files and kind == "text":
+        content = _markdown(files[0].read_text(encoding="utf-8"))
+    elif kind == "table" and files and files[0].suffix == ".csv":
+        content = _html(_table(files[0]))
+    there = bool(files) and (kind == "figure" or content is not None)
+    number = None
+    if name in captions.THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
         _, chapter, count = name.split("_")
         number = f"{kind.capitalize()} {chapter.upper()}.{int(count)}"
-    return {
-        "kind": kind, "id": name if number or kind == "text" else f"{kind}-{name}", "number": number,
-        "title": f"{number}. {title}" if number else title, "caption": caption,
-        "makers": makers.get(name, []), "reported": _reported(settings, name), "here": None,
-        "label_maps": gap.line(settings.build) if name in captions.ON_LABEL_MAPS else None,
-        **shown, "left_out": settings.shipped and name in captions.OF_TRAINING and not shown["there"],
-    }
+    thesis = artefact.get("thesis")
+    if thesis:
+        here = (numbers or {}).get(name)
+        thesis = {"data": thesis["data"], "text": _filled(thesis["text"], captions.REPORTED),
+                  "here": here and _filled(thesis["here"], here),
+                  "embedded": {"runs": settings.kitti_is_embedded,
+                               "training": settings.cityscapes_is_embedded}.get(thesis["data"], False)}
+    return {"on_label_maps": False} | artefact | {
+        "id": name if number or kind == "text" else f"{kind}-{name}", "number": number, "there": there,
+        "content": content, "files": [path.name for path in files], "makers": makers.get(name, []), "thesis": thesis,
+        "left_out": bool(settings) and settings.shipped and artefact.get("of_training", False) and not there}
 
 
-def _shown(folder, kind, name):
-    """What there is of a table, a figure or a text in a folder."""
-    files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
-    shown = ENDINGS[kind] if kind == "figure" else ENDINGS[kind][:1]
-    path = next((path for path in files if path.suffix in shown), None)
-    return {
-        "there": path is not None, "files": [path.name for path in files], "left_out": False,
-        "size": _size(path) if path and kind == "figure" else None,
-        "table": _table(path) if path and kind == "table" else None,
-        "html": _markdown(path.read_text(encoding="utf-8")) if path and kind == "text" else None,
-    }
+def _filled(template, values):
+    return texts.TEMPLATES.from_string(template).render(values)
 
 
-def build_study(folder, artefacts, facts, embedded):
-    """The page of a study as HTML, from the files in its folder.
-
-    artefacts: {(kind, name): (title, caption)}, as in captions. facts: what was run, {name: text}.
-    embedded: whether the frames are those of the embedded world.
-    """
-    shown = [{"kind": kind, "id": name if kind == "text" else f"{kind}-{name}", "number": None, "title": title,
-              "caption": caption, "makers": [], "reported": None, "here": None, "label_maps": None,
-              **_shown(folder, kind, name)}
-             for (kind, name), (title, caption) in artefacts.items()]
-    return TEMPLATES.get_template("study.html").render(
-        title="A study of masks", style="", artefacts=shown, embedded=embedded, notebooks={}, facts=facts | {
-            "code": _commit(), "Python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
-            "packages": _packages()})
+def _numbers_of(settings):
+    """This run's numbers where the thesis reports some in words, {name: numbers}, from the files that there are."""
+    numbers = {}
+    history, chosen = _table(settings.build / "model" / "history.csv"), _table(settings.figures / "table_4_1.csv")
+    seconds = _table(settings.figures / "timings" / "seconds.csv")
+    if len(history):
+        best = history.loc[history["val_loss"].idxmin()]
+        scores = {split: {key: f"{best[prefix + name]:.2f}" for key, name in (
+            ("loss", "loss"), ("f1", "f1-score"), ("iou", "iou_score"))}
+            for split, prefix in (("train", ""), ("validation", "val_"))}
+        numbers["figure_4_01"] = {"epochs": len(history), "best": int(best["epoch"]), **scores}
+    if "mean keypoints" in chosen:
+        numbers["figure_4_07"] = {"least": max(1, chosen["mean keypoints"].min()),
+                                  "most": max(1, chosen["mean keypoints"].max())}
+    if len(seconds):
+        masked = seconds[seconds["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
+        saved = 100 * (1 - masked / seconds.loc[seconds["method"] == "baseline", "seconds"].sum())
+        numbers["figure_4_17"] = {"least": f"{saved.min():.0f}", "most": f"{saved.max():.0f}"}
+    return numbers
 
 
 def _makers():
     """The notebooks in whose code a table or figure is named, {name: [notebooks]}."""
-    found = {}
+    makers = {}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         code = "\n".join("".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "code")
         for name in sorted(set(re.findall(r'"(\w+)(?:\.\w+)?"', code))):
-            found.setdefault(name, []).append(path.stem)
-    return found
+            makers.setdefault(name, []).append(path.stem)
+    return makers
 
 
-def _reported(settings, name):
-    """What the thesis says in words about a figure, and from which data."""
-    if name not in captions.REPORTS or not name.startswith("figure"):
-        return None
-    source, text = captions.REPORTS[name]
-    return {"text": text,
-            "data": {"runs": ", complete KITTI sequences", "training": ", Cityscapes", "model": ""}[source],
-            "embedded": {"runs": settings.kitti_is_embedded, "training": settings.cityscapes_is_embedded}.get(source)}
+def _made(executed=(), in_git=False):
+    """Day of the results, commit, machine and packages; a page in git is that of its commit, made anywhere, any day."""
+    def git(*arguments):
+        command = ["git", "--git-dir", ROOT / ".git", "--work-tree", ROOT, *arguments]  # of no checkout around this one
+        return subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout.strip()
 
-
-def _here(settings):
-    """This run's numbers of the kind that the thesis reports in words, {name: text}, from the files that there are."""
-    found = {}
-    history, runs = (_numbers(settings.build / name) for name in ("model/history.csv", "runs.csv"))
-    seconds = _numbers(settings.figures / "timings" / "seconds.csv")
-    if len(history):
-        best = history.loc[history["val_loss"].idxmin()]
-        scores = (f"{split} loss {best[f'{prefix}loss']:.2f}, F1 {best[f'{prefix}f1-score']:.2f}, "
-                  f"IoU {best[f'{prefix}iou_score']:.2f}" for split, prefix in (("train", ""), ("validation", "val_")))
-        found["figure_4_01"] = f"{len(history)} epochs, the best was {best['epoch']:.0f}; {'; '.join(scores)}."
-    chosen = _numbers(settings.figures / "table_4_1.csv")
-    if len(runs) and "mean keypoints" in chosen:
-        every = runs[runs["method"] == "baseline"].groupby("sequence")["mean_keypoints"].mean()
-        kept = chosen.set_index("sequence")["mean keypoints"]
-        factors = (every / kept[kept > 0]).dropna()
-        found["figure_4_07"] = (f"{factors.min():.1f} to {factors.max():.1f} times fewer than without masks, with the "
-                                "widths of Table 4.1.")
-    if len(seconds):
-        masked = seconds[seconds["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
-        saved = 100 * (1 - masked / seconds.loc[seconds["method"] == "baseline", "seconds"].sum())
-        found["figure_4_17"] = f"{saved.min():.0f} to {saved.max():.0f} %, by width.".replace("-", "−")
-    return found
-
-
-# Files
+    made = dict.fromkeys(("day", "commit", "changed", "python", "machine"))
+    made["packages"] = {name: importlib.metadata.version(name) for name in PACKAGES}
+    if in_git:
+        return made
+    try:
+        made["commit"] = git("rev-parse", "--short=12", "HEAD")
+        made["changed"] = bool(git("status", "--porcelain", "--", ".", ":!figures"))
+    except (OSError, subprocess.CalledProcessError):
+        pass
+    times = [time for path in executed for cell in _cells(path)
+             if (time := cell["metadata"].get("execution", {}).get("iopub.execute_input"))]
+    if times:
+        made["day"] = f"{datetime.fromisoformat(max(times)).astimezone(UTC):%d %B %Y}"
+    return made | {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
 
 
 def _cells(path):
     return json.loads(path.read_text(encoding="utf-8"))["cells"]
 
 
-def _numbers(path):
-    """A CSV file as a table; an empty one where there is no file."""
-    return pd.read_csv(path, dtype={"sequence": str}) if path.is_file() else pd.DataFrame()
-
-
-def _read(path):
-    """A CSV file as it is written, every cell a text; an empty table where there is no file."""
-    return pd.read_csv(path, dtype=str, keep_default_na=False) if path.is_file() else pd.DataFrame()
-
-
 def _table(path):
-    """A CSV file for reading: columns as (name, whether numbers), and rows of texts.
-
-    Whole numbers lose the point that missing values give them, and changes in percent have equally many digits.
-    """
-    table = _read(path)
-    number, whole = (table.map(lambda cell, kind=kind: bool(kind.fullmatch(cell))) for kind in (NUMBER, WHOLE))
-    counts = (number.sum(axis=1) > 1) & (number == whole).all(axis=1)  # such as a row that counts sequences
-    columns = []
-    for name, cells in table.items():
-        filled = cells[cells != ""]
-        columns.append((name, name != "sequence" and len(filled) > 0 and filled.str.fullmatch(RANGE).all()))
-        if not columns[-1][1]:
-            continue
-        digits = cells.where(number[name], "").str.partition(".")[2].str.len().max()
-        short = number[name] & (counts | whole.loc[filled.index, name].all())
-        table[name] = [cell.split(".")[0] if cut else f"{float(cell):.{digits}f}" if "%" in name and is_number else cell
-                       for cell, cut, is_number in zip(cells, short, number[name])]
-        table[name] = table[name].str.replace("-", "−")
-    return {"columns": columns, "rows": table.to_numpy().tolist()}
+    """A CSV file as a table, whole numbers beside missing ones as such; an empty one where there is no file."""
+    return pd.read_csv(path, dtype={"sequence": str}).convert_dtypes() if path.is_file() else pd.DataFrame()
 
 
-def _size(path):
-    """Width and height in a browser's pixels, so that the page keeps its place while it loads."""
-    if path.suffix == ".webp":
-        with Image.open(path) as image:
-            return [round(side * CSS_DPI / style.STYLE["savefig.dpi"]) for side in image.size]
-    with open(path, encoding="utf-8") as file:
-        head = file.read(2000)
-    sides = [re.search(rf'<svg[^>]*?\s{side}="([\d.]+)pt"', head) for side in ("width", "height")]
-    return [round(float(side[1]) * 4 / 3) for side in sides] if all(sides) else None  # silent
+def _html(table):
+    """A table as HTML, texts escaped; numbers of a column have equally many digits."""
+    numeric = [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes]
+    shown = pd.DataFrame({name: cells.astype(float) if cells.dtype == "Float64" else cells.astype(object).where(
+        cells.notna(), "") for name, cells in table.items()})
+    return Markup(shown.to_html(index=False, border=0, na_rep="", justify="unset",
+                                 classes="numbers" if sum(numeric) > len(numeric) / 2 else "words"))
 
 
 class _Renderer(mistune.HTMLRenderer):
@@ -323,7 +216,7 @@ class _Renderer(mistune.HTMLRenderer):
 
 def _markdown(text):
     """Markdown as HTML; HTML in it is shown as text."""
-    return mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])(text)
+    return Markup(mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])(text))
 
 
 def main():

@@ -1,0 +1,197 @@
+"""Chapter 4's figures and tables, the comparison and the findings: their numbers are those of the runs."""
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+
+from thesis_repro.report import chapter4, comparison, tables, texts
+from thesis_repro.report.captions import REPORTED
+from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study.jobs import ESTIMATORS, Job
+
+ELEVEN = [f"{number:02d}" for number in range(11)]
+CONTROLS = compare.SEGMENTATION_FREE_CONTROLS
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def runs_of(names, errors, repetitions=3, noise=0.0, widths=(5, 10, 15), sources=("",), seed=0):
+    """Runs with made-up errors: errors(sequence, method, width) -> RMSE in metres; the others follow from it.
+
+    noise: relative spread of the repetitions.
+    """
+    random, rows = np.random.default_rng(seed), []
+    methods = [("baseline", None, ""), ("reduced", None, "")]
+    for source in sources:
+        methods += [("masked", width, source) for width in widths] + [(name, 10, source) for name in CONTROLS]
+    for name in names:
+        for method, width, source in methods:
+            for estimator in ESTIMATORS:
+                for repetition in range(repetitions):
+                    error = errors(name, method, width) * np.exp(noise * random.normal())
+                    job = Job(name, method, width, estimator=estimator, repetition=repetition, source=source)
+                    rows.append({
+                        "sequence": name, "run": job.name, "source": source, "method": method, "dilation_width": width,
+                        "estimator": estimator, "repetition": repetition, "frames": 100, "rmse": error,
+                        "mae": error / 2, "rmse_boresight_corrected": error / 3, "rotation": error / 100,
+                        "mean_keypoints": 1900 if method == "baseline" else 500 + (width or 10), "flagged": 0})
+    return pd.DataFrame(rows).astype({"dilation_width": float})
+
+
+def halved(name, method, _):
+    """Masks halve the error, no control does."""
+    return (0.5 if method == "masked" else 1.0) * (1 + int(name) / 10)
+
+
+@pytest.mark.parametrize("metric, key, total, median, improved", [
+    ("rmse", "table_4_2_rmse_percent_change", -13.2, -5.27, 6),
+    ("mae", "table_4_3_mae_percent_change", -25.65, 1.76, 4)])
+def test_the_thesis_tables_come_out_of_the_thesis_numbers(metric, key, total, median, improved):
+    reported = REPORTED[key]
+    runs = runs_of(list(reported), lambda name, method, width: 2.0 if method == "baseline" else 2 * (
+        1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0))
+    table = tables.table_of_change(runs, metric, "thesis").set_index("sequence")
+    assert list(table) == [f"{metric.upper()}, all keypoints (m)", f"{metric.upper()}, best mask (m)", "change (%)",
+                           "change (%), thesis"]
+    for column in ("change (%)", "change (%), thesis"):
+        assert table.loc["sum (the thesis's aggregate)", column] == pytest.approx(total, abs=0.06)
+        assert table.loc["median", column] == pytest.approx(median, abs=0.05)
+        assert table.loc["sequences improved", column] == improved
+    widths = tables.table_4_1(runs, "thesis")
+    assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[:2] == [10, 11]
+
+
+def test_what_the_thesis_does_not_report_stays_empty():
+    runs = runs_of(["77"], lambda *_: 1.0)
+    assert np.isnan(tables.table_of_change(runs, "rmse", "thesis").loc[0, "change (%), thesis"])
+    assert pd.isna(tables.table_4_1(runs, "thesis").loc[0, "width, thesis"])
+
+
+def test_ratios_in_the_tables_are_those_of_the_comparison():
+    runs = runs_of(ELEVEN, halved, noise=0.2)
+    table = compare.comparisons(runs)
+    shown = comparison.table_comparison(table)
+    assert len(shown) == 2 * (1 + 2 * len(CONTROLS))
+    own = table[table["tested"] & (table["method"] != "baseline")]
+    for row in own[(own["reference"] == "baseline") & (own["metric"] == "rmse")].itertuples():
+        cell = shown[(shown["estimator"] == ESTIMATORS[row.estimator]) & (shown["over"] == "all keypoints")
+                     & shown["keypoints"].str.startswith(compare.METHODS[row.method])]["RMSE"].iloc[0]
+        ratio, low, high = map(float, cell.replace("(", "").replace(")", "").replace("-", " ").split())
+        assert (ratio, low, high) == pytest.approx((row.ratio, row.low, row.high), abs=0.0051)
+    assert set(shown[shown["over"] != "all keypoints"]["verdict"]) == {compare.LOWER}
+    widths = comparison.table_widths(runs).set_index("sequence")
+    best = thesis_tables.of_chosen_width(runs)
+    expected = compare.ratios(best, compare.of_method(runs, "baseline"), "rmse")
+    assert widths.loc[ELEVEN, "best width: RMSE"].astype(float).to_numpy() == pytest.approx(expected, abs=0.0051)
+
+
+@pytest.mark.parametrize("value, text", [(1.09, "1.09"), (1.0018, "1.0018"), (0.9951, "0.9951"), (1.0, "1.00"),
+                                         (12.345, "12.35"), (0.99, "0.99")])
+def test_a_ratio_has_as_many_digits_as_tell_it_from_one(value, text):
+    assert texts.number(value) == text
+
+
+@pytest.mark.parametrize("errors, names, verdict", [
+    (halved, ELEVEN, compare.LOWER), (lambda *of: 1 / halved(*of), ELEVEN, compare.HIGHER),
+    (lambda *_: 1.0, ELEVEN[:6], compare.NO_CLEAR_DIFFERENCE), (halved, ["00", "05"], compare.NO_CLEAR_DIFFERENCE)])
+@pytest.mark.parametrize("sources", [("",), ("net", "hand")])
+def test_findings_say_what_the_verdict_is(errors, names, verdict, sources):
+    runs = runs_of(names, errors, noise=0.02, sources=sources)
+    table = compare.comparisons(runs)
+    for source in sources:
+        assert compare.overall(compare.primary_comparison(table, source)["verdict"]) == verdict
+    text = texts.findings(runs, table, "made up")
+    enough = len(names) >= compare.MIN_SEQUENCES
+    assert text.count("Masks help here") == (verdict == compare.LOWER) * len(sources)
+    assert text.count("do worse than all") == (verdict == compare.HIGHER) * len(sources)
+    assert text.count("cannot tell whether masks help") == (not enough) * len(sources)
+    row = compare.primary_comparison(table, sources[0]).iloc[0]
+    assert texts.ratio(row) in text and "made up" in text and "nan" not in text
+
+
+def test_thesis_runs_alone_or_without_masks_have_findings_too():
+    runs = runs_of(["00", "01"], halved, repetitions=1)
+    for part in (runs[(runs["estimator"] == "thesis") & ~runs["method"].isin(CONTROLS)],
+                 runs[runs["method"] == "baseline"]):
+        assert "embedded world" in texts.findings(part, compare.comparisons(part), "embedded world")
+
+
+@pytest.mark.parametrize("names, noise, sources", [
+    (["00"], 0, ("",)), (["00", "05", "06"], 0, ("net", "by hand")), (ELEVEN, 0.9, ("",)), (["00", "05"], 0.9, ("",))])
+def test_every_figure_can_be_drawn_however_close_the_numbers_lie(names, noise, sources):
+    runs = runs_of(names, lambda *_: 0.1, noise=noise, sources=sources)
+    table = compare.comparisons(runs)
+    if sources == ("",):
+        for metric in ("rmse", "mae"):
+            for draw in (chapter4.figure_against_width, chapter4.figure_of_methods, chapter4.figure_of_sequences):
+                draw(runs, metric).draw_without_rendering()
+        chapter4.figure_4_07(runs).draw_without_rendering()
+    for figure in (comparison.figure_comparison(table), comparison.figure_keypoints(table),
+                   comparison.figure_sequences(table, runs)):
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            if axes.axison and axes.get_visible():
+                assert all(bar >= 0 for bar in axes.get_xlim())
+
+
+def test_a_row_of_the_forest_is_a_method_with_its_sequences_and_its_interval():
+    table = compare.comparisons(runs_of(ELEVEN, halved, noise=0.1))
+    axes = comparison.figure_comparison(table).axes[0]
+    row = table[(table["estimator"] == "thesis") & (table["metric"] == comparison.SHOWN[0]) & table["tested"]
+                & (table["method"] == "masked") & (table["reference"] == "baseline")].iloc[0]
+    dots, interval, marker = axes.lines[:3]
+    assert dots.get_xdata() == pytest.approx(row[ELEVEN].astype(float).to_numpy())
+    assert interval.get_xdata() == pytest.approx([row["low"], row["high"]])
+    assert marker.get_xdata() == pytest.approx([row["ratio"]])
+
+
+def test_paths_of_all_repetitions_and_their_distance_from_the_truth():
+    runs = compare.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
+    along = np.c_[np.zeros(4), np.zeros(4), np.arange(4.0)]
+    paths = {(row.sequence, row.run): along + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
+             for row in runs.itertuples()}
+    figure = chapter4.figure_paths({"00": along, "05": along}, runs[::-1], paths, "baseline")
+    true, *lines = figure.axes[0].lines
+    assert len(lines) == 3 and len(figure.axes) == 4
+    assert all(lines[0].get_linewidth() > line.get_linewidth() for line in lines[1:])
+    distances = [line.get_ydata().tolist() for line in figure.axes[2].lines]
+    assert distances == [[0, 0, 0, 5], [0, 0, 1, 5], [0, 0, 2, 5]]
+
+
+def test_bars_reach_from_the_lowest_to_the_highest_repetition():
+    runs = runs_of(["00"], lambda *_: 0.1)  # means of three equal numbers round to another one
+    for figure in (chapter4.figure_of_methods(runs, "rmse"), chapter4.figure_of_sequences(runs, "rmse")):
+        (segment,) = figure.axes[0].collections[0].get_segments()
+        assert segment[:, 1] == pytest.approx([0.1, 0.1])
+    rows = (runs["method"] == "baseline") & (runs["estimator"] == "thesis")
+    runs.loc[rows, "rmse"] = [1, 2, 6]
+    (segment,) = chapter4.figure_of_methods(runs, "rmse").axes[0].collections[0].get_segments()
+    assert segment[:, 1].tolist() == [1, 6]
+
+
+def test_keypoints_kept_are_parts_of_the_thesiss_2000():
+    lines = chapter4.figure_4_07(runs_of(["00"], lambda *_: 1.0)).axes[0].lines
+    assert lines[0].get_ydata() == pytest.approx([505 / 2000, 510 / 2000, 515 / 2000])
+
+
+def test_the_budget_adds_up():
+    measured = pd.DataFrame([(method, stage, 10.0) for method, stages in
+                             (("all keypoints", ("read", "detection", "tracking", "pose")),
+                              ("masked, width 10", tuple(chapter4.STAGES))) for stage in stages],
+                            columns=["method", "stage", "milliseconds"])
+    overlapped = pd.DataFrame({"method": ["masked, width 10", "all keypoints"], "milliseconds": [25.0, 20.0]})
+    table = tables.table_budget(measured, overlapped).set_index("stage")
+    assert table.loc["all stages (ms)"].tolist() == [40, 60] and table.loc["frames a second"].tolist() == [25, 16.7]
+    assert table.loc["between frames, overlapped (ms)"].tolist() == [20, 25]
+    assert np.isnan(table.loc["segmentation (ms)", "all keypoints"])
+    figure = chapter4.figure_budget(measured, overlapped)
+    assert sum(patch.get_width() for patch in figure.axes[0].patches) == 100

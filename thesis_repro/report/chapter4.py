@@ -1,0 +1,242 @@
+"""Figures 4.6, 4.7 and 4.9 to 4.17, and the time of a whole frame: errors in metres, keypoints and times.
+
+`runs` is the table of `runner.run`. Lines and bars stand at the mean over repetitions; bands and error bars go from the
+lowest to the highest of them. What compares methods by ratios is in comparison.py.
+"""
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from thesis_repro.odometry import THESIS
+from thesis_repro.report.style import (
+    BASELINE,
+    BLUE,
+    GREEN,
+    MASKED,
+    ORANGE,
+    PAGE_WIDTH,
+    PINK,
+    RED,
+    REDUCED,
+    SKY,
+    TRUTH,
+    line_style,
+    new_figure,
+)
+from thesis_repro.study import compare, thesis_tables
+
+METHODS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
+           "reduced": ("plainly reduced", REDUCED, "\\\\")}
+FRAME_MS = 100  # KITTI's cameras take ten frames a second
+STAGES = {"read": (SKY, ""), "segmentation": (RED, ""), "mask": (ORANGE, "//"), "detection": (BLUE, ""),
+          "tracking": (GREEN, "\\\\"), "pose": (PINK, "")}
+BAND = "lowest to highest of the repetitions"
+
+
+def figure_paths(truths, rows, paths, method):
+    """Figures 4.6, 4.11, 4.12: paths from above, and below each the distance to the true path along the way.
+
+    truths: {sequence: true positions (n, 3)}. rows: the runs to draw, of one method; repetition 0 is drawn bold, the
+    others faint. paths: {(sequence, run): estimated positions (n, 3)}.
+    """
+    groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
+    columns = min(4, len(groups))
+    count = -(-len(groups) // columns)
+    figure, axes = new_figure(2 * count, columns, height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
+                              squeeze=False, height_ratios=[2, 1] * count)
+    for place in range(len(groups), count * columns):
+        for part in (0, 1):
+            axes[2 * (place // columns) + part, place % columns].set_axis_off()
+    errors = compare.spread(rows, "rmse")
+    for place, (name, runs) in enumerate(groups.items()):
+        above, below = axes[2 * (place // columns):, place % columns][:2]
+        true = truths[name]
+        along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
+        above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
+        for order, run in enumerate(runs["run"]):
+            line = {"color": METHODS[method][1], "linewidth": 0.6, "alpha": 0.45, "label": "matched points shuffled"}
+            if order == 0:
+                line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
+            estimated = paths[name, run] + (true[1] - paths[name, run][1])  # agree at frame 1, as for the RMSE
+            above.plot(estimated[:, 0], estimated[:, 2], **line)
+            below.plot(along, np.linalg.norm(estimated - true, axis=1), **line)
+        row = errors.loc[name]
+        span = f" ({row['lowest']:.2g}-{row['highest']:.2g})" if len(runs) > 1 else ""
+        above.set_title(f"{name}: {row['mean']:.2g}{span} m", fontsize=8)
+        above.set_aspect("equal", adjustable="datalim")
+        below.set_ylim(0, None)
+        for panel in (above, below):
+            panel.tick_params(labelsize=6.5)
+            panel.xaxis.set_major_locator(MaxNLocator(3))
+            panel.yaxis.set_major_locator(MaxNLocator(3))
+        below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
+    for above, below in zip(axes[::2, 0], axes[1::2, 0]):
+        above.set_ylabel("z (m) over x (m)", fontsize=7.5)
+        below.set_ylabel("distance (m)", fontsize=7.5)
+    _legend_below(figure, axes[0, 0], 3)
+    figure.suptitle("sequence: RMSE, mean (lowest-highest of the repetitions)", fontsize=9)
+    return figure
+
+
+def figure_4_07(runs):
+    """Keypoints that masks leave, as a part of the thesis's 2000, against dilation width."""
+    masked = compare.of_method(runs, "masked")
+    kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack() / THESIS.max_keypoints
+    figure, axes = new_figure(height=4.0)
+    _lines(axes, kept)
+    axes.set(xlabel="dilation width (pixels)", ylabel=f"keypoints, part of {THESIS.max_keypoints}", ylim=(0, None),
+             title="Keypoints kept by masks of increasing dilation width")
+    return figure
+
+
+def figure_against_width(runs, metric):
+    """Figures 4.9, 4.10: the metric against dilation width, one line a sequence; below, one panel a sequence with the
+    band of its repetitions and that of all keypoints."""
+    masked = compare.of_method(runs, "masked")
+    baseline = compare.spread(compare.of_method(runs, "baseline"), metric)
+    names = sorted(masked["sequence"].unique())
+    columns = min(4, len(names))
+    count = -(-len(names) // columns)
+    label = f"{metric.upper()} (m)"
+    figure, _ = new_figure(height=3.8 + 1.35 * count)
+    figure.clear()
+    above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * count + 0.6])
+    axes = above.subplots()
+    _lines(axes, masked.groupby(["sequence", "dilation_width"])[metric].mean().unstack())
+    axes.set(xlabel="dilation width (pixels)", ylabel=label, ylim=(0, None),
+             title=f"{metric.upper()} against dilation width, means over repetitions")
+    panels = below.subplots(count, columns, squeeze=False)
+    for panel in panels.flat[len(names):]:
+        panel.set_axis_off()
+    for panel, name in zip(panels.flat, names):
+        errors = compare.spread(masked[masked["sequence"] == name], metric, by="dilation_width")
+        panel.fill_between(errors.index, errors["lowest"], errors["highest"], color=MASKED, alpha=0.25, linewidth=0,
+                           label=f"masked, {BAND}")
+        panel.plot(errors.index, errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1,
+                   label="masked, mean")
+        if name in baseline.index:
+            row = baseline.loc[name]
+            panel.axhspan(row["lowest"], row["highest"], color=BASELINE, alpha=0.2, linewidth=0,
+                          label=f"all keypoints, {BAND}")
+            panel.axhline(row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean")
+        panel.set_title(name, fontsize=8, pad=3)
+        panel.set_ylim(0, None)
+        panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        panel.tick_params(labelsize=7)
+        panel.set_xlabel("width (pixels)", fontsize=7.5)
+    for panel in panels[:, 0]:
+        panel.set_ylabel(label, fontsize=8)
+    _legend_below(below, panels[0, 0], 2)
+    return figure
+
+
+def figure_of_methods(runs, metric):
+    """Figures 4.13, 4.15: the metric of baseline, best mask and plainly reduced, all sequences."""
+    names, tables = _of_methods(runs, metric)
+    figure, axes = new_figure(height=3.2)
+    for offset, (method, table) in enumerate(tables.items()):
+        _bar(axes, np.arange(len(names)) + (offset - 1) * 0.27, table, 0.25, method)
+    axes.set_xticks(range(len(names)), names)
+    axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
+    axes.grid(axis="x", visible=False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return figure
+
+
+def figure_of_sequences(runs, metric):
+    """Figures 4.14, 4.16: the same, one panel a sequence with its own scale."""
+    names, tables = _of_methods(runs, metric)
+    columns = min(4, len(names))
+    count = -(-len(names) // columns)
+    figure, axes = new_figure(count, columns, height=1.7 * count + 0.5, squeeze=False)
+    for panel in axes.flat:
+        panel.set_axis_off()
+    for panel, name in zip(axes.flat, names):
+        panel.set_axis_on()
+        for offset, (method, table) in enumerate(tables.items()):
+            _bar(panel, [offset], table.loc[[name]], 0.8, method)
+        panel.set_title(name)
+        panel.set_xticks([])
+        panel.grid(axis="x", visible=False)
+    for panel in axes[:, 0]:
+        panel.set_ylabel(f"{metric.upper()} (m)")
+    _legend_below(figure, axes[0, 0], 3)
+    return figure
+
+
+def figure_4_17(seconds):
+    """Percent time savings of each dilation width (Equation 4.2), from the table of `time_runs`; dots: sequences."""
+    savings = thesis_tables.time_savings(seconds)
+    figure, axes = new_figure(height=3.0)
+    axes.bar(savings.index.astype(int), savings, color=MASKED, label="all sequences together")
+    for place, (_, rows) in enumerate(seconds.groupby("sequence")):
+        own = thesis_tables.time_savings(rows)
+        axes.plot(own.index.astype(int), own, "o", color="#333333", alpha=0.5, markersize=3, markeredgewidth=0,
+                  label="_" * place + "one sequence")
+    _legend_below(figure, axes, 2)
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set_xticks(savings.index.astype(int))
+    axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)",
+             title="Time of the timed frames against all keypoints (negative: time saved)")
+    axes.grid(axis="x", visible=False)
+    return figure
+
+
+def figure_budget(measured, overlapped):
+    """Milliseconds a frame of every stage, from reading the frame to its pose, against KITTI's ten frames a second.
+
+    measured: method, stage and milliseconds. overlapped: method and milliseconds between frames where the next frame is
+    read and segmented beside the odometry of this one.
+    """
+    table = measured.pivot(index="method", columns="stage", values="milliseconds").fillna(0)
+    table = table.loc[measured["method"].unique(), [stage for stage in STAGES if stage in table]]
+    between = overlapped.set_index("method")["milliseconds"].reindex(table.index)
+    ends = table.sum(axis=1)
+    figure, axes = new_figure(height=1.4 + 0.5 * len(table))
+    left = table.cumsum(axis=1) - table
+    for stage in table:
+        color, hatch = STAGES[stage]
+        axes.barh(table.index, table[stage], 0.6, left=left[stage], label=stage, color=color, hatch=hatch,
+                  edgecolor="white", linewidth=0.5)
+    axes.plot(between, range(len(table)), "D", color="black", markeredgecolor="white", markersize=6, linestyle="none",
+              label="between frames, overlapped")
+    for place, method in enumerate(table.index):
+        axes.text(np.nanmax([ends[method], between[method]]), place, f"   {ends[method]:.0f} ms", va="center",
+                  fontsize=8)
+    axes.axvline(FRAME_MS, color="black", linewidth=1, linestyle="--", label="10 frames a second")
+    axes.set(xlim=(0, max(FRAME_MS, *ends, *between) * 1.12), xlabel="time a frame (ms)",
+             ylim=(len(table) - 0.6, -0.6))
+    axes.grid(axis="y", visible=False)
+    _legend_below(figure, axes, 4)
+    return figure
+
+
+def _lines(axes, table):
+    """One line a row of a table with one column a dilation width."""
+    for index, (name, row) in enumerate(table.iterrows()):
+        axes.plot(row.index, row, marker="o", markersize=2.5, label=name, **line_style(index))
+    axes.set_xticks(table.columns.astype(int))
+    axes.legend(title="sequence", loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def _of_methods(runs, metric):
+    """(sequences, {method: mean, lowest, highest, one row a sequence}) of the three methods of the thesis."""
+    rows = {"baseline": compare.of_method(runs, "baseline"), "masked": thesis_tables.of_chosen_width(runs),
+            "reduced": compare.of_method(runs, "reduced")}
+    names = sorted(rows["baseline"]["sequence"].unique())
+    return names, {method: compare.spread(own, metric).reindex(names) for method, own in rows.items()}
+
+
+def _bar(axes, positions, table, width, method):
+    """Bars at the means of some rows of a table, with error bars that end at lowest and highest."""
+    text, color, hatch = METHODS[method]
+    axes.bar(positions, table["mean"], width, label=text, color=color, hatch=hatch, edgecolor="white", linewidth=0)
+    # a mean of equal numbers may lie a bit beside them
+    errors = np.clip([table["mean"] - table["lowest"], table["highest"] - table["mean"]], 0, None)
+    axes.errorbar(positions, table["mean"], yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2)
+
+
+def _legend_below(figure, axes, columns):
+    """A legend below the figure with each label of a panel once."""
+    handles = dict(zip(*reversed(axes.get_legend_handles_labels())))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)

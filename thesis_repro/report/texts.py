@@ -1,0 +1,96 @@
+"""Texts are templates (templates/*.j2) with numbers put in; their only conditions are what was run and the verdicts.
+
+The findings are written from the table of `compare.comparisons`; those of a run, of a study with masks of one's own and
+of the evidence on real frames come from one template.
+"""
+
+import re
+from math import ceil, log10
+from pathlib import Path
+
+import pandas as pd
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
+
+DIGITS = 2  # of a ratio, where no more are needed to tell it from 1
+TEMPLATES = Environment(loader=FileSystemLoader(Path(__file__).parent / "templates"),
+                        autoescape=lambda name: ".html" in (name or ""), undefined=StrictUndefined, trim_blocks=True,
+                        lstrip_blocks=True)
+
+
+def render(template, **values):
+    """The text of a template in the folder templates; Markdown has one empty line at once, at most."""
+    text = TEMPLATES.get_template(template).render(values).strip() + "\n"
+    return re.sub(r"\n{3,}", "\n\n", text) if ".md" in template else text
+
+
+def number(value):
+    """A ratio with two digits, or as many as it takes to see that it is not 1."""
+    near = 0 < abs(value - 1) < 0.5 * 10**-DIGITS
+    return f"{value:.{min(6, ceil(-log10(abs(value - 1))) + 1) if near else DIGITS}f}"
+
+
+def ratio(row):
+    """"1.09 (95 % CI 0.98-1.32)" from a row with ratio, low and high; the ratio alone where there is no interval."""
+    if pd.isna(row["low"]):
+        return number(row["ratio"])
+    return f"{number(row['ratio'])} ({compare.LEVEL} % CI {number(row['low'])}-{number(row['high'])})"
+
+
+TEMPLATES.filters["ratio"] = ratio
+TEMPLATES.filters["number"] = number
+
+
+def findings(runs, table, data, **more):
+    """What the runs show, as Markdown.
+
+    runs: with `compare.comparisons` of them, the table. data: one line that says where they come from.
+    more: label_maps, one line on how good these are; quality, the same in short.
+    """
+    baseline, of_masks = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
+    spread = compare.shuffle_spread(runs).groupby("estimator")["factor"].agg(["median", "max"])
+    return render(
+        "findings.md.j2", **{"label_maps": None, "quality": None} | more, data=data,
+        embedded="embedded" in data.split(";")[0], frames=baseline.groupby("sequence")["frames"].first().to_dict(),
+        repetitions=baseline["repetition"].nunique(), spread=spread.reindex(list(ESTIMATORS)).dropna().T.to_dict(),
+        estimators=ESTIMATORS, methods=compare.METHODS, metrics=compare.METRICS, fewest=compare.MIN_SEQUENCES,
+        least=compare.MIN_FOR_INTERVAL, level=compare.LEVEL, thesis_width=CONTROL_WIDTH,
+        sources=[_of_source(runs, table, source) for source in compare.sources(runs) or [""]
+                 if (of_masks["source"] == source).any()],
+        against_each_other=_against_each_other(table))
+
+
+def _of_source(runs, table, source):
+    """What the template says of one source of masks."""
+    own = table[(table["source"] == source) & table["tested"]]
+    judged = compare.primary_comparison(table, source)
+    masked = own[(own["method"] == "masked") & (own["reference"] == "baseline")]
+    corrected = own[(own["method"] == "corrected") & (own["reference"] == "baseline")
+                    & own["metric"].isin(compare.JUDGING_METRICS)]
+    controls = compare.against_controls(table, source)
+    controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)["verdict"]
+    return {"name": source, "judged": _records(judged), "verdict": compare.overall(judged["verdict"]),
+            "width": compare.tested_width(compare.of_source(runs, source)), "masked": _records(masked),
+            "corrected": _records(corrected[corrected["estimator"] == compare.judging_estimator(table)]),
+            "controls": controls.agg(compare.overall).to_dict(),
+            "stability": _stability(compare.of_source(runs, source))}
+
+
+def _stability(runs):
+    """{widths, same_best} of masks of several widths in several repetitions; None for others."""
+    widths = compare.of_method(runs, "masked")["dilation_width"].nunique()
+    agreeing = thesis_tables.stability(runs)["same_best"].dropna() if widths > 1 else ()
+    return {"widths": widths, "same_best": float(agreeing.mean())} if len(agreeing) else None
+
+
+def _against_each_other(table):
+    """Masks of one source over those of another, each pair once."""
+    rows = table[(table["method"] == "masked") & (table["reference"] == "masked") & table["metric"].isin(
+        compare.JUDGING_METRICS) & (table["estimator"] == compare.judging_estimator(table))]
+    return _records(rows[rows["source"] < rows["reference_source"]])
+
+
+def _records(table):
+    return table.to_dict("records")
