@@ -53,8 +53,8 @@ help:
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    the answer and the audit on real frames, KITTI=/path, into figures/kitti_excerpts"
-	@echo "make bench       what the odometry costs, as ratios, into build/bench.json (KITTI=/path)"
-	@echo "make weights     trains the model that ships from nothing, CAMVID=/path KITTI_SEMANTIC=/path"
+	@echo "make bench       what odometry and network cost, as ratios, into build/bench.json (KITTI=/path)"
+	@echo "make weights     trains a model as the shipped one into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path"
 	@echo "make setup       only .venv with the pinned packages; GPU=1 adds CUDA for an NVIDIA GPU"
 	@echo "make clean       removes .venv, build and the figures of other data and profiles"
 
@@ -174,8 +174,7 @@ lab: setup
 
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
-	@$(BIN)/python -m thesis_repro.bench.odometry --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}" --output build/bench.json
-	@$(BIN)/python -m thesis_repro.bench.segmentation
+	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}" --output build/bench.json
 
 .PHONY: evidence
 evidence: setup
@@ -185,7 +184,7 @@ evidence: setup
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
 	@$(if $(KITTI_SEMANTIC),,echo "KITTI_SEMANTIC must name the folder of KITTI's street scenes (train, trainannot)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.segmentation.shipped "$(CAMVID)" "$(KITTI_SEMANTIC)" build/shipped
+	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" build/shipped
 
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache

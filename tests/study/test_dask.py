@@ -132,20 +132,13 @@ def test_a_killed_worker_loses_nothing(small_world, small_labels, workers, sched
     assert set(times.values()) == {passes, passes + 1} and len(times) == 2 * FRAMES
 
 
-def test_a_scheduler_without_workers_says_so(scheduler):
-    with pytest.raises(InputError, match="has no workers; start some with 'dask worker"):
-        with cluster.open_pool(1, scheduler):
-            pass
-
-
-@pytest.mark.parametrize(("address", "said"), [("tcp://127.0.0.1:9", "none answers there"),
-                                               ("nonsense://127.0.0.1:9", "is no address")])
-def test_a_scheduler_that_does_not_answer_is_one_clear_line(address, said, monkeypatch):
+def test_a_scheduler_that_cannot_be_used_is_one_line(scheduler, monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 1)
-    with pytest.raises(InputError, match=f"Dask scheduler {address}: {said}") as error:
-        with cluster.open_pool(1, address):
-            pass
-    assert "\n" not in str(error.value)
+    for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):  # without workers, none, no address
+        with pytest.raises(InputError, match=address) as error:
+            with cluster.open_pool(1, address):
+                pass
+        assert "\n" not in str(error.value)
 
 
 def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, small_labels, tmp_path, monkeypatch):

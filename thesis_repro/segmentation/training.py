@@ -210,7 +210,7 @@ class ResumableTraining(keras.callbacks.Callback):
         self._bar.update()
 
     def on_epoch_end(self, epoch, logs=None):
-        self._bar.set_postfix_str(f"epoch {epoch + 1}, validation loss {logs['val_loss']:.3f}")
+        self._bar.set_postfix_str(f"epoch {epoch + 1}, loss {logs['loss']:.3f}")
         self.rows.append({"epoch": epoch + 1} | {name: float(value) for name, value in logs.items()})
         self._counters = [{name: float(value) for name, value in vars(other).items()
                            if name in self.COUNTERS and value is not None} for other in self.others]

@@ -1,13 +1,14 @@
-"""Where calls run that do not depend on each other: in processes of this machine, or on the workers of a Dask cluster.
+"""Where independent calls run: in processes of this machine, or on the workers of a Dask cluster.
 
-A pool has a `size`, how many calls can run at once, and `run(function, calls)`, which yields (index of the call, what
-it returned) in the order in which they end. Of a call whose worker died for good it yields the reason, a string.
+A pool has a `size`, how many calls run at once, and `run(function, calls)`, which yields (index of the call, what it
+returned) in the order in which they end. Joblib's Dask backend ends all calls with the first that is lost. So the
+futures are Dask's own here: of a call whose worker died for good the pool yields the reason, a string, and goes on.
 """
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -18,40 +19,35 @@ from thesis_repro.settings import scheduler_address
 TIMEOUT = 8  # seconds for a scheduler to answer
 
 
-class Pool(Protocol):
-    size: int
-
-    def run(self, function: Callable, calls: Sequence[tuple]) -> Iterator[tuple[int, Any]]: ...
-
-
 @contextmanager
-def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
-    """The pool of a Dask scheduler ("tcp://host:8786"), or `processes` processes of this machine where it is None."""
+def open_pool(processes: int, scheduler: str | None = None) -> Iterator["Processes | Workers"]:
+    """The pool of a Dask scheduler ("tcp://host:8786"), or `processes` processes of this machine where it is None.
+
+    Raises InputError where no scheduler answers, and where it has no workers.
+    """
     if scheduler_address(scheduler) is None:
-        yield _Processes(processes)
+        yield Processes(processes)
         return
     from dask.distributed import Client  # takes a second
 
-    # what the client would say about connections and workers that come and go
-    for name in ("distributed", "distributed.client"):  # Dask gives each a level of its own
+    for name in ("distributed", "distributed.client"):  # their warnings of workers that come and go
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, ImportError) as error:
-        reason = str(error).strip().splitlines()
-        raise InputError(f"Dask scheduler {scheduler}: none answers there "
-                         f"({reason[0] if reason else type(error).__name__}); start one with 'dask scheduler' and give "
-                         "the address that it prints, tcp://host:port") from None
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise InputError(f"Dask scheduler {scheduler}: none answers there ({reason}); start one with 'dask scheduler' "
+                         "and give the address that it prints, tcp://host:port") from None
     with client:
         if not client.nthreads():
             raise InputError(f"Dask scheduler {scheduler}: has no workers; start some with "
                              f"'dask worker {scheduler} --nthreads 1'")
-        yield _Workers(client, str(scheduler))
+        yield Workers(client, str(scheduler))
 
 
-class _Processes:
-    def __init__(self, processes: int) -> None:
-        self.size = processes
+class Processes:
+    def __init__(self, size: int) -> None:
+        self.size = size
 
     def run(self, function: Callable, calls: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
         work = joblib.Parallel(n_jobs=self.size, return_as="generator_unordered")(
@@ -66,13 +62,13 @@ def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:
     return index, function(*call)
 
 
-class _Workers:
+class Workers:
     def __init__(self, client: Any, scheduler: str) -> None:
         self.client, self.scheduler = client, scheduler
         self.size = sum(client.nthreads().values())
 
     def run(self, function: Callable, calls: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
-        """A call whose worker dies is started again on another one, by Dask, up to three times."""
+        """Dask starts a call whose worker dies on another one, up to three times."""
         from dask.distributed import as_completed
 
         index = {self.client.submit(function, *call, pure=False): number for number, call in enumerate(calls)}

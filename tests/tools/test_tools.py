@@ -1,0 +1,125 @@
+"""A smoke test of each tool on tiny input, and the numbers that its results rest on."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import keras
+import numpy as np
+import pandas as pd
+import pytest
+
+from thesis_repro import odometry
+from thesis_repro.kitti import Sequence
+from thesis_repro.segmentation.unet import build_unet
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
+
+import bench  # noqa: E402
+import proposals  # noqa: E402
+import reliability  # noqa: E402
+import train_shipped  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+
+def test_bench_sets_each_measure_against_another(small_world, monkeypatch):
+    monkeypatch.setattr(bench, "REPEATS", 1)
+    monkeypatch.setattr(bench, "WIDTHS", (5,))
+    monkeypatch.setattr(bench, "KEYPOINTS", (500, 2000))
+    sequence = Sequence(small_world / "kitti", "00").subset(5)
+    table = bench.measure(sequence, frames=20, runs=2, models={"tiny": build_unet((32, 32, 1), 35, 2)})
+    assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
+    assert (table.drop(index=4)["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
+    assert table["what"][4].startswith("memory") and table["measured"][4] < 100
+    assert len(json.loads(table.to_json(orient="records"))) == 7
+
+
+def test_operations_are_those_of_the_convolutions_that_run():
+    way_down = [32**2 * 9 * 2, 16**2 * 9 * 2 * 4, 8**2 * 9 * 4 * 8, 4**2 * 9 * 8 * 16, 2**2 * 9 * 16 * 32]
+    transposed = [2**2 * 4 * 32 * 16, 4**2 * 4 * 16 * 8, 8**2 * 4 * 8 * 4, 16**2 * 4 * 4 * 2]
+    way_up = [4**2 * 9 * 32 * 16, 8**2 * 9 * 16 * 8, 16**2 * 9 * 8 * 4, 32**2 * 9 * 4 * 2]
+    expected = 2 * (sum(way_down + transposed + way_up) + 32**2 * 2 * 35)
+    assert bench.operations(build_unet((32, 32, 1), 35, 2)) == expected
+
+
+class Line:
+    """A sequence of six frames along a line, 0.3 m apart."""
+
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 2, 3] = 0.3 * np.arange(6)
+
+
+def test_a_wrong_turn_counts_once_and_as_flagged_where_it_is():
+    turned = Line.poses.copy()
+    turned[2:, :3, :3] = [[0.999, 0, 0.0447], [0, 1, 0], [-0.0447, 0, 0.999]]  # 2.6 degrees, once
+    for flag, unflagged in (("", 1), ("ambiguous motion", 0)):
+        frames = pd.DataFrame({"flag": ["", "", flag, "", "motion not determined", ""]})
+        counts = reliability.count_steps(odometry.Result(turned, frames), Line, np.arange(6) > 0)
+        assert (counts["steps"], counts["wrong"], counts["unflagged"]) == (5, 1, unflagged)
+        assert counts["largest"] == pytest.approx(2.56, abs=0.01) and counts["not_determined"] == 1
+
+
+def test_a_run_fails_beside_its_own_shuffles_and_a_series_resumes(small_world, tmp_path):
+    arguments = ["--kitti", str(small_world / "kitti"), "--frames", "5", "--keypoints", "300", "--shuffles", "2",
+                 "--output", str(tmp_path)]
+    assert reliability.main(arguments) == 0
+    trials = tmp_path / "00-all.csv"
+    table = pd.read_csv(trials)
+    assert len(table) == 2
+    table.loc[1, "rmse"] *= 10
+    table.to_csv(trials, index=False)
+    assert reliability.main(arguments) == 0  # reads it, and does not run it again
+    rows = pd.read_csv(tmp_path / "failures.csv").set_index("method")
+    assert rows["over"].to_dict() == {"all": 1, "spread": 0}
+    assert reliability.main([*arguments, "--methods", "masked-5"]) == 1
+
+
+def test_convolutions_are_moved_by_muon_as_matrices():
+    kernel = keras.Variable(np.zeros((3, 3, 8, 4), np.float32))
+    slope = np.random.default_rng(0).normal(size=kernel.shape)
+    optimizer = train_shipped.Muon(1.0, weight_decay=None, adam_weight_decay=None)
+    optimizer.build([kernel])
+    optimizer.apply_gradients([(keras.ops.convert_to_tensor(slope, "float32"), kernel)])
+    step = kernel.numpy().reshape(72, 4) / (0.2 * 72**0.5)
+    assert np.linalg.svd(step, compute_uv=False) == pytest.approx(1, abs=0.35)  # nearly orthogonal
+
+
+def test_a_view_has_the_look_of_another_camera():
+    label = np.zeros((188, 620), np.uint8)
+    label[94 - 18:94 + 18, 310 - 18:310 + 18] = 1  # a square in KITTI's frame
+    for look, (across, down) in train_shipped.LOOKS.items():
+        shapes = []
+        for seed in range(40):
+            _, shown = train_shipped.view(label, label, "kitti", look, 320, np.random.default_rng(seed))
+            rows, columns = np.nonzero(shown)
+            if len(rows) > 20 and not shown[[0, -1]].any() and not shown[:, [0, -1]].any():
+                shapes.append(np.ptp(rows) / np.ptp(columns))
+        assert np.median(shapes) == pytest.approx(down / across, rel=0.15)
+
+
+@pytest.mark.torture
+@pytest.mark.skipif("not config.getoption('--torture')", reason="takes a minute")
+def test_the_shipped_training_ends_with_a_model_and_its_card(camvid_real, tmp_path):
+    kitti_semantic = camvid_real.parent / "kitti_semantic"
+    arguments = [str(camvid_real), str(kitti_semantic), str(tmp_path), "--epochs", "1", "--last-epochs", "1",
+                 "--steps", "1"]
+    assert train_shipped.main(arguments) == 0
+    model = keras.models.load_model(tmp_path / "streets.keras", compile=False)
+    assert model.output_shape == (None, 320, 320, 35) and "20001" in (tmp_path / "README.md").read_text()
+
+
+@pytest.mark.torture
+@pytest.mark.skipif("not config.getoption('--torture')", reason="takes a minute")
+def test_all_proposals_are_trained_and_measured(camvid_real):
+    table = proposals.compare(camvid_real, seconds=0.1, seeds=(0,), images=8)
+    assert len(table) == 3 and (table["images seen"] > 0).all()  # CamVid is gray here
+    assert table["pixel accuracy"].between(0, 1).all() and (table["images"] == 2).all()
+
+
+def test_make_weights_wants_both_folders():
+    for given, wanted in (("CAMVID=x", "KITTI_SEMANTIC"), ("KITTI_SEMANTIC=x", "CAMVID")):
+        done = subprocess.run(["make", "weights", given, "-o", "setup"], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode and wanted in done.stderr

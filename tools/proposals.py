@@ -1,0 +1,136 @@
+"""Section 5.2.1's networks, each trained for the same time: python tools/proposals.py --cityscapes ROOT [ROOT ...].
+
+The thesis's network in gray and in colour, a U-Net around a published backbone (random weights: the published ones need
+a download) and an ensemble. ROOT is a folder in one of Cityscapes' layouts. Prints one Markdown table a folder: means
+over the seeds, and the mean IoU of each. Milliseconds are processor time of one image, all cores together.
+"""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
+
+import cv2
+import keras
+import numpy as np
+import pandas as pd
+import segmentation_models as sm
+
+from thesis_repro import InputError, cityscapes
+from thesis_repro.report.style import markdown
+from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
+from thesis_repro.segmentation.unet import build_unet
+from thesis_repro.settings import PROFILES
+
+SIZES = PROFILES["demo"]
+IMAGES, SEEDS = 64, (0, 1)  # for training at most, and a quarter of them for validation
+BACKBONE, MEMBERS = "resnet18", 2  # each member of the ensemble has its part of the time
+# For trainings of minutes: the steps are few, and batch normalisation's averages must keep up with them.
+LEARNING_RATE, MOMENTUM = 0.003, 0.9
+
+
+def unet(input_shape):
+    return build_unet(input_shape, cityscapes.N_CLASSES, SIZES.base_filters)
+
+
+def backbone_unet(input_shape):
+    """A U-Net of segmentation-models around BACKBONE; grey levels are scaled to 0 to 1, as it was made for."""
+    network = sm.Unet(BACKBONE, input_shape=input_shape, classes=cityscapes.N_CLASSES, activation="softmax",
+                      encoder_weights=None)
+    inputs = keras.Input(input_shape)
+    return keras.Model(inputs, network(keras.layers.Rescaling(1 / 255)(inputs)))
+
+
+class TimeLimit(keras.callbacks.Callback):
+    """Ends a training after so many seconds of processor time; the first batch, which compiles, does not count."""
+
+    def __init__(self, seconds):
+        super().__init__()
+        self.seconds, self.start, self.batches = seconds, None, 0
+
+    def on_train_batch_end(self, batch, logs=None):
+        self.batches += 1
+        self.start = self.start or time.process_time()
+        self.model.stop_training = time.process_time() - self.start >= self.seconds
+
+
+def train(build, images, labels, seconds, seed):
+    """A network trained with the thesis's loss and augmentation for some processor time, and its batches."""
+    keras.utils.set_random_seed(seed)
+    model = build(images.shape[1:])
+    augmented = augmentation.augment_set(images, labels, augmentation.training_augmenter(images.shape[1]), seed)
+    batches = training.Batches([(images, labels), augmented], SIZES.batch_size, seed=seed)
+    for layer in model._flatten_layers():
+        if isinstance(layer, keras.layers.BatchNormalization):
+            layer.momentum = MOMENTUM
+    model.compile(keras.optimizers.Adam(LEARNING_RATE), training.total_loss())
+    limit = TimeLimit(seconds)
+    while not model.stop_training:
+        model.fit(batches.dataset(), shuffle=False, verbose=0, callbacks=[limit])
+        batches.epoch += 1
+    return model, limit.batches
+
+
+def milliseconds(model, repeats=25):
+    """Processor time of one image alone on all cores, from uint8 to label map: the median."""
+    image, times = np.zeros((1, *model.input_shape[1:]), np.uint8), []
+    for _ in range(repeats + 1):  # the first one compiles
+        started = time.process_time()
+        prediction.predict(model, image)
+        times.append(time.process_time() - started)
+    return 1000 * float(np.median(times[1:]))
+
+
+def compare(root, seconds, seeds=SEEDS, images=IMAGES):
+    """A table with a row for each network, from a folder of colour or gray images with label maps."""
+    sets = [cityscapes.load(cityscapes.pairs(root, split, limit=limit), SIZES.image_size, 3)
+            for split, limit in (("train", images), ("val", images // 4))]
+    (train_images, train_labels), (shown, shown_labels) = sets
+
+    def gray(colour):
+        return np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None] for image in colour])
+
+    networks = {"the thesis's network": (unet, gray, 1), f"backbone {BACKBONE}": (backbone_unet, gray, 1),
+                f"ensemble of {MEMBERS}": (unet, gray, MEMBERS)}
+    if (train_images[..., :1] != train_images).any():
+        networks["in colour"] = unet, np.asarray, 1
+    rows = []
+    for name, (build, convert, count) in networks.items():
+        scores = []
+        for seed in seeds:
+            members, batches = zip(*(train(build, convert(train_images), train_labels, seconds / count,
+                                           seed + 100 * number) for number in range(count)))
+            model = members[0] if count == 1 else prediction.ensemble(members)
+            confusion = quality.confusion_matrix(shown_labels, prediction.predict(model, convert(shown)))
+            mean_iou, accuracy, classes = quality.cityscapes_scores(confusion)
+            scores.append((mean_iou, accuracy, milliseconds(model), sum(batches) * SIZES.batch_size))
+        mean_iou, accuracy, cost, seen = np.mean(scores, axis=0)
+        rows.append({"network": name, "mean IoU": round(mean_iou, 3), "classes": len(classes), "images": len(shown),
+                     "by seed": ", ".join(f"{score[0]:.3f}" for score in scores), "pixel accuracy": round(accuracy, 3),
+                     "ms an image": round(cost), "parameters": model.count_params(), "images seen": round(seen)})
+        keras.backend.clear_session()
+    return pd.DataFrame(rows)
+
+
+def main(arguments=None):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cityscapes", type=Path, nargs="+", metavar="ROOT", required=True,
+                        help="folders of images and label maps")
+    parser.add_argument("--seconds", type=float, default=60, help="of processor time for each network (60)")
+    options = parser.parse_args(arguments)
+    memory.keep_freed()
+    try:
+        for root in options.cityscapes:
+            print(f"{root.name}, {options.seconds:g} s a network\n\n{markdown(compare(root, options.seconds))}")
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
