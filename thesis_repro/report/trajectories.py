@@ -1,10 +1,12 @@
 """Trajectories against the truth: one table of errors and one picture of several of them."""
 
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import evo
 import numpy as np
+import pandas as pd
 
 from thesis_repro import InputError
 from thesis_repro.files import atomic
@@ -51,42 +53,33 @@ def _errors(name, poses, true, alignment):
     ate = metrics.ate(poses, true, alignment)
     notes = [ate["note"]]
     row |= {f"ate_{key}_m": ate[key] for key in ("rmse", "mean", "median", "max")} | {"scale": ate["scale"]}
-    try:
+    with suppress(evo.EvoException):  # of the alignment; ate's note says so
         poses, _ = metrics.align(poses, true, alignment)
         rpe, segments = metrics.rpe(poses, true), metrics.kitti_errors(poses, true)
         row |= {f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value for key, value in rpe.items()}
         row |= {"t_rel_percent": segments["translation_percent"],
                 "r_rel_deg_per_100m": 100 * segments["rotation_deg_per_m"], "segments": segments["segments"]}
         notes.append(segments["note"] and f"no t_rel and r_rel: {segments['note']}")
-    except evo.EvoException:  # of the alignment; ate's note says so
-        pass
     row["note"] = "; ".join(filter(None, notes))
     return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in row.items()}
 
 
 def aligned(paths, true, alignment):
     """The paths as `metrics.align` leaves them; those that it cannot align are left out."""
-    found = {}
+    after = {}
     for name, poses in paths.items():
-        try:
-            found[name], _ = metrics.align(poses, true, alignment)
-        except evo.EvoException:
-            pass
-    return found
+        with suppress(evo.EvoException):
+            after[name], _ = metrics.align(poses, true, alignment)
+    return after
 
 
 def text(rows, alignment="none"):
     """The rows of `evaluate` as a table for reading, with a word on what is in it."""
-    wide = max(len("trajectory"), *(len(row["trajectory"]) for row in rows))
     heads = {key: head for key, head in COLUMNS.items() if key != "scale" or alignment in ("sim3", "scale")}
-    lines = ["  ".join([f"{'trajectory':{wide}}", *(f"{head:>{max(12, len(head))}}" for head in heads.values())])]
-    for row in rows:
-        values = (f"{'-' if row.get(key) is None else format(row[key], '.6f'):>{max(12, len(head))}}"
-                  for key, head in heads.items())
-        lines.append("  ".join([f"{row['trajectory']:{wide}}", *values]))
+    table = pd.DataFrame(rows, columns=["trajectory", *heads]).astype(dict.fromkeys(heads, float)).rename(columns=heads)
     how = {"none": "", "se3": " after the best rotation and shift", "sim3": " after the best rotation, shift and scale",
            "scale": " after the best scale"}[alignment]
-    lines += ["", WHY.format(aligned=how)]
+    lines = [table.to_string(index=False, float_format="%.6f", na_rep="-"), "", WHY.format(aligned=how)]
     notes = Counter(row["note"] for row in rows if row["note"])
     for note, count in notes.items():
         whose = ", ".join(row["trajectory"] for row in rows if row["note"] == note)
@@ -100,29 +93,27 @@ def figure(paths, true, title):
     paths: {name: (n, 4, 4) poses} as they are to be compared. true: (n, 4, 4), or None.
     """
     drawing, panels = new_figure(1, 1 if true is None else 2, height=3.4, squeeze=False)
-    above = panels[0, 0]
-    if true is not None:
-        above.plot(true[:, 0, 3], true[:, 2, 3], color=TRUTH, linewidth=2.2, alpha=0.6, label="ground truth")
-        travelled = metrics.travelled(true)
+    above, error = panels[0, 0], panels[0, -1]
     for index, (name, poses) in enumerate(paths.items()):
         above.plot(poses[:, 0, 3], poses[:, 2, 3], label=name, **line_style(index))
         if true is not None:
             distance = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
-            panels[0, 1].plot(travelled, distance, label=name, **line_style(index))
+            error.plot(metrics.travelled(true), distance, **line_style(index))
+    if true is not None:
+        above.plot(true[:, 0, 3], true[:, 2, 3], color=TRUTH, linewidth=2.2, alpha=0.6, label="ground truth", zorder=1)
+        error.set(xlabel="travelled (m)", ylabel="distance from the truth (m)", title="error along the way",
+                  ylim=(0, None))
     above.set(xlabel="x (m)", ylabel="z (m)", title=f"{title} from above")
     above.set_aspect("equal", adjustable="datalim")
-    if true is not None:
-        panels[0, 1].set(xlabel="travelled (m)", ylabel="distance from the truth (m)", title="error along the way")
-        panels[0, 1].set_ylim(bottom=0)
     drawing.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawing
 
 
 def check_name(path):
     """Raise InputError where the ending of a picture's name is none that can be written."""
-    known = sorted(plt.Figure().canvas.get_supported_filetypes())
-    if Path(path).suffix[1:].lower() not in known:
-        raise InputError(f"{path}: a picture's name must end in one of {', '.join(f'.{ending}' for ending in known)}")
+    endings = [f".{ending}" for ending in sorted(plt.Figure().canvas.get_supported_filetypes())]
+    if Path(path).suffix.lower() not in endings:
+        raise InputError(f"{path}: a picture's name must end in one of {', '.join(endings)}")
 
 
 def write(path, drawing):

@@ -163,11 +163,10 @@ def write_video(path, sequence, settings=THESIS, masks=None, description=None):
 
 def write_sheet(path, sequence, masks=None, description=None):
     """Write a still of SHEET evenly spaced frames, one below the other in two columns."""
-    wanted = set(np.linspace(1 if len(sequence) > 1 else 0, len(sequence) - 1, SHEET).round().astype(int).tolist())
+    wanted = np.linspace(1 if len(sequence) > 1 else 0, len(sequence) - 1, SHEET).round().astype(int)
     chosen = [picture for index, picture in enumerate(pictures(sequence, masks=masks, description=description))
               if index in wanted]
-    if len(chosen) % 2 and len(chosen) > 1:
-        chosen.append(np.full_like(chosen[0], PAPER))
+    chosen += [np.full_like(chosen[0], PAPER)] * (len(chosen) > 1 and len(chosen) % 2)
     columns = min(2, len(chosen))
     rows = [np.hstack(chosen[start:start + columns]) for start in range(0, len(chosen), columns)]
     write_png(path, np.vstack(rows))
