@@ -46,43 +46,34 @@ def _dots(image, points, color):
         cv2.circle(image, (x, y), 2, color, -1, cv2.LINE_AA)
 
 
-def draw_map(size, true, estimated, limits=None):
+def draw_map(size, true, estimated):
     """The path from above, x to the right and z upwards: an image of size (height, width).
 
     true, estimated: (n, 4, 4) poses, metres; the true path is drawn whole (None: not known), the estimated one as far
     as it goes.
-    limits: ((x, z) least, (x, z) greatest) of what has to be seen; by default what the two paths cover.
     """
     height, width = size
     image = np.full((height, width, 3), PAPER, np.uint8)
-    low, high = _limits(estimated if true is None else true, estimated) if limits is None else limits
+    paths = {ESTIMATED: estimated} if true is None else {TRUE: true, ESTIMATED: estimated}
+    points = np.concatenate([poses[:, [0, 2], 3] for poses in paths.values()])
+    centre, extent = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
+    extent = np.maximum(extent, max(1.0, 0.2 * extent.max()))  # a straight path is not a hairline
     margin = 14
-    metre = min((width - 2 * margin) / (high[0] - low[0]), (height - 2 * margin) / (high[1] - low[1]))
-    centre = (low + high) / 2
+    metre = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
 
     def pixels(poses):
         xz = (poses[:, [0, 2], 3] - centre) * metre
         return np.rint(np.stack([width / 2 + xz[:, 0], height / 2 - xz[:, 1]], axis=1)).astype(np.int32)
 
-    if true is not None:
-        cv2.polylines(image, [pixels(true)], False, TRUE, 2, cv2.LINE_AA)
-    cv2.polylines(image, [pixels(estimated)], False, ESTIMATED, 2, cv2.LINE_AA)
+    for color, poses in paths.items():
+        cv2.polylines(image, [pixels(poses)], False, color, 2, cv2.LINE_AA)
     cv2.circle(image, pixels(estimated)[-1].tolist(), 4, ESTIMATED, -1, cv2.LINE_AA)
     bar = 10.0 ** np.floor(np.log10((width - 2 * margin) / metre / 2))
-    left = (margin, height - margin)
-    cv2.line(image, left, (round(margin + bar * metre), height - margin), TEXT, 2)
-    _write(image, f"{bar:g} m", (left[0], left[1] - 6), TEXT)
+    cv2.line(image, (margin, height - margin), (round(margin + bar * metre), height - margin), TEXT, 2)
+    _write(image, f"{bar:g} m", (margin, height - margin - 6), TEXT)
     _write(image, "no ground truth" if true is None else "ground truth", (margin, 18), TRUE)
     _write(image, "estimate", (margin, 36), ESTIMATED)
     return image
-
-
-def _limits(*paths):
-    points = np.concatenate([path[:, [0, 2], 3] for path in paths])
-    low, high = points.min(axis=0), points.max(axis=0)
-    spread = np.maximum(high - low, max(1.0, 0.2 * (high - low).max()))  # a straight path is not a hairline
-    middle = (low + high) / 2
-    return middle - spread / 2, middle + spread / 2
 
 
 def _write(image, text, where, color):
@@ -99,18 +90,14 @@ def pictures(sequence, settings=THESIS, masks=None, description=None):
     true = sequence.poses.copy() if sequence.has_truth else None
     if true is not None:
         true[:, :3, 3] += odometry.pose[:3, 3] - true[0, :3, 3]
-    seen = [odometry.pose[None]] if true is None else [true]
-    limits, metres, poses = _limits(*seen), scales(sequence), []
-    indices = range(len(sequence))
+    metres, poses, indices = scales(sequence), [], range(len(sequence))
     for index in indices if description is None else progress(indices, description):
         frame, mask = sequence.frame(index), None if masks is None else masks[index]
         step = odometry.step(frame, metres[index], mask)
         poses.append(step.pose)
-        low, high = _limits(*seen, np.array(poses))
-        limits = np.minimum(limits[0], low), np.maximum(limits[1], high)
         upper = draw_frame(frame, step, settings, mask)
         height, width = frame.shape
-        lower = draw_map((int(MAP_SHARE * height), width), true, np.array(poses), limits)
+        lower = draw_map((int(MAP_SHARE * height), width), true, np.array(poses))
         _describe(lower, step, true, mask is not None)
         picture = np.vstack([upper, lower])
         yield picture[:picture.shape[0] // 2 * 2, :picture.shape[1] // 2 * 2]  # video wants even sizes
@@ -120,8 +107,8 @@ def _describe(image, step, true, masked):
     row = step.row()
     lines = [(f"frame {step.frame}", TEXT)]
     if true is not None:
-        off = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
-        lines.append((f"{off:.2f} m from the truth", TEXT))
+        error = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
+        lines.append((f"{error:.2f} m from the truth", TEXT))
     if step.detected is not None:
         lines.append((f"{step.detected} keypoints" + " inside the mask" * masked, KEPT))
     if masked:
@@ -131,9 +118,8 @@ def _describe(image, step, true, masked):
                   (f"{row['tracked'] - row['inliers']} do not", OUTLIER)]
     if row["flag"]:
         lines.append((row["flag"], DISCARDED))
-    left = image.shape[1] - 275
-    for number, (text, color) in enumerate(lines):
-        _write(image, text, (left, 20 + 20 * number), color)
+    for number, (text, color) in enumerate(lines, 1):
+        _write(image, text, (image.shape[1] - 275, 20 * number), color)
 
 
 def check_name(path):
