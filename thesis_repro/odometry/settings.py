@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from thesis_repro import InputError
 from thesis_repro.odometry import pose
 
-ESTIMATORS = ("thesis", "inliers", "refined")
+CHOICES = {"detector": ("shi-tomasi", "orb"), "mask_mode": ("detect", "filter"),
+           "essential_method": tuple(pose.ESSENTIAL_METHODS), "estimator": ("thesis", "inliers", "refined"),
+           "alignment": ("position", "pose")}
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,7 @@ class OdometrySettings:
     alignment: str = "position"
 
     def __post_init__(self) -> None:
-        for name, known in (("detector", ("shi-tomasi", "orb")), ("mask_mode", ("detect", "filter")),
-                            ("essential_method", tuple(pose.ESSENTIAL_METHODS)), ("estimator", ESTIMATORS),
-                            ("alignment", ("position", "pose"))):
+        for name, known in CHOICES.items():
             if getattr(self, name) not in known:
                 raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
                                  f"choose one of {', '.join(known)}")
