@@ -1,4 +1,4 @@
-"""One style for every figure and table, and the writing of both: SVG and PNG, CSV and Markdown.
+"""One style for every figure and table, and the writing of both: SVG or WebP, CSV and Markdown.
 
 Each module of chapters 2 to 4 draws from arrays or a table and returns a matplotlib figure.
 """
@@ -17,33 +17,25 @@ from thesis_repro.cityscapes import LABELS, colorize
 from thesis_repro.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
-STYLE = {
+matplotlib.rcParams.update({
     "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "legend.fontsize": 8,
-    "legend.frameon": False,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.6,
+    "axes.titlesize": 9, "axes.labelsize": 9,
+    "legend.fontsize": 8, "legend.frameon": False,
+    "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "axes.axisbelow": True,
+    "grid.color": "#dddddd", "grid.linewidth": 0.6,
     "lines.linewidth": 1.4,
     "image.interpolation": "nearest",
     "svg.fonttype": "none",
     "text.parse_math": False,  # names of files and sequences may hold dollars
     "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
     "savefig.dpi": 160,
-}
-matplotlib.rcParams.update(STYLE)
+})
 # Okabe and Ito's colours, distinguishable with any colour vision
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
-    "#000000", "#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
+BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
+BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # what each colour stands for in all of chapter 4
 DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"  # the note where no data is shown
-
-
 KEYPOINT = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}  # how keypoints are drawn on a frame
 EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges drawn on a frame
 
@@ -124,15 +116,14 @@ def save_figure(figure, folder, name, note):
         legend.set_loc("lower left")
         legend.set_bbox_to_anchor((box.x0, box.y0), transform=figure.transFigure)
     figure.text(0.5, -0.08 / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
-    pictures = any(axes.images for axes in figure.axes)
-    if pictures:
-        note_in_file = Image.Exif()
+    if any(axes.images for axes in figure.axes):
+        ending, other, note_in_file = ".webp", ".svg", Image.Exif()
         note_in_file[ExifTags.Base.ImageDescription] = note
         options = {"pil_kwargs": {"quality": 90, "method": 6, "exif": note_in_file}}
     else:
+        ending, other = ".svg", ".webp"
         options = {"metadata": {"Date": None, "Creator": None, "Description": note}}
-    written, other = (".webp", ".svg") if pictures else (".svg", ".webp")
-    with atomic(folder / f"{name}{written}") as temporary:
+    with atomic(folder / f"{name}{ending}") as temporary:
         figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
     (folder / f"{name}{other}").unlink(missing_ok=True)  # of a run in which it was the other kind
 
