@@ -99,7 +99,7 @@ def odometry(options):
     from thesis_repro.kitti import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
     from thesis_repro.odometry.refined import boresight
-    from thesis_repro.report import terminal, trajectories, video
+    from thesis_repro.report import terminal
 
     if bool(options.labels) != (options.dilation is not None):
         raise InputError("--labels: needs --dilation W, the width in pixels by which the boundaries are dilated"
@@ -111,8 +111,12 @@ def odometry(options):
               if vars(options).get(field.name) is not None}
     settings = replace(odometry.PRESETS[options.pyslam], **chosen)
     if options.video:
+        from thesis_repro.report import video
+
         video.check_name(options.video)
     if options.plot:
+        from thesis_repro.report import trajectories
+
         trajectories.check_name(options.plot)
     sequence = _sequence(options)
     _check_new_files({"--output": options.output, "--tum": options.tum, "--plot": options.plot,
