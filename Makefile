@@ -98,13 +98,15 @@ endif
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
-SOURCES := $(shell find thesis_repro -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html')
+SOURCES := $(shell find thesis_repro -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html.j2' \
+             -not -name 'page.css' -not -name 'captions.json')
 DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
         $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*)) $(if $(KITTI_SEMANTIC),$(wildcard $(KITTI_SEMANTIC)/*))
 
 figures: $(EXECUTED)
 	@$(BIN)/python -m thesis_repro.report.page
 	@$(BIN)/python -m thesis_repro.settings figures
+	@for notebook in $(EXECUTED); do [ -e $$notebook ] || exit 1; done
 
 $(RUN)/checked: .venv/ready $(DATA)
 	@mkdir -p $(@D)
@@ -128,13 +130,16 @@ MAKEFLAGS += -j2
 endif
 needed = $(foreach number,$(NEEDS_$(1)),$(filter $(RUN)/notebooks/$(number)_%,$(EXECUTED)))
 
+# A notebook that fails costs those that need it, but not the page, which says what is missing; make then ends with an
+# error. One that is interrupted (any other status than 1) ends make.
 define execute
 $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 	@mkdir -p $$(@D)
-	@$(BIN)/jupyter-nbconvert --to notebook --execute --log-level=CRITICAL \
+	@for needed in $(2); do [ -e $$$$needed ] || { rm -f $$@; exit 0; }; done; \
+	if $(BIN)/jupyter-nbconvert --to notebook --execute --log-level=CRITICAL \
 	  --NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution \
-	  --Execution.log_file=$$(@D)/$(basename $(1)).log --output-dir $$(@D) --output .$(1) $$<
-	@mv $$(@D)/.$(1) $$@
+	  --Execution.log_file=$$(@D)/$(basename $(1)).log --output-dir $$(@D) --output .$(1) $$<; \
+	then mv $$(@D)/.$(1) $$@; else status=$$$$?; rm -f $$@; [ $$$$status = 1 ] || exit $$$$status; fi
 endef
 previous :=
 $(foreach notebook,$(notdir $(NOTEBOOKS)),\
@@ -179,7 +184,9 @@ bench: setup
 .PHONY: evidence
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.report.evidence "$$THESIS_REPRO_KITTI" figures/kitti_excerpts $(if $(JOBS),--jobs $(JOBS))
+	@$(BIN)/python -m thesis_repro.report.evidence "$$THESIS_REPRO_KITTI" figures/kitti_excerpts \
+	  $(if $(JOBS),--jobs $(JOBS)) $(if $(filter-out all,$(FRAMES)),--frames $(FRAMES)) \
+	  $(if $(REPETITIONS),--repetitions $(REPETITIONS))
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)

@@ -110,6 +110,7 @@ def test_only_what_changed_is_made_again(tmp_path):
     write("02_two.ipynb", "from thesis_repro import InputError\nraise InputError('labels: missing; run notebook 5')")
     failed, names = make()
     assert failed.returncode != 0 and names == ["01_one", "02_two"] and "run notebook 5" in failed.stderr
+    assert (tmp_path / "figures" / "embedded-smoke" / "index.html").is_file()
     results = tmp_path / "build" / "embedded-smoke" / "notebooks"
     assert "raise InputError" in (results / "02_two.log").read_text()
     assert sorted(path.name for path in results.glob("*.ipynb")) == ["01_one.ipynb"]  # hidden ones included
