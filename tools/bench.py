@@ -96,7 +96,7 @@ def keypoint_cost(sequence, count):
 
 
 def pass_memory(sequence, frames, runs):
-    """Megabytes of a process at the start of a pass of so many runs, and what it takes more over so many frames.
+    """Megabytes that a pass of so many runs over so many frames adds to a process, and what it takes at the start.
 
     The frames of the sequence are gone through to and fro until there are as many.
     """
@@ -113,7 +113,7 @@ def _pass(sequence, frames, runs):
     odometry.run_many(sequence, settings)  # loads and compiles everything
     start = peak_memory()
     odometry.run_many(longer, settings)
-    return start / 2**20, (peak_memory() - start) / 2**20
+    return (peak_memory() - start) / 2**20, start / 2**20
 
 
 def prediction_cost(model, paths):
@@ -165,33 +165,29 @@ def measure(sequence, frames=200, runs=4, models=None):
 
     rows = []
 
-    def add(what, unit, measured, reference, value):
-        rows.append({"what": what, "unit": unit, "measured": measured, "against": reference, "reference": value,
-                     "ratio": measured / value})
+    def add(what, unit, pair, against):
+        measured, reference = map(float, pair)
+        rows.append({"what": what, "unit": unit, "measured": measured, "against": against, "reference": reference,
+                     "ratio": measured / reference})
 
     odometry.run_many(sequence.subset(2), {"": (THESIS, None)})  # compiles and loads what the first use would
     with opencv_threads(1):
-        add("a step of the odometry", "ms", *_between(step_cost(sequence), "its bare OpenCV calls"))
-        together, alone, same = shared_cost(sequence)
-        add(f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits", "ms a frame", together,
-            "one by one", alone)
+        add("a step of the odometry", "ms", step_cost(sequence), "its bare OpenCV calls")
+        *pair, same = shared_cost(sequence)
+        add(f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits", "ms a frame", pair,
+            "one by one")
         costs = {count: keypoint_cost(sequence, count) for count in KEYPOINTS}
     for count, cost in costs.items():
-        add(f"{count} keypoints", "ms a frame", cost, "2000 keypoints", costs[2000])
-    start, grown = pass_memory(sequence, frames, runs)
-    add(f"memory that {runs} runs over {frames} frames add", "MB", grown, "at the start", start)
+        add(f"{count} keypoints", "ms a frame", (cost, costs[2000]), "2000 keypoints")
+    add(f"memory that {runs} runs over {frames} frames add", "MB", pass_memory(sequence, frames, runs), "at the start")
     models = models or {"model in the package": prediction.load_shipped(),
                         "the thesis's network": build_unet((320, 320, 1), N_CLASSES)}
     for name, model in models.items():
-        add(f"label maps, {name}", "ms a frame",
-            *_between(prediction_cost(model, sequence.frame_paths[:16]), "model.predict one by one"))
-        add(f"arithmetic, {name}, {operations(model) / 1e9:.1f} GFLOP an image", "GFLOP/s a core",
-            *_between(arithmetic(model), "a matrix product"))
+        add(f"label maps, {name}", "ms a frame", prediction_cost(model, sequence.frame_paths[:16]),
+            "model.predict one by one")
+        add(f"arithmetic, {name}, {operations(model) / 1e9:.1f} GFLOP an image", "GFLOP/s a core", arithmetic(model),
+            "a matrix product")
     return pd.DataFrame(rows)
-
-
-def _between(pair, reference):
-    return float(pair[0]), reference, float(pair[1])
 
 
 def main(arguments=None):
