@@ -424,7 +424,7 @@ def build_parser():
     add("--pyslam", choices=("2021", "2024"), default="2021",
         help="the preset: PySLAM of the thesis (default), or its later algorithm; what follows changes it")
     add("--estimator", metavar="thesis|inliers|refined",
-        help="who votes on the motion: all points (PySLAM), RANSAC's inliers, or these and then a fit")
+        help="all points vote on the motion (PySLAM); RANSAC's inliers vote; or it is fitted by least squares")
     add("--detector", metavar="shi-tomasi|orb", help="of keypoints; they are tracked all the same")
     add("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")
     add("--boresight", type=float, nargs=3, metavar=("PITCH", "YAW", "ROLL"),

@@ -55,19 +55,6 @@ def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tupl
     return tracked, status.ravel() == 1
 
 
-class Keypoints:
-    """`detect` and `track` for one run."""
-
-    detect = staticmethod(detect)
-    track = staticmethod(track)
-
-    def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
-        """Nothing is shared, so nothing is prepared."""
-
-
-NOT_SHARED = Keypoints()
-
-
 class _Tracks(NamedTuple):
     """Points of many runs tracked from one frame to the next, by their sorted keys (see _key)."""
 
@@ -125,9 +112,6 @@ class SharedKeypoints:
         chosen = _spread(*self._corners.ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
                          settings.max_keypoints, settings.min_distance, *frame.shape)
         return _inside(chosen, settings, mask)
-
-
-Features = Keypoints | SharedKeypoints
 
 
 def _key(points):

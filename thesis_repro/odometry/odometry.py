@@ -69,13 +69,13 @@ class Odometry:
     """
 
     def __init__(self, intrinsics: np.ndarray, settings: OdometrySettings = THESIS, start: np.ndarray | None = None,
-                 features: keypoints.Features = keypoints.NOT_SHARED):
-        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. features: a shared keypoints source."""
+                 shared: keypoints.SharedKeypoints | None = None):
+        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. shared: keypoints in common with other runs."""
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
         self.prior = MotionPrior()  # of the refined estimator alone
-        self.features = features
+        self.keypoints: Any = shared or keypoints  # both have `detect` and `track`
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame that self.points belong to
         self.points = keypoints.NO_POINTS
@@ -102,7 +102,7 @@ class Odometry:
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
             step.points = len(self.points)
-            tracked, was_tracked = self.features.track(self.previous, frame, self.points)
+            tracked, was_tracked = self.keypoints.track(self.previous, frame, self.points)
             step.previous, step.current = self.points[was_tracked], tracked[was_tracked]
             tracked = step.current
         elif self.previous is not None or step.frame > 0:
@@ -111,7 +111,7 @@ class Odometry:
         step.seconds["track"] = time.perf_counter() - started
         if len(tracked) < self.settings.redetect_below or not len(tracked):
             started = time.perf_counter()
-            detected = self.features.detect(frame, self.settings, mask)
+            detected = self.keypoints.detect(frame, self.settings, mask)
             step.seconds["detect"] = time.perf_counter() - started
             step.detected = len(detected)
             if len(detected):

@@ -82,7 +82,7 @@ def run(sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | 
     description: of a progress bar; None for no bar.
     Raises InputError where a frame cannot be read or a mask has another size.
     """
-    return _run(sequence, {"": (settings, masks)}, keypoints.Keypoints(), description, None, 1)[""]
+    return _run(sequence, {"": (settings, masks)}, None, description, None, 1)[""]
 
 
 def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
@@ -140,9 +140,10 @@ class _Estimate:
                 run.flags[step.frame] = flag
 
 
-def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]], features: keypoints.Features,
-         description: str | None, checkpoint: Path | None, workers: int) -> dict[str, Result]:
-    members = {name: _Run(Odometry(sequence.intrinsics, settings, start_pose(sequence), features), masks,
+def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
+         shared: keypoints.SharedKeypoints | None, description: str | None, checkpoint: Path | None,
+         workers: int) -> dict[str, Result]:
+    members = {name: _Run(Odometry(sequence.intrinsics, settings, start_pose(sequence), shared), masks,
                           np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan))
                for name, (settings, masks) in runs.items()}
     groups = _groups(members.values())
@@ -154,7 +155,8 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
         waiting: list[_Estimate] = []
         for index in _with_bar(range(done, len(sequence)), description, len(sequence)):
             frame = sequence.frame(index)
-            features.expect(frame, [(leader.odometry.previous, leader.odometry.points) for leader in leaders])
+            if shared is not None:
+                shared.expect(frame, [(leader.odometry.previous, leader.odometry.points) for leader in leaders])
             observed = []
             for leader, group in zip(leaders, groups, strict=True):
                 started = time.perf_counter()

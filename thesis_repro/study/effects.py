@@ -189,7 +189,7 @@ def tracks(sequence: Sequence, chosen: dict[str, Masks | None], pairs: int = 6) 
             points = keypoints.detect(before, THESIS, None if its_masks is None else its_masks[int(index)])
             if len(points) < 10:
                 continue
-            moved, found = keypoints.NOT_SHARED.track(before, after, points)
+            moved, found = keypoints.track(before, after, points)
             distance, heading = _against_truth(points[found], moved[found], motion, sequence.intrinsics)
             residual = float(np.median(np.abs(distance)))
             fields = (points // [sequence.size[1] / 16, sequence.size[0] / 5]).astype(int)
