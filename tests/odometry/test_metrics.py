@@ -151,6 +151,15 @@ def test_relative_errors_by_hand():
     assert np.isnan(short["translation_percent"]) and short["note"]
 
 
+def test_errors_of_single_steps():
+    true = winding()
+    perfect = metrics.step_errors(true, true)
+    assert perfect["failed"] == 0 and perfect["direction"] < 0.01 and perfect["rotation"] < 1e-3
+    assert metrics.step_errors(ahead(9, turn=0.5), ahead(9))["rotation"] == pytest.approx(0.5, abs=0.01)
+    for failing in (ahead(9, turn=3.0), ahead(9, factor=-1.0)):
+        assert metrics.step_errors(failing, ahead(9))["failed"] == 100
+
+
 def test_the_errors_of_a_run():
     true = winding()
     errors = metrics.errors(drifted(true), true)

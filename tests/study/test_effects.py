@@ -1,37 +1,12 @@
 """Switches one by one, where keypoints lie, and what Canny does to boundaries."""
 
-import cv2
 import numpy as np
-import pytest
 from street import Street, Stripes
 
 from thesis_repro import masks
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.study import effects
-
-
-def turned(poses, degrees):
-    """The same path with the last rotation of every step off by an angle."""
-    some, angle = np.array(poses), np.radians(degrees)
-    for index in range(1, len(some)):
-        some[index, :3, :3] = some[index, :3, :3] @ cv2.Rodrigues(np.array([0, angle * index, 0]))[0]
-    return some
-
-
-def test_a_perfect_path_has_no_relative_error_and_a_turned_one_has_its_angle():
-    true = Street(8).poses
-    perfect = metrics.step_errors(true, true)
-    assert perfect["failed"] == 0 and perfect["direction"] < 0.01 and perfect["rotation"] < 1e-3
-    assert metrics.step_errors(turned(true, 0.5), true)["rotation"] == pytest.approx(0.5, abs=0.01)
-    assert metrics.step_errors(turned(true, 3), true)["failed"] == 100
-
-
-def test_a_path_backwards_has_failed_at_every_step():
-    true = Street(6).poses
-    back = true.copy()
-    back[:, :3, 3] *= -1
-    assert metrics.step_errors(back, true)["failed"] == 100
 
 
 def test_boundaries_of_ids_close_together_are_lost_and_far_apart_found():
