@@ -16,13 +16,11 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-import mistune
-import pandas as pd
 from markupsafe import Markup
 
 from thesis_repro import longrun, stages
 from thesis_repro.files import write_text
-from thesis_repro.report import captions, gap, texts
+from thesis_repro.report import captions, gap, tables, texts
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
@@ -80,7 +78,7 @@ def write_notebooks(paths, page):
 
 def build(settings):
     """The page of a run as HTML, from the files in its folders."""
-    makers, numbers = _makers(), _numbers_of(settings)
+    makers, numbers = _makers(), tables.beside_the_thesis(settings)
     chapters = {title: [_shown(settings.figures, artefact, makers, settings, numbers) for artefact in artefacts]
                 for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()}
     artefacts = [artefact for of_chapter in chapters.values() for artefact in of_chapter]
@@ -88,7 +86,7 @@ def build(settings):
     if not settings.figures_in_git:  # in a clone there is no build folder to link to
         notebooks = {path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
                      for path in _executed(settings)}
-    lengths = _table(settings.figures / "table_4_1.csv")
+    lengths = tables.read(settings.figures / "table_4_1.csv")
     return texts.render(
         "page.html.j2", title=f"Tables and figures, {settings.run}", settings=settings, chapters=chapters,
         shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
@@ -113,9 +111,9 @@ def _shown(folder, artefact, makers, settings=None, numbers=None):
     files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
     content = None
     if files and kind == "text":
-        content = _markdown(files[0].read_text(encoding="utf-8"))
+        content = texts.html(files[0].read_text(encoding="utf-8"))
     elif kind == "table" and files and files[0].suffix == ".csv":
-        content = _html(_table(files[0]))
+        content = tables.html(tables.read(files[0]))
     there = bool(files) and (kind == "figure" or content is not None)
     number = None
     if name in captions.THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
@@ -136,27 +134,6 @@ def _shown(folder, artefact, makers, settings=None, numbers=None):
 
 def _filled(template, values):
     return texts.TEMPLATES.from_string(template).render(values)
-
-
-def _numbers_of(settings):
-    """This run's numbers where the thesis reports some in words, {name: numbers}, from the files that there are."""
-    numbers = {}
-    history, chosen = _table(settings.build / "model" / "history.csv"), _table(settings.figures / "table_4_1.csv")
-    seconds = _table(settings.figures / "timings" / "seconds.csv")
-    if len(history):
-        best = history.loc[history["val_loss"].idxmin()]
-        scores = {split: {key: f"{best[prefix + name]:.2f}" for key, name in (
-            ("loss", "loss"), ("f1", "f1-score"), ("iou", "iou_score"))}
-            for split, prefix in (("train", ""), ("validation", "val_"))}
-        numbers["figure_4_01"] = {"epochs": len(history), "best": int(best["epoch"]), **scores}
-    if "mean keypoints" in chosen:
-        numbers["figure_4_07"] = {"least": max(1, chosen["mean keypoints"].min()),
-                                  "most": max(1, chosen["mean keypoints"].max())}
-    if len(seconds):
-        masked = seconds[seconds["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
-        saved = 100 * (1 - masked / seconds.loc[seconds["method"] == "baseline", "seconds"].sum())
-        numbers["figure_4_17"] = {"least": f"{saved.min():.0f}", "most": f"{saved.max():.0f}"}
-    return numbers
 
 
 def _makers():
@@ -193,30 +170,6 @@ def _made(executed=(), in_git=False):
 
 def _cells(path):
     return json.loads(path.read_text(encoding="utf-8"))["cells"]
-
-
-def _table(path):
-    """A CSV file as a table, whole numbers beside missing ones as such; an empty one where there is no file."""
-    return pd.read_csv(path, dtype={"sequence": str}).convert_dtypes() if path.is_file() else pd.DataFrame()
-
-
-def _html(table):
-    """A table as HTML, texts escaped; numbers of a column have equally many digits."""
-    numeric = [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes]
-    shown = pd.DataFrame({name: cells.astype(float) if cells.dtype == "Float64" else cells.astype(object).where(
-        cells.notna(), "") for name, cells in table.items()})
-    return Markup(shown.to_html(index=False, border=0, na_rep="", justify="unset",
-                                 classes="numbers" if sum(numeric) > len(numeric) / 2 else "words"))
-
-
-class _Renderer(mistune.HTMLRenderer):
-    def heading(self, text, level, **attributes):
-        return super().heading(text, max(4, level + 1), **attributes)  # below those of the page
-
-
-def _markdown(text):
-    """Markdown as HTML; HTML in it is shown as text."""
-    return Markup(mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])(text))
 
 
 def main():

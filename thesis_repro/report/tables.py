@@ -5,6 +5,7 @@
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import compare, thesis_tables
@@ -78,3 +79,41 @@ def table_budget(measured, overlapped):
                           "between frames, overlapped (ms)": between, "frames a second, overlapped": 1000 / between}).T
     table = pd.concat([table.round(2).rename(lambda stage: f"{stage} (ms)"), below.round(1)])
     return table.rename_axis("stage", axis=0).rename_axis(None, axis=1).reset_index()
+
+
+# For the page
+
+
+def read(path):
+    """A CSV file as a table, whole numbers beside missing ones as such; an empty one where there is no file."""
+    return pd.read_csv(path, dtype={"sequence": str}).convert_dtypes() if path.is_file() else pd.DataFrame()
+
+
+def html(table):
+    """A table as HTML, texts escaped; numbers of a column have equally many digits."""
+    numeric = [pd.api.types.is_numeric_dtype(dtype) for dtype in table.dtypes]
+    shown = pd.DataFrame({name: cells.astype(float) if cells.dtype == "Float64" else cells.astype(object).where(
+        cells.notna(), "") for name, cells in table.items()})
+    return Markup(shown.to_html(index=False, border=0, na_rep="", justify="unset",
+                                 classes="numbers" if sum(numeric) > len(numeric) / 2 else "words"))
+
+
+def beside_the_thesis(settings):
+    """This run's numbers where the thesis reports some in words, {name: numbers}, from the files that there are."""
+    numbers = {}
+    history, chosen = read(settings.build / "model" / "history.csv"), read(settings.figures / "table_4_1.csv")
+    seconds = read(settings.figures / "timings" / "seconds.csv")
+    if len(history):
+        best = history.loc[history["val_loss"].idxmin()]
+        scores = {split: {key: f"{best[prefix + name]:.2f}" for key, name in (
+            ("loss", "loss"), ("f1", "f1-score"), ("iou", "iou_score"))}
+            for split, prefix in (("train", ""), ("validation", "val_"))}
+        numbers["figure_4_01"] = {"epochs": len(history), "best": int(best["epoch"]), **scores}
+    if "mean keypoints" in chosen:
+        numbers["figure_4_07"] = {"least": max(1, chosen["mean keypoints"].min()),
+                                  "most": max(1, chosen["mean keypoints"].max())}
+    if len(seconds):
+        masked = seconds[seconds["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
+        saved = 100 * (1 - masked / seconds.loc[seconds["method"] == "baseline", "seconds"].sum())
+        numbers["figure_4_17"] = {"least": f"{saved.min():.0f}", "most": f"{saved.max():.0f}"}
+    return numbers

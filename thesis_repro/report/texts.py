@@ -8,8 +8,10 @@ import re
 from math import ceil, log10
 from pathlib import Path
 
+import mistune
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
@@ -37,6 +39,16 @@ def ratio(row):
     if pd.isna(row["low"]):
         return number(row["ratio"])
     return f"{number(row['ratio'])} ({compare.LEVEL} % CI {number(row['low'])}-{number(row['high'])})"
+
+
+class _Renderer(mistune.HTMLRenderer):
+    def heading(self, text, level, **attributes):
+        return super().heading(text, max(4, level + 1), **attributes)  # below those of the page
+
+
+def html(text):
+    """Markdown as HTML; HTML in it is shown as text."""
+    return Markup(mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])(text))
 
 
 TEMPLATES.filters["ratio"] = ratio
