@@ -154,7 +154,9 @@ def _panels(rows, height, **options):
 
 def _legend(figure, axes):
     handles = {label: handle for panel in axes for handle, label in zip(*panel.get_legend_handles_labels())}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
+    order = [name for name in compare.METHODS.values() if name in handles]
+    order += [name for name in handles if name not in order]  # sources
+    figure.legend([handles[name] for name in order], order, loc="outside lower center", ncols=4)
 
 
 def _against_all_keypoints(table):
