@@ -101,6 +101,13 @@ def test_jpeg_frames_without_truth_run_with_masks_named_png(tiny_kitti, tmp_path
     assert cv2.imread(str(tmp_path / "path.png")) is not None
 
 
+def test_frames_without_any_keypoint_end_well(tiny_kitti, capsys):
+    for path in (tiny_kitti / "sequences/00/image_0").iterdir():
+        cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
+    assert run("odometry", "--kitti", tiny_kitti, "--sequence", "00", "--json") == 0
+    assert printed(capsys)["mean_keypoints"] == 0
+
+
 def test_the_shell_is_told_what_could_come_next(tmp_path):
     line = "thesis-repro evaluate --al"
     request = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "answer"), "COMP_LINE": line,

@@ -79,6 +79,13 @@ def test_pixels_are_those_of_opencv(tmp_path, ending):
         assert np.array_equal(read_color(path)[..., ::-1], cv2.imread(str(path)))
 
 
+def test_too_little_memory_is_not_taken_for_damage(tmp_path, monkeypatch):
+    write_png(tmp_path / "a.png", IMAGE)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: None)
+    with pytest.raises(MemoryError):
+        read_gray(tmp_path / "a.png")
+
+
 def test_one_bit_is_black_and_white(tmp_path):
     path = tmp_path / "mask.png"
     path.write_bytes(png([[0b10100000], [0b01100000]], 3, 2, 1, 0))

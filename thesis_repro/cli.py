@@ -489,7 +489,7 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     options.command_line = shlex.join(["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)])
     try:
-        longrun.need_addresses(4 if options.function is predict else 1)
+        longrun.need_addresses(4 if options.function is predict else 2)
         return options.function(options) or 0
     except Exception as error:
         return longrun.report_error(error)

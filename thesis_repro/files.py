@@ -83,8 +83,8 @@ def _read(path, mode, flag):
             raise OSError
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)  # faster than Pillow's decoder
         if pixels is None:
-            np.empty((*image.size, 8), np.uint8)  # OpenCV does not say where memory is too short; this does
-            raise OSError
+            Image.open(BytesIO(data)).load()  # raises where the file is corrupt; OpenCV does not say why it fails
+            raise MemoryError
         return pixels
 
 

@@ -15,9 +15,11 @@ def run(result, sequence, alignment):
     if sequence.has_truth:
         values = metrics.errors(result.poses, sequence.poses, alignment).values()
         errors = {name: _number(value) for name, value in zip(ERRORS, values, strict=True)}
+    detected = result.frames["detected"].dropna()  # none where every frame is without structure
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
     return {"sequence": sequence.name, "frames": len(sequence), **errors,
-            "mean_keypoints": float(result.frames["detected"].mean()), "ms_per_frame": 1000 * float(seconds.mean()),
+            "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
+            "ms_per_frame": 1000 * float(seconds.mean()),
             "flagged": {flag: int(count) for flag, count in result.flagged.items()}}
 
 
