@@ -217,8 +217,8 @@ def evaluate(options):
 
 
 def plan(options):
-    """say how long make figures would take here, training included, its memory and disk, from a short calibration"""
-    from thesis_repro import cityscapes, kitti
+    """say how long make figures would take here, training included, from a minute of timing"""
+    from thesis_repro import cityscapes
     from thesis_repro.settings import read_settings
     from thesis_repro.study import plan
 
@@ -226,10 +226,7 @@ def plan(options):
     sizes = read_settings({"THESIS_REPRO_PROFILE": "thesis"} | {
         name: value for name, value in os.environ.items() if name.startswith("THESIS_REPRO_")}).sizes
     images = len(cityscapes.pairs(options.cityscapes, "train")) if options.cityscapes else 0
-    frames = plan.counts(options.kitti, options.complete, sizes.frames)
-    work = plan.Thesis(options.kitti, tuple(kitti.sequences(options.kitti)), sizes, repetitions=sizes.repetitions)
-    calibration = plan.calibrate(work)
-    print(plan.text(work, plan.make(work, frames, calibration, plan.CORES, images), calibration, options.complete))
+    print(plan.of_thesis(options.kitti, sizes, options.complete, images))
 
 
 # What several commands share

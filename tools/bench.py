@@ -27,8 +27,7 @@ from thesis_repro.files import write_png, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import dilate
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
-from thesis_repro.study.budget import opencv_threads
-from thesis_repro.study.plan import peak_memory
+from thesis_repro.study.timing import opencv_threads
 
 REPEATS = 3
 WIDTHS = (1, 5, 10, 15)
@@ -102,6 +101,12 @@ def pass_memory(sequence, frames, runs):
     """
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(_pass, sequence, frames, runs).result()
+
+
+def peak_memory():
+    """Bytes: the most that this process has taken so far, without what the one that started it had (Linux)."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return 1024 * next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
 
 
 def _pass(sequence, frames, runs):

@@ -21,8 +21,8 @@ from thesis_repro.masks import LabelMasks
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED
 from thesis_repro.study import controls
-from thesis_repro.study.budget import opencv_threads
 from thesis_repro.study.sources import Source
+from thesis_repro.study.timing import opencv_threads
 
 SPREAD, MOVING, WRONG = 1.5, 0.25, 2.0
 KEYPOINTS, SHUFFLES = (300, 500, 1000, 2000, 4000), 20

@@ -1,45 +1,97 @@
-"""The audit's rows, and what they are joined with."""
+"""The audit's rows, and the measurements that are joined to them."""
 
 import json
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from thesis_repro.report import audit, captions
+from thesis_repro.study import ablations, compare
+
+WORDS = ("where", "does", "right", "switch")
 
 
-def test_the_31_rows_of_the_audit_and_more_each_say_what_is_right():
-    numbers = [int(row["row"]) for row in audit.ROWS]
-    assert numbers == list(range(1, len(numbers) + 1)) and len(numbers) >= 31
-    assert all(row[key].strip() for row in audit.ROWS for key in ("where", "does", "right", "switch"))
+def ablation_runs(factors, sequences=8):
+    """A table like that of `ablations.measure`: {method: factor on the errors of all keypoints}."""
+    random, rows = np.random.default_rng(0), []
+    for number in range(sequences):
+        for method, factor in factors.items():
+            for estimator in ablations.ESTIMATORS:
+                for repetition in range(3):
+                    error = factor * np.exp(0.02 * random.normal())
+                    rows.append({"sequence": f"{number:02d}", "method": method, "estimator": estimator, "sim3": error,
+                                 "repetition": repetition, "frames": 10, "mean_keypoints": 900.0, "failed": 1.0,
+                                 "across": 0.1, "down": 0.2, **dict.fromkeys(compare.METRICS, error)})
+    return pd.DataFrame(rows)
 
 
-def test_arithmetic_is_that_of_the_thesiss_tables():
-    said = " ".join(f"{one.row}: {one.effect} {one.spread}" for one in audit.arithmetic())
-    assert "RMSE: sum -13.20, mean -1.20, median -5.27 %" in said
-    assert "MAE: sum -25.65, mean -2.33, median 1.76 %" in said
-    assert "3: 2.63 times fewer" in said and "1.98 to 4.12" in said
-    assert "4: RMSE is larger in 03, 04, 05, 07, 09; MAE is larger in 00, 03, 04, 05, 06, 07, 09" in said
-    assert "RMSE smaller in 6 of 11; lots would do as well in 50 of 100" in said
-    assert "02: -101 frames" in said and "07: -1 frames" in said
+def test_every_row_has_its_words_and_every_comparison_its_row():
+    rows = audit.WORDS["rows"]
+    assert [int(row["row"]) for row in rows] == list(range(1, len(rows) + 1)) and len(rows) >= 70
+    assert all(row[key].strip() for row in rows for key in WORDS)
+    numbers, methods = {row["row"] for row in rows}, {*audit.WORDS["metrics"]}
+    assert {spec["row"] for spec in audit.WORDS["comparisons"]} <= numbers
+    assert {metric for spec in audit.WORDS["comparisons"] for metric in spec["metrics"]} <= methods
+
+
+@pytest.mark.parametrize("row, quantity, metric, value", [
+    ("1", "sum", "RMSE", -13.2), ("1", "mean", "RMSE", -1.2), ("1", "median", "RMSE", -5.27),
+    ("1", "sum", "MAE", -25.65), ("1", "mean", "MAE", -2.33), ("1", "median", "MAE", 1.76),
+    ("3", "reduction", "", 2.626), ("4", "larger", "MAE", 7), ("41", "improved", "RMSE", 6),
+    ("41", "sign", "RMSE", 50), ("18", "frames 02", "", 101), ("60", "keypoints", "", 761.7)])
+def test_arithmetic_is_that_of_the_thesiss_tables(row, quantity, metric, value):
+    table = audit.table(audit.of_tables(), "made up")
+    chosen = table[(table["row"] == row) & (table["quantity"] == audit.WORDS["quantities"][quantity])
+                   & (table["metric"] == metric)]
+    assert chosen["value"].item() == pytest.approx(value, abs=0.011)
 
 
 def test_the_arithmetic_follows_the_numbers(monkeypatch):
     changed = json.loads(json.dumps(captions.REPORTED))
     changed["table_4_2_rmse_percent_change"]["05"] = -50.0
     monkeypatch.setattr(audit, "REPORTED", changed)
-    assert "RMSE smaller in 7 of 11" in " ".join(one.effect for one in audit.arithmetic())
+    improved = next(each for each in audit.of_tables() if each["quantity"] == audit.WORDS["quantities"]["improved"])
+    assert improved["value"] == 7
 
 
-def test_a_row_without_a_measurement_says_so_and_an_unknown_row_is_refused():
-    table = audit.table(audit.arithmetic(), "made up")
-    assert {"5", "13"} <= set(audit.missing(table)) and "1" not in audit.missing(table)
-    untried = table[table["switch"] == audit.UNTRIED]
-    assert len(untried) and (untried["effect of the switch alone"] == audit.UNTRIED).all()
+def test_words_stand_once_and_a_row_without_a_measurement_stays():
+    measurements = [audit.measurement("13", "spread", [1, 2, 3]), audit.measurement("13", "spread", 5)]
+    table = audit.table(measurements, "made up")
+    assert list(dict.fromkeys(table["row"])) == [row["row"] for row in audit.WORDS["rows"]]
+    lines = table[table["row"] == "13"]
+    assert lines["value"].tolist() == [2, 5] and lines["n"].tolist() == [3, 1] and set(lines["data"]) == {"made up"}
+    assert lines["where"].iloc[0] and not lines["where"].iloc[1]
+    missing = audit.missing(table)
+    assert "5" in missing and not {"13", "17", "53"} & {*missing}
     with pytest.raises(ValueError, match="999"):
-        audit.table([audit.Effect("999", "nothing")], "made up")
+        audit.table([{"row": "999"}], "made up")
 
 
-def test_several_effects_of_a_row_stand_together_with_their_spreads():
-    table = audit.table([audit.Effect("13", "one", "a"), audit.Effect("13", "two", "b")], "made up").set_index("row")
-    assert table.loc["13", "effect of the switch alone"] == "one; two" and table.loc["13", "spread"] == "a; b"
-    assert table.loc["13", "data"] == "made up" and table.loc["1", "data"] == "the thesis's tables"
+@pytest.mark.parametrize("value, shown", [(1.0018, 1.002), (1.00002, 1.00002), (0.999996, 0.999996), (1.0, 1.0),
+                                          (123.456, 123.5)])
+def test_what_is_not_one_is_not_shown_as_one(value, shown):
+    assert audit.rounded(value) == shown
+
+
+def test_ablations_become_ratios_of_their_reference():
+    factors = {"baseline": 1.0, "masked": 0.5, "nearest": 0.25, "strongest-100": 4.0, "dropout": 1.0}
+    measurements = pd.DataFrame(audit.of_ablations(ablation_runs(factors)))
+    ratios = measurements[measurements["unit"] == "ratio"].set_index(["row", "metric", "estimator"])["value"]
+    assert ratios["10", "RMSE", "refined"] == pytest.approx(0.5, rel=0.05) and ratios["10", "keypoints", ""] == 1
+    assert ratios["59", "RMSE", "thesis"] == pytest.approx(1, rel=0.05)
+    assert set(measurements["frames"]) == {10}
+    assert not measurements["row"].isin(["48"]).any()  # ORB was not run
+
+
+def test_trials_and_times_are_measured_against_their_reference():
+    trials = pd.DataFrame([{"method": method, "seed": seed, "mean_iou": 0.1 * seed + gain} for method, gain in (
+        ("thesis", 0), ("corrected blocks", 0.1), ("divided by 255", 0.2), ("noise of today", 0),
+        ("person weight 1", 0)) for seed in range(2)])
+    assert [each["value"] for each in audit.of_trials(trials)] == pytest.approx([0.1, 0.2, 0, 0])
+    seconds = pd.DataFrame({"method": ["baseline", "masked", "masked"], "dilation_width": [np.nan, 5, 10],
+                            "seconds": [10.0, 5.0, 9.0]})
+    measured = pd.DataFrame({"method": ["all keypoints", "masked, width 10", "masked, width 10"],
+                             "stage": ["pose", "pose", "segmentation"], "milliseconds": [10.0, 8.0, 32.0]})
+    values = {each["row"]: each["value"] for each in audit.of_time(seconds, measured)[:2]}
+    assert values == {"47": -10, "16": 4}

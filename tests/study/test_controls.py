@@ -7,8 +7,8 @@ import pytest
 from thesis_repro import InputError, masks, odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
-from thesis_repro.study import controls, results, runner
-from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, mask_control_jobs, reduced_jobs
+from thesis_repro.study import compare, controls, runner, thesis_tables
+from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
 
 WIDTH = 10
@@ -99,52 +99,32 @@ def test_a_sequence_without_label_maps_has_no_controls(sequence, tmp_path):
 
 
 def test_keypoints_spread_out_are_as_many_as_asked_for(sequence):
-    every = [len(keypoints.detect(frame, odometry.THESIS)) for frame in sequence.frames()]
-    wanted = np.mean(every) / 2
+    counts = [len(keypoints.detect(frame, odometry.THESIS)) for frame in sequence.frames()]
+    wanted = np.mean(counts) / 2
     distance = controls.min_distance(sequence, wanted)
     assert distance > odometry.THESIS.min_distance and distance == round(distance, 1)
     spread = replace(odometry.THESIS, min_distance=distance)
-    found = np.mean([len(keypoints.detect(frame, spread)) for frame in sequence.frames()])
-    assert found == pytest.approx(wanted, rel=0.03)
-    assert controls.min_distance(sequence, max(every)) == odometry.THESIS.min_distance
+    left = np.mean([len(keypoints.detect(frame, spread)) for frame in sequence.frames()])
+    assert left == pytest.approx(wanted, rel=0.03)
+    assert controls.min_distance(sequence, max(counts)) == odometry.THESIS.min_distance
 
 
-def test_jobs_of_the_controls_have_both_estimators_and_every_repetition(small_world, small_labels, tmp_path):
+def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(small_world, small_labels, tmp_path):
     kitti = small_world / "kitti"
-    jobs = [*first_jobs(["00"], (5, WIDTH), 2), *mask_control_jobs(kitti, ["00"], 2)]
-    summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
-    jobs += reduced_jobs(results.best_widths(summary), 2) + keypoint_control_jobs(
-        results.keypoints_left(summary), kitti, frames=5, repetitions=2)
-    assert len({job.name for job in jobs}) == len(jobs)
-    summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
-    assert list(summary["run"]) == [job.name for job in jobs]
-    compared = summary[~((summary["method"] == "masked") & (summary["dilation_width"] != WIDTH))]
-    runs = compared[compared["method"] != "reduced"].groupby("method").size()
-    assert set(runs.index) == {"baseline", "masked", "fewer", "spread", *controls.MASKS} and set(runs) == {4}
-    number = summary.set_index("run")["mean_keypoints"]
-    assert number[_named(number, "fewer")] == pytest.approx(number["masked-10-0"], abs=1)
-    assert number[_named(number, "spread")] == pytest.approx(number["masked-10-0"], rel=0.05)
-    assert number["masked-10-0"] == number["masked-10-refined-1"] != number["mirrored-10-0"]
-    error = summary.set_index("run")["rmse"]
-    # all orders of the correspondences may lead the refined estimator to one path
-    assert len({error["baseline-0"], error["baseline-1"], error["baseline-refined-0"]}) == 3
-
-
-def _named(series, method):
-    return next(name for name in series.index if name.startswith(method))
-
-
-def test_another_width_is_that_of_every_mask(small_world, small_labels, tmp_path):
-    kitti = small_world / "kitti"
-    jobs = [*first_jobs(["00"], (5, WIDTH)), *mask_control_jobs(kitti, ["00"], width=5)]
+    jobs = first_jobs(kitti, ["00"], {"thesis": (5, WIDTH), "refined": ()}, tested=5, repetitions=2)
     assert {job.dilation_width for job in jobs if job.method in controls.MASKS} == {5}
-    summary = runner.run(jobs, kitti, small_labels, tmp_path, frames=4)
-    number = summary.set_index("run")["mean_keypoints"]
-    assert results.tested_width(summary) == 5 and number["masked-05-0"] < number["masked-10-0"]
-    left = results.keypoints_left(summary)
-    assert left["00"] == number["masked-05-0"]
-    fewer = [job for job in keypoint_control_jobs(left, kitti, frames=4) if job.method == "fewer"]
-    assert {job.max_keypoints for job in fewer} == {round(left["00"])}
+    runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
+    left = compare.keypoints_left(runs)
+    jobs += reduced_jobs(thesis_tables.best_widths(runs), 2) + keypoint_control_jobs(left, kitti, 5, 2, width=5)
+    assert len({job.name for job in jobs}) == len(jobs)
+    runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5).set_index("run")
+    assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
+    number = runs["mean_keypoints"]
+    assert left["00"] == number["masked-05-0"] < number["masked-10-0"]
+    assert number[number.index.str.startswith("fewer")].iloc[0] == pytest.approx(left["00"], abs=1)
+    assert number[number.index.str.startswith("spread")].iloc[0] == pytest.approx(left["00"], rel=0.05)
+    # shuffling changes the thesis's path; the refined estimator may be led to one path by all of them
+    assert runs.loc[["baseline-0", "baseline-1", "baseline-refined-0"], "rmse"].nunique() == 3
 
 
 def test_all_masks_have_the_boundaries_that_are_asked_for(sequence, small_labels, made):
@@ -168,8 +148,3 @@ def test_corrected_masks_have_all_corrections_and_nothing_where_things_move(sequ
     assert not corrected[:10].any() and not corrected[:, -10:].any() and corrected.any()
     moving = np.isin(cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT), masks.MOVABLE)
     assert moving.any() and not corrected[moving].any()
-
-
-def test_without_true_label_maps_that_control_is_left_out(tiny_kitti):
-    methods = {job.method for job in mask_control_jobs(tiny_kitti, ["00"])}
-    assert methods == {"baseline", "masked", *controls.MASKS} - {"true-labels"}

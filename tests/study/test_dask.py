@@ -94,7 +94,7 @@ def reads(log):
 
 
 def test_a_killed_worker_loses_nothing(small_world, small_labels, workers, scheduler, tmp_path):
-    jobs = first_jobs(["00", "01"], (5, 15), repetitions=2)
+    jobs = first_jobs(small_world / "kitti", ["00", "01"], {"thesis": (5, 15)}, repetitions=2)
     kitti, (processes, log) = small_world / "kitti", workers
     here = runner.run(jobs, kitti, small_labels, tmp_path / "here")
     there, killed, finished = tmp_path / "there", [], {}
@@ -142,7 +142,7 @@ def test_a_scheduler_that_cannot_be_used_is_one_line(scheduler, monkeypatch):
 
 
 def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, small_labels, tmp_path, monkeypatch):
-    jobs, kitti = first_jobs(["00"], ()), small_world / "kitti"
+    jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
     record = runner.stages.made_from(tmp_path / "00")
     study = runner._Study(kitti, runner.by_name(small_labels), tmp_path, frames=None)

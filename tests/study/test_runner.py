@@ -8,7 +8,7 @@ from thesis_repro import InputError, odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, MaskSettings
 from thesis_repro.odometry import metrics
-from thesis_repro.study import budget, results, runner
+from thesis_repro.study import controls, runner, thesis_tables, timing
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
 
@@ -18,9 +18,9 @@ WIDTHS = (5, 10, 15)
 @pytest.fixture(scope="module")
 def finished(small_world, small_labels, tmp_path_factory):
     folder = tmp_path_factory.mktemp("odometry")
-    jobs = first_jobs(["00", "01"], WIDTHS)
+    jobs = first_jobs(small_world / "kitti", ["00", "01"], {"thesis": WIDTHS})
     summary = runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
-    jobs += reduced_jobs(results.best_widths(summary))
+    jobs += reduced_jobs(thesis_tables.best_widths(summary))
     return folder, jobs, runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
 
 
@@ -30,15 +30,15 @@ def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finish
     sequence = Sequence(small_world / "kitti", "01")
     alone = odometry.run(sequence, masks=LabelMasks(small_labels / "01", sequence, 15))
     row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
-    assert {name: row[name] for name in (*results.ERRORS, *results.BESIDE)} == pytest.approx(
-        metrics.errors(alone.poses, sequence.poses), nan_ok=True, rel=0)
+    expected = metrics.errors(alone.poses, sequence.poses) | metrics.step_errors(alone.poses, sequence.poses)
+    assert {name: row[name] for name in expected} == pytest.approx(expected, nan_ok=True, rel=0)
     assert row["se3"] <= row["rmse"]
     assert np.array_equal(runner.paths(summary, folder)["01", "masked-15-0"], alone.poses[:, :3, 3])
 
 
 def test_reduced_runs_have_the_keypoints_of_the_best_width(finished):
     _, _, summary = finished
-    best = results.best_widths(summary)
+    best = thesis_tables.best_widths(summary)
     for name in ("00", "01"):
         of_name = summary[(summary["sequence"] == name) & (summary["method"] == "masked")]
         assert best.loc[name, "rmse"] == of_name["rmse"].min()
@@ -95,16 +95,17 @@ def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
     assert not list(tmp_path.rglob("pass-*"))
     for job in jobs:
-        one, two = (pd.read_csv(root / job.sequence / f"{job.name}.csv") for root in (folder, tmp_path))
-        exact = [column for column in one if not column.endswith("seconds")]
-        pd.testing.assert_frame_equal(one[exact], two[exact], check_exact=True)
+        whole, resumed = (pd.read_csv(root / job.sequence / f"{job.name}.csv") for root in (folder, tmp_path))
+        exact = [column for column in whole if not column.endswith("seconds")]
+        pd.testing.assert_frame_equal(whole[exact], resumed[exact], check_exact=True)
 
 
 def test_a_broken_label_map_costs_only_the_runs_that_need_it(small_world, small_labels, tmp_path, capsys):
     shutil.copytree(small_labels, tmp_path / "labels")
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
-    jobs = first_jobs(["00"], WIDTHS) + [Job("00", "true-labels", 10), Job("00", "mirrored", 10)]
+    jobs = [*first_jobs(small_world / "kitti", ["00"], {"thesis": WIDTHS}), Job("00", "true-labels", 10),
+            Job("00", "mirrored", 10)]
     summary = runner.run(jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5)
     assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
     assert ("sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: "
@@ -129,20 +130,49 @@ def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_pat
     assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
     # the times of these runs are those of their own masks
     asked = []
-    monkeypatch.setattr(budget, "masks_of", lambda *given: asked.append(given[-1][""]) or runner.masks_of(*given))
-    budget.time_runs(jobs, kitti, [Source(small_labels, settings=chosen)], tmp_path, frames=3)
+    monkeypatch.setattr(timing, "masks_of", lambda *given: asked.append(given[-1][""]) or runner.masks_of(*given))
+    timing.time_runs(jobs, kitti, [Source(small_labels, settings=chosen)], tmp_path, frames=3)
     assert [source.settings for source in asked] == [chosen]
 
 
 def test_times_without_runs_are_one_clear_line(small_world, small_labels, tmp_path):
     with pytest.raises(InputError, match="00: holds no odometry runs; they are timed after runner.run"):
-        budget.time_runs([Job("00", "baseline")], small_world / "kitti", small_labels, tmp_path, frames=3)
+        timing.time_runs([Job("00", "baseline")], small_world / "kitti", small_labels, tmp_path, frames=3)
 
 
 def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finished, monkeypatch):
     folder, jobs, _ = finished
     first = [job for job in jobs if job.method != "reduced"]
-    timed = budget.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
+    timed = timing.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
     assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
-    again = budget.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
+    again = timing.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
     pd.testing.assert_frame_equal(timed, again)
+
+
+def test_the_mounting_angle_of_other_sequences_is_removed(small_world, small_labels, tmp_path):
+    kitti = small_world / "kitti"
+    jobs = first_jobs(kitti, ["00", "01"], {"refined": (10,)})
+    runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=6)
+    corrected = runner.with_boresight_correction(runs, kitti, tmp_path, frames=6)["rmse_boresight_corrected"]
+    # no angle is determined on six frames, so nothing is removed
+    assert corrected.tolist() == pytest.approx(runs["rmse"].tolist())
+    of_thesis = runs.assign(estimator="thesis")
+    assert runner.with_boresight_correction(of_thesis, kitti, tmp_path)["rmse_boresight_corrected"].isna().all()
+
+
+def test_the_first_jobs_are_all_that_was_asked_for_and_no_two_share_a_name(small_world, tiny_kitti):
+    label_maps, ready = Source(tiny_kitti, name="net"), Source(tiny_kitti, "masks", "ready")
+    jobs = first_jobs(small_world / "kitti", ["00"], {"thesis": (5, 10), "refined": ()}, tested=10,
+                      sources=(label_maps, ready), repetitions=2)
+    assert len({job.name for job in jobs}) == len(jobs)
+    rows = pd.DataFrame([vars(job) for job in jobs])
+    count = rows.groupby(["source", "method", "estimator"]).size()
+    assert count["", "baseline", "thesis"] == count["", "baseline", "refined"] == 2  # once for all sources
+    assert count["net", "masked", "thesis"] == 4 and count["net", "masked", "refined"] == 2
+    assert count["ready", "masked", "refined"] == 2
+    assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()
+    of = {name: set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready")}
+    assert of["net"] == {"masked", *controls.MASKS}
+    assert of["net"] - of["ready"] == set(controls.OF_LABEL_MAPS)
+    without_truth = first_jobs(tiny_kitti, ["00"], {"thesis": (5,)}, tested=5)
+    assert "true-labels" not in {job.method for job in without_truth}

@@ -23,7 +23,7 @@ from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import audit, comparison, style, texts
-from thesis_repro.study import compare, controls, effects, jobs, runner, thesis_tables
+from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
 LARGEST = 3_000_000  # bytes, of everything together
@@ -47,17 +47,17 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     _predict(sequences, build / "labels")
     runs = _runs(root, names, build, frames, repetitions, processes)
     tested = runs[~runs["dilation_width"].isin(OTHER_WIDTHS) | (runs["estimator"] == "thesis")]
-    plan = effects.Plan(orders=repetitions, chance=max(10, repetitions), frames=frames)
-    switches, prefixes = effects.measure(root, names, build / "labels", build / "audit", plan, processes)
+    switches = ablations.measure(root, names, build / "labels", build / "audit", frames=frames, repetitions=repetitions,
+                                 baseline_repetitions=max(10, repetitions), processes=processes)
     angles = boresight.explained(runner.refined_paths(runs, root, build / "odometry", frames))
-    measured = [*audit.arithmetic(), *audit.of_switches(switches), *audit.of_chance(prefixes), *audit.of_runs(tested),
+    measured = [*audit.of_tables(), *audit.of_ablations(switches), *audit.of_study(tested),
                 *audit.of_boresight(angles), *audit.of_boundaries(_boundaries(sequences, build / "labels")),
-                *audit.of_tracks(_tracks(sequences, build / "labels"))]
+                *audit.comparisons(_tracks(sequences, build / "labels"), "tracks")]
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
     longrun.sweep(folder)
-    for name, content in {"comparison": comparison.table_comparison(table), "audit": audit.table(measured, note),
+    for name, content in {"comparison": comparison.table_comparison(table), "audit": audit.table(measured),
                           "widths": comparison.table_widths(runs)}.items():
         style.save_table(content, folder, name, note)
     for name, content in {"runs": runs, "switches": switches}.items():
@@ -89,7 +89,8 @@ def _runs(root, names, build, frames, repetitions, processes):
         return runner.run(listed, root, build / "labels", build / "odometry", frames=frames, processes=processes)
 
     fewer = min(repetitions, OTHER_REPETITIONS)
-    listed = jobs.first_jobs(names, WIDTHS, repetitions) + jobs.mask_control_jobs(root, names, repetitions)
+    listed = jobs.first_jobs(root, names, {"thesis": WIDTHS, "refined": []}, tested=jobs.CONTROL_WIDTH,
+                             repetitions=repetitions)
     listed += [jobs.Job(name, method, width, estimator="refined", repetition=repetition) for name in names
                for method in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
     runs = run()
@@ -104,7 +105,7 @@ def _runs(root, names, build, frames, repetitions, processes):
 
 def _boundaries(sequences, labels):
     return pd.DataFrame([
-        effects.boundaries(read_label_map(labels / sequence.name / sequence.frame_paths[index].name), sequence.size)
+        ablations.boundaries(read_label_map(labels / sequence.name / sequence.frame_paths[index].name), sequence.size)
         for sequence in sequences for index in range(0, len(sequence), max(1, len(sequence) // LOOKED_AT))])
 
 
@@ -115,7 +116,7 @@ def _tracks(sequences, labels):
         kinds = {"all keypoints": None, "masks": masks.LabelMasks(own, sequence, width),
                  "exact boundaries": masks.LabelMasks(own, sequence, width, "exact"),
                  "random lines": controls.masks("random-lines", Source(labels), sequence, width)}
-        rows.append(effects.tracks(sequence, kinds, LOOKED_AT))
+        rows.append(ablations.tracks(sequence, kinds, LOOKED_AT))
     return pd.concat(rows, ignore_index=True)
 
 

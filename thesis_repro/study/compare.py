@@ -72,12 +72,12 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
 
     (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
     """
-    values = np.asarray(values, float)
-    values = values[~np.isnan(values)]
-    if len(values) < MIN_FOR_INTERVAL:
+    numbers = np.asarray(values, float)
+    numbers = numbers[~np.isnan(numbers)]
+    if len(numbers) < MIN_FOR_INTERVAL:
         return np.nan, np.nan
-    drawn = np.random.default_rng(0).integers(0, len(values), (DRAWS, len(values)))
-    low, high = np.percentile(values[drawn].mean(axis=1), [(100 - LEVEL) / 2, (100 + LEVEL) / 2])
+    drawn = np.random.default_rng(0).integers(0, len(numbers), (DRAWS, len(numbers)))
+    low, high = np.percentile(numbers[drawn].mean(axis=1), [(100 - LEVEL) / 2, (100 + LEVEL) / 2])
     return float(low), float(high)
 
 
@@ -87,6 +87,7 @@ def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
     logarithms = logarithms[np.isfinite(logarithms)]
     low, high = np.exp(mean_interval(logarithms))
     ratio = float(np.exp(logarithms.mean())) if len(logarithms) else np.nan
+    low, high = np.minimum(low, ratio), np.maximum(high, ratio)  # of equal ratios, rounding may put the mean outside
     return {"ratio": ratio, "low": float(low), "high": float(high), "n": len(logarithms),
             "verdict": verdict(low, high, len(logarithms))}
 
@@ -135,7 +136,7 @@ def comparisons(runs: pd.DataFrame, metrics: Iterable[str] | None = None) -> pd.
 
 def _arms(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
     """What is compared: (source, method, dilation_width, keypoints, tested) with its rows; all keypoints first."""
-    arms = []
+    arms: list[tuple[dict[str, Any], pd.DataFrame]] = []
     order = {name: place for place, name in enumerate(METHODS)}
     known = runs[runs["method"].isin(order)]
     widths = {source: tested_width(of_source(runs, source)) for source in known["source"].unique()}
@@ -235,15 +236,15 @@ def tested_width(runs: pd.DataFrame) -> int | None:
     masked = runs.loc[runs["method"] == "masked", "dilation_width"]
     if len(masked) and masked.isna().all():
         return None
-    widths = runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique()
+    widths = sorted(runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique())
     if CONTROL_WIDTH in widths:
         return CONTROL_WIDTH
     if len(widths) > 1:
-        raise InputError(f"controls of the widths {', '.join(f'{width:g}' for width in sorted(widths))}; masks are put "
+        raise InputError(f"controls of the widths {', '.join(f'{width:g}' for width in widths)}; masks are put "
                          "to the test at one width, so list the controls of one")
-    if not len(widths) and masked.nunique() == 1:
-        widths = masked.unique()
-    return int(widths[0]) if len(widths) else CONTROL_WIDTH
+    if not widths and masked.nunique() == 1:
+        widths = list(masked.unique())
+    return int(widths[0]) if widths else CONTROL_WIDTH
 
 
 def keypoints_left(runs: pd.DataFrame, width: int | None = None) -> pd.Series:
@@ -257,4 +258,6 @@ def keypoints_left(runs: pd.DataFrame, width: int | None = None) -> pd.Series:
 
 def spread(rows: pd.DataFrame, column: str, by: str = "sequence") -> pd.DataFrame:
     """Mean, lowest and highest of a column over the repetitions: a table with one row for each value of `by`."""
-    return rows.groupby(by)[column].agg(mean="mean", lowest="min", highest="max")
+    table = rows.groupby(by)[column].agg(mean="mean", lowest="min", highest="max")
+    # rounding may put the mean of equal values outside their range, and an error bar would have a negative length
+    return table.assign(mean=table["mean"].clip(table["lowest"], table["highest"]))

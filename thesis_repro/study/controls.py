@@ -99,7 +99,7 @@ class ImageEdges(OtherFrame):
         covered_low, covered_high = frame.size, 0
         best, miss = np.zeros_like(frame), wanted
         while high - low > 1 and miss > CLOSE * frame.size:
-            # interpolated, but never so near an end that the other one could stay for ever
+            # interpolated, but never so near one end that the other end could stay for ever
             share = np.clip((covered_low - wanted) / (covered_low - covered_high), 0.1, 0.9)
             threshold = int(np.clip(low * (high / low) ** share, low + 1, high - 1))
             mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), self.line_width)
@@ -151,15 +151,15 @@ def min_distance(sequence: Sequence, number: float) -> float:
     def distance(steps: int) -> float:
         return round(THESIS.min_distance + steps * STEP, 6)
 
-    def found(steps: int) -> float:
+    def mean_number(steps: int) -> float:
         settings = replace(THESIS, min_distance=distance(steps))
         return float(np.mean([len(keypoints.detect(frame, settings)) for frame, keypoints in frames]))
 
     low, high = 0, round(min(sequence.size) / STEP)
-    counts = {low: found(low)}
+    counts = {low: mean_number(low)}
     while high - low > 1:
         middle = (low + high) // 2
-        counts[middle] = found(middle)
+        counts[middle] = mean_number(middle)
         low, high = (middle, high) if counts[middle] > number else (low, middle)
     best = min(counts, key=lambda steps: abs(counts[steps] - number))
     return distance(best)

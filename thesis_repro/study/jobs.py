@@ -1,5 +1,8 @@
-"""The odometry runs behind chapter 4, as a plain list: every sequence with all keypoints, with masks of each width, and
-plainly reduced; and the controls, which ask whether it is the segmentation that helps.
+"""The odometry runs of a study, as a plain list of jobs.
+
+Chapter 4 runs every sequence with all keypoints, with masks of each width and with plainly reduced keypoints. The
+controls beside them ask whether it is the segmentation that helps. Some jobs need the number of keypoints that masks
+leave (`reduced_jobs`, `keypoint_control_jobs`), so they follow in a second list.
 """
 
 import math
@@ -29,11 +32,10 @@ class Job:
     """One run of the odometry over one sequence. What is None or left out is as in the thesis.
 
     method: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
-    dilation_width: pixels, of masks from label maps; of KEYPOINT_CONTROLS, of the masks that leave as many keypoints. source: name of where the masks come from, or those that a limit
-    of keypoints was taken from; empty where there is only one. max_keypoints, min_distance: of the detector.
-    estimator: "all" or "refined", see OdometrySettings.
-    repetition: 0 takes the correspondences in the order in which they come, which is the thesis's single run; any
-    other number is the seed that shuffles them.
+    dilation_width: pixels, of masks from label maps; of KEYPOINT_CONTROLS, of the masks that leave as many keypoints.
+    source: name of where the masks come from, or those that a limit of keypoints was taken from; empty where there is
+    only one. max_keypoints, min_distance: of the detector. estimator: "thesis" or "refined", see OdometrySettings.
+    repetition: 0 is the thesis's single run; any other number is the seed that shuffles the matched points.
     """
 
     sequence: str
@@ -58,10 +60,10 @@ class Job:
 
     @property
     def settings(self) -> OdometrySettings:
-        """What the odometry does in this job: what the thesis does, but for what the job itself says."""
-        said: dict[str, Any] = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
-                                "shuffle_seed": self.repetition or None, "estimator": self.estimator}
-        return replace(THESIS, **{name: value for name, value in said.items() if value is not None})
+        """The settings of the odometry: the thesis's, but for what the job itself says."""
+        changes: dict[str, Any] = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
+                                   "shuffle_seed": self.repetition or None, "estimator": self.estimator}
+        return replace(THESIS, **{name: value for name, value in changes.items() if value is not None})
 
     def masks(self, sequence: Sequence, sources: Mapping[str, Source]) -> controls.ControlMasks | None:
         """Its masks; None where the detector may look everywhere. sources: by name."""
@@ -73,55 +75,42 @@ class Job:
         return controls.masks(self.method, source, sequence, self.dilation_width)
 
 
-def first_jobs(names: Iterable[str], widths: Iterable[int], repetitions: int = 1) -> list[Job]:
-    """The thesis's runs that depend on no other: baseline and masks of every width, for each sequence."""
-    methods = [("baseline", None), *(("masked", width) for width in widths)]
-    return [Job(name, method, width, repetition=repetition) for name in names for method, width in methods
-            for repetition in range(repetitions)]
+def first_jobs(kitti: Path, names: Iterable[str], widths: Mapping[str, Iterable[int]], *, tested: int | None = None,
+               sources: Iterable[Source | str] = ("",), repetitions: int = 1) -> list[Job]:
+    """The runs that need no result of others: all keypoints, masks of every width and the controls that are masks.
 
-
-def mask_control_jobs(kitti: Path, names: Iterable[str], repetitions: int = 1,
-                      width: int = CONTROL_WIDTH) -> list[Job]:
-    """The controls that depend on no other run, under both estimators; baseline and masks under the refined one.
-
-    width: pixels, of all masks. Under the thesis's estimator baseline and masks are those of `first_jobs`, so this has
-    to be one of its widths. The true label maps take part where a sequence has them, in a folder labels_0 beside its
-    frames.
+    names: of the sequences. widths: pixels, of masks from label maps, by estimator: {"thesis": range(1, 16)}.
+    tested: width (pixels) of the controls, None for no controls; it joins the widths of every estimator.
+    sources: of masks, side by side; all keypoints are run once for all of them. A name stands for a source of label
+    maps, which is all that the jobs take from it.
     """
-    jobs = []
+    widths_of = {estimator: {*of_estimator, *([tested] if tested else [])}
+                 for estimator, of_estimator in widths.items()}
+    jobs: list[Job] = []
     for name in names:
-        jobs += [Job(name, method, its_width, estimator="refined", repetition=repetition)
-                 for method, its_width in (("baseline", None), ("masked", width))
-                 for repetition in range(repetitions)]
-        jobs += _repeated(mask_controls(kitti, name, width), ESTIMATORS, repetitions)
+        jobs += _repeated([Job(name, "baseline")], widths_of, repetitions)
+        for source in sources:
+            called, ready = (source, False) if isinstance(source, str) else (source.name, source.kind == "masks")
+            if ready:  # masks that came ready made have no width
+                jobs += _repeated([Job(name, "masked", source=called)], widths_of, repetitions)
+            for width in [] if ready else sorted(set().union(*widths_of.values())):
+                estimators = [estimator for estimator, of_estimator in widths_of.items() if width in of_estimator]
+                jobs += _repeated([Job(name, "masked", width, source=called)], estimators, repetitions)
+            if tested:
+                jobs += _repeated(_mask_controls(kitti, name, None if ready else tested, called), widths_of,
+                                  repetitions)
     return jobs
 
 
-def mask_controls(kitti: Path, name: str, width: int | None, source: str = "") -> list[Job]:
-    """A job of each control that is a mask, beside masks of a width; None: beside masks that come ready made."""
+def _mask_controls(kitti: Path, name: str, width: int | None, source: str) -> list[Job]:
+    """A job of each control that is a mask; width None: beside masks that come ready made.
+
+    The true label maps take part where a sequence has them, in a folder labels_0 beside its frames.
+    """
     left_out = list(controls.OF_LABEL_MAPS) if width is None else []
     if not controls.true_labels(kitti, name).is_dir():
         left_out.append("true-labels")
     return [Job(name, method, width, source=source) for method in controls.MASKS if method not in left_out]
-
-
-def study_jobs(kitti: Path, names: Iterable[str], sources: Iterable[Source], widths: Iterable[int], *,
-               tested: int | None = None, estimators: Iterable[str] = ("thesis",), repetitions: int = 1) -> list[Job]:
-    """The runs of several sources side by side that depend on no other: all keypoints once, and each source's masks.
-
-    widths: pixels, of masks from label maps. tested: that of the mask controls, None for none; where it is given, it
-    is one of the widths too.
-    """
-    jobs: list[Job] = []
-    widths, sources = sorted({*widths, *([tested] if tested else [])}), list(sources)
-    for name in names:
-        jobs.append(Job(name, "baseline"))
-        for source in sources:
-            ready = source.kind == "masks"
-            jobs += [Job(name, "masked", width, source=source.name) for width in ([None] if ready else widths)]
-            if tested:
-                jobs += mask_controls(kitti, name, None if ready else tested, source.name)
-    return _repeated(jobs, estimators, repetitions)
 
 
 def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
@@ -133,7 +122,7 @@ def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) 
 def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
     """The detector limited to each sequence's mean number of keypoints at its best width (Figure 4.12).
 
-    best: the table of `results.best_widths`.
+    best: the table of `thesis_tables.best_widths`.
     """
     return [Job(name, "reduced", max_keypoints=_whole(number), repetition=repetition)
             for name, number in best["mean_keypoints"].items() for repetition in range(repetitions)]
@@ -142,23 +131,16 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
 def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: int | None = None,
                           repetitions: int = 1, estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "",
                           width: int | None = None) -> list[Job]:
-    """As many keypoints as masks leave, {sequence: number}, without a mask: the strongest, or spread out.
+    """As many keypoints as masks leave, {sequence: mean number}, without a mask: the strongest, or spread out.
 
     "fewer" limits their number; "spread" keeps them farther apart. width: pixels, of those masks.
     """
-    jobs = []
+    jobs: list[Job] = []
     for name, number in keypoints.items():
         distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
-        jobs += keypoint_controls(name, number, distance, repetitions, estimators, source, width)
+        jobs += _repeated([Job(name, "fewer", width, max_keypoints=_whole(number), source=source),
+                           Job(name, "spread", width, min_distance=distance, source=source)], estimators, repetitions)
     return jobs
-
-
-def keypoint_controls(name: str, number: float, distance: float, repetitions: int,
-                      estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "", width: int | None = None
-                      ) -> list[Job]:
-    """`keypoint_control_jobs` of one sequence; distance: pixels, that leaves `number` keypoints."""
-    return _repeated([Job(name, "fewer", width, max_keypoints=_whole(number), source=source),
-                      Job(name, "spread", width, min_distance=distance, source=source)], estimators, repetitions)
 
 
 def _whole(number: float) -> int:
@@ -179,7 +161,7 @@ def in_passes(jobs: Iterable[Job], frames: Mapping[str, int], workers: int) -> l
     for name, of_name in groups.items():
         share = len(of_name) * frames[name] / max(everything, 1)
         pieces = min(len(of_name), math.ceil(share * (PIECES * workers if workers > 1 else 1)))
-        passes += [[job for group in some for job in group] for some in _cut(list(of_name.values()), pieces)]
+        passes += [[job for group in piece for job in group] for piece in _cut(list(of_name.values()), pieces)]
     return longest_first(passes, frames)
 
 
@@ -188,6 +170,6 @@ def longest_first(passes: list[list[Job]], frames: Mapping[str, int]) -> list[li
     return sorted(passes, key=lambda jobs: -len(jobs) * frames[jobs[0].sequence])
 
 
-def _cut(some: list, pieces: int) -> Iterator[list]:
+def _cut(groups: list, pieces: int) -> Iterator[list]:
     for index in range(pieces):
-        yield some[index * len(some) // pieces:(index + 1) * len(some) // pieces]
+        yield groups[index * len(groups) // pieces:(index + 1) * len(groups) // pieces]

@@ -1,6 +1,6 @@
-"""Runs the jobs of a study that have no result yet, here or on a cluster, and sums up what all of them gave.
+"""Runs the jobs of a study that have no result yet, here or on a cluster, and makes the tidy table of all runs.
 
-Each finished run is one CSV file, so that a stopped or failed series goes on where it was.
+Each finished run is one CSV file, one row a frame. A stopped or failed study goes on where it was.
 """
 
 import hashlib
@@ -49,7 +49,7 @@ class _Study:
 
 def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *,
         frames: int | None = None, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
-    """Run the jobs that have no result yet; returns the summary of all that succeeded, one row a job.
+    """Run the jobs that have no result yet; returns the table of all runs that succeeded, one row a job.
 
     kitti: the odometry root. labels: folder with one folder of label maps a sequence, or the sources that the jobs
     name. folder: where results are kept; those of other data, code or settings of masks are deleted.
@@ -60,7 +60,7 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
     Jobs over one sequence go over it together (`odometry.run_many`: the bits of separate runs at a fraction of the
     cost), in as many passes as it takes to keep everyone busy. A job that fails is printed with its reason and does
     not stop the others. What was running when everything stopped goes on from its checkpoint.
-    The summary's `attrs` say how many jobs were "made" now, "kept" from before, and "failed".
+    The table's `attrs` say how many jobs were "made" now, "kept" from before, and "failed".
     Raises InputError where another run is at work in the folder, where all jobs fail, or where the machine lacks
     something, such as space or memory; what is finished is kept.
     """
@@ -72,19 +72,21 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
 
 def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) -> pd.DataFrame:
     sequences = _open(jobs, study)
-    kept = sum(study.result(job).is_file() for job in jobs)
+    finished = sum(study.result(job).is_file() for job in jobs)
     failures: dict[Job, str] = {}
     with cluster.open_pool(processes, scheduler) as pool:
         lengths = {name: len(sequence) for name, sequence in sequences.items()}
         passes = _passes(jobs, lengths, study, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
-        calls = [(one, study, stages.made_from(study.folder / one[0].sequence), threads) for one in passes]
+        calls = [(of_pass, study, stages.made_from(study.folder / of_pass[0].sequence), threads)
+                 for of_pass in passes]
         # a frame of each run: passes are of very different length, and some have done a part of their frames before
-        work = [len(one) * (lengths[one[0].sequence] - _frames_done(study.state(one))) for one in passes]
+        work = [len(of_pass) * (lengths[of_pass[0].sequence] - _frames_done(study.state(of_pass)))
+                for of_pass in passes]
         with progress(None, "odometry", total=sum(work), unit="frame") as bar:
-            for one, failed in pool.run(_run_pass, calls):
-                failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[one], failed)
-                bar.update(work[one])
+            for index, failed in pool.run(_run_pass, calls):
+                failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
+                bar.update(work[index])
     for (name, reason), names in _by_reason(failures).items():
         more = f" and {len(names) - 3} more" * (len(names) > 3)
         longrun.say(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}", warning=True)
@@ -94,9 +96,9 @@ def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) 
     done = [job for job in jobs if study.result(job).is_file()]
     if not done:
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
-    summary = pd.DataFrame([_summarize(job, sequences[job.sequence], study.result(job)) for job in done])
-    summary.attrs = {"made": len(done) - kept, "kept": kept, "failed": len(jobs) - len(done)}
-    return summary
+    runs = pd.DataFrame([_row(job, sequences[job.sequence], study.result(job)) for job in done])
+    runs.attrs = {"made": len(done) - finished, "kept": finished, "failed": len(jobs) - len(done)}
+    return runs
 
 
 class _Lacking(str):
@@ -105,7 +107,7 @@ class _Lacking(str):
 
 def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
     """The sources by name; a folder is the only one, and its name is empty."""
-    return {one.name: one for one in ([Source(labels)] if isinstance(labels, Path) else labels)}
+    return {source.name: source for source in ([Source(labels)] if isinstance(labels, Path) else labels)}
 
 
 def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
@@ -118,7 +120,7 @@ def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
 def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
     """The jobs' sequences by name; what the folder holds of other data, code or settings is deleted.
 
-    Each source has a folder of its own in that of the sequence, so that what is made from one outlives another.
+    Each source has a folder of its own in that of the sequence, so a change of one source leaves the others' runs.
     """
     sequences = {name: study.sequence(name) for name in sorted({job.sequence for job in jobs})}
     for name, sequence in sequences.items():
@@ -144,8 +146,9 @@ def _versions() -> dict[str, str]:
 
 
 def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: int) -> list[list[Job]]:
-    """What is to be run, as lists of jobs, each for one pass over its sequence: one that was stopped goes on as it was,
-    the rest is cut anew. frames: of each sequence.
+    """What is to be run, as lists of jobs, each for one pass over its sequence; frames: of each sequence.
+
+    A pass that was stopped goes on as it was. The rest is cut anew.
     """
     passes: list[list[Job]] = []
     rest: list[Job] = []
@@ -167,20 +170,22 @@ def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: 
 
 def _jobs_in(state: Path) -> list[str]:
     """The names of the jobs in a checkpoint, none where it is damaged."""
-    try:
-        kept = stages.resume(state, arrays=False)
-    except InputError:
-        return []
-    return list(kept[0]["job"]["runs"]) if kept else []
+    record = _record_of(state)
+    return list(record["job"]["runs"]) if record else []
 
 
 def _frames_done(state: Path) -> int:
     """How many frames of its sequence a checkpoint has behind it, 0 where there is none."""
+    record = _record_of(state)
+    return int(record["done"]) if record else 0
+
+
+def _record_of(state: Path) -> dict[str, Any] | None:
     try:
-        kept = stages.resume(state, arrays=False)
+        checkpoint = stages.resume(state, arrays=False)
     except InputError:
-        return 0
-    return int(kept[0]["done"]) if kept else 0
+        return None
+    return checkpoint[0] if checkpoint else None
 
 
 def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
@@ -189,20 +194,20 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Sour
 
     Jobs with the same masks get the same object: so `run_many` knows that they share the work.
     """
-    made: dict[tuple, controls.ControlMasks | InputError | None] = {}
-    found: dict[Job, controls.ControlMasks | None] = {}
+    by_kind: dict[tuple, controls.ControlMasks | InputError | None] = {}
+    masks: dict[Job, controls.ControlMasks | None] = {}
     failures: dict[Job, str] = {}
     for job in jobs:
-        alike = (job.source, job.method, job.dilation_width)
-        if alike not in made:
-            made[alike] = _checked_masks(job, sequence, sources)
-        masks_or_error = made[alike]
+        kind = (job.source, job.method, job.dilation_width)
+        if kind not in by_kind:
+            by_kind[kind] = _checked_masks(job, sequence, sources)
+        masks_or_error = by_kind[kind]
         if isinstance(masks_or_error, InputError):
             failures[job] = str(masks_or_error)
         else:
-            found[job] = masks_or_error
+            masks[job] = masks_or_error
     _check_file.cache_clear()
-    return found, failures
+    return masks, failures
 
 
 def _checked_masks(job: Job, sequence: Sequence, sources: Mapping[str, Source]
@@ -232,12 +237,12 @@ def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict
         sequence = study.sequence(name)
         # all of them where there is a checkpoint to go on from, for it is one of all of them
         waiting = jobs if state.is_file() else [job for job in jobs if not study.result(job).is_file()]
-        found, failures = masks_of(waiting, sequence, study.sources)
-        if not found:  # or Dask does again what it lost the answer of
+        masks, failures = masks_of(waiting, sequence, study.sources)
+        if not masks:  # or Dask does again what it lost the answer of
             return failures
-        results = odometry.run_many(sequence, {job.name: (job.settings, its_masks) for job, its_masks in found.items()},
+        results = odometry.run_many(sequence, {job.name: (job.settings, its_masks) for job, its_masks in masks.items()},
                                     checkpoint=state, workers=threads)
-        for job in found:
+        for job in masks:
             if not study.result(job).is_file():
                 write_text(study.result(job), results.pop(job.name).frames.to_csv(index=False))
         state.unlink(missing_ok=True)
@@ -260,17 +265,24 @@ def _check_machine(folder: Path, digest: str) -> None:
         raise InputError("this worker has another version of thesis_repro or of OpenCV; install the same on all")
 
 
-def _summarize(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
+def _row(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
     frames = pd.read_csv(result, keep_default_na=False, na_values={"detected": "", "tracked": ""})
-    poses = poses_of(frames)
     return {
         "sequence": job.sequence, "run": job.name, "source": job.source, "method": job.method,
         "dilation_width": job.dilation_width, "max_keypoints": job.max_keypoints, "min_distance": job.min_distance,
-        "estimator": job.estimator, "repetition": job.repetition, "frames": len(frames),
-        **metrics.errors(poses, sequence.poses), **metrics.step_errors(poses, sequence.poses),
-        "mean_keypoints": frames["detected"].mean(),
-        "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
+        "estimator": job.estimator, "repetition": job.repetition, **measures(frames, sequence.poses),
     }
+
+
+def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
+    """What a table of runs has of a run's table of frames: its length, errors, keypoints and flagged frames.
+
+    true: poses (n, 4, 4). Errors are those of `metrics.errors` and `metrics.step_errors`.
+    """
+    poses = poses_of(frames)
+    return {"frames": len(frames), **metrics.errors(poses, true), **metrics.step_errors(poses, true),
+            "mean_keypoints": frames["detected"].mean(),
+            "flagged": int((~frames["flag"].isin(["", "stationary"])).sum())}
 
 
 def with_boresight_correction(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None) -> pd.DataFrame:
@@ -300,10 +312,10 @@ def refined_paths(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | N
                            Sequence(kitti, row.sequence).subset(frames).poses) for row in chosen.itertuples()}
 
 
-def paths(summary: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
-    """Estimated positions (n, 3) of each row of a summary, keyed by sequence and run."""
+def paths(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
+    """Estimated positions (n, 3), metres, of each row of a table of runs, keyed by sequence and run."""
     return {(row.sequence, row.run): pd.read_csv(folder / row.sequence / f"{row.run}.csv")[["x", "y", "z"]].to_numpy()
-            for row in summary.itertuples()}
+            for row in runs.itertuples()}
 
 
 def true_paths(kitti: Path, names: Iterable[str], frames: int | None = None) -> dict[str, np.ndarray]:

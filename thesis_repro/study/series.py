@@ -11,7 +11,7 @@ import pandas as pd
 from thesis_repro import InputError, kitti, longrun, masks, stages
 from thesis_repro.masks import MaskSettings
 from thesis_repro.settings import LIMITS, MOST_REPETITIONS
-from thesis_repro.study import jobs, results, runner, sources
+from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import Source
 
 MOST_WIDTH = LIMITS["WIDTHS"][1]
@@ -34,34 +34,23 @@ class Study:
     repetitions: int = 1
     frames: int | None = None
 
-    def lengths(self) -> dict[str, int]:
-        """Frames by sequence."""
-        return {name: len(kitti.Sequence(self.kitti, name).subset(self.frames)) for name in self.sequences}
-
     def first_jobs(self) -> list[jobs.Job]:
         """The runs that need no result of others."""
-        return jobs.study_jobs(self.kitti, self.sequences, self.sources, self.widths, tested=self.tested,
-                               estimators=self.estimators, repetitions=self.repetitions)
+        return jobs.first_jobs(self.kitti, self.sequences, dict.fromkeys(self.estimators, self.widths),
+                               tested=self.tested, sources=self.sources, repetitions=self.repetitions)
 
-    def second_jobs(self, summary: pd.DataFrame | None) -> list[jobs.Job]:
-        """The controls that need the number of keypoints that masks leave; of unknown numbers without a summary."""
-        found = []
-        for source in self.sources if self.tested else ():
-            if summary is None:
-                found += [job for name in self.sequences for job in jobs.keypoint_controls(
-                    name, 1, 1, self.repetitions, self.estimators, source.name, self.width_of(source))]
-            else:
-                found += jobs.keypoint_control_jobs(
-                    results.keypoints_left(results.of_source(summary, source.name)), self.kitti, self.frames,
-                    self.repetitions, self.estimators, source.name, self.width_of(source))
-        return found
+    def second_jobs(self, runs: pd.DataFrame) -> list[jobs.Job]:
+        """The controls that need the number of keypoints that masks leave in `runs`."""
+        return [job for source in (self.sources if self.tested else ()) for job in jobs.keypoint_control_jobs(
+            compare.keypoints_left(compare.of_source(runs, source.name), self.width_of(source)), self.kitti,
+            self.frames, self.repetitions, self.estimators, source.name, self.width_of(source))]
 
     def width_of(self, source: Source) -> int | None:
         """The width (pixels) at which a source is put to the test; None for masks that come ready made."""
         return None if source.kind == "masks" else self.tested
 
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
-        """All runs, those that are kept in the folder left out; returns their summary, see `runner.run`.
+        """Run what the folder does not hold yet; returns the table of all runs, see `runner.run`.
 
         Raises InputError for a folder with results of another number of frames.
         """
@@ -70,22 +59,21 @@ class Study:
 
     def _run(self, folder: Path, processes: int, scheduler: str | None) -> pd.DataFrame:
         stages.stage(folder, replace=False, frames=self.frames)
-        listed = self.first_jobs()
+        first = self.first_jobs()
 
-        def run() -> pd.DataFrame:
+        def run(listed: list[jobs.Job]) -> pd.DataFrame:
             return runner.run(listed, self.kitti, self.sources, folder / "runs", frames=self.frames,
                               processes=processes, scheduler=scheduler)
 
-        summary = run()
-        second = self.second_jobs(summary)
+        runs = run(first)
+        second = self.second_jobs(runs)
         if not second:
-            return summary
-        listed += second
-        made = summary.attrs["made"]
-        summary = run()
-        for what, more in (("made", made), ("kept", -made)):  # what the first call made the second one kept
-            summary.attrs[what] += more
-        return summary
+            return runs
+        made = runs.attrs["made"]
+        runs = run([*first, *second])
+        runs.attrs["made"] += made  # what the first call made, the second one kept
+        runs.attrs["kept"] -= made
+        return runs
 
 
 def named(folders: Iterable[tuple[str, Path]], names: Iterable[str],

@@ -1,7 +1,7 @@
-"""What things cost: every dilation width as the thesis times it (Figure 4.17), and a frame from its file to its pose
-with the network included, as Section 5.2 asks.
+"""How long things take: every dilation width as the thesis times it (Figure 4.17), and a whole frame.
 
-The second is done as a live system would: one frame after the other, the network on one image at a time, all cores.
+A whole frame goes from its file to its pose with the network included, which Section 5.2.2 asks for. It is timed as in
+a live system: one frame after the other, the network on one image at a time, all cores.
 """
 
 import time
@@ -30,7 +30,7 @@ WARM_UP = 3  # frames that load compiled code and fill caches, not counted
 
 @contextmanager
 def opencv_threads(count: int) -> Iterator[None]:
-    """So many threads inside OpenCV's functions for a while; -1 for one a core."""
+    """Use `count` threads inside OpenCV's functions in this context; -1 for one a core."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(count)
     try:
@@ -44,7 +44,7 @@ def opencv_threads(count: int) -> Iterator[None]:
 
 def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *, frames: int,
               processes: int = 1) -> pd.DataFrame:
-    """What each job costs as a run of its own: a table of sequence, run, method, dilation_width and seconds.
+    """How long each job takes as a run of its own: a table of sequence, run, method, dilation_width and seconds.
 
     Only the first `frames` frames are timed; the first two steps are left out, since they load compiled code. The jobs
     of a sequence take turns at every frame, so that what else the machine does falls on all of them alike.
@@ -69,15 +69,15 @@ def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source],
 
 def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path) -> None:
     scales = odometry.scales(sequence)
-    found, _ = masks_of(jobs, sequence, sources)
-    followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in found}
-    seconds = dict.fromkeys(found, 0.0)
+    masks_by_job, _ = masks_of(jobs, sequence, sources)
+    followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
+    seconds = dict.fromkeys(masks_by_job, 0.0)
     with opencv_threads(1):  # one thread makes times comparable
         for index in range(len(sequence)):
             frame = sequence.frame(index)
             for job, follower in followers.items():
                 masks.forget_edges()  # each run of its own would have to make them
-                its_masks = found[job]
+                its_masks = masks_by_job[job]
                 mask, masking = (None, 0.0) if its_masks is None else _timed(its_masks.__getitem__, index)
                 step = follower.step(frame, scales[index], mask)
                 if index > 1:
@@ -96,7 +96,7 @@ def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CO
             boundaries: str = "canny") -> pd.DataFrame:
     """Milliseconds a frame of every stage: a table of method, stage and milliseconds, medians over `frames` frames.
 
-    Variants: "all keypoints", without network and mask, and "masked, width 10". Stages: read (decode the PNG),
+    Methods: "all keypoints", without network and mask, and "masked, width 10". Stages: read (decode the PNG),
     segmentation (stretch to the model's input, network, class of every pixel), mask (label map to 320x320, edges,
     dilation), detection, tracking, pose (essential matrix, then rotation and translation).
     model: a Keras model of `segmentation`. width: pixels, and boundaries, see `masks.edges`, of the masks.
@@ -107,7 +107,7 @@ def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CO
     runs = {name: odometry.Odometry(sequence.intrinsics) for name in (PLAIN, masked)}
     rows = []
     with opencv_threads(-1):
-        for index in progress(range(len(sequence)), "budget"):
+        for index in progress(range(len(sequence)), "timing"):
             frame, read = _timed(sequence.frame, index)
             label_map, network = _timed(_segment, model, frame)
             mask, masking = _timed(_mask, label_map, frame.shape, width, boundaries)
@@ -126,7 +126,7 @@ def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20, widt
     """Milliseconds between frames where reading, network and mask of the next frame go on beside the odometry of this.
 
     A table of method and milliseconds (medians). A frame's own way takes as long as before or longer; more frames a
-    second come through. Variants and arguments as in `measure`.
+    second come through. Methods and arguments as in `measure`.
     """
     sequence, metres = _start(sequence, frames)
     rows = []
@@ -149,14 +149,14 @@ def measure_overlapped(sequence: Sequence, model: Any, *, frames: int = 20, widt
     return pd.DataFrame(rows)
 
 
-def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20, width: int = CONTROL_WIDTH,
+def frame_times(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20, width: int = CONTROL_WIDTH,
          boundaries: str = "canny") -> tuple[pd.DataFrame, pd.DataFrame]:
-    """(`measure`, `measure_overlapped`) of the first frames with the model in a file, measured once and kept in folder.
+    """(`measure`, `measure_overlapped`) of the first frames with the model in a file.
 
-    Measured anew when the frames, the masks, the model or the code become others.
+    The folder keeps both tables. They are measured anew when the frames, the masks, the model or the code change.
     """
     short = sequence.subset(frames + WARM_UP)
-    folder = stages.stage(folder, code=stages.code("study/budget"),
+    folder = stages.stage(folder, code=stages.code("study/timing"),
                           model=stages.content(model_file), opencv=cv2.__version__,
                           frames=stages.listing(short.frame_paths), width=width, boundaries=boundaries)
     files = {folder / "budget.csv": measure, folder / "overlapped.csv": measure_overlapped}
@@ -172,9 +172,9 @@ def kept(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20
 
 
 def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
-    """The timings to draw: `measured`, which is written to a file; or with `keep` those that the file has already.
+    """The timings to draw: `measured`, which is written to a file; with `keep` those that the file already has.
 
-    Figures in git keep the timings that came with them, or every machine and every run would change them.
+    Figures in git keep the timings that came with them. Otherwise every machine and every run would change them.
     """
     if not (keep and path.is_file()):
         write_text(path, measured.to_csv(index=False))
@@ -188,7 +188,7 @@ def _masked(width: int) -> str:
 def _start(sequence: Sequence, frames: int) -> tuple[Sequence, np.ndarray]:
     sequence = sequence.subset(frames + WARM_UP)
     if len(sequence) < WARM_UP + 2:
-        raise InputError(f"sequence {sequence.name}: {len(sequence)} frames; the budget needs {WARM_UP + 2} or more")
+        raise InputError(f"sequence {sequence.name}: {len(sequence)} frames; timing needs {WARM_UP + 2} or more")
     return sequence, odometry.scales(sequence)
 
 

@@ -1,0 +1,98 @@
+"""Ablations one by one, what the thesis's procedure reports of masks that do nothing, and boundaries."""
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from street import Street, Stripes
+
+from thesis_repro import masks
+from thesis_repro.kitti import Sequence
+from thesis_repro.odometry import THESIS, keypoints
+from thesis_repro.study import ablations
+
+
+def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
+    sequence = Sequence(small_world / "kitti", "00").subset(4)
+    runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2, baseline_repetitions=3)
+    settings, own = runs["masked", "thesis", 0]
+    assert settings == THESIS and np.array_equal(own[0], masks.LabelMasks(small_labels / "00", sequence, 10)[0])
+    dropped, same = runs["filter", "thesis", 0]
+    assert dropped.mask_mode == "filter" and same is own
+    repetitions = {estimator: {key[2] for key in runs if key[:2] == ("baseline", estimator)}
+                   for estimator in ("thesis", "refined")}
+    assert repetitions == {"thesis": {0, 1, 2}, "refined": {0, 1}}
+    for method in ("nearest", "symmetric"):
+        other = runs[method, "thesis", 0][1][0]
+        assert not np.array_equal(other, own[0]) and 0.5 < (other > 0).sum() / (own[0] > 0).sum() < 2
+    label_map = cv2.imread(str(small_labels / "00" / sequence.frame_paths[0].name), 0)
+    movable = np.isin(cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST), masks.MOVABLE)
+    assert np.array_equal(runs["static", "thesis", 0][1][0] == 0, movable)
+
+
+@pytest.mark.parametrize("amount, low, high", [(300, 280, 300), (0.5, 0.48, 0.5)])
+def test_random_keypoints_are_keypoints_and_as_many_as_asked_for(small_world, amount, low, high):
+    sequence = Sequence(small_world / "kitti", "00").subset(2)
+    drawn = ablations.RandomKeypoints(sequence, amount)
+    points = keypoints.detect(sequence.frame(0), THESIS, drawn[0])
+    every = {tuple(point) for point in keypoints.detect(sequence.frame(0), THESIS).astype(int)}
+    count = len(points) if isinstance(amount, int) else len(points) / len(every)
+    assert low <= count <= high and {tuple(point) for point in points.astype(int)} <= every
+    assert np.array_equal(drawn[0], ablations.RandomKeypoints(sequence, amount)[0])
+
+
+def test_runs_are_kept_and_not_made_again(small_world, small_labels, tmp_path, monkeypatch):
+    arguments = (small_world / "kitti", ["00"], small_labels, tmp_path)
+    options = {"repetitions": 1, "baseline_repetitions": 2, "frames": 5}
+    runs = ablations.measure(*arguments, **options)
+    assert set(runs["sequence"]) == {"00"} and runs["rmse"].notna().all() and (runs["frames"] == 5).all()
+    monkeypatch.setattr(ablations.odometry, "run_many", None)  # would fail
+    assert ablations.measure(*arguments, **options).equals(runs)
+
+
+def errors(spread, repetitions=200):
+    random = np.random.default_rng(0)
+    return pd.DataFrame([{"sequence": f"{name:02d}", "rmse": (name + 1) * np.exp(random.normal(0, spread))}
+                         for name in range(4) for _ in range(repetitions)])
+
+
+def test_the_best_of_many_gains_what_order_statistics_say():
+    assert np.abs(ablations.null_distribution(errors(0)).to_numpy()).max() < 1e-9
+    spread = 0.2
+    table = ablations.null_distribution(errors(spread, 2000))
+    # a standard normal's least of 15 is -1.736 on average, its median 0
+    assert table.loc["median", "expected"] == pytest.approx(100 * (np.exp(-1.736 * spread) - 1), abs=2.5)
+    assert table.loc["mean", "low"] < table.loc["mean", "expected"] < table.loc["mean", "high"] < 0
+    assert ablations.null_distribution(errors(spread), widths=1).loc["median", "expected"] == pytest.approx(0, abs=1.5)
+
+
+@pytest.mark.parametrize("reported, share", [(-90.0, 0), (50.0, 100)])
+def test_how_often_a_reported_number_would_come_about(reported, share):
+    table = ablations.null_distribution(errors(0.3), pd.Series([reported] * 11))
+    assert (table["share_as_low"] == share).all()
+
+
+def test_the_level_of_a_sequences_error_does_not_count():
+    own = errors(0.3)
+    other = own.assign(rmse=own["rmse"] * own["sequence"].astype(int).add(1) * 7)
+    assert np.allclose(ablations.deviations(own), ablations.deviations(other))
+
+
+def test_points_of_a_true_motion_lie_on_their_lines_and_fill_fields():
+    street = Street(3)
+    street.size = street.images[0].shape
+    corner = np.zeros(street.size, np.uint8)
+    corner[60:100, 380:440] = 255
+    table = ablations.tracks(street, {"all": None, "stripes": Stripes(40), "corner": [corner] * 3}, pairs=2)
+    means = table.groupby("method")[["residual", "fields"]].mean()
+    assert (means["residual"] < 1).all() and means.loc["corner", "fields"] < means.loc["all", "fields"]
+
+
+def test_boundaries_of_ids_close_together_are_lost_and_far_apart_found():
+    label_map = np.full((320, 320), 7, np.uint8)
+    label_map[:, 160:] = 8
+    near = ablations.boundaries(label_map, (188, 620))
+    label_map[:, 160:] = 23
+    far = ablations.boundaries(label_map, (188, 620))
+    assert near["lost"] == 100 == near["road/sidewalk"] and far["lost"] == 0 and np.isnan(far["road/sidewalk"])
+    assert far["invented"] > 0 == ablations.boundaries(np.full_like(label_map, 20), (188, 620))["invented"]

@@ -1,0 +1,139 @@
+"""Comparisons: known ratios, symmetry, intervals and verdicts on made-up runs."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from thesis_repro import InputError
+from thesis_repro.study import compare
+
+EIGHT = [f"{number:02d}" for number in range(8)]
+
+
+def runs_of(factors, sequences=EIGHT, repetitions=2, noise=0.0, estimators=("thesis", "refined"), width=10):
+    """Runs whose errors are made up: {method: factor on the error of all keypoints, or a function of the sequence}."""
+    random, rows = np.random.default_rng(0), []
+    for name in sequences:
+        for method, factor in {"baseline": 1.0, **factors}.items():
+            for estimator in estimators:
+                for repetition in range(repetitions):
+                    error = (factor(name) if callable(factor) else factor) * np.exp(noise * random.normal())
+                    rows.append({"sequence": name, "source": "" if method == "baseline" else "net", "method": method,
+                                 "dilation_width": np.nan if method == "baseline" else width, "estimator": estimator,
+                                 "repetition": repetition, "mean_keypoints": 900.0, "frames": 30,
+                                 **dict.fromkeys(compare.METRICS, (1 + int(name)) * error)})
+    return pd.DataFrame(rows)
+
+
+def arms(runs, *methods):
+    return [runs[runs["method"] == method] for method in methods]
+
+
+def test_known_ratios_come_out_and_swapping_inverts_them():
+    masked, baseline = arms(runs_of({"masked": 0.5}, noise=0.3), "masked", "baseline")
+    forth, back = compare.compare(masked, baseline, "rmse"), compare.compare(baseline, masked, "rmse")
+    assert forth["ratio"] == pytest.approx(0.5, rel=0.3) and forth["n"] == 8
+    assert forth["ratio"] * back["ratio"] == pytest.approx(1)
+    # the same sequences are drawn for both, so the bounds change places
+    assert (forth["low"] * back["high"], forth["high"] * back["low"]) == pytest.approx((1, 1))
+    exact = compare.compare(*arms(runs_of({"masked": 0.25}), "masked", "baseline"), "rmse")
+    assert exact["low"] <= exact["ratio"] <= exact["high"]
+    assert (exact["low"], exact["ratio"], exact["high"]) == pytest.approx((0.25, 0.25, 0.25))
+
+
+def test_half_and_double_are_equally_far_from_one():
+    assert compare.geometric_mean([0.5, 2.0])["ratio"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0])
+def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
+    runs = runs_of({"masked": 0.5})
+    runs.loc[(runs["sequence"] == "03") & (runs["method"] == "masked"), "rmse"] = bad
+    result = compare.compare(*arms(runs, "masked", "baseline"), "rmse")
+    assert result["n"] == 7 and result["ratio"] == pytest.approx(0.5)
+    assert np.isnan(compare.geometric_mean([np.nan])["ratio"])
+
+
+@pytest.mark.parametrize("factor, verdict", [(0.5, "lower"), (2.0, "higher"), (1.0, "no clear difference"),
+                                             (lambda name: 2.0 ** (int(name) % 2 * 2 - 1), "no clear difference")])
+def test_the_verdict_follows_the_interval(factor, verdict):
+    result = compare.compare(*arms(runs_of({"masked": factor}), "masked", "baseline"), "rmse")
+    assert result["verdict"] == verdict
+
+
+@pytest.mark.parametrize("count, verdict", [(5, "no clear difference"), (6, "lower")])
+def test_a_verdict_needs_six_sequences(count, verdict):
+    assert compare.geometric_mean([0.5 + 0.01 * index for index in range(count)])["verdict"] == verdict
+
+
+def test_the_interval_covers_the_true_mean_about_as_often_as_it_says():
+    random = np.random.default_rng(1)
+    intervals = np.array([compare.mean_interval(random.normal(7, 30, 11)) for _ in range(300)])
+    covered = ((intervals[:, 0] <= 7) & (7 <= intervals[:, 1])).mean()
+    assert 0.85 < covered < 0.98  # a percentile bootstrap of eleven is a little too narrow
+
+
+def test_the_interval_moves_with_the_values_and_needs_three():
+    values = np.random.default_rng(2).normal(0, 10, 11)
+    low, high = compare.mean_interval(values)
+    assert low < values.mean() < high and compare.mean_interval([*values, np.nan]) == (low, high)
+    assert compare.mean_interval(values * 2 + 5) == pytest.approx((low * 2 + 5, high * 2 + 5))
+    assert np.isnan(compare.mean_interval([1.0, 2.0, np.nan])).all()
+
+
+def test_the_table_sets_masks_against_all_keypoints_and_every_control():
+    factors = {"masked": 0.5, "mirrored": 1.0, "fewer": 0.25, "reduced": 3.0}
+    table = compare.comparisons(runs_of(factors))
+    pairs = set(zip(table["method"], table["reference"]))
+    assert pairs == {("baseline", "baseline"), ("masked", "baseline"), ("mirrored", "baseline"), ("fewer", "baseline"),
+                     ("masked", "mirrored"), ("masked", "fewer")}
+    rows = table[table["metric"] == "rmse"].set_index(["method", "reference", "estimator"])
+    assert rows.loc[("masked", "fewer", "refined"), "ratio"] == pytest.approx(2)
+    assert rows.loc[("masked", "mirrored", "thesis"), EIGHT].tolist() == pytest.approx([0.5] * 8)
+    primary = compare.primary_comparison(table)
+    assert set(primary["estimator"]) == {"refined"} and list(primary["metric"]) == list(compare.JUDGING_METRICS)
+    assert compare.overall(primary["verdict"]) == "lower"
+    against = compare.against_controls(table).set_index(["reference", "metric"])["verdict"]
+    assert set(against["mirrored"]) == {"lower"} and set(against["fewer"]) == {"higher"}
+    assert compare.overall(["lower", "higher"]) == compare.overall([]) == "no clear difference"
+
+
+def test_the_thesis_estimator_decides_where_the_refined_one_was_not_run():
+    table = compare.comparisons(runs_of({"masked": 0.5}, estimators=("thesis",)))
+    assert set(compare.primary_comparison(table)["estimator"]) == {"thesis"}
+
+
+def test_sources_are_compared_with_each_other_and_share_all_keypoints():
+    one, other = runs_of({"masked": 0.5}), runs_of({"masked": 0.25})
+    other = other[other["method"] == "masked"].assign(source="other")
+    runs = pd.concat([one, other])
+    assert compare.sources(runs) == ["net", "other"]
+    assert set(compare.of_source(runs, "other")["method"]) == {"baseline", "masked"}
+    table = compare.comparisons(runs, ["rmse"])
+    row = table[(table["source"] == "net") & (table["reference_source"] == "other")].iloc[0]
+    assert row["ratio"] == pytest.approx(2)
+
+
+def test_the_tested_width_is_that_of_the_controls():
+    narrow = runs_of({"masked": 0.5, "mirrored": 1.0}, width=5)
+    assert compare.tested_width(narrow) == 5
+    assert compare.tested_width(runs_of({"masked": 0.5}, width=7)) == 7  # the only one that there is
+    assert compare.tested_width(runs_of({})) == 10
+    assert compare.tested_width(runs_of({"masked": 0.5}, width=np.nan)) is None  # masks that came ready made
+    assert (compare.keypoints_left(narrow) == 900).all()
+    with pytest.raises(InputError, match="controls of the widths 5, 7"):
+        compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)]))
+
+
+def test_the_mean_of_equal_errors_is_among_them():
+    value = 1.1  # three of them sum to 3.3000000000000003
+    table = compare.spread(pd.DataFrame({"sequence": "00", "rmse": [value] * 3}), "rmse")
+    assert table.loc["00"].tolist() == [value] * 3
+    random = pd.DataFrame({"sequence": "00", "rmse": np.random.default_rng(0).normal(size=50)})
+    assert (compare.spread(random, "rmse").diff(axis=1)[["highest"]] > 0).all(axis=None)
+
+
+def test_shuffling_shows_as_a_factor():
+    runs = runs_of({}, sequences=["00"], estimators=("thesis",))
+    runs["rmse"] = [1.0, 3.0]
+    assert compare.shuffle_spread(runs)["factor"].tolist() == [3.0]
