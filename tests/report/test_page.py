@@ -195,11 +195,6 @@ def test_a_table_has_the_numbers_of_its_file(run):
                     ["sequences improved", "", "1.00", "0"]]
 
 
-def test_text_of_the_findings_cannot_become_markup(run):
-    text = read(run) and run.page.read_text()
-    assert "<strong>What</strong> &lt;b&gt;it&lt;/b&gt; shows" in text
-
-
 def test_page_and_notebooks_are_made_again_only_where_something_has_changed(run):
     html = run.executed.with_suffix(".html")
     assert page.update(run.settings)

@@ -46,11 +46,10 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     names = [sequence.name for sequence in sequences]
     _predict(sequences, build / "labels")
     runs = _runs(root, names, build, frames, repetitions, processes)
-    tested = runs[~runs["dilation_width"].isin(OTHER_WIDTHS) | (runs["estimator"] == "thesis")]
     switches = ablations.measure(root, names, build / "labels", build / "audit", frames=frames, repetitions=repetitions,
                                  baseline_repetitions=max(10, repetitions), processes=processes)
     angles = boresight.explained(runner.refined_paths(runs, root, build / "odometry", frames))
-    measured = [*audit.of_tables(), *audit.of_ablations(switches), *audit.of_study(tested),
+    measured = [*audit.of_tables(), *audit.of_ablations(switches), *audit.of_study(runs),
                 *audit.of_boresight(angles), *audit.of_boundaries(_boundaries(sequences, build / "labels")),
                 *audit.comparisons(_tracks(sequences, build / "labels"), "tracks")]
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
