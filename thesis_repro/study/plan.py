@@ -140,7 +140,10 @@ def _thesis_seconds(root: Path, name: str, sizes: Profile) -> dict[str, float]:
 
     "ablations" is their number.
     """
-    from thesis_repro.segmentation import prediction  # here and below: TensorFlow takes seconds to load
+    from thesis_repro.segmentation import quietly
+
+    with quietly():
+        from thesis_repro.segmentation import prediction  # here and below: TensorFlow takes seconds to load
 
     model, sequence, chosen = prediction.load_shipped(), kitti.Sequence(root, name), _thesis_jobs(root, name, sizes)
 
