@@ -161,7 +161,7 @@ def study(options):
     """run the odometry with masks of your own beside all keypoints and controls, and leave tables, figures, a page"""
     from thesis_repro import kitti
     from thesis_repro.settings import ALL_WIDTHS, MOST_JOBS, cores, scheduler_address
-    from thesis_repro.study import jobs, series
+    from thesis_repro.study import jobs, series, sources
 
     if not options.sources:
         raise InputError("no masks: name a folder of label maps with --labels or of masks with --masks")
@@ -175,15 +175,17 @@ def study(options):
         _refuse_mask_settings(settings)
         widths = ()
     scheduler_address(options.dask)
-    planned = series.checked(series.Study(
+    planned = series.Study(
         options.kitti.absolute(), tuple(options.sequences or kitti.sequences(options.kitti)),
-        series.named(options.sources, options.name, settings), tuple(sorted(set(widths))),
+        sources.named(options.sources, options.name, settings), tuple(sorted(set(widths))),
         jobs.CONTROL_WIDTH if options.controls is True else options.controls, tuple(dict.fromkeys(options.estimator)),
-        options.repetitions, options.frames))
+        options.repetitions, options.frames)
+    planned.check()
     if options.plan:
+        from thesis_repro.report import terminal
         from thesis_repro.study import plan
 
-        print(plan.of_study(planned))
+        print(terminal.plan_text(plan.of_study(planned)))
         return 0
     if options.jobs is not None and not 1 <= options.jobs <= MOST_JOBS:
         raise InputError(f"--jobs {options.jobs}: must be 1 or more, and at most {MOST_JOBS}")
@@ -219,6 +221,7 @@ def evaluate(options):
 def plan(options):
     """say how long make figures would take here, training included, from a minute of timing"""
     from thesis_repro import cityscapes
+    from thesis_repro.report import terminal
     from thesis_repro.settings import read_settings
     from thesis_repro.study import plan
 
@@ -226,7 +229,7 @@ def plan(options):
     sizes = read_settings({"THESIS_REPRO_PROFILE": "thesis"} | {
         name: value for name, value in os.environ.items() if name.startswith("THESIS_REPRO_")}).sizes
     images = len(cityscapes.pairs(options.cityscapes, "train")) if options.cityscapes else 0
-    print(plan.of_thesis(options.kitti, sizes, options.complete, images))
+    print(terminal.plan_text(plan.of_thesis(options.kitti, sizes, options.complete, images)))
 
 
 # What several commands share

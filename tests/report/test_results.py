@@ -188,10 +188,8 @@ def test_the_budget_adds_up():
                              (("all keypoints", ("read", "detection", "tracking", "pose")),
                               ("masked, width 10", tuple(chapter4.STAGES))) for stage in stages],
                             columns=["method", "stage", "milliseconds"])
-    overlapped = pd.DataFrame({"method": ["masked, width 10", "all keypoints"], "milliseconds": [25.0, 20.0]})
-    table = tables.table_budget(measured, overlapped).set_index("stage")
+    table = tables.table_budget(measured).set_index("stage")
     assert table.loc["all stages (ms)"].tolist() == [40, 60] and table.loc["frames a second"].tolist() == [25, 16.7]
-    assert table.loc["between frames, overlapped (ms)"].tolist() == [20, 25]
     assert np.isnan(table.loc["segmentation (ms)", "all keypoints"])
-    figure = chapter4.figure_budget(measured, overlapped)
+    figure = chapter4.figure_budget(measured)
     assert sum(patch.get_width() for patch in figure.axes[0].patches) == 100

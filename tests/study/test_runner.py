@@ -135,11 +135,6 @@ def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_pat
     assert [source.settings for source in asked] == [chosen]
 
 
-def test_times_without_runs_are_one_clear_line(small_world, small_labels, tmp_path):
-    with pytest.raises(InputError, match="00: holds no odometry runs; they are timed after runner.run"):
-        timing.time_runs([Job("00", "baseline")], small_world / "kitti", small_labels, tmp_path, frames=3)
-
-
 def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finished, monkeypatch):
     folder, jobs, _ = finished
     first = [job for job in jobs if job.method != "reduced"]

@@ -36,9 +36,11 @@ def masks(small_world, small_labels, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def study(small_world, small_labels, masks):
-    return series.checked(series.Study(
+    planned = series.Study(
         small_world / "kitti", ("00", "01"), (Source(small_labels, name="net"), Source(masks, "masks", "by-hand")),
-        (5, 7), tested=7, repetitions=2, frames=FRAMES))
+        (5, 7), tested=7, repetitions=2, frames=FRAMES)
+    planned.check()
+    return planned
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +109,7 @@ def test_a_killed_study_goes_on_and_ends_as_an_undisturbed_one(done, study, smal
 def test_plain_folders_are_taken_for_a_single_sequence(small_world, small_labels, masks, tmp_path):
     single = series.Study(small_world / "kitti", ("00",), (Source(small_labels / "00", name="a"),
                                                            Source(masks / "00", "masks", "b")), (5,), frames=4)
-    assert compare.sources(series.checked(single).run(tmp_path / "out")) == ["a", "b"]
+    assert compare.sources(single.run(tmp_path / "out")) == ["a", "b"]
 
 
 def test_a_mask_that_breaks_in_the_middle_costs_only_the_runs_that_need_it(small_world, masks, tmp_path, capsys):
@@ -117,7 +119,7 @@ def test_a_mask_that_breaks_in_the_middle_costs_only_the_runs_that_need_it(small
     data[len(data) // 2] ^= 1
     broken.write_bytes(data)
     study = series.Study(small_world / "kitti", ("00",), (Source(tmp_path / "ready", "masks", "ready"),), (), frames=5)
-    assert series.checked(study).run(tmp_path / "out")["run"].tolist() == ["baseline-0"]
+    assert study.run(tmp_path / "out")["run"].tolist() == ["baseline-0"]
     assert str(broken) in capsys.readouterr().out
 
 
@@ -144,7 +146,7 @@ def test_results_of_another_length_are_not_thrown_away(done, study):
     (["--labels", "LABELS/00"], "holds the label maps of one sequence, but 2 are asked for"),
     (["--labels", "LESS", "--sequences", "00"], "(2 of 12 frames of sequence 00 have none)"),
     (["--labels", "LESS", "--sequences", "01"], "LESS/01: no such folder"),
-    (["--labels", "LABELS", "--widths", "0"], "--widths 0: must be 1 or more"),
+    (["--labels", "LABELS", "--widths", "0"], "dilation width 0: must be 1 or more"),
     (["--labels", "LABELS", "--repetitions", "0"], "--repetitions 0: must be 1 or more"),
     (["--labels", "LABELS", "--frames", "2"], "--frames 2: must be 3 or more"),
     (["--labels", "LABELS", "--jobs", "0"], "--jobs 0: must be 1 or more"),

@@ -182,15 +182,13 @@ def figure_4_17(seconds):
     return figure
 
 
-def figure_budget(measured, overlapped):
+def figure_budget(measured):
     """Milliseconds a frame of every stage, from reading the frame to its pose, against KITTI's ten frames a second.
 
-    measured: method, stage and milliseconds. overlapped: method and milliseconds between frames where the next frame is
-    read and segmented beside the odometry of this one.
+    measured: method, stage and milliseconds, as `timing.measure` gives them.
     """
     table = measured.pivot(index="method", columns="stage", values="milliseconds").fillna(0)
     table = table.loc[measured["method"].unique(), [stage for stage in STAGES if stage in table]]
-    between = overlapped.set_index("method")["milliseconds"].reindex(table.index)
     ends = table.sum(axis=1)
     figure, axes = new_figure(height=1.4 + 0.5 * len(table))
     left = table.cumsum(axis=1) - table
@@ -198,13 +196,10 @@ def figure_budget(measured, overlapped):
         color, hatch = STAGES[stage]
         axes.barh(table.index, table[stage], 0.6, left=left[stage], label=stage, color=color, hatch=hatch,
                   edgecolor="white", linewidth=0.5)
-    axes.plot(between, range(len(table)), "D", color="black", markeredgecolor="white", markersize=6, linestyle="none",
-              label="between frames, overlapped")
-    for place, method in enumerate(table.index):
-        axes.text(np.nanmax([ends[method], between[method]]), place, f"   {ends[method]:.0f} ms", va="center",
-                  fontsize=8)
+    for place, end in enumerate(ends):
+        axes.text(end, place, f"   {end:.0f} ms", va="center", fontsize=8)
     axes.axvline(FRAME_MS, color="black", linewidth=1, linestyle="--", label="10 frames a second")
-    axes.set(xlim=(0, max(FRAME_MS, *ends, *between) * 1.12), xlabel="time a frame (ms)",
+    axes.set(xlim=(0, max(FRAME_MS, *ends) * 1.12), xlabel="time a frame (ms)",
              ylim=(len(table) - 0.6, -0.6))
     axes.grid(axis="y", visible=False)
     _legend_below(figure, axes, 4)

@@ -66,17 +66,14 @@ def table_errors(runs):
         "number": means["mean_keypoints"].round().astype(int), **errors, "flagged frames": means["flagged"].round(1)})
 
 
-def table_budget(measured, overlapped):
+def table_budget(measured):
     """Milliseconds a frame of each stage, one column a method, and the frames a second that they allow.
 
-    measured: method, stage and milliseconds. overlapped: method and milliseconds between frames where the next frame is
-    read and segmented beside the odometry of this one.
+    measured: method, stage and milliseconds, as `timing.measure` gives them.
     """
     table = measured.pivot(index="stage", columns="method", values="milliseconds")
     table = table.loc[measured["stage"].unique(), measured["method"].unique()]
-    total, between = table.sum(), overlapped.set_index("method")["milliseconds"].reindex(table.columns)
-    below = pd.DataFrame({"all stages (ms)": total, "frames a second": 1000 / total,
-                          "between frames, overlapped (ms)": between, "frames a second, overlapped": 1000 / between}).T
+    below = pd.DataFrame({"all stages (ms)": table.sum(), "frames a second": 1000 / table.sum()}).T
     table = pd.concat([table.round(2).rename(lambda stage: f"{stage} (ms)"), below.round(1)])
     return table.rename_axis("stage", axis=0).rename_axis(None, axis=1).reset_index()
 

@@ -1,8 +1,10 @@
-"""What the commands about a path print: a run's errors and a camera's angles, as JSON's records and as text."""
+"""What commands print: a run's errors and a camera's angles, as JSON's records and as text, and plans."""
 
+from thesis_repro import longrun
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import texts
+from thesis_repro.settings import cores
 
 ERRORS = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_m")
 METRES = ("rmse", "rmse_own", "rmse_others", "rotations", "directions", "ate")
@@ -45,6 +47,11 @@ def angles_text(rotation, table):
     of_day = dict(zip(boresight.ANGLES, zip(rotation.angles, rotation.low, rotation.high, strict=True), strict=True))
     return texts.render("angles.txt.j2", of_day=of_day, steps=rotation.steps, start=boresight.FIRST_STEPS,
                         rows=table.to_dict("records")).rstrip()
+
+
+def plan_text(plan):
+    """A plan of `study.plan` as lines."""
+    return texts.render("plan.txt.j2", plan=plan, duration=longrun.duration, cores=cores()).rstrip()
 
 
 def _number(value):

@@ -6,8 +6,9 @@ leave (`reduced_jobs`, `keypoint_control_jobs`), so they follow in a second list
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -76,45 +77,34 @@ class Job:
 
 
 def first_jobs(kitti: Path, names: Iterable[str], widths: Mapping[str, Iterable[int]], *, tested: int | None = None,
-               sources: Iterable[Source | str] = ("",), repetitions: int = 1) -> list[Job]:
+               sources: Iterable[Source] = (Source(Path()),), repetitions: int = 1) -> list[Job]:
     """The runs that need no result of others: all keypoints, masks of every width and the controls that are masks.
 
     names: of the sequences. widths: pixels, of masks from label maps, by estimator: {"thesis": range(1, 16)}.
     tested: width (pixels) of the controls, None for no controls; it joins the widths of every estimator.
-    sources: of masks, side by side; all keypoints are run once for all of them. A name stands for a source of label
-    maps, which is all that the jobs take from it.
+    sources: of masks, side by side; all keypoints are run once for all of them.
     """
-    widths_of = {estimator: {*of_estimator, *([tested] if tested else [])}
-                 for estimator, of_estimator in widths.items()}
     jobs: list[Job] = []
     for name in names:
-        jobs += _repeated([Job(name, "baseline")], widths_of, repetitions)
+        jobs += _repeated([Job(name, "baseline")], widths, repetitions)
         for source in sources:
-            called, ready = (source, False) if isinstance(source, str) else (source.name, source.kind == "masks")
-            if ready:  # masks that came ready made have no width
-                jobs += _repeated([Job(name, "masked", source=called)], widths_of, repetitions)
-            for width in [] if ready else sorted(set().union(*widths_of.values())):
-                estimators = [estimator for estimator, of_estimator in widths_of.items() if width in of_estimator]
-                jobs += _repeated([Job(name, "masked", width, source=called)], estimators, repetitions)
-            if tested:
-                jobs += _repeated(_mask_controls(kitti, name, None if ready else tested, called), widths_of,
-                                  repetitions)
+            if source.kind == "masks":  # they have no width
+                estimators_of: dict[int | None, list[str]] = {None: list(widths)}
+            else:
+                every = set().union(*widths.values(), [tested] if tested else [])
+                estimators_of = {width: [estimator for estimator, its_widths in widths.items()
+                                         if width in {*its_widths, tested}] for width in sorted(every)}
+            for width, estimators in estimators_of.items():
+                jobs += _repeated([Job(name, "masked", width, source=source.name)], estimators, repetitions)
+            methods = [method for method in controls.MASKS if tested and not (
+                source.kind == "masks" and method in controls.OF_LABEL_MAPS
+                or method == "true-labels" and not controls.true_labels(kitti, name).is_dir())]
+            jobs += _repeated([Job(name, method, None if source.kind == "masks" else tested, source=source.name)
+                               for method in methods], widths, repetitions)
     return jobs
 
 
-def _mask_controls(kitti: Path, name: str, width: int | None, source: str) -> list[Job]:
-    """A job of each control that is a mask; width None: beside masks that come ready made.
-
-    The true label maps take part where a sequence has them, in a folder labels_0 beside its frames.
-    """
-    left_out = list(controls.OF_LABEL_MAPS) if width is None else []
-    if not controls.true_labels(kitti, name).is_dir():
-        left_out.append("true-labels")
-    return [Job(name, method, width, source=source) for method in controls.MASKS if method not in left_out]
-
-
 def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
-    estimators = list(estimators)
     return [replace(job, estimator=estimator, repetition=repetition) for job in jobs for estimator in estimators
             for repetition in range(repetitions)]
 
@@ -148,7 +138,7 @@ def _whole(number: float) -> int:
 
 
 def in_passes(jobs: Iterable[Job], frames: Mapping[str, int], workers: int) -> list[list[Job]]:
-    """Jobs cut into lists for one pass over a sequence each, the longest first; frames: of each sequence.
+    """Jobs cut into lists for one pass over a sequence each; frames: of each sequence.
 
     A pass is at most 1 / PIECES of a worker's share, so that no worker is alone at the end; jobs with the same
     keypoints stay together, since they share most. A worker on its own takes each sequence whole.
@@ -161,15 +151,7 @@ def in_passes(jobs: Iterable[Job], frames: Mapping[str, int], workers: int) -> l
     for name, of_name in groups.items():
         share = len(of_name) * frames[name] / max(everything, 1)
         pieces = min(len(of_name), math.ceil(share * (PIECES * workers if workers > 1 else 1)))
-        passes += [[job for group in piece for job in group] for piece in _cut(list(of_name.values()), pieces)]
-    return longest_first(passes, frames)
-
-
-def longest_first(passes: list[list[Job]], frames: Mapping[str, int]) -> list[list[Job]]:
-    """The passes in the order in which they are to be started."""
-    return sorted(passes, key=lambda jobs: -len(jobs) * frames[jobs[0].sequence])
-
-
-def _cut(groups: list, pieces: int) -> Iterator[list]:
-    for index in range(pieces):
-        yield groups[index * len(groups) // pieces:(index + 1) * len(groups) // pieces]
+        ends = [index * len(of_name) // max(pieces, 1) for index in range(pieces + 1)]
+        listed = list(of_name.values())
+        passes += [sum(listed[start:end], []) for start, end in pairwise(ends)]
+    return passes

@@ -21,7 +21,7 @@ from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.study import cluster, controls
-from thesis_repro.study.jobs import Job, in_passes, longest_first
+from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
 
 
@@ -80,14 +80,15 @@ def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) 
         threads = -(-pool.size // max(1, len(passes)))
         calls = [(of_pass, study, stages.made_from(study.folder / of_pass[0].sequence), threads)
                  for of_pass in passes]
-        # a frame of each run: passes are of very different length, and some have done a part of their frames before
-        work = [len(of_pass) * (lengths[of_pass[0].sequence] - _frames_done(study.state(of_pass)))
-                for of_pass in passes]
+        work = [len(of_pass) * lengths[of_pass[0].sequence] for of_pass in passes]  # a frame of each run
         with progress(None, "odometry", total=sum(work), unit="frame") as bar:
             for index, failed in pool.run(_run_pass, calls):
                 failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
                 bar.update(work[index])
-    for (name, reason), names in _by_reason(failures).items():
+    by_reason: dict[tuple[str, str], list[str]] = {}
+    for job, reason in failures.items():
+        by_reason.setdefault((job.sequence, reason), []).append(job.name)
+    for (name, reason), names in by_reason.items():
         more = f" and {len(names) - 3} more" * (len(names) > 3)
         longrun.say(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}", warning=True)
     lacking = [reason for reason in failures.values() if isinstance(reason, _Lacking)]
@@ -108,13 +109,6 @@ class _Lacking(str):
 def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
     """The sources by name; a folder is the only one, and its name is empty."""
     return {source.name: source for source in ([Source(labels)] if isinstance(labels, Path) else labels)}
-
-
-def _by_reason(failures: Mapping[Job, str]) -> dict[tuple[str, str], list[str]]:
-    names: dict[tuple[str, str], list[str]] = {}
-    for job, reason in failures.items():
-        names.setdefault((job.sequence, reason), []).append(job.name)
-    return names
 
 
 def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
@@ -146,9 +140,9 @@ def _versions() -> dict[str, str]:
 
 
 def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: int) -> list[list[Job]]:
-    """What is to be run, as lists of jobs, each for one pass over its sequence; frames: of each sequence.
+    """What is to be run, as lists of jobs, each for one pass over its sequence, the longest first.
 
-    A pass that was stopped goes on as it was. The rest is cut anew.
+    A pass that was stopped goes on as it was. The rest is cut anew. frames: of each sequence.
     """
     passes: list[list[Job]] = []
     rest: list[Job] = []
@@ -165,66 +159,38 @@ def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: 
                 passes.append([of_name[key] for key in keys])
                 waiting = {key: job for key, job in waiting.items() if key not in keys}
         rest += waiting.values()
-    return longest_first(passes + in_passes(rest, frames, workers), frames)
+    return sorted(passes + in_passes(rest, frames, workers), key=lambda jobs: -len(jobs) * frames[jobs[0].sequence])
 
 
 def _jobs_in(state: Path) -> list[str]:
     """The names of the jobs in a checkpoint, none where it is damaged."""
-    record = _record_of(state)
-    return list(record["job"]["runs"]) if record else []
-
-
-def _frames_done(state: Path) -> int:
-    """How many frames of its sequence a checkpoint has behind it, 0 where there is none."""
-    record = _record_of(state)
-    return int(record["done"]) if record else 0
-
-
-def _record_of(state: Path) -> dict[str, Any] | None:
     try:
         checkpoint = stages.resume(state, arrays=False)
     except InputError:
-        return None
-    return checkpoint[0] if checkpoint else None
+        return []
+    return list(checkpoint[0]["job"]["runs"]) if checkpoint else []
 
 
 def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
              ) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
     """The masks of each job over a sequence, {job: masks}, and {job: reason} of those whose masks cannot be made.
 
-    Jobs with the same masks get the same object: so `run_many` knows that they share the work.
+    Every file is read here, since a bad one in the middle of a pass would stop all of it. Jobs with the same masks get
+    the same object: so `run_many` knows that they share the work.
     """
-    by_kind: dict[tuple, controls.ControlMasks | InputError | None] = {}
-    masks: dict[Job, controls.ControlMasks | None] = {}
-    failures: dict[Job, str] = {}
-    for job in jobs:
-        kind = (job.source, job.method, job.dilation_width)
-        if kind not in by_kind:
-            by_kind[kind] = _checked_masks(job, sequence, sources)
-        masks_or_error = by_kind[kind]
-        if isinstance(masks_or_error, InputError):
-            failures[job] = str(masks_or_error)
-        else:
-            masks[job] = masks_or_error
-    _check_file.cache_clear()
-    return masks, failures
-
-
-def _checked_masks(job: Job, sequence: Sequence, sources: Mapping[str, Source]
-                   ) -> controls.ControlMasks | InputError | None:
-    try:
-        its_masks = job.masks(sequence, sources)
-        for path in () if its_masks is None else its_masks.paths:
-            # here, since in the middle of a pass it would stop all of it
-            _check_file(sources[job.source], path, sequence.size)
-        return its_masks
-    except InputError as error:
-        return error
-
-
-@cache
-def _check_file(source: Source, path: Path, size: tuple[int, int]) -> None:
-    source.check_file(path, size)
+    check = cache(lambda source, path: sources[source].check_file(path, sequence.size))
+    by_kind: dict[tuple, controls.ControlMasks | None] = {}
+    reasons: dict[tuple, str] = {}
+    kinds = {job: (job.source, job.method, job.dilation_width) for job in jobs}
+    for kind, job in {kind: job for job, kind in kinds.items()}.items():
+        try:
+            by_kind[kind] = its_masks = job.masks(sequence, sources)
+            for path in its_masks.paths if its_masks is not None else ():
+                check(job.source, path)
+        except InputError as error:
+            reasons[kind] = str(error)
+    return ({job: by_kind[kind] for job, kind in kinds.items() if kind not in reasons},
+            {job: reasons[kind] for job, kind in kinds.items() if kind in reasons})
 
 
 def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict[Job, str]:
@@ -296,26 +262,29 @@ def with_boresight_correction(runs: pd.DataFrame, kitti: Path, folder: Path, fra
     """
     references = refined_paths(runs, kitti, folder, frames)
     angles = {name: boresight.angles_of_day(name, references) for name in references}
-    corrected = pd.Series(np.nan, runs.index)
-    for row in runs[runs["sequence"].isin(angles)].itertuples():
-        poses = poses_of(pd.read_csv(folder / row.sequence / f"{row.run}.csv"))
-        poses = boresight.corrected(poses, angles[row.sequence])
-        corrected[row.Index] = metrics.rmse(poses, references[row.sequence][1])
-    return runs.assign(rmse_boresight_corrected=corrected)
+    of_run = _poses(runs[runs["sequence"].isin(angles)], folder)
+    corrected = {key: metrics.rmse(boresight.corrected(poses, angles[key[0]]), references[key[0]][1])
+                 for key, poses in of_run.items()}
+    return runs.assign(rmse_boresight_corrected=[corrected.get(key, np.nan)
+                                                 for key in zip(runs["sequence"], runs["run"], strict=True)])
 
 
 def refined_paths(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None
                   ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """{sequence: (estimated, true)} of all keypoints under the refined estimator, poses (n, 4, 4), for `boresight`."""
     chosen = runs[(runs["method"] == "baseline") & (runs["estimator"] == "refined") & (runs["repetition"] == 0)]
-    return {row.sequence: (poses_of(pd.read_csv(folder / row.sequence / f"{row.run}.csv")),
-                           Sequence(kitti, row.sequence).subset(frames).poses) for row in chosen.itertuples()}
+    return {name: (poses, Sequence(kitti, name).subset(frames).poses)
+            for (name, _), poses in _poses(chosen, folder).items()}
 
 
 def paths(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
     """Estimated positions (n, 3), metres, of each row of a table of runs, keyed by sequence and run."""
-    return {(row.sequence, row.run): pd.read_csv(folder / row.sequence / f"{row.run}.csv")[["x", "y", "z"]].to_numpy()
-            for row in runs.itertuples()}
+    return {key: poses[:, :3, 3] for key, poses in _poses(runs, folder).items()}
+
+
+def _poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
+    return {(name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
+            for name, run in zip(runs["sequence"], runs["run"], strict=True)}
 
 
 def true_paths(kitti: Path, names: Iterable[str], frames: int | None = None) -> dict[str, np.ndarray]:

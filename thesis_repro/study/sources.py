@@ -1,5 +1,6 @@
 """Where the masks of a study come from: the label maps of a network, or masks ready made; several side by side."""
 
+import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,10 +53,7 @@ class Source:
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError where a file is no label map, or no mask of a (height, width)."""
-        if self.kind == "labels":
-            read_label_map(path)
-            return
-        read_mask(path, size)
+        read_label_map(path) if self.kind == "labels" else read_mask(path, size)
 
     def record(self, sequence: str) -> dict[str, str | None]:
         """What tells results of these files and settings from those of others."""
@@ -65,11 +63,33 @@ class Source:
         return {self.kind: stages.listing(listed(folder)), "made_from": made_from, **settings}
 
 
-def check(sources: Iterable[Source], sequences: Collection[Sequence]) -> None:
+def named(folders: Iterable[tuple[str, Path]], names: Iterable[str], settings: MaskSettings) -> tuple[Source, ...]:
+    """Sources from (kind, folder), the first with the first name; those without one are called as their folder.
+
+    settings: of all masks from label maps.
+    Raises InputError for a name that cannot be a folder's, for two of the same, and for more names than folders.
+    """
+    places, given = [(kind, folder.absolute()) for kind, folder in folders], list(names)
+    sources: list[Source] = []
+    if len(given) > len(places):
+        raise InputError(f"--name {given[len(places)]}: {len(given)} names for {len(places)} folders of masks; give "
+                         "one --name for each --labels or --masks, in their order")
+    for place, (kind, folder) in enumerate(places):
+        name = given[place] if place < len(given) else re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-")
+        if place < len(given) and not re.fullmatch(r"[\w+-]+", name):
+            raise InputError(f"--name {name}: a name may have letters, digits, '_', '+' and '-'")
+        if name.lower() in (source.name.lower() for source in sources):  # some file systems do not tell case
+            raise InputError(f"--name: two folders of masks would be called {name!r}; give each a --name of its own, "
+                             "in the order of --labels and --masks")
+        sources.append(Source(folder, kind, name or "masks", settings))
+    return tuple(sources)
+
+
+def check(sources: Iterable[Source], sequences: Collection[Sequence], widths: Collection[int]) -> None:
     """Raise InputError, before anything runs, where a source does not have what every frame of the sequences needs.
 
-    Of masks the size of every file is looked at; of all sources the first file of each sequence is read. (The runner
-    reads all of them, and what it finds costs only the runs that need it.)
+    widths: pixels, of masks from label maps. Of masks the size of every file is looked at; of all sources the first
+    file of each sequence is read. (The runner reads all, and what is wrong there costs only the runs that need it.)
     """
     for source in sources:
         what = KINDS[source.kind]
@@ -80,7 +100,8 @@ def check(sources: Iterable[Source], sequences: Collection[Sequence]) -> None:
                 raise InputError(f"{source.folder}: holds the {what} of one sequence, but {len(sequences)} are asked "
                                  f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "
                                  "name one with --sequences")
-            paths = source.masks(sequence, 1).paths
+            for width in widths or (1,):  # refuses widths that frames of that size cannot have
+                paths = source.masks(sequence, width).paths
             if source.kind == "masks":
                 for path in paths:
                     check_mask_size(path, glance(path)[0], sequence.size)
