@@ -73,7 +73,7 @@ def predict(options):
             with cluster.open_pool(1, options.dask) as pool:
                 new = prediction.spread_label_maps(pool.run, model_files, sequences)
         else:
-            model = prediction.load(tuple(model_files)) if options.model else prediction.load_shipped()
+            model = prediction.load(tuple(model_files))
             new = sum(prediction.write_label_maps(model, paths, output) for paths, output in sequences)
         total = sum(len(paths) for paths, _ in sequences)
         run.end("\n".join(f"{output}: {len(paths)} label maps" for paths, output in sequences)
@@ -133,7 +133,7 @@ def odometry(options):
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     if options.video:
-        video.write_video(options.video, sequence, settings, masks, description="video")
+        video.write_video(options.video, sequence, settings, masks)
     if options.plot:
         true = sequence.poses if sequence.has_truth else None
         paths = {"estimate": result.poses if true is None else metrics.shifted(result.poses, true, settings.alignment)}

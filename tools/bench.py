@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro import InputError, odometry
+from thesis_repro.cityscapes import N_CLASSES, read_image
 from thesis_repro.files import write_png, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import dilate
@@ -127,7 +128,7 @@ def prediction_cost(model, paths):
 
     def one_by_one(folder):
         for path in paths:
-            image = prediction.read_input(path, model.input_shape)[None].astype(np.float32)
+            image = read_image(path, *model.input_shape[1:])[None].astype(np.float32)
             write_png(folder / f"{path.stem}.png", model.predict(image, verbose=0).argmax(-1)[0].astype(np.uint8))
 
     with tempfile.TemporaryDirectory() as temporary:
@@ -164,7 +165,6 @@ def operations(model):
 
 def measure(sequence, frames=200, runs=4, models=None):
     """A table: what is measured, its unit, the measure, what it is set against, and their ratio."""
-    from thesis_repro.cityscapes import N_CLASSES
     from thesis_repro.segmentation import prediction
     from thesis_repro.segmentation.unet import build_unet
 

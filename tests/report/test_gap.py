@@ -41,7 +41,7 @@ def test_the_figure_has_a_panel_a_model_and_a_bar_where_there_is_a_class():
     figure = gap.figure(Gap)
     figure.draw_without_rendering()
     assert [axes.get_title() for axes in figure.axes] == [OWN, SHIPPED]
-    heights = [[bar.get_height() for bar in axes.patches if bar.get_height() == bar.get_height()]
+    heights = [[bar.get_height() for bar in axes.patches if bar.get_height() > 0]
                for axes in figure.axes]
     assert sorted(heights[0]) == [0.7, 0.8, 0.8] and len(heights[1]) == 4
 
@@ -49,13 +49,12 @@ def test_the_figure_has_a_panel_a_model_and_a_bar_where_there_is_a_class():
 def test_the_quality_of_a_runs_label_maps_is_kept_and_shown(tmp_path):
     settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "b"), "THESIS_REPRO_FIGURES": str(tmp_path / "f")})
     settings.figures.mkdir(parents=True)
-    assert gap.label_map_quality(settings.build) == [] and gap.line(settings.build) is None
+    assert gap.label_map_quality(settings.build) == []
     (settings.figures / "table_4_1.csv").write_text("sequence,frames\n00,12\n")
     style.save_table(gap.record(Gap, SHIPPED), settings.build, gap.RECORD, "note")
     rows = gap.label_map_quality(settings.build)
     assert [(row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows] == [
         (VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]
-    assert "0.50 over 2 classes on 20 images" in gap.quality(settings.build)
     html = page.build(settings)
     assert html.count("mean IoU 0.50 over 2 classes on 20 images") == 2  # below that one table, and at the top
 

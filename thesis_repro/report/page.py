@@ -92,7 +92,7 @@ def build(settings):
         shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
         of=len(captions.THESIS), missing=[one for one in artefacts if not one["there"] and not one["left_out"]],
         left_out=[one for one in artefacts if one["left_out"]], card=captions.CARD, notebooks=notebooks,
-        evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE, label_maps=gap.line(settings.build),
+        evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE, label_maps=gap.label_map_quality(settings.build),
         frames=dict(zip(lengths["sequence"], lengths["frames"])) if "frames" in lengths else {},
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
         made=_made(_executed(settings), settings.figures_in_git))

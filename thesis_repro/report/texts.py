@@ -55,16 +55,16 @@ TEMPLATES.filters["ratio"] = ratio
 TEMPLATES.filters["number"] = number
 
 
-def findings(runs, table, data, **more):
+def findings(runs, table, data, label_maps=()):
     """What the runs show, as Markdown.
 
     runs: with `compare.comparisons` of them, the table. data: one line that says where they come from.
-    more: label_maps, one line on how good these are; quality, the same in short.
+    label_maps: how good these are, rows of `gap.label_map_quality`.
     """
     baseline, of_masks = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
     spread = compare.shuffle_spread(runs).groupby("estimator")["factor"].agg(["median", "max"])
     return render(
-        "findings.md.j2", **{"label_maps": None, "quality": None} | more, data=data,
+        "findings.md.j2", label_maps=label_maps, data=data,
         embedded="embedded" in data.split(";")[0], frames=baseline.groupby("sequence")["frames"].first().to_dict(),
         repetitions=baseline["repetition"].nunique(), spread=spread.reindex(list(ESTIMATORS)).dropna().T.to_dict(),
         estimators=ESTIMATORS, methods=compare.METHODS, metrics=compare.METRICS, fewest=compare.MIN_SEQUENCES,

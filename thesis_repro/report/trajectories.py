@@ -12,14 +12,13 @@ from thesis_repro import InputError
 from thesis_repro.files import atomic
 from thesis_repro.kitti import read_poses
 from thesis_repro.odometry import metrics
+from thesis_repro.report import texts
 from thesis_repro.report.style import TRUTH, line_style, new_figure, plt
 
 # what a table shows of a row of `evaluate`: heads of columns
 COLUMNS = {"rmse_m": "RMSE m", "mae_m": "MAE m", "ate_rmse_m": "ATE m", "ate_max_m": "largest m",
            "rpe_translation_rmse_m": "RPE m", "rpe_rotation_rmse_deg": "RPE deg", "t_rel_percent": "t_rel %",
            "r_rel_deg_per_100m": "r_rel deg/100m", "scale": "scale"}
-WHY = ("RMSE and MAE are the thesis's: both paths are laid over each other at frame 1 and frame 0 is left out; "
-       "ATE is evo's, over all frames as they are{aligned}")
 
 
 def read(files, true):
@@ -44,24 +43,20 @@ def evaluate(paths, true, alignment="none"):
     paths: {name: (n, 4, 4) poses}. RMSE and MAE are the thesis's whatever the alignment is; the others are of the path
     as `metrics.align` leaves it.
     """
-    return [_errors(name, poses, true, alignment) for name, poses in paths.items()]
-
-
-def _errors(name, poses, true, alignment):
-    row = {"trajectory": name, "poses": len(poses), "alignment": alignment,
-           "rmse_m": metrics.rmse(poses, true), "mae_m": metrics.mae(poses, true)}
-    ate = metrics.ate(poses, true, alignment)
-    notes = [ate["note"]]
-    row |= {f"ate_{key}_m": ate[key] for key in ("rmse", "mean", "median", "max")} | {"scale": ate["scale"]}
-    with suppress(evo.EvoException):  # of the alignment; ate's note says so
-        poses, _ = metrics.align(poses, true, alignment)
-        rpe, segments = metrics.rpe(poses, true), metrics.kitti_errors(poses, true)
-        row |= {f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value for key, value in rpe.items()}
-        row |= {"t_rel_percent": segments["translation_percent"],
-                "r_rel_deg_per_100m": 100 * segments["rotation_deg_per_m"], "segments": segments["segments"]}
-        notes.append(segments["note"] and f"no t_rel and r_rel: {segments['note']}")
-    row["note"] = "; ".join(filter(None, notes))
-    return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in row.items()}
+    rows, after = [], aligned(paths, true, alignment)
+    for name, poses in paths.items():
+        ate = metrics.ate(poses, true, alignment)
+        row = {"trajectory": name, "poses": len(poses), "alignment": alignment, "rmse_m": metrics.rmse(poses, true),
+               "mae_m": metrics.mae(poses, true), "note": ate["note"], "scale": ate["scale"],
+               **{f"ate_{key}_m": ate[key] for key in ("rmse", "mean", "median", "max")}}
+        if name in after:  # else ate's note says why it cannot be aligned
+            rpe, segments = metrics.rpe(after[name], true), metrics.kitti_errors(after[name], true)
+            row |= {f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value for key, value in rpe.items()}
+            row |= {"t_rel_percent": segments["translation_percent"], "segments": segments["segments"],
+                    "r_rel_deg_per_100m": 100 * segments["rotation_deg_per_m"], "note": row["note"] or segments["note"]}
+        rows.append({key: None if isinstance(value, float) and np.isnan(value) else value
+                     for key, value in row.items()})
+    return rows
 
 
 def aligned(paths, true, alignment):
@@ -77,14 +72,8 @@ def text(rows, alignment="none"):
     """The rows of `evaluate` as a table for reading, with a word on what is in it."""
     heads = {key: head for key, head in COLUMNS.items() if key != "scale" or alignment in ("sim3", "scale")}
     table = pd.DataFrame(rows, columns=["trajectory", *heads]).astype(dict.fromkeys(heads, float)).rename(columns=heads)
-    how = {"none": "", "se3": " after the best rotation and shift", "sim3": " after the best rotation, shift and scale",
-           "scale": " after the best scale"}[alignment]
-    lines = [table.to_string(index=False, float_format="%.6f", na_rep="-"), "", WHY.format(aligned=how)]
-    notes = Counter(row["note"] for row in rows if row["note"])
-    for note, count in notes.items():
-        whose = ", ".join(row["trajectory"] for row in rows if row["note"] == note)
-        lines.append(note if count == len(rows) else f"{whose}: {note}")
-    return "\n".join(lines)
+    return texts.render("evaluate.txt.j2", rows=rows, alignment=alignment, table=table.to_string(
+        index=False, float_format="%.6f", na_rep="-")).rstrip()
 
 
 def figure(paths, true, title):

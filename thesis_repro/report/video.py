@@ -15,7 +15,6 @@ from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pos
 KEPT, DISCARDED, OUTLINE = (255, 140, 30), (60, 60, 230), (0, 220, 255)
 INLIER, OUTLIER = (120, 220, 0), (0, 140, 255)
 TRUE, ESTIMATED, TEXT, PAPER = (90, 90, 90), (200, 80, 0), (40, 40, 40), (255, 255, 255)
-SHEET = 4  # pictures on a still
 QUALITY = 20  # x264's constant rate factor: less is better and larger; 18 to 23 look like the original
 MAP_SHARE = 0.75  # height of the map below the frame, in heights of the frame
 
@@ -80,7 +79,7 @@ def _write(image, text, where, color):
     cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, 1, cv2.LINE_AA)
 
 
-def pictures(sequence, settings=THESIS, masks=None, description=None):
+def pictures(sequence, settings=THESIS, masks=None):
     """Run the odometry over a kitti.Sequence and yield one picture a frame, (h, w, 3) blue, green, red.
 
     Above the frame, below it what happened in numbers and the path beside the true one, growing.
@@ -90,8 +89,8 @@ def pictures(sequence, settings=THESIS, masks=None, description=None):
     true = sequence.poses.copy() if sequence.has_truth else None
     if true is not None:
         true[:, :3, 3] += odometry.pose[:3, 3] - true[0, :3, 3]
-    metres, poses, indices = scales(sequence), [], range(len(sequence))
-    for index in indices if description is None else progress(indices, description):
+    metres, poses = scales(sequence), []
+    for index in progress(range(len(sequence)), "video"):
         frame, mask = sequence.frame(index), None if masks is None else masks[index]
         step = odometry.step(frame, metres[index], mask)
         poses.append(step.pose)
@@ -99,27 +98,20 @@ def pictures(sequence, settings=THESIS, masks=None, description=None):
         height, width = frame.shape
         lower = draw_map((int(MAP_SHARE * height), width), true, np.array(poses))
         _describe(lower, step, true, mask is not None)
-        picture = np.vstack([upper, lower])
-        yield picture[:picture.shape[0] // 2 * 2, :picture.shape[1] // 2 * 2]  # video wants even sizes
+        yield np.vstack([upper, lower])[:(height + len(lower)) // 2 * 2, :width // 2 * 2]  # video wants even sizes
 
 
 def _describe(image, step, true, masked):
-    row = step.row()
-    lines = [(f"frame {step.frame}", TEXT)]
+    row = step.row() | {"masked": masked, "error": 0.0}
     if true is not None:
-        error = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
-        lines.append((f"{error:.2f} m from the truth", TEXT))
-    if step.detected is not None:
-        lines.append((f"{step.detected} keypoints" + " inside the mask" * masked, KEPT))
-    if masked:
-        lines.append(("keypoints the mask discards", DISCARDED))
-    if row["tracked"] is not None:
-        lines += [(f"{row['inliers']} tracks agree", (60, 150, 0)),
-                  (f"{row['tracked'] - row['inliers']} do not", OUTLIER)]
-    if row["flag"]:
-        lines.append((row["flag"], DISCARDED))
-    for number, (text, color) in enumerate(lines, 1):
-        _write(image, text, (image.shape[1] - 275, 20 * number), color)
+        row["error"] = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
+    lines = [("frame {frame}", TEXT, True), ("{error:.2f} m from the truth", TEXT, true is not None),
+             ("{detected} keypoints", KEPT, step.detected is not None),
+             ("keypoints the mask discards", DISCARDED, masked),
+             ("{inliers} of {tracked} tracks agree", (60, 150, 0), row["tracked"] is not None),
+             ("{flag}", DISCARDED, row["flag"])]
+    for number, (text, color) in enumerate([(text, color) for text, color, shown in lines if shown], 1):
+        _write(image, text.format(**row), (image.shape[1] - 275, 20 * number), color)
 
 
 def check_name(path):
@@ -128,31 +120,23 @@ def check_name(path):
         raise InputError(f"{path}: a video's name must end in .mp4")
 
 
-def write_video(path, sequence, settings=THESIS, masks=None, description=None):
-    """Write `pictures` as a video (H.264, as browsers play it) at the sequence's own pace (its times, seconds).
-
-    Raises InputError where the file's name does not end in .mp4.
-    """
+def write_video(path, sequence, settings=THESIS, masks=None):
+    """Write `pictures` as a video (H.264, as browsers play it) at the sequence's own pace (its times, seconds)."""
     import av  # here, because loading FFmpeg's libraries is for those alone who want a video
 
-    check_name(path)
     pace = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 1 / FRAME_TIME
     with atomic(path) as temporary, av.open(str(temporary), "w", options={"movflags": "+faststart"}) as video:
         stream = video.add_stream("libx264", rate=Fraction(pace).limit_denominator(1000), options={"crf": str(QUALITY)})
         stream.pix_fmt = "yuv420p"  # the one that every browser knows
-        for picture in pictures(sequence, settings, masks, description):
+        for picture in pictures(sequence, settings, masks):
             if not stream.codec_context.is_open:
                 stream.height, stream.width = picture.shape[:2]
             video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         video.mux(stream.encode())
 
 
-def write_sheet(path, sequence, masks=None, description=None):
-    """Write a still of SHEET evenly spaced frames, one below the other in two columns."""
-    wanted = np.linspace(1 if len(sequence) > 1 else 0, len(sequence) - 1, SHEET).round().astype(int)
-    chosen = [picture for index, picture in enumerate(pictures(sequence, masks=masks, description=description))
-              if index in wanted]
-    chosen += [np.full_like(chosen[0], PAPER)] * (len(chosen) > 1 and len(chosen) % 2)
-    columns = min(2, len(chosen))
-    rows = [np.hstack(chosen[start:start + columns]) for start in range(0, len(chosen), columns)]
-    write_png(path, np.vstack(rows))
+def write_sheet(path, sequence, masks=None):
+    """Write a still of four evenly spaced frames, two beside each other."""
+    wanted = np.linspace(min(1, len(sequence) - 1), len(sequence) - 1, 4).round().astype(int).tolist()
+    chosen = {index: picture for index, picture in enumerate(pictures(sequence, masks=masks)) if index in wanted}
+    write_png(path, np.vstack([np.hstack([chosen[index] for index in row]) for row in (wanted[:2], wanted[2:])]))

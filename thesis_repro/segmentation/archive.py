@@ -24,24 +24,24 @@ def check(path):
     try:
         config = _config(path)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        reason = str(error).strip().partition("\n")[0][:200] or type(error).__name__
-        raise InputError(f"{path}: not a model that Keras has saved, or a truncated one ({reason}); copy it again or "
-                         "train anew") from None
+        raise unreadable(path, error) from None
     _check_classes(path, config)
+
+
+def unreadable(path, error):
+    """The InputError for a model's file that gives an error when it is read."""
+    reason = str(error).strip().partition("\n")[0][:200] or type(error).__name__
+    return InputError(f"{path}: not a model that Keras can read, or a truncated one ({reason}); copy it or train anew")
 
 
 def _config(path):
     """What a model consists of according to its file: nested dicts and lists, of JSON."""
-    if not path.stat().st_size:
-        raise ValueError("it is empty")
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             for name in PARTS:
                 archive.getinfo(name)
             # a loss may be anybody's; it is not read
             return {**json.loads(archive.read(PARTS[0])), "compile_config": None}
-    if not h5py.is_hdf5(path):
-        raise ValueError("it is neither an archive nor HDF5")
     with h5py.File(path, "r") as file:
         return json.loads(file.attrs["model_config"])
 

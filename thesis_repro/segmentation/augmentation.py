@@ -24,9 +24,13 @@ def transform_list(size, fill_mask=NOTHING):
     neighbour, so integer label maps give the same labels at one byte a pixel instead of 140, provided that what comes
     from outside of the image is no label at all; `fill_mask` is that value (0 where the masks are one-hot).
     """
+    with warnings.catch_warnings(action="ignore", category=UserWarning):
+        # the thesis's own name for the transform; the library would rather have it called Affine
+        shift_and_scale = A.ShiftScaleRotate(scale_limit=0.5, rotate_limit=0, shift_limit=0.1, p=1, border_mode=0,
+                                             fill=0, fill_mask=fill_mask)
     return [
         A.HorizontalFlip(p=0.5),
-        _shift_and_scale(fill_mask),
+        shift_and_scale,
         A.PadIfNeeded(min_height=size, min_width=size, border_mode=0, fill=0, fill_mask=fill_mask),
         A.RandomCrop(height=size, width=size),
         A.GaussNoise(std_range=NOISE_STD, p=0.2),
@@ -42,14 +46,6 @@ def transform_list(size, fill_mask=NOTHING):
             A.MotionBlur(blur_limit=3, p=1),
         ], p=0.9),
     ]
-
-
-def _shift_and_scale(fill_mask):
-    with warnings.catch_warnings():
-        # the thesis's own name for the transform; the library would rather have it called Affine
-        warnings.simplefilter("ignore", UserWarning)
-        return A.ShiftScaleRotate(scale_limit=0.5, rotate_limit=0, shift_limit=0.1, p=1, border_mode=0,
-                                  fill=0, fill_mask=fill_mask)
 
 
 class Augmenter:
@@ -79,26 +75,22 @@ def training_augmenter(size):
     return Augmenter(transform_list(size))
 
 
-def validation_augmenter(size, full=False):
+def validation_augmenter():
     """What the validation set is augmented with: by a slip of the appendix, a blur and nothing else.
 
     A.3 draws Figure 3.1 between the two sets and leaves `transform` bound to the last thing drawn, the blur.
-    `full` gives the validation set the transforms of the training set, as Section 3.5.1 says.
+    Section 3.5.1 means `training_augmenter`.
     """
-    return training_augmenter(size) if full else Augmenter([_blur()])
+    return Augmenter([A.Blur(blur_limit=3, p=1)])
 
 
-def _blur():
-    return A.Blur(blur_limit=3, p=1)
-
-
-def augment_set(images, labels, augmenter, seed, description="augmenting"):
+def augment_set(images, labels, augmenter, seed):
     """Augment every image of a set once (A.3): images (n, size, size, channels) and labels (n, size, size), uint8.
 
     Returns new arrays of the same shapes. Image i depends on the seed and on i only.
     """
     augmented_images, augmented_labels = np.empty_like(images), np.empty_like(labels)
-    for index in progress(range(len(images)), description, unit="image"):
+    for index in progress(range(len(images)), "augmenting", unit="image"):
         augmented_images[index], augmented_labels[index] = augmenter(
             images[index], labels[index], image_seed(seed, index))
     return augmented_images, augmented_labels
@@ -112,14 +104,3 @@ def image_seed(seed, index, epoch=0):
 def one_hot(label_maps, n_classes):
     """One-hot encode label maps (..., height, width) to float32 (..., n_classes); NOTHING becomes all zeros."""
     return (label_maps[..., None] == np.arange(n_classes, dtype=np.uint8)).astype(np.float32)
-
-
-def examples(image, label, seed):
-    """The panels of Figures 3.1 and 3.2: a dict of titles and (image, label map) pairs, the first the original.
-
-    The appendix's three transforms, the flip made certain so that it shows.
-    """
-    transforms = {"horizontal flip": A.HorizontalFlip(p=1), "affine transformation": _shift_and_scale(NOTHING),
-                  "random blur": _blur()}
-    return {"original": (image, label),
-            **{title: Augmenter([transform])(image, label, seed) for title, transform in transforms.items()}}

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, cityscapes, files, kitti
+from thesis_repro import cityscapes, files
 from thesis_repro.segmentation import prediction, quality
 from thesis_repro.segmentation.quality import EVALUATED
 
@@ -49,21 +49,27 @@ def measure(models, domains, drives):
                            **boundary_scores(true, predicted), **shadow_errors(images, true, predicted)})
             share = (table["pixels"] / table["pixels"].sum()).to_numpy()
             classes.append(table.reset_index().assign(**where, share=share))
-    columns = ["model", "domain", "class", "id", "share", "iou"]
-    return Gap(pd.DataFrame(scores), pd.concat(classes, ignore_index=True)[columns], _flicker_of(models, drives))
+    shares = []
+    for drive in (drive.subset(FRAMES) for drive in drives[:DRIVES]):
+        label_maps = {name: prediction.predict(model, np.stack([
+            cityscapes.read_image(path, *model.input_shape[1:]) for path in drive.frame_paths]))
+            for name, model in models.items()}
+        if exact := labelled_frames([drive]):
+            label_maps[EXACT] = [cityscapes.read_label_map(pair.label) for pair in exact]
+        frames = list(drive.frames())
+        shares.append({name: flicker(maps, frames).mean() for name, maps in label_maps.items()})
+    return Gap(pd.DataFrame(scores), pd.concat(classes, ignore_index=True), pd.DataFrame(shares).mean())
 
 
-def labelled_frames(root, names, frames=None):
-    """Frames of an odometry root with their exact label maps (labels_0), spread evenly; none on real data."""
+def labelled_frames(drives):
+    """Frames of `kitti.Sequence`s with their exact label maps (labels_0), spread evenly; none on real data."""
     pairs = []
-    for name in names:
-        sequence = kitti.Sequence(root, name).subset(frames)
-        labels = sequence.folder / "labels_0"
-        if labels.is_dir():
-            count = min(len(sequence), max(1, IMAGES // len(names)))
-            for index in ((np.arange(count) + 0.5) * len(sequence) / count).astype(int):
-                path = sequence.frame_paths[index]
-                pairs.append(cityscapes.Pair(f"{name}_{path.stem}", path, labels / path.name))
+    for drive in drives:
+        if (drive.folder / "labels_0").is_dir():
+            count = min(len(drive), max(1, IMAGES // len(drives)))
+            for index in ((np.arange(count) + 0.5) * len(drive) / count).astype(int):
+                path = drive.frame_paths[index]
+                pairs.append(cityscapes.Pair(f"{drive.name}_{path.stem}", path, drive.folder / "labels_0" / path.name))
     return pairs
 
 
@@ -74,7 +80,7 @@ def boundary_scores(true, predicted):
     predicted ones with a true one as near. `chance`: all pixels with a predicted boundary as near, which is what
     boundaries drawn without looking at the image would find.
     """
-    names, hits, totals = ("found", "right", "chance"), np.zeros(3), np.zeros(3)
+    hits, totals = np.zeros(3), np.zeros(3)
     for label_maps in zip(true, predicted, strict=True):
         true_map, predicted_map = (cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
                                    for label_map in label_maps)
@@ -84,7 +90,7 @@ def boundary_scores(true, predicted):
         hits += [(true_edges & near_predicted).sum(), (predicted_edges & near_true).sum(),
                  (counted & near_predicted).sum()]
         totals += [true_edges.sum(), predicted_edges.sum(), counted.sum()]
-    return dict(zip(names, (hits / np.maximum(totals, 1)).tolist()))
+    return dict(zip(("found", "right", "chance"), (hits / np.maximum(totals, 1)).tolist()))
 
 
 def _boundary(label_map, counted):
@@ -131,12 +137,7 @@ def flicker(label_maps, frames):
     label_maps: n of (h, w) uint8, any size; frames: n of (height, width) uint8. The motion is measured by dense optical
     flow in both directions. Only pixels whose two flows cancel are compared, which leaves out what is occluded, enters
     or leaves. Exact label maps show the floor of the measure: flow that is off by a pixel at a boundary.
-
-    Raises InputError for fewer than two frames or another number of label maps.
     """
-    if len(frames) != len(label_maps) or len(frames) < 2:
-        raise InputError(f"flicker: {len(label_maps)} label maps for {len(frames)} frames; it needs at least two "
-                         "frames and a label map for each")
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     frames = [np.ascontiguousarray(frame) for frame in frames]
     label_maps = [cv2.resize(label_map, frame.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -154,19 +155,3 @@ def flicker(label_maps, frames):
         changed = (cv2.remap(label_maps[index - 1], *origin, cv2.INTER_NEAREST) != label_maps[index]) & compared
         shares.append(changed.sum() / max(compared.sum(), 1))
     return np.array(shares)
-
-
-def _flicker_of(models, drives):
-    """Mean flicker on the first frames of some drives, by model; of exact label maps too where there are some."""
-    shares = {}
-    for drive in list(drives)[:DRIVES]:
-        drive = drive.subset(FRAMES)
-        label_maps = {name: prediction.predict(model, np.stack([prediction.read_input(path, model.input_shape)
-                                                                for path in drive.frame_paths]))
-                      for name, model in models.items()}
-        exact = drive.folder / "labels_0"
-        if exact.is_dir():
-            label_maps[EXACT] = [cityscapes.read_label_map(exact / path.name) for path in drive.frame_paths]
-        for name, maps in label_maps.items():
-            shares.setdefault(name, []).append(flicker(maps, list(drive.frames())).mean())
-    return pd.Series({name: float(np.mean(values)) for name, values in shares.items()}, dtype=float)

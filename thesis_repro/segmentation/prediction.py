@@ -1,11 +1,10 @@
 """Label maps for images and whole sequences (A.7)."""
 
-import hashlib
 import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
@@ -27,8 +26,6 @@ CALL = 4  # images in one call of the network on a CPU; the activations of more 
 
 def load_shipped():
     """The model of the package, for users without a model of their own; see weights/README.md for what it is."""
-    if not SHIPPED.is_file():
-        raise InputError(f"{SHIPPED}: the shipped model is missing; reinstall the package or run `make weights`")
     return training.load_model(SHIPPED)
 
 
@@ -60,7 +57,7 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     folder with files that this project did not make, or that another run is at work in.
     """
     with longrun.claimed(output_dir):
-        batches = _open(_weights(model), paths, output_dir, batch_size)
+        batches = _open(training.weights_digest(model), paths, output_dir, batch_size)
         missing = sum(map(len, batches))
         with files.progress(None, "label maps", len(paths), initial=len(paths) - missing) as bar:
             _write_batches(model, batches, bar.update)
@@ -84,27 +81,32 @@ def _open(weights, paths, output_dir, batch_size):
 def _write_batches(model, batches, done):
     """Predict and write batches of (image, label map) paths; done: called with the length of each that is written."""
     memory.require(model, _call_size(max(map(len, batches), default=1)))
-    run = _compiled(model)
+    run, paths = _compiled(model), [[path for path, _ in batch] for batch in batches]
     with ThreadPoolExecutor(2) as pool:
-        waiting = iter(batches)
-        decoded, written = deque(), deque()
+        predicted = map(run, _ahead(pool, partial(_decode, model.input_shape), paths))
+        for count in _ahead(pool, _write, zip(batches, predicted)):
+            done(count)
 
-        def decode_next():
-            for batch in waiting:
-                decoded.append((batch, pool.submit(_decode, [path for path, _ in batch], model.input_shape)))
-                return
 
-        decode_next()
-        decode_next()
-        while decoded:
-            batch, images = decoded.popleft()
-            labels = run(images.result())
-            decode_next()
-            written.append((len(batch), pool.submit(_write, labels, [target for _, target in batch])))
-            while written and (len(written) > 2 or not decoded):
-                count, writing = written.popleft()
-                writing.result()
-                done(count)
+def _ahead(pool, function, items):
+    """The function of each item in their order, from threads that are two items ahead of whoever asks."""
+    waiting = deque()
+    for item in items:
+        waiting.append(pool.submit(function, item))
+        if len(waiting) > 2:
+            yield waiting.popleft().result()
+    yield from (future.result() for future in waiting)
+
+
+def _decode(input_shape, paths):
+    return np.stack([read_image(path, *input_shape[1:]) for path in paths])
+
+
+def _write(batch):
+    pairs, labels = batch
+    for (_, target), label_map in zip(pairs, labels, strict=True):
+        files.write_png(target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST))
+    return len(pairs)
 
 
 PART = 256  # images that a worker is given at once, in whole batches: minutes of the thesis's network on two cores
@@ -122,25 +124,17 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
     Returns how many images were predicted.
     Raises InputError for what `write_label_maps` does, after whatever could be written has been.
     """
-    with ExitStack() as held:
-        for _, folder in sequences:
-            held.enter_context(longrun.claimed(folder))
-        return _spread(run, model_files, sequences, batch_size)
-
-
-def _spread(run, model_files, sequences, batch_size):
     model_files = tuple(str(Path(path).absolute()) for path in model_files)
-    weights = _weights(load(model_files))
-    calls, missing, total = [], 0, 0
-    for paths, folder in sequences:
-        batches = _open(weights, paths, folder, batch_size)
-        step = max(1, PART // batch_size)
-        record = stages.made_from(folder)
-        calls += [(model_files, weights, Path(folder).absolute(), record, batches[start:start + step])
-                  for start in range(0, len(batches), step)]
-        missing, total = missing + sum(map(len, batches)), total + len(paths)
-    failures = []
-    with files.progress(None, "label maps", total, initial=total - missing) as bar:
+    weights, calls, missing, failures = training.weights_digest(load(model_files)), [], 0, []
+    total, step = sum(len(paths) for paths, _ in sequences), max(1, PART // batch_size)
+    with ExitStack() as held:
+        for paths, folder in sequences:
+            held.enter_context(longrun.claimed(folder))
+            batches = _open(weights, paths, folder, batch_size)
+            missing += sum(map(len, batches))
+            calls += [(model_files, Path(folder).absolute(), stages.record(folder), batches[start:start + step])
+                      for start in range(0, len(batches), step)]
+        bar = held.enter_context(files.progress(None, "label maps", total, initial=total - missing))
         for index, failed in run(_write_part, calls):
             if failed:
                 failures.append(failed)
@@ -178,45 +172,21 @@ def ensemble(models):
     return keras.Model(inputs, keras.layers.Average()(outputs), name="ensemble")
 
 
-def _write_part(model_files, weights, folder, record, batches):
+def _write_part(model_files, folder, record, batches):
     """Write some batches of a sequence, here or on another machine; returns why that failed, None where it did not."""
     try:
-        if stages.record(folder) is None or stages.made_from(folder) != record:
+        if stages.record(folder) != record:
             raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
                              "folders under the same paths")
         model = load(model_files)
-        if _weights(model) != weights:
-            raise InputError(f"{', '.join(model_files)}: holds another model for this worker than for the others, or "
-                             "has changed; start the workers again")
-        if stages.record(folder)["code"] != stages.code("segmentation/prediction"):
-            raise InputError("this worker has another version of thesis_repro; install the same on all")
+        here = {"model": training.weights_digest(model), "code": stages.code("segmentation/prediction")}
+        if record | here != record:
+            raise InputError(f"{', '.join(model_files)}: this worker has another model, or another version of "
+                             "thesis_repro; give all of them the same, and start them again")
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # whatever it is, the other parts go on and the reason is reported
         return longrun.explain(error) or f"{type(error).__name__}: {error}"
     return None
-
-
-def read_input(path, input_shape):
-    """One image file as a model's input: uint8, stretched to (height, width), gray or red, green, blue."""
-    return read_image(path, *input_shape[-3:])
-
-
-def _decode(paths, input_shape):
-    return np.stack([read_input(path, input_shape) for path in paths])
-
-
-def _write(labels, targets):
-    for label_map, target in zip(labels, targets, strict=True):
-        if label_map.shape != (SIZE, SIZE):
-            label_map = cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
-        files.write_png(target, label_map)
-
-
-def _weights(model):
-    digest = hashlib.sha256()
-    for variable in model.variables:
-        digest.update(variable.numpy().tobytes())
-    return digest.hexdigest()[:12]
 
 
 def _call_size(batch_size):

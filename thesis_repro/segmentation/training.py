@@ -82,31 +82,25 @@ class Batches:
             _check(images, labels)
         self.sets, self.batch_size, self.seed, self.augmenter = sets, batch_size, seed, augmenter
         self.epoch = 0
-        self._ends = np.cumsum([len(labels) for _, labels in sets])
+        self._places = [(which, index) for which, (images, _) in enumerate(sets) for index in range(len(images))]
 
     def __len__(self):
-        return -(-int(self._ends[-1]) // self.batch_size)
+        return -(-len(self._places) // self.batch_size)
 
     def __iter__(self):
         """The batches of the current epoch: uint8 images and uint8 label maps."""
-        count, epoch = self._ends[-1], self.epoch
-        order = np.arange(count) if self.seed is None else np.random.default_rng((self.seed, epoch)).permutation(count)
-        shape = self.sets[0][0].shape[1:]
-        for start in range(0, count, self.batch_size):
-            chosen = order[start:start + self.batch_size]
-            images = np.empty((len(chosen), *shape), np.uint8)
-            labels = np.empty((len(chosen), *shape[:2]), np.uint8)
-            for position, index in enumerate(chosen):
-                images[position], labels[position] = self._pair(int(index), epoch)
-            yield images, labels
+        epoch, order = self.epoch, np.arange(len(self._places))
+        if self.seed is not None:
+            order = np.random.default_rng((self.seed, epoch)).permutation(len(order))
+        for start in range(0, len(order), self.batch_size):
+            pairs = [self._pair(*self._places[place], epoch) for place in order[start:start + self.batch_size]]
+            yield tuple(map(np.stack, zip(*pairs)))
 
-    def _pair(self, index, epoch):
-        which = int(np.searchsorted(self._ends, index, side="right"))
-        within = index - (int(self._ends[which - 1]) if which else 0)
-        images, labels = self.sets[which]
+    def _pair(self, which, index, epoch):
         if which and self.augmenter:
-            return self.augmenter(images[within], labels[within], augmentation.image_seed(self.seed, within, epoch))
-        return images[within], labels[within]
+            images, labels = self.sets[0]
+            return self.augmenter(images[index], labels[index], augmentation.image_seed(self.seed, index, epoch))
+        return tuple(array[index] for array in self.sets[which])
 
     def dataset(self):
         """The batches as a `tf.data.Dataset` of float images and one-hot masks, made while the network works."""
@@ -138,19 +132,22 @@ def made_from(model, batches, validation):
     random = np.random.default_rng(0)
     true = augmentation.one_hot(random.integers(0, N_CLASSES, (2, 16, 16), np.uint8), N_CLASSES)
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
-    weights = sha256(b"".join(variable.numpy().tobytes() for variable in model.variables))
-    network = sha256(json.dumps(model.get_config(), default=str).encode())
-    optimizer = {key: value for key, value in model.optimizer.get_config().items() if key != "name"}  # adam, adam_1
     return {
-        "code": stages.code("segmentation/training"), "network": network.hexdigest()[:12],
-        "first_weights": weights.hexdigest()[:12], "optimizer": optimizer,
+        "code": stages.code("segmentation/training"),
+        "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
+        "first_weights": weights_digest(model),
+        "optimizer": model.optimizer.get_config() | {"name": ""},  # adam, adam_1
         "loss": float(np.asarray(model.loss(true, predicted)).mean()),
-        "images": [len(images) for images, _ in (*batches.sets, *validation.sets)],
-        "pixels": [zlib.crc32(np.ascontiguousarray(array)) for source in (batches, validation) for pair in source.sets
+        "pixels": [zlib.crc32(np.ascontiguousarray(array)) for pair in (*batches.sets, *validation.sets)
                    for array in pair],
         "batch_size": batches.batch_size, "seed": batches.seed,
         "fresh_augmentation": batches.augmenter.to_dict() if batches.augmenter else None,
     }
+
+
+def weights_digest(model):
+    """A model's weights in twelve letters."""
+    return sha256(b"".join(variable.numpy().tobytes() for variable in model.variables)).hexdigest()[:12]
 
 
 class ResumableTraining(keras.callbacks.Callback):
@@ -171,17 +168,15 @@ class ResumableTraining(keras.callbacks.Callback):
         """
         super().__init__()
         self.folder, self.batches, self.others = Path(folder), batches, others
-        self.rows, self._counters, self._bar, self._claim = [], [], None, ExitStack()
+        self.rows, self._counters, self._open = [], [], ExitStack()
         self._variables = model.variables + model.optimizer.variables
         state = stages.resume(self.folder / STATE)
-        if state is None:
-            return
-        job, arrays = state
-        if [arrays[name].shape for name in arrays] != [tuple(variable.shape) for variable in self._variables]:
-            raise InputError(f"{self.folder}: holds the training of another network; delete it or choose another one")
-        for variable, value in zip(self._variables, arrays.values(), strict=True):
-            variable.assign(value)
-        self.rows, self._counters = job["rows"], job["counters"]
+        if state is not None:
+            (self.rows, self._counters), arrays = state
+            if [value.shape for value in arrays.values()] != [tuple(variable.shape) for variable in self._variables]:
+                raise InputError(f"{self.folder}: holds the training of another network; delete it or choose another")
+            for variable, value in zip(self._variables, arrays.values()):
+                variable.assign(value)
 
     @property
     def history(self):
@@ -195,13 +190,14 @@ class ResumableTraining(keras.callbacks.Callback):
         return epochs if stopped else min(len(self.rows), epochs)
 
     def on_train_begin(self, logs=None):
-        self._claim.enter_context(longrun.claimed(self.folder))
+        self._open.enter_context(longrun.claimed(self.folder))
         self.model.save = partial(_save_whole, self.model)  # Keras itself writes in place
+        self._open.callback(delattr, self.model, "save")
         for other, counters in zip(self.others, self._counters):
             vars(other).update(counters)
-        total = self.params["epochs"] * len(self.batches)
-        self._bar = files.progress(description="training", total=total, unit="batch",
-                                   initial=len(self.rows) * len(self.batches))
+        self._bar = self._open.enter_context(files.progress(
+            description="training", total=self.params["epochs"] * len(self.batches), unit="batch",
+            initial=len(self.rows) * len(self.batches)))
 
     def on_epoch_begin(self, epoch, logs=None):
         self.batches.epoch = epoch
@@ -215,13 +211,11 @@ class ResumableTraining(keras.callbacks.Callback):
         self._counters = [{name: float(value) for name, value in vars(other).items()
                            if name in self.COUNTERS and value is not None} for other in self.others]
         files.write_text(self.folder / HISTORY, self.history.to_csv(index=False))
-        stages.store(self.folder / STATE, {"rows": self.rows, "counters": self._counters},
+        stages.store(self.folder / STATE, [self.rows, self._counters],
                      {f"{index}": variable.numpy() for index, variable in enumerate(self._variables)})
 
     def on_train_end(self, logs=None):
-        self._bar.close()
-        self._claim.close()
-        del self.model.save
+        self._open.close()
 
 
 def _save_whole(model, path, **options):
@@ -241,19 +235,12 @@ def load_model(path):
     try:
         model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile each raise their own
-        reason = (str(error).strip() or type(error).__name__).split("\n")[0][:200]
-        raise InputError(f"{path}: not a model that Keras can read, or a truncated one ({reason}); "
-                         "copy it again or train anew") from None
-    check_shape(model, path)
-    if not all(np.isfinite(variable.numpy()).all() for variable in model.variables):
-        raise InputError(f"{path}: holds weights that are not finite, of a training that failed; train anew")
-    return model
-
-
-def check_shape(model, name):
-    """Raise InputError unless a model takes square images, gray or in colour, and gives 35 probabilities a pixel."""
+        raise archive.unreadable(path, error) from None
     inputs, outputs = getattr(model, "input_shape", ()), getattr(model, "output_shape", ())
     square = len(inputs) == 4 and inputs[1] is not None and inputs[1] == inputs[2] and inputs[3] in (1, 3)
     if not square or outputs != (*inputs[:3], N_CLASSES):
-        raise InputError(f"{name}: a model from {inputs} to {outputs}; expected (None, size, size, 1 or 3) to "
+        raise InputError(f"{path}: a model from {inputs} to {outputs}; expected (None, size, size, 1 or 3) to "
                          f"(None, size, size, {N_CLASSES}), so name another model")
+    if not all(np.isfinite(variable.numpy()).all() for variable in model.variables):
+        raise InputError(f"{path}: holds weights that are not finite, of a training that failed; train anew")
+    return model

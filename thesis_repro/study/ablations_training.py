@@ -91,10 +91,10 @@ def _train(model: Any, train: Pairs, validation: Pairs, method: str, seed: int, 
 def validation_losses(model: Any, images: np.ndarray, labels: np.ndarray, seeds: int) -> pd.DataFrame:
     """The validation loss of a model by what the set is augmented with: columns seed, nothing, blur and all."""
     model.compile(loss=training.total_loss())
-    size, rows = images.shape[1], []
+    augmenters = augmentation.validation_augmenter(), augmentation.training_augmenter(images.shape[1])
+    rows = []
     for seed in range(seeds):
-        blurred, transformed = (augmentation.augment_set(
-            images, labels, augmentation.validation_augmenter(size, full=full), seed) for full in (False, True))
+        blurred, transformed = (augmentation.augment_set(images, labels, augmenter, seed) for augmenter in augmenters)
         sets = {"nothing": (images, labels), "blur": blurred, "all": transformed}
         rows.append({"seed": seed} | {name: float(model.evaluate(
             pictures.astype(np.float32), augmentation.one_hot(maps, N_CLASSES), batch_size=4, verbose=0))
