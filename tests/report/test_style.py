@@ -15,7 +15,7 @@ from thesis_repro.report import style
                                        (300, 2000), (1.5, 0.7), (np.nan, 1.2), (0, np.inf)])
 def test_a_ratio_axis_has_a_few_round_ticks_within_it(low, high):
     axis = plt.figure().add_subplot().yaxis
-    style.ratio_axis(axis, low, high)
+    style.ratio_axis(axis, [low, high])
     ticks, (bottom, top) = axis.get_ticklocs(), axis.get_view_interval()
     assert axis.get_scale() == "log" and 2 <= len(ticks) <= 8 and all((bottom <= ticks) & (ticks <= top))
     assert all(bottom <= value <= top for value in (low, high) if 0 < value < np.inf)

@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgba_array
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.patches import Patch, Rectangle
 
 from thesis_repro.odometry import metrics
 from thesis_repro.report import style
@@ -17,27 +17,22 @@ GRAY, LIGHT_GRAY = "#777777", "#bbbbbb"
 def figure_2_01():
     """Figure 2.1: a basic convolutional network as a diagram."""
     figure, axes = _diagram((0, 18.6), (0, 5.6), height=2.3)
-    middle, layer_end = 3.1, None
-    for name, detail, left, side, maps, color in (
-            ("input", "image", 0.2, 3.2, 1, "#aaaaaa"), ("convolution", "one map per kernel", 3.5, 2.8, 5, BLUE),
-            ("activation", "ReLU", 6.9, 2.8, 5, SKY), ("pooling", "2x2, largest", 10.3, 1.4, 5, ORANGE)):
-        offsets = 0.15 * np.arange(maps)
-        for offset in offsets:
-            axes.add_patch(Rectangle((left + offset, middle - side / 2 + offsets[-1] / 2 - offset), 0.65 * side, side,
+    middle = 3.1
+    for name, left, side, maps, color in (
+            ("input\nimage", 0.2, 3.2, 1, "#aaaaaa"), ("convolution\none map per kernel", 3.5, 2.8, 5, BLUE),
+            ("activation\nReLU", 6.9, 2.8, 5, SKY), ("pooling\n2x2, largest", 10.3, 1.4, 5, ORANGE)):
+        for offset in np.arange(maps) * 0.15:
+            axes.add_patch(Rectangle((left + offset, middle - side / 2 - offset + 0.3), 0.65 * side, side,
                                      facecolor=color, edgecolor="white", linewidth=0.8))
-        if layer_end is not None:
-            _arrow(axes, (layer_end, middle), (left, middle))
-        layer_end = left + 0.65 * side + offsets[-1]
-        _caption_below(axes, (left + layer_end) / 2, name, detail)
+        axes.text(left + side / 2, 0.45, name, ha="center", va="center", fontsize=8)
+    for start, end in ((2.4, 3.5), (5.95, 6.9), (9.35, 10.3), (11.85, 13.3)):
+        _arrow(axes, (start, middle), (end, middle))
     inputs, outputs = (middle + 0.62 * (np.arange(count) - (count - 1) / 2) for count in (6, 4))
-    _arrow(axes, (layer_end, middle), (13.4, middle))
     axes.plot([[13.6], [16.3]], [np.repeat(inputs, 4), np.tile(outputs, 6)], color=LIGHT_GRAY, linewidth=0.5, zorder=0)
-    for x, heights, color, name, detail in ((13.6, inputs, GREEN, "dense", "every input, weighted"),
-                                            (16.3, outputs, RED, "softmax", "class scores")):
+    for x, heights, color, name in ((13.6, inputs, GREEN, "dense\nevery input, weighted"),
+                                    (16.3, outputs, RED, "softmax\nclass scores")):
         axes.scatter(np.full(len(heights), x), heights, s=110, color=color)
-        _caption_below(axes, x, name, detail)
-    for number, height in enumerate(reversed(outputs), 1):
-        axes.text(16.75, height, f"class {number}", va="center", fontsize=8)
+        axes.text(x, 0.45, name, ha="center", va="center", fontsize=8)
     return figure
 
 
@@ -147,12 +142,10 @@ def figure_2_06():
     axes.plot(*np.transpose(path), color="white", linewidth=1, marker="o", markersize=3)
     for point, marker, size, label in ((path[0], "s", 9, "start"), (path[-1], "*", 14, f"after {steps} steps")):
         axes.plot(*point, marker, color=RED, markersize=size, markeredgecolor="white", label=label)
+    for valley in (-1.28, 1.16):  # along y = 0, where the slope vanishes
+        axes.text(valley, -0.7, f"valley of loss {loss(valley, 0):.2f}", color="white", fontsize=8, ha="center")
     axes.set(xlabel="first weight (no unit)", ylabel="second weight (no unit)")
     axes.grid(visible=False)
-    for sign in (-1, 1):  # along y = 0 the valleys lie where the slope 2 x (x^2 - 1.5) + 0.35 vanishes
-        valley = next(root.real for root in np.roots([2, 0, -3, 0.35]) if sign * root.real > 1)
-        axes.annotate(f"valley of loss {loss(valley, 0):.2f}", (valley, 0), (valley, -0.8), color="white", fontsize=8,
-                      ha="center", arrowprops={"arrowstyle": "-", "color": "white", "lw": 0.8})
     axes.legend(loc="upper left", labelcolor="white")
     figure.colorbar(levels, label="loss (no unit)")
     return figure
@@ -200,30 +193,26 @@ def figure_2_07(model):
 def figure_2_08(poses, title):
     """Figure 2.8: camera poses C of a sequence from above, and the motions T between them (Equations 2.2, 2.3).
 
-    poses: a few (n, 4, 4) camera-to-world poses, metres. A wedge opens to where the camera looks.
+    poses: a few (n, 4, 4) camera-to-world poses, metres. A short arrow points to where the camera looks.
     """
     poses = np.linalg.inv(poses[0]) @ poses  # the first camera is where the path starts, and looks up the page
     positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
-    extent = max(np.ptp(positions, axis=0).max(), 1e-6)
     figure, axes = style.new_figure(height=3.8)
-    for index, (position, sideways, forward) in enumerate(zip(positions, right, ahead)):
-        wedge = np.array([(0, 0), (0.6, 1), (-0.6, 1)]) @ (sideways, forward)
-        axes.add_patch(Polygon(position + 0.06 * extent * wedge, facecolor=SKY, edgecolor=BLUE, alpha=0.8))
+    axes.plot(*positions.T, "o", markersize=4, color="black")
+    axes.quiver(*positions.T, *ahead.T, color=BLUE, angles="xy", scale=18, width=0.006, zorder=3)
+    for index, (position, sideways) in enumerate(zip(positions, right)):
         _formula(axes, position, f"$C_{{{index}}}$", 16 * sideways, "black")
     for index, (start, end) in enumerate(zip(positions, positions[1:]), 1):
         motion = np.linalg.inv(poses[index - 1]) @ poses[index]  # Equation 2.3, for T
+        name, length = f"$T_{{{index},{index - 1}}}$", np.linalg.norm(motion[:3, 3])
         axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": RED, "shrinkA": 3, "shrinkB": 3,
                                                   "connectionstyle": "arc3,rad=-0.3"})
         to_the_left = (end - start)[::-1] * (-1, 1)
-        name, length = f"$T_{{{index},{index - 1}}}$", np.linalg.norm(motion[:3, 3])
         _formula(axes, (start + end) / 2 + 0.15 * to_the_left, name, 11 * to_the_left / max(length, 1e-9), RED)
         axes.plot([], [], color=RED, label=f"{name}: {length:.1f} m, {metrics.angles(motion):.1f}°")
-    axes.plot(*positions.T, "o", markersize=3.5, color="black")
     axes.set(xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)", title=title)
-    axes.set_aspect("equal")
-    reach = np.maximum(np.ptp(positions, axis=0) / 2 + 0.2 * extent, 0.35 * extent)
-    middle = (positions.min(axis=0) + positions.max(axis=0)) / 2
-    axes.axis(np.stack([middle - reach, middle + reach], axis=1).ravel())
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.2)
     for text in axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=0.8).get_texts():
         text.set_parse_math(True)
     return figure
@@ -249,7 +238,6 @@ def figure_2_09(first, second, title):
         axes.plot((u, x), (v, y + first.shape[0] + gap.shape[0]), linewidth=0.8, color=scale.to_rgba(match.distance),
                   marker="o", markersize=2)
     figure.colorbar(scale, ax=axes, shrink=0.7, pad=0.01, label="bits of 256 that differ")
-    figure.set_figheight(0.92 * figure.get_figheight())  # the bar takes some of the width
     return figure
 
 
@@ -276,15 +264,12 @@ def figure_2_11(first, second, kept, lost, new, titles):
     kept is a pair of arrays, where the same keypoints lie in the first and in the second frame.
     """
     figure, axes = style.frame_panels(first, 2)
-    for panel, image, title, (text, points, marker, color), again in (
-            (axes[0], first, titles[0], ("not found again", lost, "x", RED), kept[0]),
-            (axes[1], second, titles[1], ("new", new, "^", ORANGE), kept[1])):
-        style.show_image(panel, image, f"{title}: {len(again)} found again, {len(points)} {text}")
-        panel.scatter(*again.T, s=5, color=GREEN, linewidths=0, label="found again")
-        panel.scatter(*points.T, s=9, color=color, marker=marker, linewidths=0.8 if marker == "x" else 0, label=text)
-    handles, labels = (first_two + last[1:] for first_two, last in zip(
-        *(panel.get_legend_handles_labels() for panel in axes), strict=True))
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, markerscale=2)
+    for panel, image, title, again in zip(axes, (first, second), titles, kept, strict=True):
+        style.show_image(panel, image, title)
+        panel.scatter(*again.T, s=5, color=GREEN, linewidths=0, label=f"{len(again)} found again")
+    axes[0].scatter(*lost.T, s=9, color=RED, marker="x", linewidths=0.8, label=f"{len(lost)} not found again")
+    axes[1].scatter(*new.T, s=9, color=ORANGE, marker="^", linewidths=0, label=f"{len(new)} new")
+    style.legend_below(figure, axes, 3)
     return figure
 
 
@@ -310,11 +295,6 @@ def _diagram(xlim, ylim, **size):
 
 def _arrow(axes, start, end, color="black", zorder=1):
     axes.annotate("", end, start, zorder=zorder, arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 0.9})
-
-
-def _caption_below(axes, x, name, detail):
-    axes.text(x, 0.75, name, ha="center", va="center")
-    axes.text(x, 0.2, detail, ha="center", va="center", fontsize=7, color=GRAY)
 
 
 def _formula(axes, point, text, offset, color):

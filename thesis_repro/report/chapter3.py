@@ -54,7 +54,7 @@ def figure_3_05(counts, n_images):
     figure, axes = style.new_figure(height=3.4)
     axes.bar([label.name for label in present], pixels, color=[np.array(label.color) / 255 for label in present],
              edgecolor="#555555", linewidth=0.5)
-    style.ratio_axis(axes.yaxis, min(pixels) / 2, max(pixels))
+    style.ratio_axis(axes.yaxis, [min(pixels) / 2, max(pixels)])
     axes.yaxis.set_major_formatter("{x:,.0f}")
     axes.set(ylabel="pixels", xlabel="category", title=f"{n_images} training label maps")
     axes.tick_params(axis="x", labelrotation=45, labelsize=8)

@@ -4,25 +4,14 @@
 lowest to the highest of them. What compares methods by ratios is in comparison.py.
 """
 
+import itertools
+
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
 from thesis_repro.odometry import THESIS
-from thesis_repro.report.style import (
-    BASELINE,
-    BLUE,
-    GREEN,
-    MASKED,
-    ORANGE,
-    PAGE_WIDTH,
-    PINK,
-    RED,
-    REDUCED,
-    SKY,
-    TRUTH,
-    line_style,
-    new_figure,
-)
+from thesis_repro.report import style
+from thesis_repro.report.style import BASELINE, BLUE, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, RED, REDUCED, SKY, TRUTH
 from thesis_repro.study import compare, thesis_tables
 
 METHODS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
@@ -42,14 +31,13 @@ def figure_paths(truths, rows, paths, method):
     groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
     columns = min(4, len(groups))
     count = -(-len(groups) // columns)
-    figure, axes = new_figure(2 * count, columns, height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
-                              squeeze=False, height_ratios=[2, 1] * count)
-    for place in range(len(groups), count * columns):
-        for part in (0, 1):
-            axes[2 * (place // columns) + part, place % columns].set_axis_off()
+    figure, axes = style.new_figure(2 * count, columns, height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
+                                    squeeze=False, height_ratios=[2, 1] * count)
+    pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))  # the path, and its error below
+    for panel in itertools.chain(*pairs[len(groups):]):
+        panel.remove()
     errors = compare.spread(rows, "rmse")
-    for place, (name, runs) in enumerate(groups.items()):
-        above, below = axes[2 * (place // columns):, place % columns][:2]
+    for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
         true = truths[name]
         along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
         above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
@@ -65,15 +53,14 @@ def figure_paths(truths, rows, paths, method):
         above.set_title(f"{name}: {row['mean']:.2g}{span} m", fontsize=8)
         above.set_aspect("equal", adjustable="datalim")
         below.set_ylim(0, None)
+        below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
         for panel in (above, below):
             panel.tick_params(labelsize=6.5)
-            panel.xaxis.set_major_locator(MaxNLocator(3))
-            panel.yaxis.set_major_locator(MaxNLocator(3))
-        below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
-    for above, below in zip(axes[::2, 0], axes[1::2, 0]):
+            panel.locator_params(nbins=4)
+    for above, below in pairs[::columns]:
         above.set_ylabel("z (m) over x (m)", fontsize=7.5)
         below.set_ylabel("distance (m)", fontsize=7.5)
-    _legend_below(figure, axes[0, 0], 3)
+    style.legend_below(figure, axes[0, :1], 3)
     figure.suptitle("sequence: RMSE, mean (lowest-highest of the repetitions)", fontsize=9)
     return figure
 
@@ -82,7 +69,7 @@ def figure_4_07(runs):
     """Keypoints that masks leave, as a part of the thesis's 2000, against dilation width."""
     masked = compare.of_method(runs, "masked")
     kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack() / THESIS.max_keypoints
-    figure, axes = new_figure(height=4.0)
+    figure, axes = style.new_figure(height=4.0)
     _lines(axes, kept)
     axes.set(xlabel="dilation width (pixels)", ylabel=f"keypoints, part of {THESIS.max_keypoints}", ylim=(0, None),
              title="Keypoints kept by masks of increasing dilation width")
@@ -95,85 +82,68 @@ def figure_against_width(runs, metric):
     masked = compare.of_method(runs, "masked")
     baseline = compare.spread(compare.of_method(runs, "baseline"), metric)
     names = sorted(masked["sequence"].unique())
-    columns = min(4, len(names))
-    count = -(-len(names) // columns)
     label = f"{metric.upper()} (m)"
-    figure, _ = new_figure(height=3.8 + 1.35 * count)
-    figure.clear()
-    above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * count + 0.6])
+    rows = -(-len(names) // 4)
+    figure = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
     _lines(axes, masked.groupby(["sequence", "dilation_width"])[metric].mean().unstack())
     axes.set(xlabel="dilation width (pixels)", ylabel=label, ylim=(0, None),
              title=f"{metric.upper()} against dilation width, means over repetitions")
-    panels = below.subplots(count, columns, squeeze=False)
-    for panel in panels.flat[len(names):]:
-        panel.set_axis_off()
-    for panel, name in zip(panels.flat, names):
+    _, panels = style.small_panels(names, "width (pixels)", below)
+    for panel, name in zip(panels, names, strict=True):
         errors = compare.spread(masked[masked["sequence"] == name], metric, by="dilation_width")
         panel.fill_between(errors.index, errors["lowest"], errors["highest"], color=MASKED, alpha=0.25, linewidth=0,
                            label=f"masked, {BAND}")
         panel.plot(errors.index, errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1,
                    label="masked, mean")
-        if name in baseline.index:
-            row = baseline.loc[name]
-            panel.axhspan(row["lowest"], row["highest"], color=BASELINE, alpha=0.2, linewidth=0,
-                          label=f"all keypoints, {BAND}")
-            panel.axhline(row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean")
-        panel.set_title(name, fontsize=8, pad=3)
+        row = baseline.loc[name]
+        panel.axhspan(row["lowest"], row["highest"], color=BASELINE, alpha=0.2, linewidth=0,
+                      label=f"all keypoints, {BAND}")
+        panel.axhline(row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean")
         panel.set_ylim(0, None)
-        panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-        panel.tick_params(labelsize=7)
-        panel.set_xlabel("width (pixels)", fontsize=7.5)
-    for panel in panels[:, 0]:
-        panel.set_ylabel(label, fontsize=8)
-    _legend_below(below, panels[0, 0], 2)
+    below.supylabel(label, fontsize=8)
+    style.legend_below(below, panels, 2)
     return figure
 
 
 def figure_of_methods(runs, metric):
     """Figures 4.13, 4.15: the metric of baseline, best mask and plainly reduced, all sequences."""
     names, tables = _of_methods(runs, metric)
-    figure, axes = new_figure(height=3.2)
+    figure, axes = style.new_figure(height=3.2)
     for offset, (method, table) in enumerate(tables.items()):
         _bar(axes, np.arange(len(names)) + (offset - 1) * 0.27, table, 0.25, method)
     axes.set_xticks(range(len(names)), names)
     axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
     axes.grid(axis="x", visible=False)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    style.legend_below(figure, [axes], 3)
     return figure
 
 
 def figure_of_sequences(runs, metric):
     """Figures 4.14, 4.16: the same, one panel a sequence with its own scale."""
     names, tables = _of_methods(runs, metric)
-    columns = min(4, len(names))
-    count = -(-len(names) // columns)
-    figure, axes = new_figure(count, columns, height=1.7 * count + 0.5, squeeze=False)
-    for panel in axes.flat:
-        panel.set_axis_off()
-    for panel, name in zip(axes.flat, names):
-        panel.set_axis_on()
+    figure, panels = style.small_panels(names)
+    for panel, name in zip(panels, names, strict=True):
         for offset, (method, table) in enumerate(tables.items()):
             _bar(panel, [offset], table.loc[[name]], 0.8, method)
-        panel.set_title(name)
         panel.set_xticks([])
         panel.grid(axis="x", visible=False)
-    for panel in axes[:, 0]:
-        panel.set_ylabel(f"{metric.upper()} (m)")
-    _legend_below(figure, axes[0, 0], 3)
+    figure.supylabel(f"{metric.upper()} (m)", fontsize=8)
+    style.legend_below(figure, panels, 3)
     return figure
 
 
 def figure_4_17(seconds):
     """Percent time savings of each dilation width (Equation 4.2), from the table of `time_runs`; dots: sequences."""
     savings = thesis_tables.time_savings(seconds)
-    figure, axes = new_figure(height=3.0)
+    figure, axes = style.new_figure(height=3.0)
     axes.bar(savings.index.astype(int), savings, color=MASKED, label="all sequences together")
-    for place, (_, rows) in enumerate(seconds.groupby("sequence")):
+    for _, rows in seconds.groupby("sequence"):
         own = thesis_tables.time_savings(rows)
         axes.plot(own.index.astype(int), own, "o", color="#333333", alpha=0.5, markersize=3, markeredgewidth=0,
-                  label="_" * place + "one sequence")
-    _legend_below(figure, axes, 2)
+                  label="one sequence")
+    style.legend_below(figure, [axes], 2)
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xticks(savings.index.astype(int))
     axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)",
@@ -190,7 +160,7 @@ def figure_budget(measured):
     table = measured.pivot(index="method", columns="stage", values="milliseconds").fillna(0)
     table = table.loc[measured["method"].unique(), [stage for stage in STAGES if stage in table]]
     ends = table.sum(axis=1)
-    figure, axes = new_figure(height=1.4 + 0.5 * len(table))
+    figure, axes = style.new_figure(height=1.4 + 0.5 * len(table))
     left = table.cumsum(axis=1) - table
     for stage in table:
         color, hatch = STAGES[stage]
@@ -202,14 +172,14 @@ def figure_budget(measured):
     axes.set(xlim=(0, max(FRAME_MS, *ends) * 1.12), xlabel="time a frame (ms)",
              ylim=(len(table) - 0.6, -0.6))
     axes.grid(axis="y", visible=False)
-    _legend_below(figure, axes, 4)
+    style.legend_below(figure, [axes], 4)
     return figure
 
 
 def _lines(axes, table):
     """One line a row of a table with one column a dilation width."""
     for index, (name, row) in enumerate(table.iterrows()):
-        axes.plot(row.index, row, marker="o", markersize=2.5, label=name, **line_style(index))
+        axes.plot(row.index, row, marker="o", markersize=2.5, label=name, **style.line_style(index))
     axes.set_xticks(table.columns.astype(int))
     axes.legend(title="sequence", loc="center left", bbox_to_anchor=(1, 0.5))
 
@@ -226,12 +196,5 @@ def _bar(axes, positions, table, width, method):
     """Bars at the means of some rows of a table, with error bars that end at lowest and highest."""
     text, color, hatch = METHODS[method]
     axes.bar(positions, table["mean"], width, label=text, color=color, hatch=hatch, edgecolor="white", linewidth=0)
-    # a mean of equal numbers may lie a bit beside them
-    errors = np.clip([table["mean"] - table["lowest"], table["highest"] - table["mean"]], 0, None)
+    errors = [table["mean"] - table["lowest"], table["highest"] - table["mean"]]
     axes.errorbar(positions, table["mean"], yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2)
-
-
-def _legend_below(figure, axes, columns):
-    """A legend below the figure with each label of a panel once."""
-    handles = dict(zip(*reversed(axes.get_legend_handles_labels())))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)

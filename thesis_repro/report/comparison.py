@@ -4,23 +4,16 @@ A figure has one row of panels an estimator and one column an error: those that 
 measures it. Several sources of masks are further rows.
 """
 
+import textwrap
+from itertools import cycle
+
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.ticker import MaxNLocator
 
-from thesis_repro.report import texts
-from thesis_repro.report.style import (
-    BASELINE,
-    BLACK,
-    GREEN,
-    MASKED,
-    ORANGE,
-    PAGE_WIDTH,
-    PINK,
-    SKY,
-    new_figure,
-    ratio_axis,
-)
+from thesis_repro.report import style, texts
+from thesis_repro.report.style import BASELINE, BLACK, GREEN, MASKED, ORANGE, PINK, SKY
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
 
@@ -33,10 +26,11 @@ KEYS = ["source", "method", "dilation_width", "estimator"]
 
 def figure_comparison(table):
     """Every method's ratio to all keypoints, a row each: sequences in grey, geometric mean, bootstrap interval."""
-    rows = _against_all_keypoints(table)
+    rows = _tested(_over_all_keypoints(table))
     labels = _labels(rows)
-    order = list(dict.fromkeys(labels))
-    figure, panels = _panels(rows, height=0.9 + 0.21 * len(order), sharey=True)
+    order = list(labels.unique())
+    figure, panels = _panels(rows, height=0.9 + 0.21 * len(order), xlabel="ratio to all keypoints\n(left of 1: lower)",
+                             sharey=True)
     for panel, of_panel in panels:
         for index, row in of_panel.iterrows():
             y, color = order.index(labels[index]), MASKED if row["method"] == "masked" else BASELINE
@@ -44,132 +38,110 @@ def figure_comparison(table):
             panel.plot(values, [y - 0.22] * len(values), "o", color="#555555", alpha=0.45, markersize=3,
                        markeredgewidth=0)
             panel.plot([row["low"], row["high"]], [y + 0.1] * 2, color=color, linewidth=2.2)
-            panel.plot(row["ratio"], y + 0.1, "D" if row["method"] == "masked" else "o", color=color, markersize=5,
-                       markeredgecolor="white")
+            panel.plot(row["ratio"], y + 0.1, "D", color=color, markersize=5, markeredgecolor="white")
         panel.axvline(1, color="black", linewidth=0.8)
         panel.grid(axis="y", visible=False)
         panel.set_yticks(range(len(order)), order, fontsize=7)
         panel.set_ylim(len(order) - 0.5, -0.6)
-        _ratio_axis(panel.xaxis)
-    for panel in figure.axes[-len(panels) // len(set(rows["estimator"])):]:
-        panel.set_xlabel("ratio to all keypoints\n(left of 1: lower)", fontsize=8)
+        style.ratio_axis(panel.xaxis, np.concatenate([line.get_xdata() for line in panel.lines]))
     return figure
 
 
 def figure_keypoints(table):
     """Ratio to all keypoints against the mean number of keypoints; lines lead through the other widths."""
-    rows = table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
-    several = rows["source"].nunique() > 1
-    rows = rows[rows["method"] == "masked"] if several else rows
-    series = rows["source"] if several else rows["method"]
-    tested = set(_against_all_keypoints(table).index)
-    figure, panels = _panels(rows, height=2.3)
+    rows, looks = _arms(table)
+    tested = _tested(rows)
+    figure, panels = _panels(rows, height=2.3, xlabel="mean number of keypoints")
     for panel, of_panel in panels:
-        for place, (name, line) in enumerate(of_panel.sort_values("keypoints").groupby(series, sort=False)):
-            style = {"color": COLORS[place % len(COLORS)], "marker": MARKERS[place % len(MARKERS)]} if several else \
-                _style(name)
-            at_width = line[line.index.isin(tested)]
-            panel.plot(line["keypoints"], line["ratio"], color=style["color"], linewidth=0.9, alpha=0.6)
-            for row in at_width.itertuples():
-                panel.plot([row.keypoints] * 2, [row.low, row.high], color=style["color"], linewidth=1.6)
+        for name, look in looks.items():
+            line = of_panel[of_panel["arm"] == name].sort_values("keypoints")
+            at_width = line[line.index.isin(tested.index)]
+            panel.plot(line["keypoints"], line["ratio"], color=look["color"], linewidth=0.9, alpha=0.6)
+            panel.vlines(at_width["keypoints"], at_width["low"], at_width["high"], color=look["color"], linewidth=1.6)
             panel.plot(at_width["keypoints"], at_width["ratio"], linestyle="none", markersize=6,
-                       markeredgecolor="white", markeredgewidth=0.5,
-                       label=name if several else compare.METHODS[name], **style)
+                       markeredgecolor="white", markeredgewidth=0.5, label=name, **look)
         panel.plot(of_panel["reference_keypoints"].iloc[0], 1, "k*", markersize=8, label=compare.METHODS["baseline"])
         panel.axhline(1, color="black", linewidth=0.8)
         panel.xaxis.set_major_locator(MaxNLocator(4))
-        _ratio_axis(panel.yaxis)
-    _legend(figure, figure.axes)
-    for panel in figure.axes[-len(panels) // len(set(rows["estimator"])):]:
-        panel.set_xlabel("mean number of keypoints", fontsize=8)
+        intervals = tested.loc[tested.index.intersection(of_panel.index), ["low", "high"]]
+        style.ratio_axis(panel.yaxis, [*of_panel["ratio"], *intervals.to_numpy().ravel(), 1])
+    style.legend_below(figure, figure.axes, 4)
     return figure
 
 
-def figure_sequences(table, runs, metric="rmse_boresight_corrected"):
+def figure_sequences(table, runs):
     """Ratio to all keypoints against keypoints, one panel a sequence, under the estimator that judges.
 
     runs: those of the table, for the number of keypoints of each sequence.
     """
-    metric = metric if (table["metric"] == metric).any() else "rmse"
+    metric = next(name for name in SHOWN if (table["metric"] == name).any())
     estimator = compare.judging_estimator(table)
-    rows = table[(table["reference"] == "baseline") & (table["metric"] == metric) & (table["method"] != "baseline")
-                 & (table["estimator"] == estimator)]
-    several = rows["source"].nunique() > 1
-    rows = rows[rows["method"] == "masked"] if several else rows
+    rows, looks = _arms(table[(table["metric"] == metric) & (table["estimator"] == estimator)])
     keypoints = runs.groupby([*KEYS, "sequence"], dropna=False)["mean_keypoints"].mean().rename("own").reset_index()
-    points = rows.melt(KEYS, _sequences(table), "sequence", "its_ratio").merge(keypoints).dropna(subset=["its_ratio"])
-    names = sorted(points["sequence"].unique())
-    columns = min(4, len(names))
-    count = -(-len(names) // columns)
-    figure, axes = new_figure(count, columns, height=PAGE_WIDTH / columns * count * 0.85 + 0.9, squeeze=False)
-    for panel in axes.flat[len(names):]:
-        panel.set_axis_off()
-    for panel, name in zip(axes.flat, names):
-        own = points[points["sequence"] == name].sort_values("own")
-        for place, (key, line) in enumerate(own.groupby("source" if several else "method", sort=False)):
-            style = {"color": COLORS[place % len(COLORS)], "marker": MARKERS[place % len(MARKERS)]} if several else \
-                _style(key)
-            panel.plot(line["own"], line["its_ratio"], linewidth=0.9, markersize=4.5, markeredgewidth=0,
-                       label=key if several else compare.METHODS[key], **style)
+    points = rows.melt([*KEYS, "arm"], _sequences(table), "sequence", "own_ratio").merge(keypoints).dropna(
+        subset="own_ratio").sort_values("own")
+    figure, panels = style.small_panels(sorted(points["sequence"].unique()), "number of keypoints")
+    for panel in panels:
+        own = points[points["sequence"] == panel.get_title()]
+        for name, look in looks.items():
+            line = own[own["arm"] == name]
+            panel.plot(line["own"], line["own_ratio"], linewidth=0.9, markersize=4.5, markeredgewidth=0, label=name,
+                       **look)
         panel.axhline(1, color="black", linewidth=0.8)
-        panel.set_title(name)
-        panel.tick_params(labelsize=7)
-        panel.xaxis.set_major_locator(MaxNLocator(3))
-        _ratio_axis(panel.yaxis)
-    _legend(figure, axes.flat[:len(names)])
+        style.ratio_axis(panel.yaxis, [*own["own_ratio"], 1])
+    style.legend_below(figure, panels, 4)
     figure.suptitle(f"{compare.METRICS[metric]}, {ESTIMATORS[estimator]}: ratio to all keypoints", fontsize=9)
-    for panel in axes.flat[max(0, len(names) - columns):len(names)]:
-        panel.set_xlabel("number of keypoints", fontsize=8)
     return figure
 
 
-def _ratio_axis(axis):
-    """Make an axis logarithmic, with 1 in it, around what its panel's lines show."""
-    values = np.concatenate([line.get_data()[axis.axis_name == "y"] for line in axis.axes.lines]).astype(float)
-    values = [*values[np.isfinite(values) & (values > 0)], 1]
-    ratio_axis(axis, min(values), max(values))
-
-
-def _style(method):
-    place = list(compare.METHODS).index(method)
-    return {"color": COLORS[place], "marker": MARKERS[place]}
-
-
-def _panels(rows, height, **options):
+def _panels(rows, height, xlabel, **options):
     """(figure, (panel, its rows)), one row of panels an estimator and one column an error; height: inches a row."""
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
     metrics = [name for name in SHOWN if (rows["metric"] == name).any()]
-    figure, axes = new_figure(len(estimators), len(metrics), height=0.7 + height * len(estimators), squeeze=False,
-                              **options)
-    panels = []
-    for row, estimator in zip(axes, estimators):
-        row[0].set_ylabel(ESTIMATORS[estimator])
-        for panel, metric in zip(row, metrics):
-            panel.tick_params(labelsize=7)
-            panels.append((panel, rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]))
+    figure, axes = style.new_figure(len(estimators), len(metrics), height=0.7 + height * len(estimators), squeeze=False,
+                                    **options)
     for panel, metric in zip(axes[0], metrics):
-        panel.set_title(compare.METRICS[metric].replace(", ", ",\n"))
-    return figure, panels
+        panel.set_title(textwrap.fill(compare.METRICS[metric], 18))
+    for panel, estimator in zip(axes[:, 0], estimators):
+        panel.set_ylabel(ESTIMATORS[estimator])
+    for panel in axes[-1]:
+        panel.set_xlabel(xlabel, fontsize=8)
+    for panel in axes.flat:
+        panel.tick_params(labelsize=7)
+    groups = rows.groupby(["estimator", "metric"])
+    keys = [(estimator, metric) for estimator in estimators for metric in metrics]
+    return figure, [(panel, groups.get_group(key)) for panel, key in zip(axes.flat, keys, strict=True)]
 
 
-def _legend(figure, axes):
-    handles = {label: handle for panel in axes for handle, label in zip(*panel.get_legend_handles_labels())}
-    order = [name for name in compare.METHODS.values() if name in handles]
-    order += [name for name in handles if name not in order]  # sources
-    figure.legend([handles[name] for name in order], order, loc="outside lower center", ncols=4)
+def _over_all_keypoints(table):
+    return table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
 
 
-def _against_all_keypoints(table):
-    """Every method over all keypoints: at the tested width, or at every one where none of its source is tested."""
-    rows = table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
+def _arms(table):
+    """(rows over all keypoints, {arm: colour and marker}); arm, a column of the rows, says which line they belong to.
+
+    A line is a method, or the masks of one source where there are several.
+    """
+    rows = _over_all_keypoints(table)
+    if rows["source"].nunique() > 1:
+        rows = rows[rows["method"] == "masked"]
+        rows, names = rows.assign(arm=rows["source"]), rows["source"].unique()
+    else:
+        rows, names = rows.assign(arm=rows["method"].map(compare.METHODS)), compare.METHODS.values()
+    looks = {name: {"color": color, "marker": marker}
+             for name, color, marker in zip(names, cycle(COLORS), cycle(MARKERS)) if (rows["arm"] == name).any()}
+    return rows, looks
+
+
+def _tested(rows):
+    """Rows at the tested width, or at every one where masks of their source have none of that width."""
     masked = rows[(rows["method"] == "masked") & rows["tested"]]
     return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
 
 
 def _labels(rows):
     """What each row is called: source where there are several, method, width of masks."""
-    several = rows["source"].nunique() > 1
-    source = rows["source"] + ": " if several else ""
+    source = rows["source"] + ": " if rows["source"].nunique() > 1 else ""
     width = rows["dilation_width"].where(rows["method"] == "masked")
     width = width.map(", width {:g}".format, na_action="ignore").fillna("")
     return source + rows["method"].map(compare.METHODS) + width
@@ -185,22 +157,19 @@ def table_comparison(table):
 
     The last column is the verdict of the errors that judge together (`compare.overall`).
     """
-    rows = pd.concat([_against_all_keypoints(table), table[table["reference"] != "baseline"]])
-    rows = rows.assign(what=_labels(rows), place=range(len(rows)))
+    rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
+    rows = rows.assign(what=_labels(rows))
     shown = []
-    for _, of_pair in rows.groupby(["estimator", *KEYS[:3], "reference_source", "reference"], dropna=False, sort=False):
-        first, judging = of_pair.iloc[0], of_pair[of_pair["metric"].isin(compare.JUDGING_METRICS)]
-        reference = compare.METHODS[first["reference"]]
-        if first["reference_source"] not in ("", first["source"]):
-            reference = f"{first['reference_source']}: {reference}"
+    for _, pair in rows.groupby(["estimator", *KEYS[:3], "reference_source", "reference"], dropna=False, sort=False):
+        first, judging = pair.iloc[0], pair[pair["metric"].isin(compare.JUDGING_METRICS)]
+        other_source = "" if first["reference_source"] in ("", first["source"]) else f"{first['reference_source']}: "
         shown.append({
             "estimator": ESTIMATORS[first["estimator"]], "keypoints": first["what"],
-            "number": round(first["keypoints"]), "over": reference, "sequences": of_pair["n"].max(),
-            **{compare.METRICS[row["metric"]]: _short(row) for _, row in of_pair.iterrows()},
+            "number": round(first["keypoints"]), "over": other_source + compare.METHODS[first["reference"]],
+            "sequences": pair["n"].max(), **{compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()},
             "verdict": compare.overall(judging["verdict"]) if len(judging) else pd.NA})
-    columns = ["estimator", "keypoints", "number", "over", "sequences",
-               *(name for name in compare.METRICS.values() if any(name in row for row in shown)), "verdict"]
-    return pd.DataFrame(shown, columns=columns)
+    table = pd.DataFrame(shown)
+    return table[[*(name for name in table if name != "verdict"), "verdict"]]
 
 
 def _short(row):
@@ -212,30 +181,46 @@ def table_widths(runs):
 
     Below each source's sequences their geometric mean with its bootstrap interval, and in how many the error is lower.
     """
-    tables = []
+    tables = {}
     for source in compare.sources(runs) or [""]:
         own = compare.of_source(runs, source)
         if compare.of_method(own, "masked")["dilation_width"].nunique() > 1:
-            part = _widths(own)
-            tables.append(part.assign(masks=source)[["masks", *part]] if len(compare.sources(runs)) > 1 else part)
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+            tables[source] = _widths(own)
+    if len(compare.sources(runs)) > 1 and tables:
+        return pd.concat(tables, names=["masks"]).reset_index("masks")
+    return next(iter(tables.values()), pd.DataFrame())
 
 
 def _widths(runs):
     chosen, baseline = thesis_tables.chosen_widths(runs), compare.of_method(runs, "baseline")
     metrics = [name for name in ("rmse", "rmse_boresight_corrected") if name in runs and runs[name].notna().any()]
-    shown, ratios = pd.DataFrame(index=chosen.index), {}
+    columns, ratios = {}, {}
     for choice, words in CHOICES.items():
-        shown[words] = chosen[choice]
+        columns[words] = chosen[choice]
+        rows = thesis_tables.of_chosen_width(runs, chosen[choice])
         for metric in metrics:
-            rows = thesis_tables.of_chosen_width(runs, chosen[choice])
-            ratios[f"{words}: {compare.METRICS[metric]}"] = compare.ratios(rows, baseline, metric)
-            shown[f"{words}: {compare.METRICS[metric]}"] = np.nan
-    again = thesis_tables.stability(runs)
-    ratios["best width of one repetition, in the others: RMSE"] = again["elsewhere"]
-    shown = shown.assign(**{name: values.map(texts.number, na_action="ignore") for name, values in ratios.items()},
-                         **{"same best width in two repetitions (%)": again["same_best"].round()})
+            name = f"{words}: {compare.METRICS[metric]}"
+            columns[name] = ratios[name] = compare.ratios(rows, baseline, metric)
+    again, name = thesis_tables.stability(runs), "best width of one repetition, in the others: RMSE"
+    columns[name] = ratios[name] = again["elsewhere"]
+    columns["same best width in two repetitions (%)"] = again["same_best"].round()
+    table = pd.DataFrame(columns, index=chosen.index).astype(object)
+    table[list(ratios)] = table[list(ratios)].map(texts.number, na_action="ignore")
     below = {"geometric mean": {name: _short(compare.geometric_mean(values)) for name, values in ratios.items()},
              "lower in": {name: f"{(values < 1).sum()} of {values.notna().sum()}" for name, values in ratios.items()}}
-    table = pd.concat([shown, pd.DataFrame(below).T]).reindex(columns=shown.columns)
+    table = pd.concat([table, pd.DataFrame(below).T]).reindex(columns=table.columns)
     return table.rename_axis("sequence").reset_index()
+
+
+def save(table, runs, folder, note):
+    """Write the three figures and both tables into a folder; returns (kind, name) of each."""
+    figures = {"comparison": figure_comparison(table), "comparison_keypoints": figure_keypoints(table),
+               "comparison_sequences": figure_sequences(table, runs)}
+    tables = {"comparison": table_comparison(table), "widths": table_widths(runs)}
+    tables = {name: shown for name, shown in tables.items() if len(shown)}
+    for name, figure in figures.items():
+        style.save_figure(figure, folder, name, note)
+        plt.close(figure)
+    for name, shown in tables.items():
+        style.save_table(shown, folder, name, note)
+    return [*(("figure", name) for name in figures), *(("table", name) for name in tables)]

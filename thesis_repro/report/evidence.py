@@ -56,16 +56,11 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
     longrun.sweep(folder)
-    for name, content in {"comparison": comparison.table_comparison(table), "audit": audit.table(measured),
-                          "widths": comparison.table_widths(runs)}.items():
-        style.save_table(content, folder, name, note)
+    style.save_table(audit.table(measured), folder, "audit", note)
+    comparison.save(table, runs, folder, note)
     for name, content in {"runs": runs, "switches": switches}.items():
         # six digits are more than shuffling the matched points leaves alone
         write_text(folder / f"{name}.csv", content.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
-    for name, figure in {"comparison": comparison.figure_comparison(table),
-                         "comparison_keypoints": comparison.figure_keypoints(table),
-                         "comparison_sequences": comparison.figure_sequences(table, runs)}.items():
-        style.save_figure(figure, folder, name, note)
     write_text(folder / "README.md", texts.render("evidence.md.j2", findings=texts.findings(runs, table, note)))
     files = sorted(path for path in folder.iterdir() if path.is_file())
     size = sum(path.stat().st_size for path in files)

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import matplotlib.pyplot as plt
-
 from thesis_repro import stages
 from thesis_repro.files import write_text
 from thesis_repro.report import comparison, page, style, tables, texts
@@ -20,18 +18,8 @@ def write(study, runs, folder):
     table, note = compare.comparisons(runs), data_note(study)
     style.save_table(runs.round(DIGITS), folder, "runs", note)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
-    figures = {"comparison": comparison.figure_comparison(table),
-               "comparison_keypoints": comparison.figure_keypoints(table),
-               "comparison_sequences": comparison.figure_sequences(table, runs)}
-    of_numbers = {"comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
-                  "errors": tables.table_errors(runs)}
-    of_numbers = {name: numbers for name, numbers in of_numbers.items() if len(numbers)}
-    for name, figure in figures.items():
-        style.save_figure(figure, folder, name, note)
-        plt.close(figure)
-    for name, numbers in of_numbers.items():
-        style.save_table(numbers, folder, name, note)
-    names = {("text", "findings"), *(("figure", name) for name in figures), *(("table", name) for name in of_numbers)}
+    style.save_table(tables.table_errors(runs), folder, "errors", note)
+    names = {("text", "findings"), ("table", "errors"), *comparison.save(table, runs, folder, note)}
     write_text(folder / page.PAGE, page.build_study(
         folder, names, study=study, embedded=is_embedded(study.kitti), kinds=KINDS, estimators=ESTIMATORS,
         line_width=controls.LINE_WIDTH, changed={source.name: _changed(source) for source in study.sources},

@@ -72,6 +72,33 @@ def show_image(axes, image, title, **options):
     axes.set_axis_off()
 
 
+def small_panels(names, xlabel="", figure=None):
+    """A grid of panels, at most four in a row, each with a name as its title and ticks that are few: (figure, panels).
+
+    xlabel: of the lowest of each column. figure: a part of one, to put them in.
+    """
+    columns = min(4, len(names))
+    rows = -(-len(names) // columns)
+    figure = figure or plt.figure(figsize=(PAGE_WIDTH, rows * 1.65 + 0.6), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for panel in panels[len(names):]:
+        panel.remove()
+    for panel, name in zip(panels, names, strict=False):
+        panel.set_title(name, fontsize=8, pad=3)
+        panel.tick_params(labelsize=7)
+        panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    panels = panels[:len(names)]
+    for panel in panels[-columns:]:
+        panel.set_xlabel(xlabel, fontsize=8)
+    return figure, panels
+
+
+def legend_below(figure, panels, columns):
+    """A legend below the figure with each label of its panels once."""
+    handles = {label: handle for panel in panels for handle, label in zip(*panel.get_legend_handles_labels())}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+
+
 def class_legend(figure, *label_maps, also=()):
     """Name the classes of label maps below a figure, which grows by the legend's height; `also`: further handles."""
     names = {}  # Cityscapes gives several labels one colour
@@ -83,13 +110,14 @@ def class_legend(figure, *label_maps, also=()):
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
 
 
-def ratio_axis(axis, low, high):
-    """Make `axis`, as axes.yaxis, logarithmic, just wider than the values `low` to `high`, with a few round ticks.
+def ratio_axis(axis, values):
+    """Make `axis`, as axes.yaxis, logarithmic, just wider than the positive ones of the values, with a few round ticks.
 
-    Equal values get room around them. Values that are not positive and finite count as 1.
+    Equal values get room around them.
     """
-    low, high = (value if np.isfinite(value) and value > 0 else 1.0 for value in (low, high))
-    low, high = min(low, high), max(low, high)
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values) & (values > 0)]
+    low, high = (values.min(), values.max()) if len(values) else (1, 1)
     margin = max((high / low) ** 0.05, 1.1 if high < 1.1 * low else 1)
     low, high = low / margin, high * margin
     # within a factor of five, ticks at equal differences are rounder than ticks at equal ratios
