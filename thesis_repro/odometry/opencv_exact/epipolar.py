@@ -4,10 +4,9 @@ from thesis_repro.compiled import inner
 
 
 @inner
-def entries(matrix):
-    """The nine entries of a 3x3 matrix, row by row: as single numbers they stay in registers."""
-    return (matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[1, 0], matrix[1, 1], matrix[1, 2],
-            matrix[2, 0], matrix[2, 1], matrix[2, 2])
+def entries(e):
+    """The nine entries of an array (9): as single numbers they stay in registers."""
+    return e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
 
 
 @inner

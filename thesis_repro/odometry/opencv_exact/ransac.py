@@ -83,7 +83,7 @@ def _opencv_solution(columns, sample, threshold, probability, limit):
     stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
     best = 0, None, None
     for start in range(0, 0 if stack is None else len(stack), 3):
-        mask = _inlier_mask(stack[start:start + 3], columns, limit)
+        mask = _inlier_mask(stack[start:start + 3].ravel(), columns, limit)
         inliers = int(mask.sum())
         if inliers > best[0]:
             best = inliers, stack[start:start + 3].copy(), mask.reshape(-1, 1)
@@ -173,8 +173,7 @@ def _may_beat(e, margin, rough, limit, best):
     # root of the sum of squares. The rounding of what is made of those two is in `wide`.
     doubt = np.float32(4.001 * margin + 1e-6 * (1 + root))
     wide = np.float32(1.00001 * limit)
-    matrix = (np.float32(e[0]), np.float32(e[1]), np.float32(e[2]), np.float32(e[3]), np.float32(e[4]),
-              np.float32(e[5]), np.float32(e[6]), np.float32(e[7]), np.float32(e[8]))
+    matrix = epipolar.entries(e.astype(np.float32))
     outliers = 0
     for start in range(0, count, SCORING_BLOCK):
         stop = min(start + SCORING_BLOCK, count)
@@ -214,7 +213,7 @@ def _bounds(e, margin, columns, limit, best):
 @inner
 def _bounds_of_block(e, margin, x, y, u, v, limit):
     root = np.sqrt(limit)
-    matrix = e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
+    matrix = epipolar.entries(e)
     low, high = 0, 0
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.linalg import lapack
 
-from thesis_repro.compiled import fast, inner
+from thesis_repro.compiled import fast
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
 
@@ -21,7 +20,6 @@ RESTART_SCALES = (4, 1)  # thresholds: scales of the second start
 SAME_MOTION_COSINE = np.cos(np.radians(15.0))  # of the angle between two directions of motion
 LOWER_COST = 0.99  # of the first start's cost: below it, the difference is more than rounding
 POINTS_PER_BLOCK = 64
-DIAGONAL = np.diag_indices(5)
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, p
                     threshold)
     second = first
     for scale in RESTART_SCALES:
-        second = _minimise(second, current, previous, scale * threshold)
+        second = _minimise(*second, current, previous, scale * threshold)
     near_second = near(*second, current, previous, SUPPORT_THRESHOLDS * threshold)
     second = _rounds(second, current, previous, near_second, threshold)
     first_cost, second_cost = (_normal_equations(*motion, current, previous, threshold / 2)[0]
@@ -90,7 +88,7 @@ def _rounds(motion, current, previous, chosen, threshold):
     for _ in range(REFINE_ROUNDS):
         if chosen.sum() < MIN_CORRESPONDENCES:
             break
-        motion = _minimise(motion, current[chosen], previous[chosen], threshold / 2)
+        motion = _minimise(*motion, current[chosen], previous[chosen], threshold / 2)
         chosen = near(*motion, current, previous, SUPPORT_THRESHOLDS * threshold)
     return motion
 
@@ -113,10 +111,7 @@ def _deviations(rotation, translation, current, previous, scale):
 @fast
 def near(r, t, current, previous, limit):
     """N booleans: the correspondences whose Sampson distance from the motion is below the limit."""
-    cross, matrix = np.empty((3, 3)), np.empty((3, 3))
-    _skew(t, cross)
-    np.dot(cross, r, matrix)
-    essential = epipolar.entries(matrix)
+    essential = epipolar.entries(np.dot(_skew(t), r).ravel())
     mask = np.empty(len(current), np.bool_)
     for index in range(len(current)):
         x, y = current[index, 0], current[index, 1]
@@ -126,14 +121,16 @@ def near(r, t, current, previous, limit):
     return mask
 
 
-def _minimise(motion, current, previous, scale):
+@fast
+def _minimise(r, t, current, previous, scale):
     """Levenberg and Marquardt's iteration: steps of (H + damping diag H) change = -gradient, while the cost falls."""
-    (r, t), damping = motion, 1e-4
+    damping = 1e-4
     cost, hessian, gradient = _normal_equations(r, t, current, previous, scale)
     for _ in range(MAX_ITERATIONS):
         damped = hessian.copy()
-        damped[DIAGONAL] += damping * hessian[DIAGONAL] + 1e-12
-        change = lapack.dgesv(damped, -gradient)[2]
+        for k in range(5):
+            damped[k, k] += damping * hessian[k, k] + 1e-12
+        change = np.linalg.solve(damped, -gradient)
         r_new, t_new = _moved(r, t, change)
         cost_new, hessian_new, gradient_new = _normal_equations(r_new, t_new, current, previous, scale)
         if cost_new < cost:
@@ -176,80 +173,66 @@ def cheirality_votes(rotation, t, current, previous, parallax):
     return forward, backward
 
 
-@inner
-def _cross(a, b, out):
-    """Write the cross product of two vectors."""
-    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+@fast
+def _skew(v):
+    """The matrix [v]x of the cross product with v (Equation 2.5)."""
+    matrix = np.zeros((3, 3))
+    matrix[0, 1], matrix[0, 2], matrix[1, 2] = -v[2], v[1], -v[0]
+    matrix[1, 0], matrix[2, 0], matrix[2, 1] = v[2], -v[1], v[0]
+    return matrix
 
 
-@inner
-def _skew(v, out):
-    """Write the matrix [v]x of the cross product with v (Equation 2.5)."""
-    out[0, 0], out[0, 1], out[0, 2] = 0.0, -v[2], v[1]
-    out[1, 0], out[1, 1], out[1, 2] = v[2], 0.0, -v[0]
-    out[2, 0], out[2, 1], out[2, 2] = -v[1], v[0], 0.0
+@fast
+def _normalised(v0, v1, v2):
+    """The unit vector (3) in the direction of three numbers."""
+    norm, vector = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2), np.empty(3)
+    vector[0], vector[1], vector[2] = v0 / norm, v1 / norm, v2 / norm
+    return vector
 
 
-@inner
+@fast
 def _tangents(t):
-    """Two unit vectors (2, 3) that are perpendicular to the unit vector t and to each other."""
-    axis, tangents = np.zeros(3), np.empty((2, 3))
-    least = 0
-    for k in range(1, 3):
-        if abs(t[k]) < abs(t[least]):
-            least = k
-    axis[least] = 1.0
-    first = tangents[0]
-    _cross(t, axis, first)
-    norm = np.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
-    for k in range(3):
-        first[k] /= norm
-    _cross(t, first, tangents[1])
-    return tangents
+    """Two unit vectors that are perpendicular to the unit vector t and to each other."""
+    if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):  # the first is at right angles to the axis t is farthest from
+        first = _normalised(0.0, t[2], -t[1])
+    elif abs(t[1]) <= abs(t[2]):
+        first = _normalised(-t[2], 0.0, t[0])
+    else:
+        first = _normalised(t[1], -t[0], 0.0)
+    second = np.empty(3)
+    second[0], second[1] = t[1] * first[2] - t[2] * first[1], t[2] * first[0] - t[0] * first[2]
+    second[2] = t[0] * first[1] - t[1] * first[0]
+    return first, second
 
 
 @fast
 def _moved(r, t, change):
     """The motion after a change of five parameters: exp([turn]x) R (Rodrigues' formula), t moved along its tangents."""
     angle = np.sqrt(change[0] * change[0] + change[1] * change[1] + change[2] * change[2])
-    cross, square, rodrigues, r_new = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    _skew(change, cross)
-    np.dot(cross, cross, square)
+    cross, rodrigues = _skew(change), np.empty((3, 3))
+    square = np.dot(cross, cross)
+    sine, cosine = (np.sin(angle) / angle, (1 - np.cos(angle)) / (angle * angle)) if angle > 1e-12 else (1.0, 0.0)
     for i in range(3):
         for j in range(3):
-            rodrigues[i, j] = 1.0 if i == j else 0.0
-            if angle > 1e-12:
-                rodrigues[i, j] = (rodrigues[i, j] + np.sin(angle) / angle * cross[i, j]
-                                   + (1 - np.cos(angle)) / (angle * angle) * square[i, j])
-            else:
-                rodrigues[i, j] += cross[i, j]
-    np.dot(rodrigues, r, r_new)
-    tangents, t_new = _tangents(t), np.empty(3)
-    for k in range(3):
-        t_new[k] = t[k] + change[3] * tangents[0, k] + change[4] * tangents[1, k]
-    norm = np.sqrt(t_new[0] * t_new[0] + t_new[1] * t_new[1] + t_new[2] * t_new[2])
-    for k in range(3):
-        t_new[k] /= norm
-    return r_new, t_new
+            rodrigues[i, j] = (i == j) + sine * cross[i, j] + cosine * square[i, j]
+    first, second = _tangents(t)
+    return np.dot(rodrigues, r), _normalised(t[0] + change[3] * first[0] + change[4] * second[0],
+                                             t[1] + change[3] * first[1] + change[4] * second[1],
+                                             t[2] + change[3] * first[2] + change[4] * second[2])
 
 
-@inner
+@fast
 def _essential_and_derivatives(r, t):
-    """E (6, 3, 3) and its derivatives: [t]x [unit]x R by the rotation's three, [tangent]x R by t's two parameters."""
-    matrices, tangents = np.empty((6, 3, 3)), _tangents(t)
-    cross_t, cross, product, unit = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    _skew(t, cross_t)
-    np.dot(cross_t, r, matrices[0])
+    """E (6, 9), row by row, and its derivatives: [t]x [unit]x R by the rotation's three, [tangent]x R by t's two."""
+    matrices, unit = np.empty((6, 3, 3)), np.zeros((3, 3))
+    cross, (first, second) = _skew(t), _tangents(t)
+    np.dot(cross, r, matrices[0])
     for k in range(3):
-        for i in range(3):
-            unit[i] = 1.0 if i == k else 0.0
-        _skew(unit, cross)
-        np.dot(cross, r, product)
-        np.dot(cross_t, product, matrices[1 + k])
-    for k in range(2):
-        _skew(tangents[k], cross)
-        np.dot(cross, r, matrices[4 + k])
-    return matrices
+        unit[k, k] = 1.0
+        np.dot(cross, np.dot(_skew(unit[k]), r), matrices[1 + k])
+    np.dot(_skew(first), r, matrices[4])
+    np.dot(_skew(second), r, matrices[5])
+    return matrices.reshape(6, 9)
 
 
 @fast

@@ -7,7 +7,7 @@ motion lies within given angles of an expected one are counted, so the other can
 
 import numpy as np
 
-from thesis_repro.compiled import fast
+from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
 from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, OPENCV_SEED, draw
@@ -24,58 +24,74 @@ def ransac_with_prior(current: np.ndarray, previous: np.ndarray, threshold: floa
     translation's sign is not looked at.
     """
     columns = np.ascontiguousarray(np.hstack([current, previous]).T)
-    matrices = _candidates(columns)
-    headings = _translations(matrices)
-    near = np.abs((headings * translation).sum(axis=1)) >= np.cos(np.radians(min(max_heading, 90.0)))
-    matrices, headings = matrices[near], headings[near]
-    most, best = 0, None
-    pairs = (headings, _rotations(matrices, headings)), (-headings, _rotations(matrices, -headings))
-    near_rotation = [((rotations * rotation).sum(axis=(1, 2)) - 1) / 2 >= np.cos(np.radians(min(max_rotation, 180.0)))
-                     for _, rotations in pairs]
-    for index in np.flatnonzero(near_rotation[0] | near_rotation[1]):
-        inliers = _count_inliers(matrices[index], columns, threshold * threshold)
-        if inliers > most:
-            signed_headings, rotations = pairs[0 if near_rotation[0][index] else 1]
-            most, best = inliers, (rotations[index], signed_headings[index])
-    return best
+    most, best_rotation, best_translation = _best(
+        columns, threshold * threshold, np.ascontiguousarray(rotation), np.ascontiguousarray(translation),
+        np.cos(np.radians(min(max_rotation, 180.0))), np.cos(np.radians(min(max_heading, 90.0))),
+        np.uint64(OPENCV_SEED))
+    return (best_rotation, best_translation) if most else None
 
 
-def _candidates(columns):
-    """Essential matrices (K, 3, 3) of unit norm through random samples of five correspondences (columns: 4, N)."""
-    state, sample, five = OPENCV_SEED, np.empty(SAMPLE_SIZE, np.int64), np.empty((SAMPLE_SIZE, 4))
-    solutions = [np.empty((0, 9))]
+@fast
+def _best(columns, limit, rotation, translation, min_rotation_cosine, min_heading_cosine, state):
+    sample, five = np.empty(SAMPLE_SIZE, np.int64), np.empty((SAMPLE_SIZE, 4))
+    r, t = np.empty((3, 3)), np.empty(3)
+    most, best_r, best_t = 0, np.empty((3, 3)), np.empty(3)
     for _ in range(MAX_SAMPLES):
-        state = draw(np.uint64(state), columns, sample, five)
-        sure, matrices, _ = solve(five)
-        if sure:
-            solutions.append(matrices)
-    return np.concatenate(solutions).reshape(-1, 3, 3)
+        state = draw(state, columns, sample, five)
+        _, solutions, _ = solve(five)  # none where it is unsure
+        for index in range(len(solutions)):
+            e, near = epipolar.entries(solutions[index]), False
+            _translation(e, t)
+            if abs(t[0] * translation[0] + t[1] * translation[1] + t[2] * translation[2]) < min_heading_cosine:
+                continue
+            for _ in range(2):  # with t, and with -t, which belongs to the other rotation
+                _rotation(e, t, r)
+                product = 0.0
+                for i in range(3):
+                    for j in range(3):
+                        product += r[i, j] * rotation[i, j]
+                near = (product - 1) / 2 >= min_rotation_cosine
+                if near:
+                    break
+                t[0], t[1], t[2] = -t[0], -t[1], -t[2]
+            if not near:
+                continue
+            inliers = 0
+            for k in range(columns.shape[1]):
+                algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(e, columns[0, k], columns[1, k], columns[2, k],
+                                                                   columns[3, k])
+                inliers += 1 if algebraic * algebraic <= limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) else 0
+            if inliers > most:
+                most, best_r, best_t = inliers, r.copy(), t.copy()
+    return most, best_r, best_t
 
 
-def _translations(matrices):
-    """The unit translations (K, 3) of essential matrices (K, 3, 3), of any sign: each is normal to all columns."""
-    normals = np.stack([np.cross(matrices[:, :, a], matrices[:, :, (a + 1) % 3]) for a in range(3)])
-    squares = (normals * normals).sum(axis=2)
-    index = squares.argmax(axis=0), np.arange(len(matrices))  # of the best conditioned pair of columns
-    return normals[index] / np.sqrt(squares[index])[:, None]
+@inner
+def _translation(e, t):
+    """Write the unit translation of an essential matrix, one of its two signs: it is normal to all columns."""
+    largest = -1.0
+    for a in range(3):  # the best conditioned pair of columns gives it
+        b = (a + 1) % 3
+        c0 = e[3 + a] * e[6 + b] - e[6 + a] * e[3 + b]
+        c1 = e[6 + a] * e[b] - e[a] * e[6 + b]
+        c2 = e[a] * e[3 + b] - e[3 + a] * e[b]
+        size = c0 * c0 + c1 * c1 + c2 * c2
+        if size > largest:
+            largest, t[0], t[1], t[2] = size, c0, c1, c2
+    norm = np.sqrt(largest)
+    t[0], t[1], t[2] = t[0] / norm, t[1] / norm, t[2] / norm
 
 
-def _rotations(matrices, translations):
-    """The rotations (K, 3, 3) that make essential matrices (K, 3, 3, unit norm) [t]x R for unit translations (K, 3).
+@inner
+def _rotation(e, t, r):
+    """Write the rotation that makes an essential matrix (unit norm) [t]x R; the other sign of t gives the other one.
 
     Horn (1990), Recovering baseline and orientation from essential matrix: R = cof(E) - [t]x E for unit t.
     """
     size = np.sqrt(2.0)  # the norm of [t]x R
-    cofactors = np.stack([np.cross(matrices[:, (i + 1) % 3], matrices[:, (i + 2) % 3]) for i in range(3)], axis=1)
-    return size * size * cofactors - size * np.cross(translations[:, :, None], matrices, axis=1)
-
-
-@fast
-def _count_inliers(matrix, columns, limit):
-    """How many correspondences (4, N) have a squared Sampson distance within the limit."""
-    e, inliers = epipolar.entries(matrix), 0
-    for k in range(columns.shape[1]):
-        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(e, columns[0, k], columns[1, k], columns[2, k],
-                                                           columns[3, k])
-        inliers += 1 if algebraic * algebraic <= limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) else 0
-    return inliers
+    for i in range(3):
+        i1, i2 = 3 * ((i + 1) % 3), 3 * ((i + 2) % 3)
+        for j in range(3):
+            j1, j2 = (j + 1) % 3, (j + 2) % 3
+            cofactor = e[i1 + j1] * e[i2 + j2] - e[i1 + j2] * e[i2 + j1]
+            r[i, j] = size * size * cofactor - size * (t[(i + 1) % 3] * e[i2 + j] - t[(i + 2) % 3] * e[i1 + j])
