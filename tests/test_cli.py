@@ -1,5 +1,4 @@
 import json
-import os
 import subprocess
 import sys
 from importlib import metadata
@@ -106,14 +105,6 @@ def test_frames_without_any_keypoint_end_well(tiny_kitti, capsys):
         cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
     assert run("odometry", "--kitti", tiny_kitti, "--sequence", "00", "--json") == 0
     assert printed(capsys)["mean_keypoints"] == 0
-
-
-def test_the_shell_is_told_what_could_come_next(tmp_path):
-    line = "thesis-repro evaluate --al"
-    request = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "answer"), "COMP_LINE": line,
-               "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
-    subprocess.run([sys.executable, "-m", "thesis_repro"], env=os.environ | request, check=True)
-    assert (tmp_path / "answer").read_text().strip() == "--align"
 
 
 @pytest.mark.real

@@ -127,7 +127,7 @@ def test_a_log_has_what_was_said_every_warning_and_the_error(tmp_path, capsys):
         longrun.say("sequence 00 failed", warning=True)
         run.end("3 runs")
         raise InputError("bad")
-    assert capsys.readouterr().out.startswith("sequence 00 failed\n3 runs\n0 s; 2 warnings; log: ")
+    assert capsys.readouterr().out.startswith("sequence 00 failed\n3 runs\n0:00:00 h; warnings: 2; log: ")
     lines = (tmp_path / "out" / longrun.LOG).read_text().splitlines()
     assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
     assert any("WARNING" in line and "odd" in line for line in lines)

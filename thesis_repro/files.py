@@ -4,7 +4,7 @@ import os
 import re
 import struct
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from tqdm import tqdm
 from thesis_repro import InputError, longrun
 
 BAR_DELAY = 1  # seconds before a bar shows: what is over sooner needs none
-IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 END_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # the last bytes of a whole file
 TAIL = 4096  # bytes at the end of a file, where a quick look expects its end mark
 
@@ -24,9 +23,8 @@ TAIL = 4096  # bytes at the end of a file, where a quick look expects its end ma
 def read_gray(path):
     """Read one image as 8-bit gray, shape (height, width); colours become their luminance.
 
-    Raises InputError when the file is missing, empty, truncated, corrupt or no PNG or JPEG, where it has 16 bits a
-    channel, and where it claims more pixels than Pillow takes for harmless. (JPEG has no checksums, so a changed byte
-    inside one cannot be noticed.)
+    Raises InputError for a file that is no whole PNG or JPEG of 8 bits a channel, and for one that claims more pixels
+    than Pillow takes for harmless. (JPEG has no checksums, so a changed byte inside one cannot be noticed.)
     """
     return _read(path, "L", cv2.IMREAD_GRAYSCALE)
 
@@ -45,16 +43,9 @@ def read_ids(path):
     with _errors_named(path), open(path, "rb") as file:
         image = _header(path, file)
         stored = str(image.tile)  # with Pillow's name of the mode in the file: "L;4" is gray of 4 bits
-    if image.format != "PNG":
-        raise InputError(f"{path}: is no PNG file; ids must be stored exactly, as an 8-bit gray PNG")
-    if image.mode in ("1", "P") or "L;" in stored:
-        raise InputError(f"{path}: holds {'a palette' if image.mode == 'P' else 'less than 8 bits a pixel'}, so the "
-                         "ids would be read as colours; save them as an 8-bit gray PNG")
-    if image.mode == "L":
-        return read_gray(path)
-    channels = read_color(path)
-    if (channels != channels[..., :1]).any():
-        raise InputError(f"{path}: holds colours where ids are expected; save the ids as an 8-bit gray PNG")
+    channels = np.atleast_3d(read_gray(path) if image.mode == "L" else read_color(path))
+    if image.format != "PNG" or image.mode in ("1", "P") or "L;" in stored or (channels != channels[..., :1]).any():
+        raise InputError(f"{path}: must be an 8-bit gray PNG, which keeps ids as they are; save it as one")
     return np.ascontiguousarray(channels[..., 0])
 
 
@@ -97,25 +88,16 @@ def _header(path, file):
 
 @contextmanager
 def _errors_named(path):
-    """Raise an InputError that names the image and the remedy where the system, Pillow or OpenCV raise another."""
+    """Raise an InputError that names the image where the system, Pillow or OpenCV raise another error."""
     try:
         yield
     except InputError:
         raise
-    except FileNotFoundError:
-        path = Path(path)
-        broken = f" (it is a link to {os.readlink(path)}, which does not exist)" if path.is_symlink() else ""
-        raise InputError(f"{path}: no such image{broken}; check the folder it should be in") from None
     except Image.DecompressionBombError:
-        raise InputError(f"{path}: claims to hold more pixels than any camera takes; it is damaged or made to exhaust "
-                         "memory, so take it away") from None
-    except Image.UnidentifiedImageError:
-        what = "not a PNG or JPEG image" if Path(path).stat().st_size else "is empty"
-        raise InputError(f"{path}: {what}; copy or download it again") from None
+        raise InputError(f"{path}: claims to hold more pixels than any camera takes; take it away") from None
     except (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, cv2.error) as error:
-        if getattr(error, "strerror", None):
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the file and its permissions") from None
-        raise InputError(f"{path}: the image is truncated or corrupt; copy or download it again") from None
+        reason = getattr(error, "strerror", None) or "it is no whole PNG or JPEG image; copy it again"
+        raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
 def listed(folder, pattern="*.png"):
@@ -128,9 +110,9 @@ def images(folder):
 
     Hidden ones are left out. Raises InputError where there are both kinds.
     """
-    paths = [path for path in listed(folder, "*") if path.suffix.lower() in IMAGE_FORMATS]
-    if len({IMAGE_FORMATS[path.suffix.lower()] for path in paths}) > 1:
-        raise InputError(f"{folder}: holds PNG and JPEG images; one folder must hold one kind, so move the others away")
+    paths = [path for path in listed(folder, "*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    if len({path.suffix.lower() == ".png" for path in paths}) > 1:
+        raise InputError(f"{folder}: holds PNG and JPEG images; move those of one kind away")
     numbers = numbers_of(paths)
     return paths if numbers is None else [path for _, path in sorted(zip(numbers, paths))]
 
@@ -164,13 +146,9 @@ def atomic(path):
 
 def check_output(path):
     """Raise InputError where a file that is to be written is a folder, or where no folder for it can be made."""
-    path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; name a file to write")
     parent = next(folder for folder in path.absolute().parents if folder.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        reason = "may not be written to" if parent.is_dir() else "is a file"
-        raise InputError(f"{path}: cannot be written, since {parent} {reason}; name another one")
+    if path.is_dir() or not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError(f"{path}: cannot be written; name a file in a folder that you may write to")
 
 
 def write_text(path, text):
@@ -206,12 +184,8 @@ def progress(iterable=None, description="", total=None, unit="frame", initial=0)
     terminal, a line now and then takes the place of the bar.
     """
     stream = sys.stderr
-    target = os.environ.get("THESIS_REPRO_PROGRESS")
-    if target:
-        try:
-            stream = open(target, "a", buffering=1)
-        except OSError:
-            pass
+    with suppress(KeyError, OSError):
+        stream = open(os.environ["THESIS_REPRO_PROGRESS"], "a", buffering=1)
     live = stream.isatty()
     return tqdm(iterable, desc=description, total=total, unit=unit, initial=initial, dynamic_ncols=live,
                 file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live,

@@ -1,5 +1,6 @@
 """KITTI odometry: one sequence's frames, camera, times and true poses, and trajectory files."""
 
+import warnings
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
@@ -46,32 +47,25 @@ FRAME_TIME = 0.1  # seconds between KITTI's frames, and between those of a seque
 
 
 def sequences(root: str | Path) -> list[str]:
-    """Names of the sequences under root/sequences that hold frames, sorted, less those of `without_truth`.
+    """Names of the sequences with frames and true poses, sorted. Raises InputError where there are none.
 
-    Raises InputError when there are none.
+    Of 00 to 10 only the frames need be there: if they have no poses, a file is missing, which `Sequence` says.
     """
     names = [name for name in _with_frames(root) if _has_truth(root, name)]
     if not names:
-        raise InputError(f"{Path(root) / 'sequences'}: no sequence holds frames (image_0 or image_2) and true poses; "
-                         "the images and the poses of the odometry benchmark are needed")
+        raise InputError(f"{Path(root) / 'sequences'}: no sequence holds frames (image_0 or image_2) and true poses")
     return names
 
 
 def without_truth(root: str | Path) -> list[str]:
-    """Names of the sequences that hold frames but have no true poses, sorted: the benchmark keeps those of 11 to 21 to
-    itself, and a sequence of one's own may have none.
-
-    The odometry runs over them, but there is nothing to compare it with. 00 to 10 without poses are not among them:
-    there a file is missing.
-    """
+    """Names of the other sequences with frames, sorted, such as 11 to 21, whose poses the benchmark keeps to itself."""
     return [name for name in _with_frames(root) if not _has_truth(root, name)]
 
 
 def _with_frames(root):
     root = Path(root)
     if not (root / "sequences").is_dir():
-        raise InputError(f"{root}: holds no folder 'sequences'; KITTI must name the folder that holds "
-                         "sequences/NN/image_0 and poses/NN.txt")
+        raise InputError(f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt")
     return sorted(folder.name for folder in (root / "sequences").iterdir()
                   if folder.is_dir() and (images_of(folder).name in IMAGE_FOLDERS or images(folder)))
 
@@ -81,25 +75,24 @@ def _has_truth(root, name):
 
 
 def images_of(folder: str | Path, camera: str | None = None) -> Path:
-    """Where the frames of a sequence's folder are: in the one of IMAGE_FOLDERS that `camera` names, or else in the
-    first of them that is there, or else in the folder itself.
-
-    Raises InputError for another camera.
+    """Where the frames of a sequence's folder are: in `camera`, or else the first of IMAGE_FOLDERS that is there, or
+    else the folder itself. Raises InputError for another camera and for a folder that is not there.
     """
     if camera is not None and camera not in IMAGE_FOLDERS:
         raise InputError(f"camera {camera!r}: unknown; choose one of {', '.join(sorted(IMAGE_FOLDERS))}")
     candidates = [Path(folder) / name for name in ([camera] if camera else IMAGE_FOLDERS)]
-    return next((path for path in candidates if path.is_dir()), candidates[0] if camera else Path(folder))
+    where = next((path for path in candidates if path.is_dir()), candidates[0] if camera else Path(folder))
+    if not where.is_dir():
+        raise InputError(f"{where}: no such folder; the frames must be there")
+    return where
 
 
 class Sequence:
     """One odometry sequence in the official layout: sequences/NN/image_0, calib.txt, times.txt and poses/NN.txt.
 
-    Frames are PNG or JPEG, numbered without gaps; without gray ones in image_0 the colour ones of image_2 are read, as
-    gray. Times increase, and poses are rotations of right-handed axes with positions in metres. (The true poses
-    are those of image_0's camera, 6 cm beside the other's.) Where there is no times.txt, `times` has KITTI's ten
-    frames a second. Where there is no file of poses, `has_truth` is False.
-    Everything but the frames is read and checked when the object is made; frames are read when asked for.
+    Frames are PNG or JPEG, numbered without gaps; colour ones are read as gray. Without times.txt, `times` has KITTI's
+    ten frames a second. Without a file of poses, `has_truth` is False. (The true poses are those of image_0's camera,
+    6 cm beside image_2's.) Everything but the frames is read and checked when the object is made.
     Raises InputError, naming the file, for whatever is missing or malformed.
     """
 
@@ -113,17 +106,11 @@ class Sequence:
         poses; by default one metre a frame.
         """
         self.root, self.folder, self.poses_path = _places(root, name)
-        self.name = self.folder.name
-        self.speed = speed
-        if not self.folder.is_dir():
-            raise InputError(f"{self.folder / (camera or 'image_0')}: no such folder; sequence {self.name} must hold "
-                             "its frames there (gray in image_0 or colour in image_2)")
+        self.name, self.speed = self.folder.name, speed
         where = images_of(self.folder, camera)
-        if not where.is_dir():
-            raise InputError(f"{where}: no such folder; sequence {self.name} must hold its frames there")
         self.frame_paths = images(where)
         if not self.frame_paths:
-            raise InputError(f"{where}: holds no PNG or JPEG frames; sequence {self.name} is empty")
+            raise InputError(f"{where}: holds no PNG or JPEG frames")
         check_numbering(self.frame_paths)
         self.intrinsics = read_intrinsics(self.folder / "calib.txt", where.name)
         times = self.folder / "times.txt"
@@ -134,25 +121,15 @@ class Sequence:
         if self.has_truth:
             self._poses = read_poses(self.poses_path)
             check_count(self.poses_path, len(self._poses), self.frame_paths)
-        if speed is not None:
-            self._check_speed(speed)
-
-    def _check_speed(self, speed):
-        if self.has_truth:
-            raise InputError(f"speed: sequence {self.name} has true poses ({self.poses_path}), from which the length "
-                             "of each step is taken; give none")
-        if not 0 < speed <= MAX_SPEED:
-            raise InputError(f"speed: {speed} is none; give metres a second, above 0 and at most {MAX_SPEED:,}")
-        if not self.has_times:
-            raise InputError(f"{self.folder / 'times.txt'}: no such file; a speed needs the times of the frames, in "
-                             "seconds, one a line")
+        if speed is not None and (self.has_truth or not self.has_times or not 0 < speed <= MAX_SPEED):
+            raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s, and needs {times} and no "
+                             f"{self.poses_path}, from which steps would be taken")
 
     @property
     def poses(self) -> np.ndarray:
         """True camera-to-world poses, (n, 4, 4), metres. Raises InputError where there are none."""
         if not self.has_truth:
-            raise InputError(f"{self.poses_path}: no such file; sequence {self.name} has no true poses, and this needs "
-                             "them")
+            raise InputError(f"{self.poses_path}: no such file; true poses are needed")
         return self._poses
 
     @property
@@ -175,10 +152,7 @@ class Sequence:
 
     @cached_property
     def size(self) -> tuple[int, int]:
-        """(height, width) of the first frame; every frame must have it.
-
-        Raises InputError where it is less than MIN_FRAME_SIDE, and where the camera cannot be that of such frames.
-        """
+        """(height, width) of the first frame; every frame must have it. Raises what `check_camera` raises."""
         height, width = read_gray(self.frame_paths[0]).shape
         check_camera(self.folder / "calib.txt", self.intrinsics, self.frame_paths[0], (height, width))
         return height, width
@@ -212,46 +186,35 @@ def _places(root, name):
         root, name = folder.parent.parent, folder.name  # it is one of KITTI's after all
     root, name = Path(root), str(name)
     if name in ("", ".", "..") or "/" in name:
-        raise InputError(f"sequence {name!r}: is no name of a folder in {root / 'sequences'}; give one, such as 00")
+        raise InputError(f"sequence {name!r}: must be the name of a folder in {root / 'sequences'}, such as 00")
     if name.isdigit() and not (root / "sequences" / name).is_dir():
         name = name.zfill(2)
     return root, root / "sequences" / name, root / "poses" / f"{name}.txt"
 
 
 def true_poses(root: str | Path | None, name: str | Path) -> np.ndarray:
-    """The true poses of a sequence, (n, 4, 4), whose frames need not be there; root and name as Sequence takes them.
-
-    Raises InputError where there are none.
-    """
-    path = _places(root, name)[2]
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; without true poses there is nothing to compare with")
-    return read_poses(path)
+    """The true poses of a sequence, (n, 4, 4), whose frames need not be there; root and name as Sequence takes them."""
+    return read_poses(_places(root, name)[2])
 
 
 def check_numbering(paths: list[Path]) -> None:
-    """Raise InputError for frames that count by one with a gap, and for two of one number.
+    """Raise InputError for two frames of one number, and for frames that count by one with a gap.
 
     (Every fifth frame, say, or times are no count.)
     """
-    numbers = numbers_of(paths) or []
-    for index, (before, after) in enumerate(pairwise(numbers), 1):
+    for (before, first), (after, second) in pairwise(zip(numbers_of(paths) or [], paths)):
         if before == after:
-            raise InputError(f"{paths[index]}: has the number of {paths[index - 1].name}; take one of them away")
+            raise InputError(f"{second}: has the number of {first.name}; take one of them away")
     missing = missing_frames(paths)
     if missing:
-        index = next(index for index, (before, after) in enumerate(pairwise(numbers), 1) if after - before > 1)
-        count = f"{len(missing)}{' or more' * (len(missing) == MAX_MISSING_NAMED)}"
-        more = f" ({count} are missing in all)" if len(missing) > 1 else ""
-        raise InputError(f"{missing[0]}: is missing between {paths[index - 1].name} and {paths[index].name}{more}; "
-                         "copy it again, for the odometry needs every frame")
+        raise InputError(f"{missing[0]}: this frame is missing; the odometry needs every one")
 
 
 def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
-    """The files that are not there of frames that count by one.
+    """The files that are not there of frames that count by one, at most MAX_MISSING_NAMED.
 
     count: of all frames, which then begin with 0 (KITTI's) or with 1, or else where the first of `paths` does: those
-    before the first and after the last are found too. No more than MAX_MISSING_NAMED are named.
+    before the first and after the last are missing too.
     """
     numbers = numbers_of(paths)
     steps = [after - before for before, after in pairwise(numbers or [])]
@@ -270,52 +233,28 @@ def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
-    """Raise InputError, naming the first missing frame where there is a count, unless a file has a line a frame."""
-    if count == len(frame_paths):
-        return
-    missing = missing_frames(frame_paths, count) if count > len(frame_paths) else []
-    about = f" (the first without one: {missing[0].name})" if missing else ""
-    raise InputError(f"{path}: {count} lines for {len(frame_paths)} frames in {frame_paths[0].parent}{about}; "
-                     "one line a frame is needed")
+    """Raise InputError unless a file has a line a frame."""
+    if count != len(frame_paths):
+        missing = missing_frames(frame_paths, count) if count > len(frame_paths) else []
+        named = f" (the first without one: {missing[0].name})" if missing else ""
+        raise InputError(f"{path}: {count} lines for {len(frame_paths)} frames{named}; one line a frame is needed")
 
 
 def check_size(path: Path, size: tuple[int, ...], first_size: tuple[int, int]) -> None:
     """Raise InputError for a frame whose (height, width) is not that of the sequence's first one."""
     if size != first_size:
-        raise InputError(f"{path}: {_size(size)} pixels, but the first frame of the sequence has {_size(first_size)}; "
-                         "all frames must have one size")
-
-
-def _size(shape):
-    return f"{shape[1]}x{shape[0]}"
-
-
-def _read_text(path):
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check its name, or copy it from the data set again") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are none"
-        raise InputError(f"{path}: cannot be read as text ({reason}); check the file and its permissions") from None
+        raise InputError(f"{path}: {size[1]}x{size[0]} pixels; the first frame has {first_size[1]}x{first_size[0]}")
 
 
 def _read_numbers(path, columns):
-    rows = []
-    for number, line in enumerate(_read_text(path).splitlines(), 1):
-        if not line.strip():
-            continue
-        try:
-            row = [float(word) for word in line.split()]
-        except ValueError:
-            row = []
-        if len(row) != columns or not np.isfinite(row).all():
-            raise InputError(f"{path}, line {number}: expected {columns} finite number{'s' * (columns > 1)}, "
-                             f"found {line.strip()[:60]!r}; copy the file again")
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path}: is empty; one line a frame is needed")
-    return np.array(rows, np.float64)
+    try:
+        with open(path, encoding="utf-8") as file, warnings.catch_warnings(action="ignore"):
+            rows = np.loadtxt(file, np.float64, comments=None, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not rows.size or rows.shape[1] != columns or not np.isfinite(rows).all():
+        raise InputError(f"{path}: must hold {columns} finite numbers a line, one line a frame")
+    return rows
 
 
 def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
@@ -324,33 +263,30 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     Raises InputError for a file without it, and for numbers that are no camera's without distortion and skew.
     """
     key = f"P{camera[-1]}" if camera in IMAGE_FOLDERS else "P0"
-    for line in _read_text(path).splitlines():
-        if line.startswith(f"{key}:"):
-            try:
-                values = np.array([float(word) for word in line[3:].split()], np.float64)
-            except ValueError:
-                values = np.empty(0)
-            matrix = values.reshape(3, 4)[:, :3] if values.shape == (12,) and np.isfinite(values).all() else None
-            if matrix is None or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-                raise InputError(f"{path}: {key} must be 12 finite numbers with positive focal lengths, "
-                                 f"found {line.strip()[:60]!r}; copy the file again")
-            if matrix[0, 1] or matrix[1, 0] or not np.array_equal(matrix[2], [0, 0, 1]):
-                raise InputError(f"{path}: {key} must be f 0 u 0, 0 f v 0, 0 0 1 0 of a camera without distortion and "
-                                 f"skew, found {line.strip()[:60]!r}; copy the file again")
-            return matrix
-    raise InputError(f"{path}: has no line '{key}:' with the projection matrix of {camera}; copy the file again")
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        matrix = np.array([line[3:].split() for line in lines if line.startswith(f"{key}:")][0], np.float64)
+        matrix = matrix.reshape(3, 4)[:, :3]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, IndexError):
+        matrix = np.zeros((3, 3))
+    (fx, _, u), (_, fy, v), _ = matrix
+    plain = np.array([[fx, 0, u], [0, fy, v], [0, 0, 1]])
+    if min(fx, fy) <= 0 or not np.isfinite(matrix).all() or not np.array_equal(matrix, plain):
+        raise InputError(f"{path}: must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion")
+    return matrix
 
 
 def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[int, int]) -> None:
     """Raise InputError where a camera matrix cannot be that of frames of (height, width), or these are too small."""
     height, width = size
     if min(size) < MIN_FRAME_SIDE:
-        raise InputError(f"{frame}: {_size(size)} pixels are too few for an odometry; a side needs {MIN_FRAME_SIDE} or "
-                         "more")
+        raise InputError(f"{frame}: {width}x{height} pixels; a side needs {MIN_FRAME_SIDE} or more")
     (fx, _, u), (_, fy, v), _ = intrinsics
     if not (0 <= u <= width and 0 <= v <= height and all(width / 100 < focal < width * 100 for focal in (fx, fy))):
-        raise InputError(f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} are not those of a camera with "
-                         f"frames of {_size(size)} pixels; take the file of these frames")
+        raise InputError(f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} do not fit frames of "
+                         f"{width}x{height} pixels")
 
 
 def read_times(path: str | Path) -> np.ndarray:
@@ -358,8 +294,7 @@ def read_times(path: str | Path) -> np.ndarray:
     times = _read_numbers(path, 1)[:, 0]
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
-        raise InputError(f"{path}, line {late[0] + 2}: time does not increase; copy the file again, or take it away: "
-                         f"then frames count as {FRAME_TIME:g} s apart")
+        raise InputError(f"{path}, line {late[0] + 2}: time does not increase; mend or remove the file")
     return times
 
 
@@ -374,14 +309,11 @@ def read_poses(path: str | Path) -> np.ndarray:
     rotations = poses[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    for index in np.flatnonzero(~(error <= ROTATION_TOLERANCE))[:1]:
-        raise InputError(f"{path}, line {index + 1}: is no rotation (off by {error[index]:.2g}); the file is damaged "
-                         "or in another form than KITTI's")
-    for index in np.flatnonzero(np.linalg.det(rotations) < 0)[:1]:
-        raise InputError(f"{path}, line {index + 1}: is a mirrored rotation, of axes that are left-handed; KITTI's x "
-                         "points to the right, y down and z ahead")
-    for index in np.flatnonzero(np.abs(poses[:, :3, 3]).max(axis=1) > MAX_POSITION)[:1]:
-        raise InputError(f"{path}, line {index + 1}: is no position in metres; the file is damaged")
+        mirrored = np.linalg.det(rotations) < 0
+    far = np.abs(poses[:, :3, 3]).max(axis=1) > MAX_POSITION
+    wrong = np.flatnonzero(~(error <= ROTATION_TOLERANCE) | mirrored | far)
+    if len(wrong):
+        raise InputError(f"{path}, line {wrong[0] + 1}: must be a right-handed rotation and a position in metres")
     return poses
 
 

@@ -12,6 +12,7 @@ import resource
 import sys
 import time
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from pathlib import Path
 
 from thesis_repro import InputError, one_line
@@ -19,25 +20,17 @@ from thesis_repro import InputError, one_line
 LOG = "log.txt"
 RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
 TEMPORARY = re.compile(r"\..+\.\d+(\.\w+)?")  # the names that `temporary` gives
-GOES_ON = "the same command then goes on"
-OTHER_FOLDER = "check who may read and write there, or name another folder"
 # what a user can do about an error of the system, by its number
-REMEDIES = {
-    errno.ENOSPC: f"make room on its disk, or name a folder on another; {GOES_ON}",
-    errno.EDQUOT: f"make room, or name a folder on another disk; {GOES_ON}",
-    errno.EFBIG: f"allow larger files (ulimit -f); {GOES_ON}",
-    errno.EROFS: "name a folder on a disk that may be written to",
-    errno.EACCES: OTHER_FOLDER,
-    errno.EPERM: OTHER_FOLDER,
-    errno.EMFILE: f"allow more open files (ulimit -n); {GOES_ON}",
-    errno.EIO: f"check its disk, or the connection to it; {GOES_ON}",
-}
-NO_MEMORY = f"memory ran out; free some, or work with fewer processes (--jobs, JOBS); {GOES_ON}"
-WORKER_KILLED = ("a process was killed, most likely because memory ran out; what was finished is kept, so start again, "
-                 "with fewer processes (JOBS or --jobs)")
+ROOM, ACCESS = "make room on its disk, or name a folder on another", "name a folder that you may write to"
+REMEDIES = {errno.ENOSPC: ROOM, errno.EDQUOT: ROOM, errno.EFBIG: "allow larger files (ulimit -f)", errno.EROFS: ACCESS,
+            errno.EACCES: ACCESS, errno.EPERM: ACCESS, errno.EMFILE: "allow more open files (ulimit -n)",
+            errno.EIO: "check its disk, or the connection to it"}
+NO_MEMORY = "memory ran out; free some, or work with fewer processes (--jobs, JOBS), and start again"
+WORKER_KILLED = ("a process was killed, most likely because memory ran out; start again with fewer processes (--jobs, "
+                 "JOBS), and it goes on")
 # what libraries write in errors of their own
-NO_MEMORY_TEXTS = ("nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc", "ut of memory",
-                  "failed to map segment", "can't start new thread")
+NO_MEMORY_TEXTS = ("MemoryError", "nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc",
+                  "ut of memory", "failed to map segment", "can't start new thread")
 
 _log = logging.getLogger("thesis_repro")
 _log.addHandler(logging.NullHandler())
@@ -53,16 +46,14 @@ def explain(error):
     if isinstance(error, InputError):
         return str(error)
     while error is not None:
-        number, name, text = number_of(error), getattr(error, "filename", None), str(error)
-        if (isinstance(error, MemoryError) or number == errno.ENOMEM or type(error).__name__ == "ResourceExhaustedError"
-                or any(words in text for words in NO_MEMORY_TEXTS)):
+        number, name, text = number_of(error), getattr(error, "filename", None), f"{type(error).__name__} {error}"
+        if number == errno.ENOMEM or text.startswith("ResourceExhausted") or any(words in text
+                                                                                 for words in NO_MEMORY_TEXTS):
             return NO_MEMORY
-        if type(error).__name__ == "TerminatedWorkerError":  # of joblib
+        if text.startswith("TerminatedWorkerError"):  # of joblib
             return WORKER_KILLED
-        if number in REMEDIES:
-            return f"{name or 'a file'}: {os.strerror(number)}; {REMEDIES[number]}"
-        if isinstance(error, OSError) and name is not None and number is not None:
-            return f"{name}: {os.strerror(number)}; check the path"
+        if number in REMEDIES or isinstance(error, OSError) and name is not None and number is not None:
+            return f"{name or 'a file'}: {os.strerror(number)}; {REMEDIES.get(number, 'check the path')}"
         error = error.__cause__ or error.__context__
     return None
 
@@ -76,28 +67,21 @@ def number_of(error):
 
 
 def need_addresses(gigabytes):
-    """Raise InputError where `ulimit -v` is less than the libraries take when they are loaded.
-
-    Some of them end the process by a signal then, without a message.
-    """
+    """Raise InputError where `ulimit -v` is too little for the libraries, some of which then end without a message."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < gigabytes * 2**30:
-        raise InputError(f"ulimit -v {limit // 1024}: too little memory, for the libraries alone take more; allow "
-                         f"{gigabytes * 2**20} or more, or unlimited")
+        raise InputError(f"ulimit -v {limit // 1024}: too little memory; allow {gigabytes * 2**20} or more")
 
 
 def remedy(text):
     """What to do about an error of which only the text is known, to be put behind it; empty for most errors."""
-    if "MemoryError" in text or any(words in text for words in NO_MEMORY_TEXTS):
+    if any(words in text for words in NO_MEMORY_TEXTS):
         return f"; {NO_MEMORY}"
     return next((f"; {REMEDIES[number]}" for number in REMEDIES if os.strerror(number) in text), "")
 
 
 def report_error(error):
-    """Print in one line on standard error why a command ends, and return its exit status.
-
-    Raises an error that `explain` does not know.
-    """
+    """Print why a command ends, and return its exit status. Raises an error that `explain` does not know."""
     line = explain(error)
     if line is None:
         raise error
@@ -118,14 +102,14 @@ def sweep(folder):
                 Path(where, name).unlink(missing_ok=True)
 
 
-_held: dict[tuple, int] = {}  # how many times this process holds each folder, by device and inode
+_held = set()  # the folders that this process holds, by device and inode
 
 
 @contextmanager
 def claimed(folder):
     """Hold a folder, made where there is none, for this process until the block ends, in whatever way it ends.
 
-    Raises InputError where another process holds it. Where the file system knows no locks, everybody may go on.
+    Raises InputError where another process holds it.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
@@ -136,34 +120,31 @@ def claimed(folder):
         with locked(folder):
             yield
     finally:
-        for path in new:  # those that are still empty
-            with suppress(OSError):
+        with suppress(OSError):
+            for path in new:  # those that are still empty
                 path.rmdir()
 
 
 @contextmanager
 def locked(path):
-    """Hold a folder or file that is there, as `claimed` does."""
-    descriptor = os.open(path, os.O_RDONLY)  # its lock ends with the process, so a killed run leaves none
-    status = os.fstat(descriptor)
+    """Hold a folder or file that is there, as `claimed` does; within the block, this process may hold it again."""
+    status = os.stat(path)
     key = status.st_dev, status.st_ino
+    if key in _held:
+        yield
+        return
+    descriptor = os.open(path, os.O_RDONLY)  # its lock ends with the process, so a killed run leaves none
     try:
-        if key not in _held:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(f"{path}: another run is at work there; wait until it has ended, or name another "
-                                 "folder") from None
-            except OSError:
-                pass
-        _held[key] = _held.get(key, 0) + 1
         try:
-            yield
-        finally:
-            _held[key] -= 1
-            if not _held[key]:
-                del _held[key]
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{path}: another run is at work there; wait, or name another folder") from None
+        except OSError:  # a file system without locks
+            pass
+        _held.add(key)
+        yield
     finally:
+        _held.discard(key)
         os.close(descriptor)
 
 
@@ -171,12 +152,13 @@ def locked(path):
 
 
 class _LogFile(logging.FileHandler):
-    """Starts its file once the folder holds results, so that a run which is refused leaves nothing."""
+    """The log of a run. It starts once the folder holds results, so that a run which is refused leaves nothing."""
 
     def __init__(self, folder, ours):
         super().__init__(folder / LOG, delay=True, encoding="utf-8")
         self.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-        self.folder, self.ours, self.waiting, self.warnings = folder, ours, [], 0
+        self.folder, self.ours, self.waiting = folder, ours, []
+        self.warnings, self.started = 0, time.monotonic()
 
     def emit(self, record):
         self.warnings += record.levelno == logging.WARNING
@@ -192,25 +174,17 @@ class _LogFile(logging.FileHandler):
     def handleError(self, record):
         pass  # the results report a full disk; the log need not
 
-
-class Run:
-    """A long run with its log."""
-
-    def __init__(self, handler):
-        self._handler, self._started = handler, time.monotonic()
-
     def end(self, text):
         """Print what came of the run, how long it took, how many warnings there were, and where the log is."""
-        count = self._handler.warnings
-        say(f"{text}\n{duration(time.monotonic() - self._started)}; {count or 'no'} warning{'s' * (count != 1)}; "
-            f"log: {self._handler.folder / LOG}")
+        seconds = timedelta(seconds=round(time.monotonic() - self.started))
+        say(f"{text}\n{seconds} h; warnings: {self.warnings}; log: {self.folder / LOG}")
 
 
 @contextmanager
 def logged(folder, what, ours=False):
-    """Log what is printed, every warning, and the error that ends the block, in a folder; yields a `Run`.
+    """Log what is printed, every warning, and the error that ends the block, in a folder; yields the `_LogFile`.
 
-    what: the first line. ours: the folder holds results already; otherwise the log starts with the folder's record.
+    what: the first line. ours: the folder holds results already; otherwise the log starts with its record.
     """
     handler = _LogFile(Path(folder), ours)
     loggers = _log, logging.getLogger("py.warnings")
@@ -219,7 +193,7 @@ def logged(folder, what, ours=False):
     logging.captureWarnings(True)
     _log.info(what)
     try:
-        yield Run(handler)
+        yield handler
     except Exception as error:
         reason = explain(error)
         _log.error(reason or type(error).__name__, exc_info=reason is None)
@@ -244,10 +218,3 @@ def note(text, level=logging.ERROR):
     """Log a text."""
     for line in text.splitlines():
         _log.log(level, line)
-
-
-def duration(seconds):
-    """A time in words of two units: "3 h 12 min"."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s" if minutes else f"{seconds} s"

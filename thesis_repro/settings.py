@@ -14,30 +14,15 @@ from thesis_repro import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 PREFIX = "THESIS_REPRO_"
-VARIABLES = {
-    "PROFILE": "size of the run: smoke, demo or thesis",
-    "KITTI": "folder of the KITTI odometry benchmark (sequences, poses)",
-    "CITYSCAPES": "folder of Cityscapes, in the official or in the flat layout",
-    "KITTI_SEMANTIC": "folder of KITTI's street scenes with label maps (train, trainannot), to judge label maps by",
-    "BUILD": "folder for everything that can be made again",
-    "FIGURES": "folder for the tables and figures",
-    "JOBS": "processes that work at once; as many as there are cores when not set",
-    "DASK_SCHEDULER": "address of a Dask scheduler (tcp://host:8786) that the odometry runs are sent to",
-    "PROGRESS": "file or terminal that progress bars are written to",
-    # sizes of the profile, one by one
-    "IMAGE_SIZE": "pixels, both ways, of the network's input",
-    "BASE_FILTERS": "channels of the network's first block",
-    "BATCH_SIZE": "images in a batch",
-    "EPOCHS": "most epochs of the training",
-    "FRAMES": "frames from the start of each sequence, or all",
-    "WIDTHS": "dilation widths in pixels, such as 5,10 or 1-15",
-    "REPETITIONS": "runs of each kind, each with the matched points shuffled in another way",
-}
-MOST_JOBS, MOST_REPETITIONS = 1024, 1000
-# the least and the most that each may be, and what it must be a multiple of
+# the least and the most that each number may be, and what it must be a multiple of
 LIMITS = {"IMAGE_SIZE": (32, 4096, 16), "BASE_FILTERS": (1, 1024, 1), "BATCH_SIZE": (1, 4096, 1),
-          "EPOCHS": (1, 100_000, 1), "FRAMES": (5, 10**7, 1), "WIDTHS": (1, 1000, 1),
-          "REPETITIONS": (1, MOST_REPETITIONS, 1)}
+          "EPOCHS": (1, 100_000, 1), "FRAMES": (5, 10**7, 1), "WIDTHS": (1, 1000, 1), "REPETITIONS": (1, 1000, 1),
+          "JOBS": (1, 1024, 1)}
+MOST_REPETITIONS = LIMITS["REPETITIONS"][1]
+SIZES = tuple(name for name in LIMITS if name != "JOBS")  # of a profile, to be changed one by one
+# (PROGRESS: the file or terminal that progress bars are written to; the others are fields of Settings)
+VARIABLES = ("PROFILE", "KITTI", "CITYSCAPES", "KITTI_SEMANTIC", "BUILD", "FIGURES", "DASK_SCHEDULER", "PROGRESS",
+             *LIMITS)
 ALL_WIDTHS = tuple(range(1, 16))
 
 
@@ -139,26 +124,25 @@ class Settings:
 def read_settings(environment=None):
     """The settings from the environment's THESIS_REPRO_ variables.
 
-    Raises InputError for an unknown variable, an unknown profile, a missing data folder or a bad number. Sizes that are
-    not the profile's are part of the run's name.
+    Sizes that are not the profile's are part of the run's name. Raises InputError for what is unknown, for a missing
+    data folder and for a bad number.
     """
     environment = os.environ if environment is None else environment
     given = {name[len(PREFIX):]: value for name, value in environment.items() if name.startswith(PREFIX) and value}
-    for name in sorted(given.keys() - VARIABLES.keys()):
-        raise InputError(f"{PREFIX}{name}: unknown setting; known are {', '.join(PREFIX + key for key in VARIABLES)}")
+    for name in sorted(given.keys() - set(VARIABLES)):
+        raise InputError(f"{PREFIX}{name}: unknown setting; known are {', '.join(VARIABLES)}")
     profile = given.get("PROFILE", "demo")
     if profile not in PROFILES:
         raise InputError(f"PROFILE={profile}: unknown profile; choose one of {', '.join(PROFILES)}")
-    jobs = given.get("JOBS", str(cores()))
-    if not 1 <= (_whole(jobs) or 0) <= MOST_JOBS:
-        raise InputError(f"JOBS={jobs}: must be a whole number of processes, 1 or more, and at most {MOST_JOBS}")
     build = Path(given.get("BUILD", ROOT / "build")).absolute()
     figures = Path(given.get("FIGURES", ROOT / "figures")).absolute()
     world = build / f"world-{profile}"
     kitti, cityscapes, kitti_semantic = (_data_folder(name, given.get(name))
                                          for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC"))
     data = "_".join(_short_name(name, path) for name, path in (("kitti", kitti), ("cityscapes", cityscapes)) if path)
-    sizes = replace(PROFILES[profile], **{name.lower(): _size(name, given[name]) for name in LIMITS if name in given})
+    changed = {name.lower(): _widths(text) if name == "WIDTHS" else number(name, text)
+               for name, text in given.items() if name in SIZES and (name, text) != ("FRAMES", "all")}
+    sizes = replace(PROFILES[profile], **changed | ({"frames": None} if given.get("FRAMES") == "all" else {}))
     judged = f"_{_short_name('semantic', kitti_semantic)}" if kitti_semantic else ""
     run = "-".join([f"{data or 'embedded'}{judged}", profile, *(f"{name.replace('_', '-')}-{_in_a_name(value)}"
                                                                 for name, value in _changed(profile, sizes).items())])
@@ -168,43 +152,38 @@ def read_settings(environment=None):
         cityscapes_is_embedded=cityscapes is None, run=run, build=build / run,
         # the default run's figures are what visitors see; those of all others go into folders beside them
         figures=figures if run == "embedded-demo" else figures / run,
-        world=world, jobs=int(jobs), scheduler=scheduler_address(given.get("DASK_SCHEDULER")),
-        kitti_semantic=kitti_semantic)
+        world=world, jobs=processes(given.get("JOBS", str(cores()))),
+        scheduler=scheduler_address(given.get("DASK_SCHEDULER")), kitti_semantic=kitti_semantic)
 
 
-def _size(name, text):
-    """The value of one size that is given as text: "3", "all" for FRAMES, "1-15" for WIDTHS; InputError if none."""
-    if name == "FRAMES" and text == "all":
-        return None
+def number(name, text):
+    """The whole number that the setting `name` is given as text. Raises InputError for anything else."""
     least, most, step = LIMITS[name]
-    numbers = _numbers(text, most) if name == "WIDTHS" else [_whole(text)]
-    if not numbers or any(number is None or not least <= number <= most or number % step for number in numbers):
-        kind = "whole numbers, such as 5,10 or 1-15," if name == "WIDTHS" else "a whole number"
-        raise InputError(f"{name}={text[:60]}: must be {kind}{' or all,' * (name == 'FRAMES')} of {least} or more"
-                         f"{f' and a multiple of {step}' * (step > 1)}, and at most {most}")
-    return tuple(numbers) if name == "WIDTHS" else numbers[0]
+    value = int(text) if re.fullmatch("[0-9]{1,19}", text) else -1
+    if not least <= value <= most or value % step:
+        multiple = f", a multiple of {step}" if step > 1 else ""
+        raise InputError(f"{name}={text[:60]}: must be a whole number from {least} to {most}{multiple}")
+    return value
 
 
-def _whole(text):
-    """The whole number that a text is, 0 or more; None where it is something else."""
-    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else None
+def processes(text):
+    """The number of processes that a text gives; InputError for no such number."""
+    return number("JOBS", text)
 
 
-def _numbers(text, most):
-    """The numbers of "1-3, 7", sorted; none where it is something else, or holds one above `most`."""
-    numbers = set()
-    for word in text.replace(",", " ").split():
-        first, dash, last = word.partition("-")
-        begin, end = _whole(first), _whole(last if dash else first)
-        if begin is None or end is None or not begin <= end <= most:
-            return []
-        numbers |= set(range(begin, end + 1))
-    return sorted(numbers)
+def _widths(text):
+    matches = [re.fullmatch("([0-9]{1,4})(?:-([0-9]{1,4}))?", word) for word in text.replace(",", " ").split()]
+    ranges = [range(int(match[1]), int(match[2] or match[1]) + 1) for match in matches if match]
+    widths = sorted({width for widths in ranges for width in widths})
+    least, most, _ = LIMITS["WIDTHS"]
+    if not all(matches) or not all(ranges) or not widths or widths[0] < least or widths[-1] > most:
+        raise InputError(f"WIDTHS={text[:60]}: must be whole numbers from {least} to {most}, such as 5,10 or 1-15")
+    return tuple(widths)
 
 
 def _changed(profile, sizes):
     """The sizes that are not the profile's, by name."""
-    own = {name.lower(): getattr(sizes, name.lower()) for name in LIMITS}
+    own = {name.lower(): getattr(sizes, name.lower()) for name in SIZES}
     return {name: value for name, value in own.items() if value != getattr(PROFILES[profile], name)}
 
 
@@ -214,11 +193,10 @@ def _in_a_name(value):
 
 
 def scheduler_address(text):
-    """The address of a Dask scheduler, or None for none; InputError where it is no address, for which Dask would start
-    a cluster of its own or read a file."""
+    """The address of a Dask scheduler, or None for none. Raises InputError for anything else: Dask would start a
+    cluster of its own or read a file."""
     if text is not None and not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d{1,5}", text):
-        raise InputError(f"Dask scheduler {text}: is no address; start one with 'dask scheduler' and give the address "
-                         "that it prints, tcp://host:port")
+        raise InputError(f"Dask scheduler {text}: must be tcp://host:port, as 'dask scheduler' prints it")
     return text
 
 
@@ -246,10 +224,7 @@ def _short(value):
     if value is None:
         return "all"
     if isinstance(value, Path):
-        try:
-            return value.relative_to(ROOT)
-        except ValueError:
-            return value
+        return value.relative_to(ROOT) if value.is_relative_to(ROOT) else value
     if isinstance(value, tuple):
         return ", ".join(map(str, value))
     return value

@@ -23,10 +23,9 @@ _PACKAGE = Path(__file__).parent
 def stage(folder, *, replace=True, **inputs):
     """The folder of one stage, holding only results that were made from `inputs` (JSON values).
 
-    What an earlier run with the same inputs finished is kept; results of other inputs are deleted, or with `replace`
-    False refused; what a killed run left half written is deleted. Raises InputError for those that are refused, for
-    results of another kind (most of whose inputs have other names), for a file or a folder that this project did not
-    make, and for one that another run holds (`longrun.claimed`).
+    What an earlier run with the same inputs finished is kept; half-written files of a killed run are deleted, and so
+    are results of other inputs. Raises InputError for those if `replace` is False, for results of another kind (most of
+    whose inputs have other names), for files that this project did not make, and for a folder that another run holds.
     """
     folder = Path(folder)
     with longrun.claimed(folder):
@@ -36,12 +35,10 @@ def stage(folder, *, replace=True, **inputs):
             raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
         if earlier is not None and earlier != wanted:
             if not replace:
-                key = next(key for key in {**wanted, **earlier} if wanted.get(key) != earlier.get(key))
-                raise InputError(f"{folder}: holds results of other settings ({key} {earlier.get(key)!r}, not "
-                                 f"{wanted.get(key)!r}); remove the folder or choose another")
+                raise InputError(f"{folder}: holds results of {earlier}, not {wanted}; choose another folder")
             if 2 * len(earlier.keys() & wanted.keys()) <= len(earlier.keys() | wanted.keys()):
-                raise InputError(f"{folder}: holds results of another kind (made from {', '.join(sorted(earlier))}), "
-                                 "which would be lost; choose another folder")
+                raise InputError(f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
+                                 "choose another folder")
             _empty(folder)
         longrun.sweep(folder)
         if earlier != wanted:
@@ -73,7 +70,7 @@ def record(folder):
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError):
-        raise InputError(f"{path}: is damaged; remove the folder to make its results anew") from None
+        raise InputError(f"{path}: is damaged; remove its folder") from None
 
 
 def made_from(folder):
@@ -85,15 +82,15 @@ def made_from(folder):
 
 
 def store(path, job, arrays):
-    """Keep what a long job needs to go on: `job`, what it is and how far (JSON values), and arrays by name."""
+    """Write what a long job needs to go on: `job` (JSON values) and arrays by name."""
     with atomic(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, job=json.dumps(job), **{f"array {name}": array for name, array in arrays.items()})
 
 
 def resume(path, arrays=True):
-    """What `store` kept, (job, arrays); None where there is nothing. Raises InputError for a damaged file.
+    """What `store` wrote, (job, arrays), or with `arrays` False the job alone, {}; None where there is nothing.
 
-    arrays: False leaves them unread, to look at the job alone.
+    Raises InputError for a damaged file.
     """
     path = Path(path)
     if not path.is_file():
@@ -103,7 +100,7 @@ def resume(path, arrays=True):
             names = [name for name in state.files if name != "job"] if arrays else []
             return json.loads(str(state["job"])), {name.removeprefix("array "): state[name] for name in names}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        raise InputError(f"{path}: is damaged; delete it to start from the beginning") from None
+        raise InputError(f"{path}: is damaged; remove it to begin anew") from None
 
 
 # Digests
@@ -115,13 +112,7 @@ def code(*places):
 
     Everything of the package that they import counts with them. Comments and docstrings do not.
     """
-    paths = [path for place in places for path in _modules(place)]
-    trees = {}
-    while paths:
-        path = paths.pop()
-        if path not in trees:
-            trees[path] = ast.parse(path.read_text(encoding="utf-8"))
-            paths += _imported(trees[path])
+    trees = _trees(places)
     digest = hashlib.sha256()
     for path in sorted(trees):
         for node in ast.walk(trees[path]):
@@ -131,12 +122,17 @@ def code(*places):
     return digest.hexdigest()[:12]
 
 
-def _modules(place):
-    folder, module = _PACKAGE / place, _PACKAGE / f"{place}.py"
-    paths = sorted(folder.glob("*.py")) if folder.is_dir() else [module] * module.is_file()
-    if not paths:
-        raise ValueError(f"{place}: no folder or module of the package")
-    return paths
+def _trees(places):
+    """The parsed modules of some places and of all that they import, {path: tree}."""
+    paths = [path for place in places
+             for path in (sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"])]
+    trees = {}
+    while paths:
+        path = paths.pop()
+        if path not in trees:
+            trees[path] = ast.parse(path.read_text(encoding="utf-8"))
+            paths += _imported(trees[path])
+    return trees
 
 
 def _imported(tree):
@@ -151,11 +147,8 @@ def _imported(tree):
 
 def listing(paths):
     """A digest of files by name and size: enough to notice other data without reading gigabytes."""
-    digest = hashlib.sha256()
-    for path in paths:
-        path = Path(path)
-        digest.update(f"{path.parent.name}/{path.name}:{path.stat().st_size}\n".encode())
-    return digest.hexdigest()[:12]
+    lines = [f"{path.parent.name}/{path.name}:{path.stat().st_size}\n" for path in map(Path, paths)]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
 
 
 def content(path):

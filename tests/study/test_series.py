@@ -149,7 +149,6 @@ def test_results_of_another_length_are_not_thrown_away(done, study):
     (["--labels", "LABELS", "--widths", "0"], "dilation width 0: must be 1 or more"),
     (["--labels", "LABELS", "--repetitions", "0"], "--repetitions 0: must be 1 or more"),
     (["--labels", "LABELS", "--frames", "2"], "--frames 2: must be 3 or more"),
-    (["--labels", "LABELS", "--jobs", "0"], "--jobs 0: must be 1 or more"),
 ])
 def test_bad_input_is_one_clear_line_before_anything_runs(small_world, small_labels, masks, tmp_path, capsys, given,
                                                           names):

@@ -173,7 +173,6 @@ odometry --sequence mine -> mine
 {MASKS[:-3]}kitti -> --output kitti
 {MASKS[:-3]}mine -> mine
 {STUDY} --widths 5000 -> --widths 5000
-{STUDY} --jobs 0 -> --jobs 0
 {STUDY} --sequences 00 00 -> --sequences
 {STUDY} --dask nonsense -> nonsense
 {STUDY[:-3]}mine -> mine
@@ -235,11 +234,9 @@ def misused_options():
             yield from (([command, option, value], option) for value in values)
             if action.nargs != "?":
                 yield [command, f"{option}=yes" if action.nargs == 0 else option], option
-            if type(action).__name__ == "_Once":
-                count = action.nargs if isinstance(action.nargs, int) else 1
-                yield [command, *([option, *[next(iter(action.choices or ["3"]))] * count] * 2)], option
     yield from ((words.split(), named) for words, named in (
-        ("nonsense", "'nonsense'"), (f"{ODOMETRY} --nonsense", "--nonsense"), (f"{LABELLED} --masks masks", "--masks")))
+        ("nonsense", "'nonsense'"), (f"{ODOMETRY} --nonsense", "--nonsense"), (f"{LABELLED} --masks masks", "--masks"),
+        (f"{STUDY} --jobs 0", "--jobs")))
 
 
 @pytest.mark.short
