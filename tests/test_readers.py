@@ -14,7 +14,7 @@ from thesis_repro.settings import LIMITS, PROFILES, SIZES, read_settings
 
 # the same examples in every run; a loaded machine is no reason to fail
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=200,
-                          suppress_health_check=[HealthCheck.function_scoped_fixture])
+                          suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 settings.load_profile("repeatable")
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True) | st.integers(-10**400, 10**400).map(str)
