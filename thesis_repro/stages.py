@@ -35,7 +35,8 @@ def stage(folder, *, replace=True, **inputs):
             raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
         if earlier is not None and earlier != wanted:
             if not replace:
-                raise InputError(f"{folder}: holds results of {earlier}, not {wanted}; choose another folder")
+                other = [key for key in {**wanted, **earlier} if wanted.get(key) != earlier.get(key)]
+                raise InputError(f"{folder}: holds results of other settings ({', '.join(other)}); name another folder")
             if 2 * len(earlier.keys() & wanted.keys()) <= len(earlier.keys() | wanted.keys()):
                 raise InputError(f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
                                  "choose another folder")
