@@ -142,7 +142,7 @@ def test_results_of_another_length_are_not_thrown_away(done, study):
     (["--labels", "LABELS", "--margin", "-1"], "margin=-1: must be 0 or more pixels"),
     (["--masks", "LABELS"], "320x320 pixels, but the frames have"),
     (["--masks", "TRUE", "--sequences", "00"], "different values; a mask has 0 and 255 (label maps go with --labels)"),
-    (["--labels", "LABELS", "--sequences", "77"], "77/image_0: no such folder"),
+    (["--labels", "LABELS", "--sequences", "77"], "77: no such folder"),
     (["--labels", "LABELS/00"], "holds the label maps of one sequence, but 2 are asked for"),
     (["--labels", "LESS", "--sequences", "00"], "(2 of 12 frames of sequence 00 have none)"),
     (["--labels", "LESS", "--sequences", "01"], "LESS/01: no such folder"),
