@@ -1,7 +1,5 @@
 """The audit's rows, and the measurements that are joined to them."""
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -26,20 +24,20 @@ def ablation_runs(factors, sequences=8):
     return pd.DataFrame(rows)
 
 
-def test_every_row_has_its_words_and_every_comparison_its_row():
+def test_every_row_has_its_words_and_everything_measured_its_row():
     rows = audit.WORDS["rows"]
     assert [int(row["row"]) for row in rows] == list(range(1, len(rows) + 1)) and len(rows) >= 70
     assert all(row[key].strip() for row in rows for key in WORDS)
-    numbers, methods = {row["row"] for row in rows}, {*audit.WORDS["metrics"]}
-    assert {spec["row"] for spec in audit.WORDS["comparisons"]} <= numbers
-    assert {metric for spec in audit.WORDS["comparisons"] for metric in spec["metrics"]} <= methods
+    assert {spec["row"] for spec in audit.WORDS["measured"] + audit.WORDS["arithmetic"]} <= {row["row"] for row in rows}
+    assert all({*spec["metrics"]} <= {*audit.WORDS["metrics"]} for spec in audit.WORDS["measured"]
+               if "unit" not in spec and "label" not in spec)
 
 
 @pytest.mark.parametrize("row, quantity, metric, value", [
     ("1", "sum", "RMSE", -13.2), ("1", "mean", "RMSE", -1.2), ("1", "median", "RMSE", -5.27),
     ("1", "sum", "MAE", -25.65), ("1", "mean", "MAE", -2.33), ("1", "median", "MAE", 1.76),
     ("3", "reduction", "", 2.626), ("4", "larger", "MAE", 7), ("41", "improved", "RMSE", 6),
-    ("41", "sign", "RMSE", 50), ("18", "frames 02", "", 101), ("60", "keypoints", "", 761.7)])
+    ("41", "sign", "RMSE", 50), ("60", "keypoints", "", 761.7)])
 def test_arithmetic_is_that_of_the_thesiss_tables(row, quantity, metric, value):
     table = audit.table(audit.of_tables(), "made up")
     chosen = table[(table["row"] == row) & (table["quantity"] == audit.WORDS["quantities"][quantity])
@@ -48,9 +46,8 @@ def test_arithmetic_is_that_of_the_thesiss_tables(row, quantity, metric, value):
 
 
 def test_the_arithmetic_follows_the_numbers(monkeypatch):
-    changed = json.loads(json.dumps(captions.REPORTED))
-    changed["table_4_2_rmse_percent_change"]["05"] = -50.0
-    monkeypatch.setattr(audit, "REPORTED", changed)
+    name = "table_4_2_rmse_percent_change"
+    monkeypatch.setattr(audit, "REPORTED", captions.REPORTED | {name: captions.REPORTED[name] | {"05": -50.0}})
     improved = next(each for each in audit.of_tables() if each["quantity"] == audit.WORDS["quantities"]["improved"])
     assert improved["value"] == 7
 
@@ -84,11 +81,29 @@ def test_ablations_become_ratios_of_their_reference():
     assert not measurements["row"].isin(["48"]).any()  # ORB was not run
 
 
+def test_other_tables_are_measured_by_sequence_and_say_how_many_frames_they_rest_on():
+    shares = pd.DataFrame({"sequence": ["00", "00", "01"], "frame": [0, 5, 0], "lost": [10.0, 30.0, 40.0],
+                           "road/sidewalk": [np.nan, np.nan, 60.0], "building/fence": np.nan})
+    values = {each["quantity"]: each for each in audit.measured(shares, "boundaries")}
+    assert {name: (each["value"], each["n"]) for name, each in values.items()} == {
+        "boundary pixels lost": (30, 2), "boundary pixels lost, road/sidewalk": (60, 1)}
+    assert {each["frames"] for each in values.values()} == {2}
+    tracks = pd.DataFrame({"sequence": ["00"] * 4, "frame": [0, 0, 3, 3], "method": ["all keypoints", "masks"] * 2,
+                           "residual": [1.0, 2.0, 1.0, 8.0]})
+    (each,) = audit.measured(tracks, "tracks")
+    assert (each["row"], each["frames"], each["n"]) == ("32", 2, 1) and each["value"] == pytest.approx(4)
+    angles = pd.DataFrame({"sequence": ["00", "01"], "pitch": [0.1, 0.3], "rmse": [2.0, 2.0], "rmse_own": [1.0, 1.0]})
+    values = {each["metric"]: each["value"] for each in audit.measured(angles, "boresight")}
+    assert values == pytest.approx({"": 0.2, "RMSE": 0.5})
+
+
 def test_trials_and_times_are_measured_against_their_reference():
     trials = pd.DataFrame([{"method": method, "seed": seed, "mean_iou": 0.1 * seed + gain} for method, gain in (
         ("thesis", 0), ("corrected blocks", 0.1), ("divided by 255", 0.2), ("noise of today", 0),
         ("person weight 1", 0)) for seed in range(2)])
-    assert [each["value"] for each in audit.of_trials(trials)] == pytest.approx([0.1, 0.2, 0, 0])
+    measurements = {each["metric"]: each["value"] for each in audit.measured(trials, "trials")}
+    assert measurements == pytest.approx({"corrected blocks": 0.1, "divided by 255": 0.2, "noise of today": 0,
+                                          "person weight 1": 0})
     seconds = pd.DataFrame({"method": ["baseline", "masked", "masked"], "dilation_width": [np.nan, 5, 10],
                             "seconds": [10.0, 5.0, 9.0]})
     measured = pd.DataFrame({"method": ["all keypoints", "masked, width 10", "masked, width 10"],

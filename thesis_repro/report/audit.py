@@ -1,8 +1,8 @@
 """The audit: where the thesis contradicts itself, its code or its libraries, and what each of these does, in numbers.
 
-All words are in audit.json: the rows, the wording of each quantity, and the list of comparisons. The functions here
-turn tables into measurements, one dictionary each; `table` joins them to the rows. Ratios are those of
-`study.compare`; intervals are bootstrap intervals over what `n` counts.
+audit.json has the rows, and lists what is measured of which table. The functions here turn tables into measurements,
+one dictionary each; `table` joins them to the rows. Ratios are those of `study.compare`; intervals are bootstrap
+intervals over what `n` counts: sequences, where nothing else is said.
 """
 
 import json
@@ -13,32 +13,32 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.cityscapes import LABELS
-from thesis_repro.kitti import FRAME_COUNTS
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import ablations, compare, thesis_tables
 
 WORDS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))
 WIDTHS = range(9, 12)  # that the thesis calls best
+TEXTS = ["quantity", "metric", "estimator", "unit", "data"]
 NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
 
 
 def measurement(row, quantity, values, unit="", **more):
     """One measurement of a row: the mean of one value or several, their interval and number.
 
-    quantity: of audit.json's "quantities". more: further columns (metric, estimator, frames, data).
+    quantity: words, or their name in audit.json. more: further columns (metric, estimator, frames, data).
     """
     values = np.asarray(values, float).ravel()
     values = values[~np.isnan(values)]
     low, high = compare.mean_interval(values)
-    return {"row": row, "quantity": WORDS["quantities"][quantity], "value": values.mean() if len(values) else np.nan,
-            "unit": unit, "low": low, "high": high, "n": len(values), **more}
+    return {"row": row, "quantity": WORDS["quantities"].get(quantity, quantity), "unit": unit,
+            "value": values.mean() if len(values) else np.nan, "low": low, "high": high, "n": len(values), **more}
 
 
 def ratio(row, quantity, ratios, **more):
     """One measurement of a row: the geometric mean of one ratio a sequence."""
     result = compare.geometric_mean(ratios)
-    return {"row": row, "quantity": WORDS["quantities"].get(quantity, quantity), "value": result["ratio"],
-            "unit": "ratio", "low": result["low"], "high": result["high"], "n": result["n"], **more}
+    return measurement(row, quantity, [], "ratio", **more) | {
+        "value": result["ratio"], "low": result["low"], "high": result["high"], "n": result["n"]}
 
 
 def table(measurements, data="this run"):
@@ -47,23 +47,16 @@ def table(measurements, data="this run"):
     data: where measured numbers come from. Numbers are rounded, but never to 1 what is not 1: an
     interval that excludes 1 shows it. Raises ValueError for a measurement of no row.
     """
-    by_row = {}
-    for each in measurements:
-        by_row.setdefault(each["row"], []).append(each)
-    unknown = by_row.keys() - {row["row"] for row in WORDS["rows"]}
+    words = pd.DataFrame(WORDS["rows"]).rename(columns={"does": "the thesis or its code",
+                                                        "right": "what would be right"})
+    numbers = pd.DataFrame(measurements).reindex(columns=["row", *NUMBERS]).astype(dict.fromkeys(TEXTS, object))
+    unknown = set(numbers["row"]) - set(words["row"])
     if unknown:
         raise ValueError(f"measurements of no row of audit.json: {', '.join(sorted(unknown))}")
-    lines = []
-    for row in WORDS["rows"]:
-        words = {"row": row["row"], "where": row["where"], "the thesis or its code": row["does"],
-                 "what would be right": row["right"], "switch": row["switch"]}
-        for index, each in enumerate(by_row.get(row["row"], [{}])):
-            numbers = {"data": data, **each} if each else {}
-            numbers |= {key: rounded(numbers[key]) for key in ("value", "low", "high") if key in numbers}
-            lines.append((words if not index else dict.fromkeys(words, "") | {"row": row["row"]}) | {
-                name: numbers.get(name, "" if name in ("quantity", "metric", "estimator", "unit", "data") else np.nan)
-                for name in NUMBERS})
-    return pd.DataFrame(lines).astype({"n": "Int64", "frames": "Int64"})
+    lines = words.merge(numbers.fillna({"data": data}), on="row", how="left").fillna(dict.fromkeys(TEXTS, ""))
+    lines.loc[lines["row"].duplicated(), words.columns.drop("row")] = ""
+    lines[["value", "low", "high"]] = lines[["value", "low", "high"]].map(rounded)
+    return lines.astype({"n": "Int64", "frames": "Int64"})
 
 
 def rounded(value):
@@ -80,36 +73,55 @@ def missing(audit):
     return [row for row in audit.loc[audit["quantity"] == "", "row"] if row not in of_words]
 
 
-def comparisons(runs, kind):
-    """The comparisons of audit.json between parts of a table of runs.
+def measured(table, kind):
+    """The measurements that audit.json lists for one kind of table, each with the number of frames of a sequence.
 
-    kind: "ablations" (`ablations.measure`), "study" (`runner.run`) or "tracks" (`ablations.tracks`).
+    kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (those of `ablations`),
+    "shares" (of pixels, a row a frame), "boresight" (`boresight.explained`), "trials" (`ablations_training.trials`).
+    With a unit it is the mean over sequences, less that of the reference if there is one. Without, it is a ratio: to
+    the reference, or to another column ("over") of the same rows.
     """
-    measurements = []
-    for spec in WORDS["comparisons"]:
-        if spec["runs"] != kind:
-            continue
-        own, other = (_arm(runs, spec[key], spec.get(widths)) for key, widths in
-                      (("method", "widths"), ("reference", "reference_widths")))
-        pairs = [spec["estimators"]] if "estimators" in spec else [(name, name) for name in compare.ESTIMATORS]
-        for metric in spec["metrics"]:
-            for estimators in pairs if metric != "mean_keypoints" and kind != "tracks" else [(None, None)]:
-                rows, reference = (table if name is None else table[table["estimator"] == name]
-                                   for table, name in zip((own, other), estimators, strict=True))
-                ratios = compare.ratios(rows, reference, metric) if metric in runs else []
-                if len(ratios):
-                    measurements.append(ratio(spec["row"], spec["quantity"], ratios, estimator=estimators[0] or "",
-                                              metric=WORDS["metrics"][metric]))
+    measurements, table = [], table.rename(columns={"seed": "sequence"})  # of trials
+    for spec in (spec for spec in WORDS["measured"] if spec["runs"] == kind):
+        for metric in (metric for metric in spec["metrics"] if metric in table):
+            of_each = "estimator" in table and metric != "mean_keypoints"
+            pairs = [(name, name) for name in compare.ESTIMATORS] if of_each else [("", "")]
+            for own, other in [spec["estimators"]] if "estimators" in spec else pairs:
+                rows = _arm(table, own, spec.get("method"), spec.get("widths"))
+                reference = _arm(table, other, spec.get("reference"), spec.get("reference_widths"))
+                if "over" in spec:
+                    reference = rows.assign(**{metric: rows[spec["over"]]})
+                more = {"metric": spec.get("label", WORDS["metrics"].get(metric, "")), "estimator": own,
+                        "frames": frames_of(table)}
+                if "unit" not in spec:
+                    each = ratio(spec["row"], spec["quantity"], compare.ratios(rows, reference, metric), **more)
+                else:
+                    means = rows.groupby("sequence")[metric].mean()
+                    if "reference" in spec:
+                        means -= reference.groupby("sequence")[metric].mean()
+                    each = measurement(spec["row"], spec["quantity"], means, spec["unit"], **more)
+                measurements += [each] if each["n"] else []
     return measurements
 
 
-def _arm(runs, method, widths):
-    rows = runs[runs["method"] == method]
+def _arm(table, estimator, method, widths):
+    """The rows of a method under an estimator, of some widths; what is empty or None chooses nothing."""
+    if estimator and "estimator" in table:
+        table = table[table["estimator"] == estimator]
     if widths == "best":
-        return thesis_tables.of_chosen_width(runs)
-    if widths == "tested":
-        widths = [compare.tested_width(runs)]
-    return rows if widths is None else rows[rows["dilation_width"].isin(widths)]
+        return thesis_tables.of_chosen_width(table)
+    if widths is not None:
+        widths = [compare.tested_width(table)] if widths == "tested" else widths
+        table = table[table["dilation_width"].isin(widths)]
+    return table if method is None else table[table["method"] == method]
+
+
+def frames_of(table):
+    """How many frames of a sequence a table rests on, on average; NaN where it does not say."""
+    sequences = table.groupby("sequence")
+    if "frames" in table:
+        return round(sequences["frames"].first().mean())
+    return round(sequences["frame"].nunique().mean()) if "frame" in table else np.nan
 
 
 def of_tables():
@@ -127,19 +139,16 @@ def of_tables():
                          measurement("41", "improved", improved, "sequences", metric=name),
                          measurement("41", "sign", 100 * as_many, "%", metric=name)]
     best = pd.DataFrame(REPORTED["table_4_1"])
-    parameters = REPORTED["figure_a1_model_summary"]["rows"][-1]["params"]
+    factors, classes = 2000 / best["mean_keypoints"], REPORTED["training"]["classes"]
     measurements += [
         measurement("3", "reduction", 2000 / best["mean_keypoints"].mean(), "ratio"),
-        measurement("3", "reduction of each", 2000 / best["mean_keypoints"], "ratio"),
-        measurement("3", "three", (2000 / best["mean_keypoints"] >= 3).sum(), "sequences"),
-        measurement("9", "categories", len(LABELS)), measurement("9", "outputs", REPORTED["training"]["classes"]),
-        measurement("9", "parameters", parameters // REPORTED["training"]["classes"]),
-        measurement("18", "frames 02", FRAME_COUNTS["02"] - 4560, "frames"),
-        measurement("18", "frames 07", FRAME_COUNTS["07"] - 1100, "frames"),
+        measurement("3", "reduction of each", factors, "ratio"),
+        measurement("3", "three", (factors >= 3).sum(), "sequences"),
+        measurement("9", "categories", len(LABELS)), measurement("9", "outputs", classes),
+        measurement("9", "parameters", REPORTED["figure_a1_model_summary"]["rows"][-1]["params"] // classes),
         measurement("35", "widths", best["dilation_width"].isin(WIDTHS).sum(), "sequences"),
-        measurement("45", "draws", 1), measurement("60", "keypoints", best["mean_keypoints"]),
-        measurement("66", "iou train", 0.46 - 0.5), measurement("66", "iou validation", 0.35 - 0.5),
-        measurement("69", "other size", 4, "sequences")]  # 00 to 03
+        measurement("60", "keypoints", best["mean_keypoints"]),
+        *(measurement(**each) for each in WORDS["arithmetic"])]
     return [{**each, "data": "the thesis's numbers"} for each in measurements]
 
 
@@ -159,49 +168,22 @@ def of_study(runs):
         measurements += [ratio("2", "best same", of_best, metric="RMSE"),
                          ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
                          measurement("2", "same best", stability["same_best"], "%")]
-    frames = round(runs.groupby("sequence")["frames"].first().mean())
-    return [{"frames": frames, **each} for each in [*measurements, *comparisons(runs, "study")]]
+    return [*({**each, "frames": frames_of(runs)} for each in measurements), *measured(runs, "study")]
 
 
 def of_ablations(runs):
-    """Rows 10, 12 to 15, 28 to 30, 34, 36, 37, 39, 40, 42, 48, 50, 59 and 70, from `ablations.measure`."""
-    measurements = comparisons(runs, "ablations")
-    for estimator in compare.ESTIMATORS:
-        spread = compare.shuffle_spread(runs[runs["estimator"] == estimator])
-        measurements.append(ratio("14", "spread", spread["factor"], metric="RMSE", estimator=estimator))
-        for row, quantity, method in (("29", "failed all", "baseline"), ("29", "failed masks", "masked"),
-                                      ("34", "failed few", "strongest-100")):
-            failed = compare.of_method(runs, method, estimator).groupby("sequence")["failed"].mean()
-            measurements.append(measurement(row, quantity, failed, "%", estimator=estimator))
-    errors = compare.of_method(runs, "baseline", "refined").groupby("sequence")[
-        ["rmse", "se3", "sim3", "across", "down"]].mean()
-    for quantity, column in (("aligned", "se3"), ("scaled", "sim3")):
-        measurements.append(ratio("15", quantity, errors[column] / errors["rmse"], metric="RMSE", estimator="refined"))
-    measurements += [measurement("30", column, errors[column], "degrees", estimator="refined")
-                     for column in ("across", "down")]
-    reported = pd.Series(REPORTED["table_4_2_rmse_percent_change"])
-    null = ablations.null_distribution(compare.of_method(runs, "baseline", "thesis"), reported)
-    measurements += [{**measurement("39", f"null {name}", null.loc[name, "expected"], "%", metric="RMSE"),
-                      "low": null.loc[name, "low"], "high": null.loc[name, "high"], "n": ablations.STUDIES}
-                     for name in ("mean", "median")]
-    measurements.append(measurement("39", "as low", null.loc["mean", "share_as_low"], "%", metric="RMSE"))
-    frames = round(runs.groupby("sequence")["frames"].first().mean())
-    return [{"frames": frames, **each} for each in measurements]
-
-
-def of_boresight(explained):
-    """Row 30: the mounting angle, and the RMSE with it removed over the raw one (`boresight.explained`)."""
-    return [*(measurement("30", angle, explained[angle], "degrees", estimator="refined")
-              for angle in ("pitch", "yaw")),
-            *(ratio("30", quantity, explained[column] / explained["rmse"], metric="RMSE", estimator="refined")
-              for quantity, column in (("own angle", "rmse_own"), ("day angle", "rmse_others")))]
-
-
-def of_boundaries(shares):
-    """Rows 10 and 11, from a table of `ablations.boundaries`, one row a label map."""
-    return [measurement("10", "invented", shares["invented"], "%"), measurement("11", "lost", shares["lost"], "%"),
-            *(measurement("11", f"lost {name}", shares[name], "%") for name in shares
-              if "/" in name and shares[name].notna().any())]
+    """Rows 14 and 39, and what audit.json lists, from `ablations.measure`."""
+    null = ablations.null_distribution(compare.of_method(runs, "baseline", "thesis"),
+                                       pd.Series(REPORTED["table_4_2_rmse_percent_change"]))
+    spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
+    measurements = [
+        *(ratio("14", "spread", factors, metric="RMSE", estimator=estimator)
+          for estimator, factors in spread.groupby("estimator")["factor"]),
+        *(measurement("39", f"null {name}", null.loc[name, "expected"], "%", metric="RMSE")
+          | {"low": null.loc[name, "low"], "high": null.loc[name, "high"], "n": ablations.STUDIES}
+          for name in ("mean", "median")),
+        measurement("39", "as low", null.loc["mean", "share_as_low"], "%", metric="RMSE")]
+    return [*({**each, "frames": frames_of(runs)} for each in measurements), *measured(runs, "ablations")]
 
 
 def of_time(seconds, measured):
@@ -213,11 +195,3 @@ def of_time(seconds, measured):
     return [measurement("47", "saved", near if len(near) else savings, "%"),
             measurement("16", "whole frame", stages[masked].sum() / stages[plain].sum(), "ratio"),
             *(measurement("49", "stage", value, "ms", metric=stage) for stage, value in stages[masked].items())]
-
-
-def of_trials(trials):
-    """Rows 5, 21, 22 and 27, from the table of `ablations_training.trials`; n counts seeds."""
-    rows = {"corrected blocks": "5", "divided by 255": "21", "noise of today": "22", "person weight 1": "27"}
-    scores = trials.pivot(index="seed", columns="method", values="mean_iou")
-    return [measurement(row, "trial", scores[method] - scores["thesis"], "IoU", metric=method)
-            for method, row in rows.items()]

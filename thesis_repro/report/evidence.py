@@ -50,8 +50,9 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
                                  baseline_repetitions=max(10, repetitions), processes=processes)
     angles = boresight.explained(runner.refined_paths(runs, root, build / "odometry", frames))
     measured = [*audit.of_tables(), *audit.of_ablations(switches), *audit.of_study(runs),
-                *audit.of_boresight(angles), *audit.of_boundaries(_boundaries(sequences, build / "labels")),
-                *audit.comparisons(_tracks(sequences, build / "labels"), "tracks")]
+                *audit.measured(angles, "boresight"),
+                *audit.measured(_boundaries(sequences, build / "labels"), "boundaries"),
+                *audit.measured(_tracks(sequences, build / "labels"), "tracks")]
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
@@ -99,7 +100,8 @@ def _runs(root, names, build, frames, repetitions, processes):
 
 def _boundaries(sequences, labels):
     return pd.DataFrame([
-        ablations.boundaries(read_label_map(labels / sequence.name / sequence.frame_paths[index].name), sequence.size)
+        {"sequence": sequence.name, "frame": index} | ablations.boundaries(
+            read_label_map(labels / sequence.name / sequence.frame_paths[index].name), sequence.size)
         for sequence in sequences for index in range(0, len(sequence), max(1, len(sequence) // LOOKED_AT))])
 
 
