@@ -12,6 +12,7 @@ from pathlib import Path
 from thesis_repro import InputError, longrun, one_line
 from thesis_repro.settings import processes
 
+PICTURES = (".png", ".svg", ".pdf", ".jpg")  # what --plot writes
 DESCRIPTION = "Keypoint masks from semantic segmentation for monocular visual odometry: a thesis, reproduced."
 
 
@@ -103,14 +104,8 @@ def odometry(options):
     chosen = {field.name: vars(options)[field.name] for field in fields(odometry.OdometrySettings)
               if vars(options).get(field.name) is not None}
     settings = replace(odometry.PRESETS[options.pyslam], **chosen)
-    if options.video:
-        from thesis_repro.report import video
-
-        video.check_name(options.video)
-    if options.plot:
-        from thesis_repro.report import trajectories
-
-        trajectories.check_name(options.plot)
+    _check_ending(options.video, ".mp4")
+    _check_ending(options.plot, *PICTURES)
     sequence = _sequence(options)
     masks = _masks(options, sequence)
     _check_new_files(options, sequence.poses_path, sequence.folder / "calib.txt", sequence.folder / "times.txt",
@@ -124,8 +119,12 @@ def odometry(options):
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     if options.video:
+        from thesis_repro.report import video
+
         video.write_video(options.video, sequence, settings, masks)
     if options.plot:
+        from thesis_repro.report import trajectories
+
         true = sequence.poses if sequence.has_truth else None
         paths = {"estimate": result.poses if true is None else metrics.shifted(result.poses, true, settings.alignment)}
         trajectories.write(options.plot, trajectories.figure(paths, true, f"sequence {sequence.name}"))
@@ -189,8 +188,7 @@ def evaluate(options):
     from thesis_repro.kitti import true_poses
     from thesis_repro.report import trajectories
 
-    if options.plot:
-        trajectories.check_name(options.plot)
+    _check_ending(options.plot, *PICTURES)
     true = true_poses(options.kitti, options.sequence)
     _check_new_files(options, *options.poses)
     paths = trajectories.read(options.poses, true)
@@ -269,6 +267,12 @@ def _check_result_folder(output, *inputs):
             raise InputError(f"--output {output}: holds the input {path}; name another folder")
 
 
+def _check_ending(path, *endings):
+    """Raise InputError where a file to be written has another ending, which would name a form that is not written."""
+    if path and path.suffix.lower() not in endings:
+        raise InputError(f"{path}: its name must end in {' or '.join(endings)}")
+
+
 def _check_new_files(options, *inputs):
     """Raise InputError, before anything runs, for a file that cannot be written or that would harm an input."""
     from thesis_repro.files import check_output
@@ -313,7 +317,7 @@ SHARED = {
                          "trainannot, val and valannot"),
     "--output": dict(type=Path, required=True, metavar="DIR", help="folder for everything that is written"),
     "--plot": dict(type=Path, metavar="FILE", help="the paths from above with the true one, and their errors along the "
-                   "way (.png, .svg, .pdf, ...)"),
+                   "way (.png, .svg, .pdf, .jpg)"),
     "--json": dict(action="store_true", help="print JSON"),
 }
 SEQUENCE, REQUIRED = ("--kitti", "--sequence", "--camera"), {"required": True}

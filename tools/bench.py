@@ -5,7 +5,6 @@ and writes it as JSON. Nothing fails for being slow.
 """
 
 import argparse
-import math
 import os
 import sys
 import tempfile
@@ -139,30 +138,6 @@ def prediction_cost(model, paths):
     return costs
 
 
-def arithmetic(model, side=2048):
-    """GFLOP/s of a core of a network and of a large float32 matrix product: medians of turns, in processor time."""
-    import tensorflow as tf
-
-    from thesis_repro.segmentation import prediction
-
-    images = np.zeros((prediction.CALL, *model.input_shape[1:]), np.uint8)
-    matrix = tf.ones((side, side))
-    product = tf.function(lambda: tf.reduce_sum(tf.matmul(matrix, matrix)))
-    turns = [(seconds(lambda: prediction.predict(model, images), time.process_time),
-              seconds(lambda: product().numpy(), time.process_time)) for _ in range(REPEATS + 1)][1:]
-    return np.array([len(images) * operations(model), 2 * side**3]) / np.median(turns, axis=0) / 1e9
-
-
-def operations(model):
-    """Floating-point operations of one image: a multiplication and an addition for each weight of a convolution."""
-    total = 0
-    for layer in model.layers:
-        if "Conv2D" in type(layer).__name__:  # a transposed one uses its weights once for each value that it reads
-            places = (layer.input if "Transpose" in type(layer).__name__ else layer.output).shape[1:3]
-            total += 2 * math.prod(places) * math.prod(layer.kernel.shape)
-    return total
-
-
 def measure(sequence, frames=200, runs=4, models=None):
     """A table: what is measured, its unit, the measure, what it is set against, and their ratio."""
     from thesis_repro.segmentation import prediction
@@ -190,8 +165,6 @@ def measure(sequence, frames=200, runs=4, models=None):
     for name, model in models.items():
         add(f"label maps, {name}", "ms a frame", prediction_cost(model, sequence.frame_paths[:16]),
             "model.predict one by one")
-        add(f"arithmetic, {name}, {operations(model) / 1e9:.1f} GFLOP an image", "GFLOP/s a core", arithmetic(model),
-            "a matrix product")
     return pd.DataFrame(rows)
 
 

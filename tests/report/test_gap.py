@@ -51,7 +51,7 @@ def test_the_quality_of_a_runs_label_maps_is_kept_and_shown(tmp_path):
     settings.figures.mkdir(parents=True)
     assert gap.label_map_quality(settings.build) == []
     (settings.figures / "table_4_1.csv").write_text("sequence,frames\n00,12\n")
-    style.save_table(gap.record(Gap, SHIPPED), settings.build, gap.RECORD, "note")
+    style.save_table(Gap.scores.assign(used=Gap.scores["model"] == SHIPPED), settings.build, gap.RECORD, "note")
     rows = gap.label_map_quality(settings.build)
     assert [(row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows] == [
         (VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]

@@ -30,12 +30,6 @@ def test_corrected_blocks_have_both_convolutions_in_a_row():
     assert rows["conv2d_17"]["connected_to"] == "activation_16[0][0]"
 
 
-def test_the_first_convolution_of_a_block_is_dead_in_the_thesis():
-    rows = {row["layer"].split()[0]: row for row in summary_rows(build_unet((32, 32, 1), 35, 4))}
-
-    assert "conv2d" not in rows and rows["conv2d_1"]["connected_to"] == "input_2[0][0]"
-
-
 def test_base_filters_scale_every_block():
     outputs = {row["layer"].split()[0]: row["output_shape"] for row in summary_rows(build_unet((64, 64, 3), 5, 8))}
 

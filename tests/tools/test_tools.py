@@ -34,15 +34,7 @@ def test_bench_sets_each_measure_against_another(small_world, monkeypatch):
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
     assert (table.drop(index=4)["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
     assert table["what"][4].startswith("memory") and table["measured"][4] < 100
-    assert len(json.loads(table.to_json(orient="records"))) == 7
-
-
-def test_operations_are_those_of_the_convolutions_that_run():
-    way_down = [32**2 * 9 * 2, 16**2 * 9 * 2 * 4, 8**2 * 9 * 4 * 8, 4**2 * 9 * 8 * 16, 2**2 * 9 * 16 * 32]
-    transposed = [2**2 * 4 * 32 * 16, 4**2 * 4 * 16 * 8, 8**2 * 4 * 8 * 4, 16**2 * 4 * 4 * 2]
-    way_up = [4**2 * 9 * 32 * 16, 8**2 * 9 * 16 * 8, 16**2 * 9 * 8 * 4, 32**2 * 9 * 4 * 2]
-    expected = 2 * (sum(way_down + transposed + way_up) + 32**2 * 2 * 35)
-    assert bench.operations(build_unet((32, 32, 1), 35, 2)) == expected
+    assert len(json.loads(table.to_json(orient="records"))) == 6
 
 
 class Line:

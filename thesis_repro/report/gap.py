@@ -61,15 +61,11 @@ def figure(gap):
     return drawn
 
 
-def record(gap, used):
-    """The scores as a table to be kept in the build folder (RECORD); used: name of the model that the odometry uses."""
-    return gap.scores.assign(used=gap.scores["model"] == used)
-
-
 def label_map_quality(build):
     """How good the label maps of a run are, from its build folder: a list of dicts, one a domain, for the templates.
 
-    They have the columns of `domain_gap.Gap.scores`, and `seen`: whether some images were in the model's training.
+    The table (RECORD) is `domain_gap.Gap.scores` with a column `used`, true for the model that the odometry uses.
+    `seen` says whether some images were in the model's training.
     The domain that masks are made on comes first where it has true label maps. Empty where nothing was measured.
     """
     path = build / f"{RECORD}.csv"

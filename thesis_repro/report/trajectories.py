@@ -98,13 +98,6 @@ def figure(paths, true, title):
     return drawing
 
 
-def check_name(path):
-    """Raise InputError where the ending of a picture's name is none that can be written."""
-    endings = [f".{ending}" for ending in sorted(plt.Figure().canvas.get_supported_filetypes())]
-    if Path(path).suffix.lower() not in endings:
-        raise InputError(f"{path}: a picture's name must end in one of {', '.join(endings)}")
-
-
 def write(path, drawing):
     """Write a figure in the format that the file's ending names."""
     with atomic(path) as temporary:

@@ -1,12 +1,10 @@
 """Pictures of the odometry at work: keypoints kept and discarded, tracks, the mask's outline, the path so far."""
 
 from fractions import Fraction
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from thesis_repro import InputError
 from thesis_repro.files import atomic, progress, write_png
 from thesis_repro.kitti import FRAME_TIME
 from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pose
@@ -41,8 +39,8 @@ def draw_frame(frame, step, settings=THESIS, mask=None):
 
 
 def _dots(image, points, color):
-    for x, y in np.rint(points).astype(int).tolist():
-        cv2.circle(image, (x, y), 2, color, -1, cv2.LINE_AA)
+    for point in np.rint(points).astype(int).tolist():
+        cv2.circle(image, point, 2, color, -1, cv2.LINE_AA)
 
 
 def draw_map(size, true, estimated):
@@ -112,12 +110,6 @@ def _describe(image, step, true, masked):
              ("{flag}", DISCARDED, row["flag"])]
     for number, (text, color) in enumerate([(text, color) for text, color, shown in lines if shown], 1):
         _write(image, text.format(**row), (image.shape[1] - 275, 20 * number), color)
-
-
-def check_name(path):
-    """Raise InputError where the name of a video does not end in .mp4."""
-    if Path(path).suffix != ".mp4":
-        raise InputError(f"{path}: a video's name must end in .mp4")
 
 
 def write_video(path, sequence, settings=THESIS, masks=None):

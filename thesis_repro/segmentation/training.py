@@ -66,10 +66,9 @@ def strategy():
 class Batches:
     """The input of the network: sets of images and label maps, of which every epoch shows each image once.
 
-    Images (n, size, size, channels) and label maps (n, size, size) stay uint8, and the sets stay separate arrays; an
-    image becomes float and a label map one-hot in its batch. At 5950 images of 320x320 that is 1.3 GB instead of 85 GB.
-    Unlike a `tf.data` shuffle, the order depends on (seed, epoch) alone, so that a resumed run sees what an undisturbed
-    one sees.
+    Images (n, size, size, channels) and label maps (n, size, size) stay uint8; an image becomes float and a label map
+    one-hot in its batch. At 5950 images of 320x320 that is 1.3 GB instead of 85 GB. Unlike a `tf.data` shuffle, the
+    order depends on (seed, epoch) alone, so that a resumed run sees what an undisturbed one sees.
     """
 
     def __init__(self, sets, batch_size, seed=None, augmenter=None):
@@ -79,7 +78,12 @@ class Batches:
         Raises InputError for an empty set, images and label maps that do not match, and unknown label ids.
         """
         for images, labels in sets:
-            _check(images, labels)
+            if len(images) == 0 or images.ndim != 4 or images.shape[:3] != labels.shape:
+                raise InputError(f"images {images.shape} and label maps {labels.shape}; expected (n, size, size, "
+                                 "channels) and (n, size, size), n at least 1")
+            highest = labels[labels != augmentation.NOTHING].max(initial=0)
+            if highest >= N_CLASSES:
+                raise InputError(f"label id {highest} is above {N_CLASSES - 1}; label maps must hold Cityscapes ids")
         self.sets, self.batch_size, self.seed, self.augmenter = sets, batch_size, seed, augmenter
         self.epoch = 0
         self._places = [(which, index) for which, (images, _) in enumerate(sets) for index in range(len(images))]
@@ -110,17 +114,6 @@ class Batches:
         # grey levels stay 0 to 255: the appendix imports `normalize` and never calls it; NOTHING becomes zeros
         batches = batches.map(lambda images, labels: (tf.cast(images, tf.float32), tf.one_hot(labels, N_CLASSES)))
         return batches.apply(tf.data.experimental.assert_cardinality(len(self)))
-
-
-def _check(images, labels):
-    if len(images) == 0:
-        raise InputError("an empty set: training needs at least one image with its label map, for validation too")
-    if images.ndim != 4 or images.shape[:3] != labels.shape or images.shape[1] != images.shape[2]:
-        raise InputError(f"images {images.shape} and label maps {labels.shape} do not match; expected "
-                         "(n, size, size, channels) and (n, size, size)")
-    known = labels[labels != augmentation.NOTHING]
-    if known.size and known.max() >= N_CLASSES:
-        raise InputError(f"label id {known.max()} is above {N_CLASSES - 1}; label maps must hold Cityscapes label ids")
 
 
 def made_from(model, batches, validation):
