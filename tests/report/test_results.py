@@ -59,7 +59,7 @@ def test_the_thesis_tables_come_out_of_the_thesis_numbers(metric, key, total, me
     reported = REPORTED[key]
     runs = runs_of(list(reported), lambda name, method, width: 2.0 if method == "baseline" else 2 * (
         1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0))
-    table = tables.table_of_change(runs, metric, "thesis").set_index("sequence")
+    table = tables.table_of_change(thesis_tables.of_chosen_width(runs), runs, metric, "thesis").set_index("sequence")
     assert list(table) == [f"{metric.upper()}, all keypoints (m)", f"{metric.upper()}, best mask (m)", "change (%)",
                            "change (%), thesis"]
     for column in ("change (%)", "change (%), thesis"):
@@ -72,7 +72,8 @@ def test_the_thesis_tables_come_out_of_the_thesis_numbers(metric, key, total, me
 
 def test_what_the_thesis_does_not_report_stays_empty():
     runs = runs_of(["77"], lambda *_: 1.0)
-    assert np.isnan(tables.table_of_change(runs, "rmse", "thesis").loc[0, "change (%), thesis"])
+    table = tables.table_of_change(thesis_tables.of_chosen_width(runs), runs, "rmse", "thesis")
+    assert np.isnan(table.loc[0, "change (%), thesis"])
     assert pd.isna(tables.table_4_1(runs, "thesis").loc[0, "width, thesis"])
 
 

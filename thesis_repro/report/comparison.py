@@ -7,7 +7,6 @@ measures it. Several sources of masks are further rows.
 import textwrap
 from itertools import cycle
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.ticker import MaxNLocator
@@ -212,15 +211,7 @@ def _widths(runs):
     return table.rename_axis("sequence").reset_index()
 
 
-def save(table, runs, folder, note):
-    """Write the three figures and both tables into a folder; returns (kind, name) of each."""
-    figures = {"comparison": figure_comparison(table), "comparison_keypoints": figure_keypoints(table),
-               "comparison_sequences": figure_sequences(table, runs)}
-    tables = {"comparison": table_comparison(table), "widths": table_widths(runs)}
-    tables = {name: shown for name, shown in tables.items() if len(shown)}
-    for name, figure in figures.items():
-        style.save_figure(figure, folder, name, note)
-        plt.close(figure)
-    for name, shown in tables.items():
-        style.save_table(shown, folder, name, note)
-    return [*(("figure", name) for name in figures), *(("table", name) for name in tables)]
+def figures(table, runs):
+    """All three, by name."""
+    return {"comparison": figure_comparison(table), "comparison_keypoints": figure_keypoints(table),
+            "comparison_sequences": figure_sequences(table, runs)}

@@ -57,8 +57,9 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
     longrun.sweep(folder)
-    style.save_table(audit.table(measured), folder, "audit", note)
-    comparison.save(table, runs, folder, note)
+    style.save_all(comparison.figures(table, runs), {
+        "comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
+        "audit": audit.table(measured)}, folder, note)
     for name, content in {"runs": runs, "switches": switches}.items():
         # six digits are more than shuffling the matched points leaves alone
         write_text(folder / f"{name}.csv", content.to_csv(index=False, lineterminator="\n", float_format="%.6g"))

@@ -105,20 +105,17 @@ def _progress_path():
 
 def _reason(error):
     """Why a notebook failed, in one line."""
-    reason = f"{type(error).__name__}: {error}"
+    if isinstance(error, DeadKernelError):
+        return "the kernel died, as it does where there is not enough memory"
+    name, text = type(error).__name__, str(error)
     if isinstance(error, CellExecutionError):
-        reason = f"{error.ename}: {error.evalue}"
-        reason = reason.partition("\n")[0] + longrun.remedy(reason)
-    elif isinstance(error, DeadKernelError):
-        reason = "the kernel died, as it does where there is not enough memory"
-    return COLORS.sub("", reason).strip().partition("\n")[0]
+        name, text = error.ename, error.evalue
+    lines = COLORS.sub("", f"{name}: {text}").strip().splitlines()
+    return lines[0] + longrun.remedy(text)
 
 
 def _report(folder, error):
     """Say in one line why the executed notebook itself could not be written."""
     if isinstance(error, OSError) and error.filename is None:
         error.filename = str(folder)
-    try:
-        longrun.report_error(error)
-    except Exception:
-        traceback.print_exception(error)
+    print(longrun.explain(error) or "".join(traceback.format_exception(error)), file=sys.stderr)

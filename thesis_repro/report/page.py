@@ -7,12 +7,14 @@ templates/page.html.j2 says how.
 
 import hashlib
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -58,7 +60,7 @@ def write_notebooks(paths, page):
 
     The last line of the HTML says what it was made from: dates would not do, since a machine's clock can jump.
     """
-    parts = [path for path in [*HERE.iterdir(), *(HERE / "templates").iterdir()] if path.is_file()]
+    parts = [Path(__file__), *(HERE / "templates").iterdir()]
     for path in paths:
         digests = [f"{part.name} {stages.content(part)}\n" for part in sorted([*parts, path])]
         made_from = f"<!-- made from {hashlib.sha256(''.join(digests).encode()).hexdigest()[:12]} -->\n"
@@ -81,21 +83,20 @@ def build(settings):
     makers, numbers = _makers(), tables.beside_the_thesis(settings)
     chapters = {title: [_shown(settings.figures, artefact, makers, settings, numbers) for artefact in artefacts]
                 for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()}
-    artefacts = [artefact for of_chapter in chapters.values() for artefact in of_chapter]
-    notebooks = {}
-    if not settings.figures_in_git:  # in a clone there is no build folder to link to
-        notebooks = {path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
-                     for path in _executed(settings)}
+    executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
     lengths = tables.read(settings.figures / "table_4_1.csv")
     return texts.render(
         "page.html.j2", title=f"Tables and figures, {settings.run}", settings=settings, chapters=chapters,
         shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
-        of=len(captions.THESIS), missing=[one for one in artefacts if not one["there"] and not one["left_out"]],
-        left_out=[one for one in artefacts if one["left_out"]], card=captions.CARD, notebooks=notebooks,
-        evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE, label_maps=gap.label_map_quality(settings.build),
+        of=len(captions.THESIS), card=captions.CARD, label_maps=gap.label_map_quality(settings.build),
+        missing=[artefact for artefact in artefacts if not artefact["there"] and not artefact["left_out"]],
+        left_out=[artefact for artefact in artefacts if artefact["left_out"]],
+        notebooks={} if settings.figures_in_git else {  # in a clone there is no build folder to link to
+            path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures) for path in executed},
+        evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE,
         frames=dict(zip(lengths["sequence"], lengths["frames"])) if "frames" in lengths else {},
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
-        made=_made(_executed(settings), settings.figures_in_git))
+        made=_made(executed, settings.figures_in_git))
 
 
 def build_study(folder, names, **facts):
@@ -119,21 +120,17 @@ def _shown(folder, artefact, makers, settings=None, numbers=None):
     if name in captions.THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
         _, chapter, count = name.split("_")
         number = f"{kind.capitalize()} {chapter.upper()}.{int(count)}"
-    thesis = artefact.get("thesis")
+    thesis = dict(artefact.get("thesis", ()))
     if thesis:
-        here = (numbers or {}).get(name)
-        thesis = {"data": thesis["data"], "text": _filled(thesis["text"], captions.REPORTED),
-                  "here": here and _filled(thesis["here"], here),
-                  "embedded": {"runs": settings.kitti_is_embedded,
-                               "training": settings.cityscapes_is_embedded}.get(thesis["data"], False)}
+        fill = texts.TEMPLATES.from_string
+        thesis["text"] = fill(thesis["text"]).render(captions.REPORTED)
+        thesis["here"] = name in numbers and fill(thesis["here"]).render(numbers[name])
+        thesis["embedded"] = (settings.kitti_is_embedded if thesis["data"] == "runs" else
+                              thesis["data"] == "training" and settings.cityscapes_is_embedded)
     return {"on_label_maps": False} | artefact | {
         "id": name if number or kind == "text" else f"{kind}-{name}", "number": number, "there": there,
         "content": content, "files": [path.name for path in files], "makers": makers.get(name, []), "thesis": thesis,
         "left_out": bool(settings) and settings.shipped and artefact.get("of_training", False) and not there}
-
-
-def _filled(template, values):
-    return texts.TEMPLATES.from_string(template).render(values)
 
 
 def _makers():
@@ -156,11 +153,9 @@ def _made(executed=(), in_git=False):
     made["packages"] = {name: importlib.metadata.version(name) for name in PACKAGES}
     if in_git:
         return made
-    try:
+    with suppress(OSError, subprocess.CalledProcessError):
         made["commit"] = git("rev-parse", "--short=12", "HEAD")
         made["changed"] = bool(git("status", "--porcelain", "--", ".", ":!figures"))
-    except (OSError, subprocess.CalledProcessError):
-        pass
     times = [time for path in executed for cell in _cells(path)
              if (time := cell["metadata"].get("execution", {}).get("iopub.execute_input"))]
     if times:

@@ -18,11 +18,13 @@ def write(study, runs, folder):
     table, note = compare.comparisons(runs), data_note(study)
     style.save_table(runs.round(DIGITS), folder, "runs", note)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
-    style.save_table(tables.table_errors(runs), folder, "errors", note)
-    names = {("text", "findings"), ("table", "errors"), *comparison.save(table, runs, folder, note)}
+    names = style.save_all(comparison.figures(table, runs), {
+        "comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
+        "errors": tables.table_errors(runs)}, folder, note)
     write_text(folder / page.PAGE, page.build_study(
-        folder, names, study=study, embedded=is_embedded(study.kitti), kinds=KINDS, estimators=ESTIMATORS,
-        line_width=controls.LINE_WIDTH, changed={source.name: _changed(source) for source in study.sources},
+        folder, [("text", "findings"), *names], study=study, embedded=is_embedded(study.kitti), kinds=KINDS,
+        estimators=ESTIMATORS, line_width=controls.LINE_WIDTH,
+        changed={source.name: _changed(source) for source in study.sources},
         widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
         frames=runs.groupby("sequence")["frames"].first().to_dict()))
     return folder / page.PAGE

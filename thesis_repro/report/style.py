@@ -163,6 +163,17 @@ def save_table(table, folder, name, note):
     write_text(folder / f"{name}.md", f"{markdown(table)}\n{note}\n")
 
 
+def save_all(figures, tables, folder, note):
+    """Write figures and tables that have rows, {name: ...} of each; returns (kind, name) of what was written."""
+    tables = {name: table for name, table in tables.items() if len(table)}
+    for name, figure in figures.items():
+        save_figure(figure, folder, name, note)
+        plt.close(figure)
+    for name, table in tables.items():
+        save_table(table, folder, name, note)
+    return [*(("figure", name) for name in figures), *(("table", name) for name in tables)]
+
+
 def markdown(table):
     """A pandas table as a Markdown one; numbers are aligned to the right, missing values are empty."""
     numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]

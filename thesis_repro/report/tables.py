@@ -23,32 +23,27 @@ def table_4_1(runs, reported_as):
         f"mean keypoints, {reported_as}": reported["mean_keypoints"]}).reset_index()
 
 
-def table_of_change(runs, metric, reported_as):
+def table_of_change(best, runs, metric, reported_as):
     """Tables 4.2 and 4.3: the metric (m) with all keypoints and with the best mask, and Equation 4.1 in percent.
 
-    The thesis's "aggregate" is the sum of the sequences' percentages; mean, its bootstrap interval and median stand
-    below it.
+    best: the rows of each sequence's best width (`thesis_tables.of_chosen_width`). The thesis's "aggregate" is the sum
+    of the sequences' percentages; mean, its bootstrap interval and median stand below it.
     """
-    key = {"rmse": "table_4_2_rmse_percent_change", "mae": "table_4_3_mae_percent_change"}[metric]
-    best, reported = thesis_tables.of_chosen_width(runs), pd.Series(REPORTED[key])
-    ours = thesis_tables.changes(best, runs, metric)
+    reported = pd.Series(REPORTED[f"table_4_{2 if metric == 'rmse' else 3}_{metric}_percent_change"])
+    changes = thesis_tables.changes(best, runs, metric)
     rows = {f"{metric.upper()}, all keypoints (m)": compare.of_method(runs, "baseline"),
             f"{metric.upper()}, best mask (m)": best}
     table = pd.DataFrame({name: own.groupby("sequence")[metric].mean().map(lambda value: float(f"{value:.3g}"))
                           for name, own in rows.items()})
-    theirs = f"change (%), {reported_as}"
-    table = table.assign(**{"change (%)": ours.round(2), theirs: reported.reindex(table.index)})
-    below = pd.DataFrame({"change (%)": _below(ours), theirs: _below(reported)}).round(2).reindex(columns=table.columns)
-    return pd.concat([table, below]).rename_axis("sequence").reset_index()
-
-
-def _below(changes):
-    """What stands below a column of percent changes."""
-    low, high = compare.mean_interval(changes)
-    interval = f"mean, {compare.LEVEL} % CI over sequences"
-    return pd.Series({"sum (the thesis's aggregate)": changes.sum(min_count=1), "mean": changes.mean(),
-                      f"{interval}, from": low, f"{interval}, to": high, "median": changes.median(),
-                      "sequences improved": (changes < 0).sum()}, dtype=float)
+    theirs, interval, below = f"change (%), {reported_as}", f"mean, {compare.LEVEL} % CI over sequences", {}
+    for name, values in (("change (%)", changes), (theirs, reported)):
+        low, high = compare.mean_interval(values)
+        below[name] = {"sum (the thesis's aggregate)": values.sum(min_count=1), "mean": values.mean(),
+                       f"{interval}, from": low, f"{interval}, to": high, "median": values.median(),
+                       "sequences improved": (values < 0).sum()}
+    table = table.assign(**{"change (%)": changes, theirs: reported.reindex(table.index)})
+    table = pd.concat([table, pd.DataFrame(below, dtype=float).reindex(columns=table.columns)])
+    return table.round({"change (%)": 2, theirs: 2}).rename_axis("sequence").reset_index()
 
 
 def table_errors(runs):
@@ -101,16 +96,9 @@ def beside_the_thesis(settings):
     history, chosen = read(settings.build / "model" / "history.csv"), read(settings.figures / "table_4_1.csv")
     seconds = read(settings.figures / "timings" / "seconds.csv")
     if len(history):
-        best = history.loc[history["val_loss"].idxmin()]
-        scores = {split: {key: f"{best[prefix + name]:.2f}" for key, name in (
-            ("loss", "loss"), ("f1", "f1-score"), ("iou", "iou_score"))}
-            for split, prefix in (("train", ""), ("validation", "val_"))}
-        numbers["figure_4_01"] = {"epochs": len(history), "best": int(best["epoch"]), **scores}
+        numbers["figure_4_01"] = {"epochs": len(history), "best": history.loc[history["val_loss"].idxmin()].to_dict()}
     if "mean keypoints" in chosen:
-        numbers["figure_4_07"] = {"least": max(1, chosen["mean keypoints"].min()),
-                                  "most": max(1, chosen["mean keypoints"].max())}
+        numbers["figure_4_07"] = {"keypoints": chosen["mean keypoints"].clip(lower=1)}
     if len(seconds):
-        masked = seconds[seconds["method"] == "masked"].groupby("dilation_width")["seconds"].sum()
-        saved = 100 * (1 - masked / seconds.loc[seconds["method"] == "baseline", "seconds"].sum())
-        numbers["figure_4_17"] = {"least": f"{saved.min():.0f}", "most": f"{saved.max():.0f}"}
+        numbers["figure_4_17"] = {"saved": 0 - thesis_tables.time_savings(seconds)}
     return numbers

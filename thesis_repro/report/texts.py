@@ -62,6 +62,9 @@ def findings(runs, table, data, label_maps=()):
     label_maps: how good these are, rows of `gap.label_map_quality`.
     """
     baseline, of_masks = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
+    pairs = table[(table["method"] == "masked") & (table["reference"] == "masked")
+                  & table["metric"].isin(compare.JUDGING_METRICS) & (table["source"] < table["reference_source"])
+                  & (table["estimator"] == compare.judging_estimator(table))]  # each pair of sources once
     spread = compare.shuffle_spread(runs).groupby("estimator")["factor"].agg(["median", "max"])
     return render(
         "findings.md.j2", label_maps=label_maps, data=data,
@@ -71,38 +74,20 @@ def findings(runs, table, data, label_maps=()):
         least=compare.MIN_FOR_INTERVAL, level=compare.LEVEL, thesis_width=CONTROL_WIDTH,
         sources=[_of_source(runs, table, source) for source in compare.sources(runs) or [""]
                  if (of_masks["source"] == source).any()],
-        against_each_other=_against_each_other(table))
+        against_each_other=pairs.to_dict("records"))
 
 
 def _of_source(runs, table, source):
     """What the template says of one source of masks."""
-    own = table[(table["source"] == source) & table["tested"]]
-    judged = compare.primary_comparison(table, source)
-    masked = own[(own["method"] == "masked") & (own["reference"] == "baseline")]
-    corrected = own[(own["method"] == "corrected") & (own["reference"] == "baseline")
-                    & own["metric"].isin(compare.JUDGING_METRICS)]
+    runs, judged = compare.of_source(runs, source), compare.primary_comparison(table, source)
+    rows = table[(table["source"] == source) & (table["reference"] == "baseline") & table["tested"]]
+    judging = rows["metric"].isin(compare.JUDGING_METRICS) & (rows["estimator"] == compare.judging_estimator(table))
     controls = compare.against_controls(table, source)
     controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)["verdict"]
-    return {"name": source, "judged": _records(judged), "verdict": compare.overall(judged["verdict"]),
-            "width": compare.tested_width(compare.of_source(runs, source)), "masked": _records(masked),
-            "corrected": _records(corrected[corrected["estimator"] == compare.judging_estimator(table)]),
-            "controls": controls.agg(compare.overall).to_dict(),
-            "stability": _stability(compare.of_source(runs, source))}
-
-
-def _stability(runs):
-    """{widths, same_best} of masks of several widths in several repetitions; None for others."""
     widths = compare.of_method(runs, "masked")["dilation_width"].nunique()
-    agreeing = thesis_tables.stability(runs)["same_best"].dropna() if widths > 1 else ()
-    return {"widths": widths, "same_best": float(agreeing.mean())} if len(agreeing) else None
-
-
-def _against_each_other(table):
-    """Masks of one source over those of another, each pair once."""
-    rows = table[(table["method"] == "masked") & (table["reference"] == "masked") & table["metric"].isin(
-        compare.JUDGING_METRICS) & (table["estimator"] == compare.judging_estimator(table))]
-    return _records(rows[rows["source"] < rows["reference_source"]])
-
-
-def _records(table):
-    return table.to_dict("records")
+    same_best = thesis_tables.stability(runs)["same_best"].mean() if widths > 1 else None
+    return {"name": source, "judged": judged.to_dict("records"), "verdict": compare.overall(judged["verdict"]),
+            "width": compare.tested_width(runs), "masked": rows[rows["method"] == "masked"].to_dict("records"),
+            "corrected": rows[judging & (rows["method"] == "corrected")].to_dict("records"),
+            "controls": controls.agg(compare.overall).to_dict(), "widths": widths,
+            "same_best": None if pd.isna(same_best) else float(same_best)}
