@@ -31,7 +31,7 @@ def point():
 def test_canny_misses_neighbouring_ids_and_exact_does_not():
     # road 7 and sidewalk 8 differ by one: too little for thresholds of 5 and 15
     assert not masks.edges(bands("road", "sidewalk"), (64, 96)).any()
-    exact = masks.edges(bands("road", "sidewalk"), (64, 96), boundaries="exact")
+    exact = masks.edges(bands("road", "sidewalk"), (64, 96), MaskSettings("exact"))
     assert np.array_equal(np.unique(np.nonzero(exact)[1]), [47])
     canny = masks.edges(bands("road", "sky"), (64, 96))
     assert set(np.unique(canny)) == {0, 255} and abs(np.nonzero(canny)[1] - 47.5).max() <= 1
@@ -55,8 +55,6 @@ def test_without_corrections_masks_are_the_thesiss_to_the_bit():
     enlarged = cv2.resize(streets(), SIZE[::-1])
     theirs = cv2.dilate(cv2.Canny(enlarged, 5, 15), np.ones((10, 10), np.uint8))
     assert np.array_equal(masks.keypoint_mask(streets(), SIZE, 10), theirs)
-    assert np.array_equal(masks.keypoint_mask(streets(), SIZE, 10, "exact"),
-                          masks.keypoint_mask(streets(), SIZE, 10, MaskSettings(boundaries="exact")))
 
 
 # The corrections, each by itself

@@ -3,7 +3,7 @@
 A mask is uint8 of the frame's size: keypoints may lie where it is 255 and not where it is 0.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -50,17 +50,12 @@ class MaskSettings:
             if pixels < 0:
                 raise InputError(f"{name}={pixels}: must be 0 or more pixels")
 
-    @classmethod
-    def of(cls, settings: "MaskSettings | str") -> "MaskSettings":
-        """The settings themselves; a string names the boundaries alone."""
-        return cls(settings) if isinstance(settings, str) else settings
 
-
-def edges(label_map: np.ndarray, size: tuple[int, int], boundaries: str = "canny", symmetric: bool = False,
-          classes: tuple[str, ...] = ()) -> np.ndarray:
+def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings = MaskSettings()) -> np.ndarray:
     """Boundaries between classes at the frame's size.
 
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
+    Of the settings, movable and margin do not matter here.
 
     boundaries "canny" is the thesis: enlarge bilinearly (which invents ids along every boundary), then Canny (5, 15)
     on the ids themselves, so that a boundary shows only where two ids are far enough apart. "exact" is the correction:
@@ -70,20 +65,19 @@ def edges(label_map: np.ndarray, size: tuple[int, int], boundaries: str = "canny
     classes: names of labels; only boundaries of these. Canny knows no classes, so a Canny edge belongs to them where it
     lies within two pixels of such a boundary.
     """
-    MaskSettings(boundaries, classes=classes)  # refuses what is unknown
-    height, width = size
-    if boundaries == "canny":
-        canny = cv2.Canny(cv2.resize(label_map, (width, height)), CANNY_LOW, CANNY_HIGH)
-        if not classes:
+    if settings.boundaries == "canny":
+        canny = cv2.Canny(cv2.resize(label_map, size[::-1]), CANNY_LOW, CANNY_HIGH)
+        if not settings.classes:
             return canny
-        return canny & dilate(edges(label_map, size, "exact", True, classes), CLASS_EDGE_WINDOW, True)
-    enlarged = _enlarged(label_map, size, symmetric)
-    chosen = np.isin(enlarged, [ID[name] for name in classes]) if classes else np.ones(size, bool)
+        of_classes = edges(label_map, size, replace(settings, boundaries="exact", symmetric=True))
+        return canny & dilate(of_classes, CLASS_EDGE_WINDOW)
+    enlarged = _enlarged(label_map, size, settings.symmetric)
+    chosen = np.isin(enlarged, [ID[name] for name in settings.classes]) if settings.classes else np.ones(size, bool)
     different = np.zeros(size, bool)
     for pixel, neighbour in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         change = (enlarged[pixel] != enlarged[neighbour]) & (chosen[pixel] | chosen[neighbour])
         different[pixel] |= change
-        if symmetric:
+        if settings.symmetric:
             different[neighbour] |= change
     return different.astype(np.uint8) * 255
 
@@ -126,19 +120,15 @@ def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettin
 
 
 def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int,
-                  settings: MaskSettings | str = MaskSettings()) -> np.ndarray:
-    """The mask of one frame from its label map: `dilate(edges(...))`, less what is `forbidden`.
-
-    settings: a string stands for `MaskSettings(boundaries=...)`.
-    """
-    settings = MaskSettings.of(settings)
+                  settings: MaskSettings = MaskSettings()) -> np.ndarray:
+    """The mask of one frame from its label map: `dilate(edges(...))`, less what is `forbidden`."""
     return _widened(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
 
 
 def _edges_and_forbidden(label_map, size, settings):
     """The parts of a mask that do not depend on its width; None where nothing is forbidden."""
     everywhere = settings.movable is None and not settings.margin
-    return (edges(label_map, size, settings.boundaries, settings.symmetric, settings.classes),
+    return (edges(label_map, size, settings),
             None if everywhere else forbidden(label_map, size, settings))
 
 
@@ -155,7 +145,7 @@ def boundaries_found(mask: np.ndarray, true_labels: np.ndarray) -> float:
 
     True boundaries are marked on both sides (`edges`, exact and symmetric). NaN where there are none.
     """
-    true = edges(true_labels, mask.shape, "exact", symmetric=True) > 0
+    true = edges(true_labels, mask.shape, MaskSettings("exact", symmetric=True)) > 0
     return float((mask[true] > 0).mean()) if true.any() else np.nan
 
 
@@ -173,11 +163,11 @@ class LabelMasks:
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int,
-                 settings: MaskSettings | str = MaskSettings()) -> None:
+                 settings: MaskSettings = MaskSettings()) -> None:
         self.paths = _files_of_frames(folder, sequence, "label map")
         self.size = sequence.size
         self.dilation_width = dilation_width
-        self.settings = MaskSettings.of(settings)
+        self.settings = settings
         check_width(dilation_width, self.size)
         for name, pixels, most in (("margin", self.settings.margin, (min(self.size) - 1) // 2),
                                    ("movable", self.settings.movable or 0, max(self.size) - 1)):

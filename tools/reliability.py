@@ -17,7 +17,7 @@ import pandas as pd
 from thesis_repro import InputError, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks
+from thesis_repro.masks import LabelMasks, MaskSettings
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED
 from thesis_repro.study import controls
@@ -38,7 +38,7 @@ def methods(sequence, labels=None):
     if labels is not None:
         for width in WIDTHS:
             by_name[f"masked-{width}"] = THESIS, LabelMasks(labels, sequence, width)
-            by_name[f"exact-{width}"] = THESIS, LabelMasks(labels, sequence, width, "exact")
+            by_name[f"exact-{width}"] = THESIS, LabelMasks(labels, sequence, width, MaskSettings("exact"))
         for name in CONTROLS:
             by_name[name] = THESIS, controls.masks(name, Source(labels), sequence, WIDTHS[-1])
     return by_name

@@ -87,9 +87,9 @@ def test_true_labels_are_those_of_the_world(sequence, small_world, made):
     label_map = cv2.imread(str(small_world / "kitti/sequences/00/labels_0/000005.png"), cv2.IMREAD_GRAYSCALE)
     assert label_map.shape == sequence.size
     assert np.array_equal(made["true-labels"][5], masks.keypoint_mask(label_map, sequence.size, WIDTH))
-    exact = masks.keypoint_mask(label_map, sequence.size, WIDTH, "exact")
+    exact = masks.keypoint_mask(label_map, sequence.size, WIDTH, masks.MaskSettings("exact"))
     near = masks.keypoint_mask(cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST), sequence.size, WIDTH,
-                               "exact")
+                               masks.MaskSettings("exact"))
     assert np.array_equal(made["exact-boundaries"][5], near) and not np.array_equal(near, exact)
 
 
@@ -128,7 +128,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(small_wor
 
 
 def test_all_masks_have_the_boundaries_that_are_asked_for(sequence, small_labels, made):
-    exact = masks.LabelMasks(small_labels / "00", sequence, WIDTH, "exact")
+    exact = masks.LabelMasks(small_labels / "00", sequence, WIDTH, masks.MaskSettings("exact"))
     source = Source(small_labels, settings=masks.MaskSettings("exact"))
     chosen = {method: controls.masks(method, source, sequence, WIDTH)
               for method in controls.MASKS}

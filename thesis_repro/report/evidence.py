@@ -111,7 +111,7 @@ def _tracks(sequences, labels):
     for sequence in sequences:
         own, width = labels / sequence.name, jobs.CONTROL_WIDTH
         kinds = {"all keypoints": None, "masks": masks.LabelMasks(own, sequence, width),
-                 "exact boundaries": masks.LabelMasks(own, sequence, width, "exact"),
+                 "exact boundaries": masks.LabelMasks(own, sequence, width, masks.MaskSettings("exact")),
                  "random lines": controls.masks("random-lines", Source(labels), sequence, width)}
         rows.append(ablations.tracks(sequence, kinds, LOOKED_AT))
     return pd.concat(rows, ignore_index=True)

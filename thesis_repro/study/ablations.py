@@ -126,7 +126,7 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
     refined one. A repetition other than 0 is the seed that shuffles the matched points. All keypoints have
     `baseline_repetitions` under the thesis's estimator, from which `null_distribution` draws.
     """
-    own = masks.LabelMasks(labels, sequence, dilation_width, boundaries)
+    own = masks.LabelMasks(labels, sequence, dilation_width, MaskSettings(boundaries))
     sample = range(0, len(sequence), max(1, len(sequence) // 8))
     number = round(np.mean([len(keypoints.detect(sequence.frame(index), THESIS, own[index])) for index in sample]))
 
@@ -262,7 +262,7 @@ def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]
     """
     nearest = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
     bilinear = cv2.resize(label_map, size[::-1])
-    exact = masks.edges(label_map, size, "exact") > 0
+    exact = masks.edges(label_map, size, MaskSettings("exact")) > 0
     missed = masks.dilate(masks.edges(label_map, size), 2 * NEAR + 1) == 0
     around = np.ones((2 * NEAR + 1, 2 * NEAR + 1), np.uint8)
     there = np.zeros(nearest.shape, bool)
