@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from thesis_repro import InputError
 from thesis_repro.cli import main
 from thesis_repro.kitti import read_poses
-from thesis_repro.odometry import metrics
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.odometry.refined.boresight import corrected, rotation
 
@@ -82,7 +81,7 @@ def test_the_table_says_what_the_rotation_explains_of_each_sequence():
     assert (table["rmse_own"] < table["rmse"] / 2).all()
     assert (table["rmse_others"].dropna() < table["rmse"].dropna()[:2] / 2).all() and np.isnan(
         table.loc["00", "rmse_others"])
-    assert (table["directions"] > table["rotations"]).all()  # the angle is in the directions
+    assert (table[["camera_sway", "truth_sway"]] > 0).any().all()
 
 
 def test_the_commands_estimate_and_apply(small_world, tmp_path, capsys):
@@ -100,13 +99,3 @@ def test_the_commands_estimate_and_apply(small_world, tmp_path, capsys):
     assert read_poses(turned) == pytest.approx(corrected(read_poses(raw), KNOWN), abs=1e-12)
     assert summaries[0]["rmse_m"] != summaries[1]["rmse_m"]
     assert summaries[0]["ate_se3_m"] == pytest.approx(summaries[1]["ate_se3_m"], abs=1e-6)
-
-
-def test_a_run_with_other_poses_has_them_in_its_table(small_world):
-    from thesis_repro import odometry
-    from thesis_repro.kitti import Sequence
-
-    result = odometry.run(Sequence(small_world / "kitti", "00").subset(4))
-    poses = corrected(result.poses, KNOWN)
-    assert np.array_equal(odometry.passes.poses_of(result.with_poses(poses).frames), poses)
-    assert metrics.rmse(poses, result.poses) > 0

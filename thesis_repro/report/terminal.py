@@ -7,7 +7,7 @@ from thesis_repro.report import texts
 from thesis_repro.settings import cores
 
 ERRORS = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_m")
-METRES = ("rmse", "rmse_own", "rmse_others", "rotations", "directions", "ate")
+METRES = ("rmse", "rmse_own", "rmse_others")
 
 
 def run(result, sequence, alignment):
@@ -45,7 +45,7 @@ def angles(rotation, table):
 def angles_text(rotation, table):
     """The same as lines."""
     of_day = dict(zip(boresight.ANGLES, zip(rotation.angles, rotation.low, rotation.high, strict=True), strict=True))
-    return texts.render("angles.txt.j2", of_day=of_day, steps=rotation.steps, start=boresight.FIRST_STEPS,
+    return texts.render("angles.txt.j2", of_day=of_day, steps=rotation.steps,
                         rows=table.to_dict("records")).rstrip()
 
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
 from thesis_repro import InputError
 from thesis_repro.odometry import metrics
@@ -30,8 +31,6 @@ SMOOTHED_STEPS = 9  # long enough to average noise out, shorter than a turn
 MIN_BLOCK_STEPS = 20  # drawn together, because errors of neighbouring steps are correlated
 MAX_BLOCKS = 8  # of a sequence
 BOOTSTRAP_DRAWS = 200
-# 95 %: Student's t of 1, 2, ... degrees of freedom, and of more
-STUDENT_T = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.1)
 MAX_HALF_INTERVAL = 1.0  # degrees: an angle whose interval reaches farther to either side is not determined
 Paths = tuple[np.ndarray, np.ndarray]  # estimated and true poses of one sequence, (n, 4, 4) each
 
@@ -156,7 +155,7 @@ def _with_interval(equations, free):
     random, count = np.random.default_rng(0), len(equations.blocks)
     drawn = [_fit(equations, [equations.blocks[index] for index in random.integers(0, count, count)], free)
              for _ in range(BOOTSTRAP_DRAWS)]
-    widening = np.sqrt(count / (count - 1)) * STUDENT_T[min(count - 1, len(STUDENT_T)) - 1]
+    widening = np.sqrt(count / (count - 1)) * stdtrit(count - 1, 0.975)
     return _fit(equations, equations.blocks, free), np.std(drawn, axis=0) * widening
 
 
@@ -181,7 +180,6 @@ def _fit(equations, blocks, free):
 # Recording days of KITTI's sequences. The cameras were calibrated anew on each.
 DAYS = {**dict.fromkeys(("00", "01", "02"), "2011-10-03"), "03": "2011-09-26",
         **{f"{number:02d}": "2011-09-30" for number in range(4, 11)}}
-FIRST_STEPS = 15
 MAX_STRAIGHT_TURN = 0.2  # degrees of turn in a straight step
 
 
@@ -191,22 +189,14 @@ def explained(paths: Mapping[str, Paths]) -> pd.DataFrame:
     steps; pitch, yaw, roll and their _low and _high (degrees, NaN: not determined), from the sequence itself.
     rmse: as it is. rmse_own, rmse_others: with the angles of the sequence itself, and of the `others` given here that
     were recorded on the same day (NaN where there are none).
-    rotations, directions: the RMSE of a path that takes only the rotations, or only the directions of motion, from the
-    odometry and all else from the truth. The angle can only improve the second. The two errors may cancel each other,
-    and then improving one of them makes the sum worse.
     camera_sway, truth_sway: robust standard deviation in degrees of the sideways direction of motion on straight
     steps. A car cannot slide, so the one that sways more is in error.
-    start: degrees by which rotations of odometry and truth differ over the first FIRST_STEPS steps. ate: metres,
-    aligned (se3).
     """
     rows = []
     for name, (estimated, true) in paths.items():
         own = estimate([paths[name]])
         others = same_day(name, paths)
         motion, given = _motions(estimated), _motions(true)
-        rotations_alone, directions_alone = given.copy(), given.copy()
-        rotations_alone[:, :3, :3], directions_alone[:, :3, 3] = motion[:, :3, :3], motion[:, :3, 3]
-        first, first_true = (_composed(steps[:FIRST_STEPS], np.eye(4))[-1, :3, :3] for steps in (motion, given))
         row = {"sequence": name, "steps": own.steps}
         for angle, *values in zip(ANGLES, own.angles, own.low, own.high, strict=True):
             row |= dict(zip((angle, f"{angle}_low", f"{angle}_high"), values, strict=True))
@@ -214,11 +204,7 @@ def explained(paths: Mapping[str, Paths]) -> pd.DataFrame:
             "rmse": metrics.rmse(estimated, true),
             "rmse_own": metrics.rmse(corrected(estimated, own.usable), true),
             "rmse_others": metrics.rmse(corrected(estimated, angles_of_day(name, paths)), true) if others else np.nan,
-            "others": " ".join(others),
-            "rotations": metrics.rmse(_composed(rotations_alone, true[0]), true),
-            "directions": metrics.rmse(_composed(directions_alone, true[0]), true),
-            "camera_sway": _sway(motion, given), "truth_sway": _sway(given, given),
-            "start": float(metrics.angles(first.T @ first_true)), "ate": metrics.ate(estimated, true, "se3")["rmse"]})
+            "others": " ".join(others), "camera_sway": _sway(motion, given), "truth_sway": _sway(given, given)})
     return pd.DataFrame(rows)
 
 
@@ -231,13 +217,6 @@ def angles_of_day(name: str, paths: Mapping[str, Paths]) -> np.ndarray:
 def same_day(name: str, names: Iterable[str]) -> list[str]:
     """Those of `names` that were recorded on the day of sequence `name`, itself left out."""
     return [other for other in names if other != name and name in DAYS and DAYS.get(other) == DAYS[name]]
-
-
-def _composed(motions, start):
-    poses = [start]
-    for motion in motions:
-        poses.append(poses[-1] @ motion)
-    return np.array(poses)
 
 
 def _sway(motion, true_motion):
