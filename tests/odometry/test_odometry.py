@@ -299,17 +299,6 @@ def test_shuffled_inliers_belong_to_their_points(drive):
     np.testing.assert_array_equal(step.inliers, distances < THESIS.threshold)
 
 
-def test_inliers_alone_decide_the_sign():
-    # 60 good points and 140 that fit the motion's rotation but lie behind: they outvote the good ones unless masked.
-    world = np.random.RandomState(0).uniform([-5, -2, 4], [5, 2, 30], (200, 3))
-    current = world[:, :2] / world[:, 2:]
-    ahead, back = world + [0, 0, 1.0], world - [0, 0, 1.0]
-    previous = np.where(np.arange(200)[:, None] < 60, ahead[:, :2] / ahead[:, 2:], back[:, :2] / back[:, 2:])
-    matrix = np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]])
-    assert pose.recover_pose(matrix, current, previous)[2][2] == pytest.approx(-1)
-    assert pose.recover_pose(matrix, current[:60], previous[:60])[2][2] == pytest.approx(1)
-
-
 @pytest.mark.parametrize("method", ["usac", "usac-magsac"])
 def test_other_essential_methods_find_the_way(drive, method):
     few = Changed(drive, frames=5)
@@ -322,12 +311,6 @@ def test_orb_keypoints_find_the_way(drive):
     result = odometry.run(drive, replace(THESIS, detector="orb"))
     assert metrics.rmse(result.poses, drive.poses) < 0.1
     assert result.frames["detected"].gt(500).all()
-
-
-def test_minimum_distance_thins_the_keypoints_out(drive):
-    points = keypoints.detect(drive.frame(0), replace(THESIS, min_distance=10))
-    distances = np.linalg.norm(points[:, None] - points[None], axis=-1) + 1e9 * np.eye(len(points))
-    assert 100 < len(points) < 500 and distances.min() >= 10
 
 
 def test_the_later_pyslam_turns_first_and_gates_on_the_shift_of_points(drive):

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -55,24 +54,6 @@ def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tupl
     return tracked, status.ravel() == 1
 
 
-class _Tracks(NamedTuple):
-    """Points of many runs tracked from one frame to the next, by their sorted keys (see _key)."""
-
-    previous: np.ndarray
-    current: np.ndarray
-    keys: np.ndarray
-    tracked: np.ndarray
-    success: np.ndarray
-
-
-class _Corners(NamedTuple):
-    """A frame's corner strength and its local maxima (see _ranked_maxima)."""
-
-    frame: np.ndarray
-    strength: np.ndarray
-    ranked: tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
 class SharedKeypoints:
     """`detect` and `track` with the same results for many runs over one frame, at little more than the cost of one.
 
@@ -81,8 +62,8 @@ class SharedKeypoints:
     """
 
     def __init__(self) -> None:
-        self._tracks: _Tracks | None = None
-        self._corners: _Corners | None = None
+        self._tracks: tuple[np.ndarray, ...] = ()  # both frames, the sorted keys of all points, what `track` returns
+        self._corners: tuple | None = None  # the frame, its corner strength, and its _ranked_maxima
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
         """Track to `frame` the points of all runs that come from the same previous frame (nearly always all)."""
@@ -90,26 +71,27 @@ class SharedKeypoints:
         if with_points:
             first, _ = with_points[0]
             keys = np.unique(np.concatenate([_key(points) for previous, points in with_points if previous is first]))
-            self._tracks = _Tracks(first, frame, keys, *track(first, frame, keys.view(np.float32).reshape(-1, 2)))
+            self._tracks = first, frame, keys, *track(first, frame, keys.view(np.float32).reshape(-1, 2))
 
     def track(self, previous: np.ndarray, current: np.ndarray,
               points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        tracks = self._tracks
-        if tracks is None or previous is not tracks.previous or current is not tracks.current:  # resumed, say
+        if not self._tracks or previous is not self._tracks[0] or current is not self._tracks[1]:  # resumed, say
             return track(previous, current, points)
-        where = np.searchsorted(tracks.keys, _key(points))
-        return tracks.tracked[where], tracks.success[where]
+        _, _, keys, tracked, success = self._tracks
+        where = np.searchsorted(keys, _key(points))
+        return tracked[where], success[where]
 
     def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
         if settings.detector != "shi-tomasi" or settings.min_distance < 1:
             return detect(frame, settings, mask)
-        if self._corners is None or frame is not self._corners.frame:
+        if self._corners is None or frame is not self._corners[0]:
             strength = cv2.cornerMinEigenVal(frame, BLOCK_SIZE)
-            self._corners = _Corners(frame, strength, _ranked_maxima(strength, cv2.dilate(strength, None)))
+            self._corners = frame, strength, _ranked_maxima(strength, cv2.dilate(strength, None))
+        _, strength, ranked = self._corners
         inside = mask if settings.mask_mode == "detect" else None
         # As OpenCV compares: the limit in double precision, rounded to single.
-        limit = np.float32(cv2.minMaxLoc(self._corners.strength, inside)[1] * QUALITY)
-        chosen = _spread(*self._corners.ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
+        limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * QUALITY)
+        chosen = _spread(*ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
                          settings.max_keypoints, settings.min_distance, *frame.shape)
         return _inside(chosen, settings, mask)
 

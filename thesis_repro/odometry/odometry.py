@@ -212,7 +212,7 @@ class Essential:
 
     current: np.ndarray
     previous: np.ndarray
-    order: np.ndarray | None  # in which they were fed
+    order: np.ndarray | slice  # in which they were fed
     matrix: np.ndarray | None
     inliers: np.ndarray  # (N,) booleans, as fed
     problem: str
@@ -220,8 +220,6 @@ class Essential:
 
     def in_order(self) -> np.ndarray:
         """The inliers in the order of the step's points."""
-        if self.order is None:
-            return self.inliers
         inliers = np.empty_like(self.inliers)
         inliers[self.order] = self.inliers
         return inliers
@@ -229,12 +227,10 @@ class Essential:
 
 def _essential(step, settings, intrinsics):
     started = time.perf_counter()
-    current = pose.normalise(step.current, intrinsics)
-    previous = pose.normalise(step.previous, intrinsics)
-    order = None
+    order: np.ndarray | slice = slice(None)
     if settings.shuffle_seed is not None:
-        order = np.random.default_rng((settings.shuffle_seed, step.frame)).permutation(len(current))
-        current, previous = current[order], previous[order]
+        order = np.random.default_rng((settings.shuffle_seed, step.frame)).permutation(len(step.current))
+    current, previous = (pose.normalise(points, intrinsics)[order] for points in (step.current, step.previous))
     result = pose.essential_matrix(current, previous, settings.threshold, settings.essential_method)
     return Essential(current, previous, order, *result, time.perf_counter() - started)
 

@@ -153,7 +153,10 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
     done = _resume(checkpoint, job, members, leaders)
     with ThreadPoolExecutor(workers) as pool:
         waiting: list[_Estimate] = []
-        for index in _with_bar(range(done, len(sequence)), description, len(sequence)):
+        indices: Iterable[int] = range(done, len(sequence))
+        if description is not None:
+            indices = progress(indices, description, total=len(sequence), initial=done)
+        for index in indices:
             frame = sequence.frame(index)
             if shared is not None:
                 shared.expect(frame, [(leader.odometry.previous, leader.odometry.points) for leader in leaders])
@@ -190,10 +193,6 @@ def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
         estimated = tuple(getattr(settings, key) for key in ESSENTIAL_SETTINGS)
         groups.setdefault(observed, {}).setdefault(estimated, []).append(member)
     return [list(group.values()) for group in groups.values()]
-
-
-def _with_bar(indices: range, description: str | None, total: int) -> Iterable[int]:
-    return indices if description is None else progress(indices, description, total=total, initial=indices.start)
 
 
 def _finish(estimates: Iterable[_Estimate]) -> None:
