@@ -179,11 +179,6 @@ def test_bars_reach_from_the_lowest_to_the_highest_repetition():
     assert segment[:, 1].tolist() == [1, 6]
 
 
-def test_keypoints_kept_are_parts_of_the_thesiss_2000():
-    lines = chapter4.figure_4_07(runs_of(["00"], lambda *_: 1.0)).axes[0].lines
-    assert lines[0].get_ydata() == pytest.approx([505 / 2000, 510 / 2000, 515 / 2000])
-
-
 def test_the_budget_adds_up():
     measured = pd.DataFrame([(method, stage, 10.0) for method, stages in
                              (("all keypoints", ("read", "detection", "tracking", "pose")),

@@ -24,12 +24,12 @@ def figure_2_01():
         for offset in np.arange(maps) * 0.15:
             axes.add_patch(Rectangle((left + offset, middle - side / 2 - offset + 0.3), 0.65 * side, side,
                                      facecolor=color, edgecolor="white", linewidth=0.8))
-        axes.text(left + side / 2, 0.45, name, ha="center", va="center", fontsize=8)
+        axes.text(left + 0.325 * side + 0.075 * (maps - 1), 0.45, name, ha="center", va="center", fontsize=8)
     for start, end in ((2.4, 3.5), (5.95, 6.9), (9.35, 10.3), (11.85, 13.3)):
         _arrow(axes, (start, middle), (end, middle))
     inputs, outputs = (middle + 0.62 * (np.arange(count) - (count - 1) / 2) for count in (6, 4))
     axes.plot([[13.6], [16.3]], [np.repeat(inputs, 4), np.tile(outputs, 6)], color=LIGHT_GRAY, linewidth=0.5, zorder=0)
-    for x, heights, color, name in ((13.6, inputs, GREEN, "dense\nevery input, weighted"),
+    for x, heights, color, name in ((13.6, inputs, GREEN, "dense\nall, weighted"),
                                     (16.3, outputs, RED, "softmax\nclass scores")):
         axes.scatter(np.full(len(heights), x), heights, s=110, color=color)
         axes.text(x, 0.45, name, ha="center", va="center", fontsize=8)
@@ -143,7 +143,7 @@ def figure_2_06():
     for point, marker, size, label in ((path[0], "s", 9, "start"), (path[-1], "*", 14, f"after {steps} steps")):
         axes.plot(*point, marker, color=RED, markersize=size, markeredgecolor="white", label=label)
     for valley in (-1.28, 1.16):  # along y = 0, where the slope vanishes
-        axes.text(valley, -0.7, f"valley of loss {loss(valley, 0):.2f}", color="white", fontsize=8, ha="center")
+        axes.text(valley, -0.7, f"loss {loss(valley, 0):.2f}", color="white", fontsize=8, ha="center")
     axes.set(xlabel="first weight (no unit)", ylabel="second weight (no unit)")
     axes.grid(visible=False)
     axes.legend(loc="upper left", labelcolor="white")

@@ -43,7 +43,7 @@ class Execution(ExecutePreprocessor):
     def preprocess(self, nb, resources=None, km=None):
         name, log = resources["metadata"]["name"], Path(self.log_file)
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
-        sys.excepthook = lambda kind, error, trace: _report(log.parent, error)  # where its result cannot be written
+        sys.excepthook = self._say_why  # where its result cannot be written
         log.parent.mkdir(parents=True, exist_ok=True)
         log.touch()
         with longrun.locked(log), longrun.logged(log.parent, f"make figures, {name}", ours=True), \
@@ -64,6 +64,11 @@ class Execution(ExecutePreprocessor):
                 sys.exit(1)
             longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
         return executed
+
+    def _say_why(self, kind, error, trace):
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(Path(self.log_file).parent)
+        print(longrun.explain(error) or "".join(traceback.format_exception(error)), file=sys.stderr)
 
     @contextmanager
     def setup_kernel(self, **options):
@@ -112,10 +117,3 @@ def _reason(error):
         name, text = error.ename, error.evalue
     lines = COLORS.sub("", f"{name}: {text}").strip().splitlines()
     return lines[0] + longrun.remedy(text)
-
-
-def _report(folder, error):
-    """Say in one line why the executed notebook itself could not be written."""
-    if isinstance(error, OSError) and error.filename is None:
-        error.filename = str(folder)
-    print(longrun.explain(error) or "".join(traceback.format_exception(error)), file=sys.stderr)
