@@ -32,5 +32,5 @@ def test_one_core_and_two_give_the_same_bits():
     first, second, *_ = sorted(os.sched_getaffinity(0))
     runs = [subprocess.Popen([sys.executable, "-c", TRAIN, cores], stdout=subprocess.PIPE, text=True)
             for cores in (f"{first},{second}", f"{first}")]
-    two, one = (run.communicate()[0].split() for run in runs)
-    assert two[-1] == one[-1] and len(one[-1]) == 64
+    both_cores, one_core = (run.communicate()[0].split() for run in runs)
+    assert both_cores[-1] == one_core[-1] and len(one_core[-1]) == 64
