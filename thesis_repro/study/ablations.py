@@ -36,27 +36,20 @@ FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesi
 # Masks that differ from the thesis's in one thing
 
 
-class MasksFromLabels:
-    """Masks made of each frame's label map by a function of (label map, size): masks[i] for frame i."""
+class EnlargedNearest:
+    """Masks made by a function of each frame's label map enlarged by nearest neighbours: masks[i] for frame i."""
 
-    def __init__(self, folder: Path, sequence: Sequence, make: Callable[[np.ndarray, tuple], np.ndarray]) -> None:
-        self.paths = [Path(folder) / path.name for path in sequence.frame_paths]
-        self.size, self.make = sequence.size, make
+    def __init__(self, folder: Path, sequence: Sequence, make: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.folder, self.sequence, self.make = Path(folder), sequence, make
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self.make(read_label_map(self.paths[index]), self.size)
+        label_map = read_label_map(self.folder / self.sequence.frame_paths[index].name)
+        return self.make(cv2.resize(label_map, self.sequence.size[::-1], interpolation=cv2.INTER_NEAREST))
 
 
-def enlarged_nearest(label_map: np.ndarray, size: tuple[int, int], dilation_width: int) -> np.ndarray:
-    """The thesis's mask, but the label map is enlarged by nearest neighbours, not bilinearly (audit row 10)."""
-    enlarged = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
-    return masks.dilate(cv2.Canny(enlarged, masks.CANNY_LOW, masks.CANNY_HIGH), dilation_width)
-
-
-def without_classes(label_map: np.ndarray, size: tuple[int, int], ids: Iterable[int]) -> np.ndarray:
+def without_classes(ids: Iterable[int], label_map: np.ndarray) -> np.ndarray:
     """No boundaries: all of the frame but some classes (Section 5.2.2: static objects, trees and bushes)."""
-    enlarged = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.where(np.isin(enlarged, list(ids)), np.uint8(0), np.uint8(255))
+    return np.where(np.isin(label_map, list(ids)), np.uint8(0), np.uint8(255))
 
 
 class RandomKeypoints:
@@ -126,23 +119,20 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
     refined one. A repetition other than 0 is the seed that shuffles the matched points. All keypoints have
     `baseline_repetitions` under the thesis's estimator, from which `null_distribution` draws.
     """
-    own = masks.LabelMasks(labels, sequence, dilation_width, MaskSettings(boundaries))
+    from_labels = partial(masks.LabelMasks, labels, sequence, dilation_width)
+    own = from_labels(MaskSettings(boundaries))
     sample = range(0, len(sequence), max(1, len(sequence) // 8))
     number = round(np.mean([len(keypoints.detect(sequence.frame(index), THESIS, own[index])) for index in sample]))
-
-    def from_labels(settings: MaskSettings) -> masks.LabelMasks:
-        return masks.LabelMasks(labels, sequence, dilation_width, settings)
-
     methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
         "baseline": (THESIS, None),
         "masked": (THESIS, own),
         "filter": (replace(THESIS, mask_mode="filter"), own),
-        "nearest": (THESIS, MasksFromLabels(labels, sequence,
-                                            lambda ids, size: enlarged_nearest(ids, size, dilation_width))),
+        "nearest": (THESIS, EnlargedNearest(labels, sequence, lambda label_map: masks.dilate(
+            cv2.Canny(label_map, masks.CANNY_LOW, masks.CANNY_HIGH), dilation_width))),
         "symmetric": (THESIS, from_labels(MaskSettings(boundaries, symmetric=True))),
         "corrected": (THESIS, from_labels(CORRECTED)),
         "masked-static": (THESIS, from_labels(MaskSettings(boundaries, movable=0))),
-        **{method: (THESIS, MasksFromLabels(labels, sequence, partial(without_classes, ids=ids)))
+        **{method: (THESIS, EnlargedNearest(labels, sequence, partial(without_classes, ids)))
            for method, ids in WITHOUT.items()},
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
         "random": (THESIS, RandomKeypoints(sequence, number)),

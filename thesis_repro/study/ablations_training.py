@@ -4,6 +4,7 @@ So few steps show how a slip changes the beginning of a training, not where a wh
 """
 
 import os
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -20,7 +21,7 @@ import tensorflow as tf
 
 from thesis_repro import files
 from thesis_repro.cityscapes import CLASS_WEIGHTS, ID, N_CLASSES
-from thesis_repro.segmentation import augmentation, quality, training
+from thesis_repro.segmentation import augmentation, quality
 from thesis_repro.segmentation.unet import build_unet
 
 Pairs = tuple[np.ndarray, np.ndarray]  # images (n, size, size, 1) and label maps (n, size, size), uint8
@@ -49,10 +50,8 @@ def trials(train: Pairs, validation: Pairs, *, steps: int, seeds: int, base_filt
 def _trials(train: Pairs, validation: Pairs, steps: int, seeds: int, base_filters: int, batch_size: int, threads: int,
             corrected: bool, weights: np.ndarray, methods: tuple[str, ...]) -> list[dict[str, Any]]:
     """The trainings of one network with one loss: compiled once for all of them, since that takes longest."""
-    try:
+    with suppress(RuntimeError):  # TensorFlow has begun in this process
         tf.config.threading.set_intra_op_parallelism_threads(threads)
-    except RuntimeError:  # TensorFlow has begun in this process
-        pass
     fresh = partial(build_unet, train[0].shape[1:], N_CLASSES, base_filters, corrected_blocks=corrected)
     model = fresh()
     model.compile(keras.optimizers.Adam(RATE),
@@ -86,33 +85,3 @@ def _train(model: Any, train: Pairs, validation: Pairs, method: str, seed: int, 
     predicted = model.predict(validation[0].astype(np.float32) / scale, verbose=0).argmax(axis=-1)
     mean_iou, accuracy, _ = quality.cityscapes_scores(quality.confusion_matrix(validation[1], predicted))
     return {"mean_iou": mean_iou, "accuracy": accuracy}
-
-
-def validation_losses(model: Any, images: np.ndarray, labels: np.ndarray, seeds: int) -> pd.DataFrame:
-    """The validation loss of a model by what the set is augmented with: columns seed, nothing, blur and all."""
-    model.compile(loss=training.total_loss())
-    augmenters = augmentation.validation_augmenter(), augmentation.training_augmenter(images.shape[1])
-    rows = []
-    for seed in range(seeds):
-        blurred, transformed = (augmentation.augment_set(images, labels, augmenter, seed) for augmenter in augmenters)
-        sets = {"nothing": (images, labels), "blur": blurred, "all": transformed}
-        rows.append({"seed": seed} | {name: float(model.evaluate(
-            pictures.astype(np.float32), augmentation.one_hot(maps, N_CLASSES), batch_size=4, verbose=0))
-            for name, (pictures, maps) in sets.items()})
-    return pd.DataFrame(rows)
-
-
-def invented_ids(label_map: np.ndarray, seed: int) -> tuple[float, float]:
-    """Share of pixels (percent) with an id that the label map does not hold, where it is transformed: (image, mask).
-
-    As an image (Figure 3.2 of the appendix) it is shifted, scaled and blurred with interpolation.
-    """
-    transforms = [A.Affine(scale=(0.5, 1.5), translate_percent=(-0.1, 0.1), p=1), A.Blur(blur_limit=3, p=1)]
-
-    def share(kind: str) -> float:
-        compose = A.Compose(transforms)
-        compose.set_random_seed(seed)
-        given = {"image": label_map} if kind == "image" else {"image": np.zeros_like(label_map), "mask": label_map}
-        return 100 * float((~np.isin(compose(**given)[kind], [0, *np.unique(label_map)])).mean())
-
-    return share("image"), share("mask")

@@ -60,13 +60,6 @@ DRAWS = 10_000
 LOWER, HIGHER, NO_CLEAR_DIFFERENCE = VERDICTS = ("lower", "higher", "no clear difference")
 
 
-def verdict(low: float, high: float, count: int) -> str:
-    """What an interval of ratios over `count` sequences shows: LOWER, HIGHER or NO_CLEAR_DIFFERENCE."""
-    if count < MIN_SEQUENCES:
-        return NO_CLEAR_DIFFERENCE
-    return LOWER if high < 1 else HIGHER if low > 1 else NO_CLEAR_DIFFERENCE
-
-
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
     """Bootstrap interval (low, high) of the mean of one value a sequence; NaN values are left out.
 
@@ -82,14 +75,18 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
 
 
 def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
-    """{ratio, low, high, n, verdict} of one ratio a sequence: geometric mean and `mean_interval` of the logarithms."""
+    """{ratio, low, high, n, verdict} of one ratio a sequence: geometric mean and `mean_interval` of the logarithms.
+
+    The verdict is LOWER or HIGHER where the interval of at least MIN_SEQUENCES sequences excludes 1.
+    """
     logarithms = np.log(np.asarray(ratios, float))
     logarithms = logarithms[np.isfinite(logarithms)]
     low, high = np.exp(mean_interval(logarithms))
     ratio = float(np.exp(logarithms.mean())) if len(logarithms) else np.nan
     low, high = np.minimum(low, ratio), np.maximum(high, ratio)  # of equal ratios, rounding may put the mean outside
+    verdict = LOWER if high < 1 else HIGHER if low > 1 else NO_CLEAR_DIFFERENCE
     return {"ratio": ratio, "low": float(low), "high": float(high), "n": len(logarithms),
-            "verdict": verdict(low, high, len(logarithms))}
+            "verdict": verdict if len(logarithms) >= MIN_SEQUENCES else NO_CLEAR_DIFFERENCE}
 
 
 def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Series:
@@ -104,11 +101,6 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
     return np.exp((logarithms(rows) - logarithms(reference)).dropna())
 
 
-def compare(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> dict[str, Any]:
-    """{ratio, low, high, n, verdict} of a metric in some rows of runs over the reference rows."""
-    return geometric_mean(ratios(rows, reference, metric))
-
-
 def comparisons(runs: pd.DataFrame, metrics: Iterable[str] | None = None) -> pd.DataFrame:
     """Every method against all keypoints, and masks against every control and every other source.
 
@@ -121,14 +113,12 @@ def comparisons(runs: pd.DataFrame, metrics: Iterable[str] | None = None) -> pd.
     rows = []
     for estimator in ESTIMATORS:
         of_estimator = runs[runs["estimator"] == estimator]
-        arms = _arms(of_estimator)
-        for (own, own_rows), (other, other_rows) in _pairs(arms):
-            row = {**own, **{f"reference{key}": other[name] for key, name in
-                             (("_source", "source"), ("", "method"), ("_keypoints", "keypoints"))}}
+        for (own, own_rows), (other, other_rows) in _pairs(_arms(of_estimator)):
+            row = {**own, "reference_source": other["source"], "reference": other["method"],
+                   "reference_keypoints": other["keypoints"], "estimator": estimator}
             for metric in names:
                 by_sequence = ratios(own_rows, other_rows, metric)
-                rows.append({**row, "metric": metric, "estimator": estimator, **geometric_mean(by_sequence),
-                             **by_sequence})
+                rows.append({**row, "metric": metric, **geometric_mean(by_sequence), **by_sequence})
     columns = ["source", "method", "dilation_width", "keypoints", "reference_source", "reference",
                "reference_keypoints", "metric", "estimator", "tested", "ratio", "low", "high", "n", "verdict"]
     return pd.DataFrame(rows, columns=[*columns, *sorted(runs["sequence"].unique())])
@@ -168,15 +158,16 @@ def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.Dat
     Masks help where both verdicts are LOWER; the segmentation helps where masks are LOWER than each of
     SEGMENTATION_FREE_CONTROLS too (`against_controls`).
     """
-    rows = table[(table["method"] == "masked") & (table["reference"] == "baseline") & table["tested"]
-                 & table["metric"].isin(JUDGING_METRICS)]
-    rows = rows if source is None else rows[rows["source"] == source]
-    return rows[rows["estimator"] == judging_estimator(rows)]
+    return _judging(table[table["tested"]], ["baseline"], source)
 
 
 def against_controls(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
     """The rows of `comparisons` that set masks against the controls without segmentation, as `primary_comparison`."""
-    rows = table[(table["method"] == "masked") & table["reference"].isin(SEGMENTATION_FREE_CONTROLS)
+    return _judging(table, SEGMENTATION_FREE_CONTROLS, source)
+
+
+def _judging(table: pd.DataFrame, references: Iterable[str], source: str | None) -> pd.DataFrame:
+    rows = table[(table["method"] == "masked") & table["reference"].isin(list(references))
                  & table["metric"].isin(JUDGING_METRICS)]
     rows = rows if source is None else rows[rows["source"] == source]
     return rows[rows["estimator"] == judging_estimator(rows)]

@@ -4,7 +4,6 @@ If the odometry gains as much from them, it is not the segmentation that helps. 
 those of `masks`.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -113,23 +112,10 @@ class ImageEdges(OtherFrame):
         return best
 
 
-def _exact_boundaries(source: Source, sequence: Sequence, dilation_width: int | None) -> FileMasks:
-    return replace(source, settings=replace(source.settings, boundaries="exact")).masks(sequence, dilation_width)
-
-
-def _corrected(source: Source, sequence: Sequence, dilation_width: int | None) -> FileMasks:
-    return replace(source, settings=CORRECTED).masks(sequence, dilation_width)
-
-
-def _true_labels(source: Source, sequence: Sequence, dilation_width: int | None) -> FileMasks:
-    return replace(source, folder=true_labels(sequence.root, sequence.name)).masks(sequence, dilation_width)
-
-
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-MASKS: dict[str, Callable[[Source, Sequence, int | None], ControlMasks]] = {
-    "other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges,
-    "exact-boundaries": _exact_boundaries, "corrected": _corrected, "true-labels": _true_labels}
+OF_MASKS = {"other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges}
 OF_LABEL_MAPS = ("exact-boundaries", "corrected", "true-labels")  # ask what label maps are good for
+MASKS = (*OF_MASKS, *OF_LABEL_MAPS)
 
 
 def masks(method: str, source: Source, sequence: Sequence, dilation_width: int | None) -> ControlMasks:
@@ -137,7 +123,14 @@ def masks(method: str, source: Source, sequence: Sequence, dilation_width: int |
 
     dilation_width: pixels, of masks from label maps.
     """
-    return MASKS[method](source, sequence, dilation_width)
+    if method in OF_MASKS:
+        return OF_MASKS[method](source, sequence, dilation_width)
+    if method == "true-labels":
+        source = replace(source, folder=true_labels(sequence.root, sequence.name))
+    else:
+        source = replace(source, settings=CORRECTED if method == "corrected" else
+                         replace(source.settings, boundaries="exact"))
+    return source.masks(sequence, dilation_width)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:
