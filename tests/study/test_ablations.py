@@ -66,10 +66,10 @@ def test_the_best_of_many_gains_what_order_statistics_say():
     assert ablations.null_distribution(errors(spread), widths=1).loc["median", "expected"] == pytest.approx(0, abs=1.5)
 
 
-@pytest.mark.parametrize("reported, share", [(-90.0, 0), (50.0, 100)])
-def test_how_often_a_reported_number_would_come_about(reported, share):
-    table = ablations.null_distribution(errors(0.3), pd.Series([reported] * 11))
-    assert (table["share_as_low"] == share).all()
+def test_how_often_a_reported_number_would_come_about():
+    for reported, share in ((-90.0, 0), (50.0, 100)):
+        table = ablations.null_distribution(errors(0.3), pd.Series([reported] * 11))
+        assert (table["share_as_low"] == share).all()
 
 
 def test_the_level_of_a_sequences_error_does_not_count():

@@ -45,10 +45,6 @@ def test_known_ratios_come_out_and_swapping_inverts_them():
     assert (exact["low"], exact["ratio"], exact["high"]) == pytest.approx((0.25, 0.25, 0.25))
 
 
-def test_half_and_double_are_equally_far_from_one():
-    assert compare.geometric_mean([0.5, 2.0])["ratio"] == pytest.approx(1)
-
-
 @pytest.mark.parametrize("bad", [np.nan, 0.0])
 def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
     runs = runs_of({"masked": 0.5})
@@ -97,14 +93,11 @@ def test_the_table_sets_masks_against_all_keypoints_and_every_control():
     primary = compare.primary_comparison(table)
     assert set(primary["estimator"]) == {"refined"} and list(primary["metric"]) == list(compare.JUDGING_METRICS)
     assert compare.overall(primary["verdict"]) == "lower"
+    of_thesis = compare.primary_comparison(table[table["estimator"] == "thesis"])
+    assert set(of_thesis["estimator"]) == {"thesis"}  # where the refined one was not run
     against = compare.against_controls(table).set_index(["reference", "metric"])["verdict"]
     assert set(against["mirrored"]) == {"lower"} and set(against["fewer"]) == {"higher"}
     assert compare.overall(["lower", "higher"]) == compare.overall([]) == "no clear difference"
-
-
-def test_the_thesis_estimator_decides_where_the_refined_one_was_not_run():
-    table = compare.comparisons(runs_of({"masked": 0.5}, estimators=("thesis",)))
-    assert set(compare.primary_comparison(table)["estimator"]) == {"thesis"}
 
 
 def test_sources_are_compared_with_each_other_and_share_all_keypoints():

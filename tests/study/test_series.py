@@ -112,17 +112,6 @@ def test_plain_folders_are_taken_for_a_single_sequence(small_world, small_labels
     assert compare.sources(single.run(tmp_path / "out")) == ["a", "b"]
 
 
-def test_a_mask_that_breaks_in_the_middle_costs_only_the_runs_that_need_it(small_world, masks, tmp_path, capsys):
-    shutil.copytree(masks, tmp_path / "ready")
-    broken = tmp_path / "ready" / "00" / "000003.png"
-    data = bytearray(broken.read_bytes())
-    data[len(data) // 2] ^= 1
-    broken.write_bytes(data)
-    study = series.Study(small_world / "kitti", ("00",), (Source(tmp_path / "ready", "masks", "ready"),), (), frames=5)
-    assert study.run(tmp_path / "out")["run"].tolist() == ["baseline-0"]
-    assert str(broken) in capsys.readouterr().out
-
-
 def test_results_of_another_length_are_not_thrown_away(done, study):
     before = files(done[0])
     shorter = series.Study(study.kitti, study.sequences, study.sources, study.widths, frames=5)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from thesis_repro.report import captions
-from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study import thesis_tables
 
 REPORTED = json.loads((Path(captions.__file__).parent / "reported.json").read_text())
 ELEVEN = [f"{number:02d}" for number in range(11)]
@@ -78,12 +78,6 @@ def test_a_real_optimum_is_found_again_in_other_repetitions_and_luck_is_not():
     luck = thesis_tables.stability(runs_of(lambda *_: 1.0, noise=0.2))
     assert luck["same_best"].mean() < 20 and luck["elsewhere"].mean() == pytest.approx(1, abs=0.1)
     assert thesis_tables.stability(runs_of(own_optimum, repetitions=1)).isna().all(axis=None)
-
-
-def test_repetitions_are_averaged_before_changes_are_taken():
-    runs = runs_of(lambda *_: 1.0, ["00"], (5,))
-    runs.loc[runs["method"] == "baseline", "rmse"] = [1, 2, 3, 4, 10]
-    assert thesis_tables.changes(compare.of_method(runs, "masked"), runs, "rmse")["00"] == -75
 
 
 def test_time_saved_is_negative_over_all_sequences_together():

@@ -57,7 +57,7 @@ MIN_FOR_INTERVAL = 3  # sequences; drawing anew from fewer says nothing
 MIN_SEQUENCES = 6
 LEVEL = 95  # percent, of all intervals
 DRAWS = 10_000
-LOWER, HIGHER, NO_CLEAR_DIFFERENCE = VERDICTS = ("lower", "higher", "no clear difference")
+LOWER, HIGHER, NO_CLEAR_DIFFERENCE = ("lower", "higher", "no clear difference")
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:

@@ -33,9 +33,8 @@ def of_study(study: Study) -> dict[str, Any]:
     # a limit of keypoints and a distance between them, for each source
     second = 2 * len(study.sources) * len(study.estimators) * study.repetitions if study.tested else 0
     runs = len(first) // len(frames) + second  # of a sequence
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # bars of single runs
-        cost = _seconds_a_frame(lambda count, folder: runner.run(chosen, study.kitti, study.sources, folder,
-                                                                 frames=count)) / len(chosen)
+    cost = _seconds_a_frame(lambda count, folder: runner.run(chosen, study.kitti, study.sources, folder, frames=count)
+                            ) / len(chosen)
     return _plan([("odometry", runs * len(frames), "runs", total * runs * cost)], frames, name,
                  total * runs * ROW_BYTES)
 
@@ -52,9 +51,8 @@ def of_thesis(root: Path, sizes: Profile, complete: bool = False, training_image
               for name, count in (kitti.FRAME_COUNTS if complete else lengths).items()}
     total = sum(frames.values())
     timed_frames = sum(min(count, sizes.timed_frames) for count in frames.values())
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # bars of single runs
-        cost = _costs(root, name, sizes)
-        network, training = _network_seconds(sizes) if training_images else (cost["label map"], 0.0)
+    cost = _costs(root, name, sizes)
+    network, training = _network_seconds(sizes) if training_images else (cost["label map"], 0.0)
     # of a sequence; with the plainly reduced ones, "fewer" and "spread"
     runs = int(cost["runs"]) + (1 + 2 * len(jobs.ESTIMATORS)) * sizes.repetitions
     steps = []
@@ -126,9 +124,10 @@ def _seconds_a_frame(run: Callable[[int, Path], Any]) -> float:
 
 
 def _timed(work: Callable[[], Any]) -> float:
-    started = time.process_time()
-    work()
-    return time.process_time() - started
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # bars of single runs
+        started = time.process_time()
+        work()
+        return time.process_time() - started
 
 
 def _network_seconds(sizes: Profile) -> tuple[float, float]:

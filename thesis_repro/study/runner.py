@@ -91,9 +91,9 @@ def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) 
     for (name, reason), names in by_reason.items():
         more = f" and {len(names) - 3} more" * (len(names) > 3)
         longrun.say(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}", warning=True)
-    lacking = [reason for reason in failures.values() if isinstance(reason, _Lacking)]
-    if lacking:  # no answer can be trusted that is left out for want of space
-        raise InputError(lacking[0])
+    for reason in failures.values():
+        if isinstance(reason, _Lacking):  # no answer can be trusted that is left out for want of space
+            raise InputError(reason)
     done = [job for job in jobs if study.result(job).is_file()]
     if not done:
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")

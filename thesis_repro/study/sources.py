@@ -34,12 +34,8 @@ class Source:
     def of(self, sequence: str) -> Path:
         """The folder with the files of one sequence."""
         own = self.folder / sequence
-        return self.folder if not own.is_dir() and self.is_plain else own
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether the folder itself holds files, as `thesis-repro predict` and `masks` write them."""
-        return any(self.folder.glob("[!.]*.png"))
+        is_plain = any(self.folder.glob("[!.]*.png"))  # as `thesis-repro predict` and `masks` write them
+        return self.folder if not own.is_dir() and is_plain else own
 
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
         """The masks of a sequence. dilation_width: pixels, of masks from label maps.

@@ -12,9 +12,6 @@ import pandas as pd
 from thesis_repro.odometry.metrics import percent_change
 from thesis_repro.study import compare
 
-THESIS_METRICS = ("rmse", "mae")
-CHOICES = ("best", "left_out", "fixed")  # of the width, see `chosen_widths`
-
 
 def best_widths(runs: pd.DataFrame) -> pd.DataFrame:
     """The width with the lowest RMSE of each sequence (Table 4.1), with means over its repetitions.

@@ -81,10 +81,7 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
 
 def frame_times(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20, width: int = CONTROL_WIDTH,
                 boundaries: str = "canny") -> pd.DataFrame:
-    """`measure` of the first frames with the model in a file.
-
-    The folder keeps the table. It is measured anew when the frames, the masks, the model or the code change.
-    """
+    """`measure` with the model in a file. The folder keeps the table until frames, masks, model or code change."""
     short = sequence.subset(frames + WARM_UP)
     path = stages.stage(folder, code=stages.code("study/timing"), model=stages.content(model_file),
                         opencv=cv2.__version__, frames=stages.listing(short.frame_paths), width=width,
@@ -104,7 +101,7 @@ def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CO
     Stages: read (the frame's file), segmentation (stretch to the model's input, network, class of every pixel), mask
     (label map to 320x320, edges, dilation), detection, tracking, pose (essential matrix, then rotation and
     translation). model: a Keras model of `segmentation`. width (pixels), boundaries: of the masks, see `masks.edges`.
-    The methods take turns at every frame. Raises InputError for a sequence with too few frames.
+    The methods take turns. Raises InputError for a sequence with too few frames.
     """
     sequence = sequence.subset(frames + WARM_UP)
     if len(sequence) < WARM_UP + 2:
