@@ -1,6 +1,7 @@
 """What commands print: a run's errors and a camera's angles, as JSON's records and as text, and plans."""
 
-from thesis_repro import longrun
+from datetime import timedelta
+
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import texts
@@ -51,7 +52,8 @@ def angles_text(rotation, table):
 
 def plan_text(plan):
     """A plan of `study.plan` as lines."""
-    return texts.render("plan.txt.j2", plan=plan, duration=longrun.duration, cores=cores()).rstrip()
+    return texts.render("plan.txt.j2", plan=plan, cores=cores(),
+                        duration=lambda seconds: timedelta(seconds=round(seconds))).rstrip()
 
 
 def _number(value):
