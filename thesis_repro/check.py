@@ -33,8 +33,7 @@ class _Problems(list):
 
         results = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(
             joblib.delayed(problems_of)(item) for item in items)
-        bar = files.progress(results, description, total=len(items), unit="file")
-        self.add([problem for problems in bar for problem in problems], deep)
+        self.add(sum(files.progress(results, description, total=len(items), unit="file"), []), deep)
 
     def add(self, problems, deep):
         self += problems if deep else problems[:MAX_NAMED]
@@ -55,72 +54,55 @@ def check_kitti(root, deep=False):
         fact, its_problems = _check_sequence(root, name, name in with_truth, deep)
         facts.append(fact)
         problems += its_problems
-        if not its_problems:
-            sound.append(name)
-    compared = [name for name in sound if name in with_truth]
-    facts += [_can("odometry, predict and masks", sound), _can("evaluate, boresight, study and plan", compared)]
-    facts[-1] += (f"; make figures KITTI={root}" if with_truth and compared == with_truth else
-                  "; make figures needs all sequences without fault, so mend or move away the others")
+        sound += [] if its_problems else [name]
+    for commands, names in (("odometry, predict and masks", sound),
+                            ("evaluate, boresight, study and plan", [name for name in sound if name in with_truth])):
+        facts.append(f"can be run: {commands} with {', '.join(names)}" if names else f"cannot be run: {commands}")
+    facts.append(f"{'cannot' if problems else 'can'} be run: make figures KITTI={root}")
     return facts, problems
-
-
-def _can(commands, names):
-    return f"can be run: {commands} with {', '.join(names)}" if names else f"cannot be run: {commands}"
 
 
 def _check_sequence(root, name, needs_truth, deep):
     """(what a sequence holds in one line, its problems)"""
-    folder, problems, notes = Path(root) / "sequences" / name, _Problems(), []
+    folder, problems = Path(root) / "sequences" / name, _Problems()
     where = kitti.images_of(folder)
     paths = problems.of(files.images, where)
     if not paths:
-        return f"sequence {name}: no frames", problems or [f"{where}: holds no PNG or JPEG frames; copy them there"]
+        return f"sequence {name}: no frames", problems or [f"{where}: holds no PNG or JPEG frames"]
     matrix = problems.of(kitti.read_intrinsics, folder / "calib.txt", where.name)
     poses, times, rows = Path(root) / "poses" / f"{name}.txt", folder / "times.txt", {}
     if needs_truth:
         rows[poses] = problems.of(kitti.read_poses, poses)
-    else:
-        notes.append("no true poses, so the study passes it over and the odometry takes steps of --speed or 1 m")
     if times.is_file():
         rows[times] = problems.of(kitti.read_times, times)
-    else:
-        notes.append(f"no times.txt, so {1 / kitti.FRAME_TIME:g} frames a second")
     counts = {path: len(values) for path, values in rows.items() if values is not None}
-    most = max(counts.values(), default=0)
-    missing = kitti.missing_frames(paths, most if most > len(paths) else None)
-    problems.add([f"{path}: is missing; copy it again" for path in missing], deep)
+    missing = kitti.missing_frames(paths, max([count for count in counts.values() if count > len(paths)], default=None))
+    problems.add([f"{path}: is missing" for path in missing], deep)
     if not missing:
         problems.of(kitti.check_numbering, paths)
         for path, count in counts.items():
             problems.of(kitti.check_count, path, count, paths)
-    size, colour = problems.of(files.glance, paths[0]) or (None, False)
+    size, _ = problems.of(files.glance, paths[0]) or (None, None)
     if size and matrix is not None:
         problems.of(kitti.check_camera, folder / "calib.txt", matrix, paths[0], size)
+        camera = kitti.CAMERAS.get(name)
+        if camera and size == (camera.height, camera.width) and not np.allclose(
+                matrix[[0, 1, 0, 1], [0, 1, 2, 2]], [camera.fx, camera.fy, camera.cx, camera.cy], rtol=0, atol=1e-3):
+            problems.append(f"{folder / 'calib.txt'}: is not the camera of sequence {name}")
 
     def check_frame(path):
         its_size = files.read_gray(path).shape if deep or path in (paths[0], paths[-1]) else files.glance(path)[0]
         kitti.check_size(path, its_size, size)
 
     problems.of_each(check_frame, paths if size else paths[1:], f"sequence {name}", deep)
-    if where.name in kitti.IMAGE_FOLDERS[1:]:
-        notes.append(f"the frames of {where.name}, read as gray")
-    elif colour:
-        notes.append("frames in colour, read as gray")
-    if len(paths) != kitti.FRAME_COUNTS.get(name, len(paths)):
-        notes.append(f"an excerpt: the complete sequence has {kitti.FRAME_COUNTS[name]}")
-    camera = kitti.CAMERAS.get(name)
-    if camera and size == (camera.height, camera.width) and matrix is not None:
-        difference = np.abs(matrix[[0, 1, 0, 1], [0, 1, 2, 2]] - [camera.fx, camera.fy, camera.cx, camera.cy]).max()
-        if difference > 1e-3:
-            problems.append(f"{folder / 'calib.txt'}: the camera differs from the thesis's by {difference:.4g} pixels; "
-                            f"it must be the file of sequence {name}")
-        else:
-            notes.append("the thesis's camera")
-    elif camera and size:
-        notes.append(f"not the thesis's size of {camera.width}x{camera.height}")
-    fact = (f"sequence {name}: {len(paths)}{f' of {len(paths) + len(missing)}' if missing else ''} frames"
-            f"{f' of {size[1]}x{size[0]}' if size else ''}{', all decoded' * deep}")
-    return "; ".join([fact, *notes]), problems
+    complete = kitti.FRAME_COUNTS.get(name, len(paths))
+    notes = {f"{len(paths)} of {len(paths) + len(missing)} frames": bool(missing),
+             f"{len(paths)} frames{f' of {size[1]}x{size[0]}' if size else ''}": not missing,
+             f"in {where.name}": where.name != kitti.IMAGE_FOLDERS[0],
+             f"an excerpt of {complete}": complete != len(paths),
+             "no true poses, so steps are those of --speed or 1 m": not needs_truth,
+             f"no times.txt, so {1 / kitti.FRAME_TIME:g} frames a second": not times.is_file()}
+    return f"sequence {name}: {'; '.join(note for note, holds in notes.items() if holds)}", problems
 
 
 def check_cityscapes(root, deep=False, splits=("train", "val"), used="make figures CITYSCAPES"):
@@ -134,12 +116,11 @@ def check_cityscapes(root, deep=False, splits=("train", "val"), used="make figur
         if listing is None:
             continue
         images, labels, where = listing
-        problems.add([f"{images[name]}: has no label map; add it or remove the file" if name in images else
-                      f"{labels[name]}: has no image; add it or remove the file"
+        problems.add([f"{(images | labels)[name]}: has no {'label map' if name in images else 'image'}"
                       for name in sorted(images.keys() ^ labels.keys())], deep)
         pairs = [cityscapes.Pair(name, images[name], labels[name]) for name in sorted(images.keys() & labels.keys())]
         if not pairs:
-            problems.append(f"{where}: no PNG images with label maps; the {split} split must hold at least one")
+            problems.append(f"{where}: no PNG images with label maps")
             continue
         ids, ends = set(), (pairs[0], pairs[-1])
 
@@ -151,15 +132,13 @@ def check_cityscapes(root, deep=False, splits=("train", "val"), used="make figur
             else:
                 size, label_size = files.glance(pair.image)[0], files.glance(pair.label)[0]
             if size != label_size:
-                raise InputError(f"{pair.label}: {label_size[1]}x{label_size[0]} pixels, but {pair.image.name} has "
-                                 f"{size[1]}x{size[0]}; a label map must have the size of its image")
+                raise InputError(f"{pair.label}: {label_size[1]}x{label_size[0]} pixels; its image has "
+                                 f"{size[1]}x{size[0]}")
 
         problems.of_each(check_pair, pairs, f"split {split}", deep)
-        complete = cityscapes.OFFICIAL.get(split, 0) if (Path(root) / "leftImg8bit").is_dir() else 0
-        excerpt = f"; an excerpt: the complete split has {complete}" if len(pairs) < complete else ""
         names = ", ".join(f"{label.name} {label.id}" for label in cityscapes.LABELS if label.id in ids)
-        facts.append(f"split {split}: {len(pairs)} images with label maps{excerpt}"
-                     f"; {'labels' if deep else 'labels in the first and last'}: {names}")
+        facts.append(f"split {split}: {len(pairs)} images with label maps; "
+                     f"{'labels' if deep else 'labels in the first and last'}: {names}")
     facts.append(f"{'cannot' if problems else 'can'} be run: {used}={root}")
     return facts, list(dict.fromkeys(problems))
 

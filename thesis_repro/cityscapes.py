@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -9,10 +10,19 @@ import numpy as np
 from thesis_repro import InputError
 from thesis_repro.files import listed, progress, read_color, read_gray, read_ids
 
+
+class Label(NamedTuple):
+    """A row of Tables 3.1 and 3.2: name, id, Dice weight, and its colour (red, green, blue)."""
+
+    name: str
+    id: int
+    weight: float
+    color: tuple
+
+
 # Tables 3.1 and 3.2; colours as the Cityscapes scripts draw them. "background" exists in the tables only:
 # the network has 35 outputs, and no label map holds 35 (audit: the tables list one category too many).
-# name, id, Dice weight, colour (red, green, blue)
-_TABLE = [
+LABELS = tuple(Label(*row) for row in [
     ("unlabeled", 0, 1.0, (0, 0, 0)),
     ("ego vehicle", 1, 1.0, (0, 0, 0)),
     ("rectification border", 2, 1.0, (0, 0, 0)),
@@ -49,26 +59,12 @@ _TABLE = [
     ("bicycle", 33, 2.3, (119, 11, 32)),
     ("license plate", 34, 0.5, (0, 0, 142)),
     ("background", 35, 0.5, (0, 0, 0)),
-]
-
-
-@dataclass(frozen=True)
-class Label:
-    name: str
-    id: int
-    weight: float
-    color: tuple
-
-
-LABELS = tuple(Label(*row) for row in _TABLE)
+])
 N_CLASSES = 35  # Figure A.1: ids 0 to 34
 CLASS_WEIGHTS = np.array([label.weight for label in LABELS[:N_CLASSES]], np.float32)
 COLORS = np.array([label.color for label in LABELS], np.uint8)
 ID = {label.name: label.id for label in LABELS}
 
-OFFICIAL = {"train": 2975, "val": 500}  # images of the complete splits
-VALIDATION_FRACTION = 0.2
-SPLIT_RANDOM_STATE = 0
 
 
 @dataclass(frozen=True)
@@ -89,21 +85,17 @@ def pairs(root, split, limit=None):
     """The image and label map pairs of one split ("train" or "val"), sorted by name.
 
     limit: at most so many of them, spread evenly over the split (its images are sorted by city); None for all.
-
-    Both layouts are read: the official one (leftImg8bit, gtFine) and the appendix's flat one (train, trainannot).
     The appendix pairs two unsorted directory listings by position (A.2); here the names decide.
-
     Raises InputError for a missing folder, an empty split or an image without its label map.
     """
     images, labels, where = listing(root, split)
     if not images:
-        raise InputError(f"{where}: no PNG images; the {split} split must hold at least one")
+        raise InputError(f"{where}: no PNG images")
     lonely = sorted(images.keys() ^ labels.keys())
     if lonely:
         name = lonely[0]
         here, missing = (images[name], "label map") if name in images else (labels[name], "image")
-        more = f" ({len(lonely)} such files)" if len(lonely) > 1 else ""
-        raise InputError(f"{here}: has no {missing}{more}; add the {missing} or remove the file")
+        raise InputError(f"{here}: has no {missing}")
     names = sorted(images)
     if limit is not None and limit < len(names):
         names = [names[index * len(names) // limit] for index in range(limit)]
@@ -111,11 +103,11 @@ def pairs(root, split, limit=None):
 
 
 def listing(root, split):
-    """The images and the label maps of a split by name, {name: path} each, and the folder of the images."""
+    """The images and the label maps of a split by name, {name: path} each, and the folder of the images.
+
+    Both layouts are read: the official one (leftImg8bit, gtFine) and the appendix's flat one (train, trainannot).
+    """
     root = Path(root)
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder; CITYSCAPES must name the folder that holds leftImg8bit and gtFine, "
-                         "or train, trainannot, val and valannot")
     if (root / "leftImg8bit").is_dir():
         where = root / "leftImg8bit" / split
         image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
@@ -126,7 +118,7 @@ def listing(root, split):
         images = {f.stem: f for f in listed(where)}
         labels = {f.stem: f for f in listed(root / f"{split}annot")}
     else:
-        raise InputError(f"{root}: holds neither leftImg8bit/{split} nor {split}; see the README for the two layouts")
+        raise InputError(f"{root}: must be a folder that holds leftImg8bit and gtFine, or {split} and {split}annot")
     return images, labels, where
 
 
@@ -143,8 +135,7 @@ def read_label_map(path):
     """One label map of Cityscapes ids, uint8. Raises InputError where an id is 35 or more, and what `read_ids` does."""
     label_map = read_ids(path)
     if label_map.max() >= N_CLASSES:
-        raise InputError(f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; label maps must hold "
-                         "Cityscapes label ids (the files that end in labelIds.png), not train ids or colours")
+        raise InputError(f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; take the labelIds.png files")
     return label_map
 
 
@@ -167,4 +158,4 @@ def split_train_validation(image_pairs):
 
     if len(image_pairs) < 2:
         raise InputError(f"{len(image_pairs)} training image: at least 2 are needed to split off a validation set")
-    return train_test_split(image_pairs, test_size=VALIDATION_FRACTION, random_state=SPLIT_RANDOM_STATE)
+    return train_test_split(image_pairs, test_size=0.2, random_state=0)
