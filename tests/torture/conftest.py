@@ -4,13 +4,14 @@ A test here runs with `--torture` alone; one that is marked `short` runs among a
 the ledger, whose counts are printed at the end.
 """
 
+import sys
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import TimeoutExpired
 
 import pytest
-from trials import KINDS, OUTCOMES, Lost
+from trials import KINDS, OUTCOMES, Lost, thesis
 
 HERE = Path(__file__).parent
 
@@ -57,6 +58,28 @@ def small_model(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.keras"
     build_unet((64, 64, 1), N_CLASSES, 4).save(path)
     return path
+
+
+@pytest.fixture
+def words(small_world, small_labels, small_model):
+    """words(name, output): a command that writes into `output`. "odometry.png" writes a plot there, and so on."""
+    kitti = ["--kitti", small_world / "kitti"]
+    frames = [*kitti, "--sequence", "00"]
+
+    def command(name, output="out"):
+        options = {".txt": "--output", ".tum": "--tum", ".svg": "--plot", ".png": "--plot", ".mp4": "--video"}
+        if name.startswith("odometry"):
+            return thesis("odometry", *frames, options[name[-4:]], f"{output}{name[-4:]}")
+        return {
+            "synthesize": thesis("synthesize", output, "--profile", "smoke"),
+            "training": [sys.executable, HERE / "small_training.py", output, 3],
+            "predict": thesis("predict", "--images", small_world / "kitti/sequences/00", "--model", small_model,
+                              "--output", output),
+            "masks": thesis("masks", *frames, "--labels", small_labels / "00", "--dilation", 5, "--output", output),
+            "study": thesis("study", *kitti, "--labels", small_labels, "--widths", 5, "--repetitions", 1, "--jobs", 2,
+                            "--output", output)}[name]
+
+    return command
 
 
 def pytest_terminal_summary(terminalreporter):

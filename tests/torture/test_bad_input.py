@@ -172,7 +172,7 @@ odometry --sequence mine -> mine
 {MASKS[:-3]}labels -> --output labels
 {MASKS[:-3]}kitti -> --output kitti
 {MASKS[:-3]}mine -> mine
-{STUDY} --widths 5000 -> --widths 5000
+{STUDY} --widths 5000 -> 5000
 {STUDY} --sequences 00 00 -> --sequences
 {STUDY} --dask nonsense -> nonsense
 {STUDY[:-3]}mine -> mine

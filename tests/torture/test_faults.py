@@ -5,39 +5,15 @@ import resource
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from trials import contents, finish, kill, lost_unless, nothing_stray, refused, run, same, start, succeed, thesis
+from trials import contents, finish, kill, lost_unless, nothing_stray, refused, run, same, start, succeed
 
-HERE = Path(__file__).parent
 short = pytest.mark.short
-
-
-@pytest.fixture
-def words(small_world, small_labels, small_model):
-    """words(name, output): a command that writes into `output`. "odometry.png" writes a plot there, and so on."""
-    kitti = ["--kitti", small_world / "kitti"]
-    frames = [*kitti, "--sequence", "00"]
-
-    def command(name, output="out"):
-        options = {".txt": "--output", ".tum": "--tum", ".svg": "--plot", ".png": "--plot", ".mp4": "--video"}
-        if name.startswith("odometry"):
-            return thesis("odometry", *frames, options[name[-4:]], f"{output}{name[-4:]}")
-        return {
-            "synthesize": thesis("synthesize", output, "--profile", "smoke"),
-            "training": [sys.executable, HERE / "small_training.py", output, 3],
-            "predict": thesis("predict", "--images", small_world / "kitti/sequences/00", "--model", small_model,
-                              "--output", output),
-            "masks": thesis("masks", *frames, "--labels", small_labels / "00", "--dilation", 5, "--output", output),
-            "study": thesis("study", *kitti, "--labels", small_labels, "--widths", 5, "--repetitions", 1, "--jobs", 2,
-                            "--output", output)}[name]
-
-    return command
 
 
 @pytest.fixture

@@ -5,32 +5,14 @@ import shlex
 import shutil
 import sys
 import time
-from pathlib import Path
 
-import cv2
 import nbformat
-import numpy as np
 import pytest
 import trials
-from trials import ROOT, TIMEOUT, contents, finish, kill, nothing_stray, same, snapshot, start, succeed, thesis
+from trials import ROOT, TIMEOUT, contents, finish, kill, nothing_stray, same, snapshot, start, succeed
 
 from thesis_repro import longrun
 from thesis_repro.settings import read_settings
-
-HERE = Path(__file__).parent
-DRAWING = """
-import numpy as np
-from thesis_repro.report import style
-from thesis_repro.settings import read_settings
-folder = read_settings().figures
-for number in range(6):
-    figure, axes = style.new_figure()
-    axes.plot(np.random.default_rng(number).random((400, 5)))
-    style.save_figure(figure, folder, f"figure_{number}", "made up")
-    figure, axes = style.new_figure()
-    axes.imshow(np.random.default_rng(number).random((200, 300)))
-    style.save_figure(figure, folder, f"picture_{number}", "made up")
-"""
 
 
 def look(folder):
@@ -91,50 +73,47 @@ def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: 
         nothing_stray(where)
 
 
-def test_the_embedded_world(ledger, tmp_path):
-    torture(ledger, "synthesize", thesis("synthesize", "world", "--profile", "smoke"), tmp_path, "world", 3, 0)
+WORLD = "from thesis_repro import world; world.write('out', sequences=['00'], frames=20, scale=0.2, " \
+        "train_images=20, validation_images=10, jobs=1)"
 
 
-def test_a_small_embedded_world(ledger, tmp_path):
-    write = "from thesis_repro import world; world.write('world', sequences=['00'], frames=20, scale=0.2, " \
-            "train_images=20, validation_images=10, jobs=1)"
-    torture(ledger, "synthesize, small", [sys.executable, "-c", write], tmp_path, "world", 7, 1)
+@pytest.mark.parametrize("name, kills", [
+    ("synthesize", 3), ("world", 7), ("training", 5), ("predict", 5), ("study", 9)])
+def test_a_command_that_writes(ledger, words, tmp_path, name, kills):
+    command = [sys.executable, "-c", WORLD] if name == "world" else words(name)
+    torture(ledger, name, command, tmp_path, "out", kills, 1)
 
 
-def test_training(ledger, tmp_path):
-    torture(ledger, "training", [sys.executable, HERE / "small_training.py", "model", 6], tmp_path, "model", 5, 2)
-
-
-def test_label_maps(ledger, tmp_path, small_model):
-    (tmp_path / "images").mkdir()
-    for index, image in enumerate(np.random.default_rng(0).integers(0, 256, (400, 64, 96), np.uint8)):
-        cv2.imwrite(str(tmp_path / "images" / f"{index:06d}.png"), image)
-    torture(ledger, "predict", thesis("predict", "--images", "images", "--model", small_model, "--output",
-                                      "labels"), tmp_path, "labels", 5, 3)
-
-
-def study(small_world, small_labels):
-    return thesis("study", "--kitti", small_world / "kitti", "--labels", small_labels, "--widths", 5, "--controls", 5,
-                  "--repetitions", 1, "--estimator", "thesis", "refined", "--output", "study")
-
-
-def test_a_study(ledger, tmp_path, small_world, small_labels):
-    torture(ledger, "study", study(small_world, small_labels), tmp_path, "study", 9, 4)
-
-
-def test_the_drawing_of_a_study(ledger, tmp_path, small_world, small_labels):
-    command = study(small_world, small_labels)
-    succeed(command, tmp_path)
-    shutil.copytree(tmp_path / "study", tmp_path / "runs")
+def test_the_drawing_of_a_study(ledger, words, tmp_path):
+    succeed(words("study"), tmp_path)
+    shutil.copytree(tmp_path / "out", tmp_path / "runs")
 
     def prepare():
         """All runs are there, no table and no figure."""
-        shutil.copytree(tmp_path / "runs", tmp_path / "study")
-        for path in (tmp_path / "study").iterdir():
+        shutil.copytree(tmp_path / "runs", tmp_path / "out")
+        for path in (tmp_path / "out").iterdir():
             if path.is_file() and path.name != longrun.RECORD:
                 path.unlink()
 
-    torture(ledger, "the drawing of figures and a study's page", command, tmp_path, "study", 6, 5, prepare)
+    torture(ledger, "the drawing of figures and a study's page", words("study"), tmp_path, "out", 6, 5, prepare)
+
+
+DRAWING = """
+import numpy as np
+from thesis_repro.report import style
+from thesis_repro.settings import read_settings
+for number in range(12):
+    figure, axes = style.new_figure()
+    axes.plot(np.random.default_rng(number).random((400, 5)))
+    style.save_figure(figure, read_settings().figures, f"figure_{number}", "made up")
+"""
+PAGE = [sys.executable, "-m", "thesis_repro.report.page"]
+
+
+def own_folders(folder):
+    """Environment and settings of a run that keeps everything in a folder."""
+    changes = {"THESIS_REPRO_BUILD": str(folder / "build"), "THESIS_REPRO_FIGURES": str(folder / "figures")}
+    return changes, read_settings(changes)
 
 
 def test_the_figures_of_a_notebook(ledger, tmp_path):
@@ -152,15 +131,6 @@ def test_the_figures_of_a_notebook(ledger, tmp_path):
                f"--Execution.log_file={done}/one.log", f"--output-dir={done}", "--output=one.ipynb", "one.ipynb"]
     command = ["bash", "-c", f"{shlex.join(execute)} && {shlex.join(PAGE)}"]
     torture(ledger, "a notebook that draws", command, tmp_path, ".", 4, 6, prepare, **changes)
-
-
-PAGE = [sys.executable, "-m", "thesis_repro.report.page"]
-
-
-def own_folders(folder):
-    """Environment and settings of a run that keeps everything in a folder."""
-    changes = {"THESIS_REPRO_BUILD": str(folder / "build"), "THESIS_REPRO_FIGURES": str(folder / "figures")}
-    return changes, read_settings(changes)
 
 
 @pytest.mark.short

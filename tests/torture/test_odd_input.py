@@ -20,16 +20,14 @@ def sequence(root, name, count=8):
     """A sequence of noise that moves, its label maps and masks in folders with names as odd as its own."""
     images = root / "kitti" / "sequences" / name / "image_0"
     noise = np.random.default_rng(0).integers(0, 256, (48, 80), np.uint8)
-    labels = np.repeat([[7], [23]], 16, axis=0).repeat(40, axis=1).astype(np.uint8)
-    mask = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
     for folder in (images, root / "labels <i>&", root / "masks", root / "kitti/poses"):
         folder.mkdir(parents=True)
+    labels, mask = np.full((32, 40), [[7]] * 16 + [[23]] * 16), np.full((48, 64), [0] * 32 + [255] * 32)
     for index in range(count):
         cv2.imwrite(str(images / f"{index:06d}.png"), noise[:, index:index + 64])
-        cv2.imwrite(str(root / "labels <i>&" / f"{index:06d}.png"), labels)
-        cv2.imwrite(str(root / "masks" / f"{index:06d}.png"), mask)
+        cv2.imwrite(str(root / "labels <i>&" / f"{index:06d}.png"), labels.astype(np.uint8))
+        cv2.imwrite(str(root / "masks" / f"{index:06d}.png"), mask.astype(np.uint8))
     (images.parent / "calib.txt").write_text("P0: 50 0 32 0 0 50 24 0 0 0 1 0\n")
-    (images.parent / "times.txt").write_text("".join(f"{index / 10}\n" for index in range(count)))
     (root / f"kitti/poses/{name}.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {index}\n" for index in range(count)))
 
 
