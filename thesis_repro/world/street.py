@@ -195,7 +195,7 @@ def _house_row(plan, side, span, gap, setback, floors, pitched):
     across, along = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.45, 0.45, 6), np.linspace(0.05, 0.95, 5)))
     while s < span[1] - 6:
         width, depth = min(rng.uniform(9, 17), span[1] - s), rng.uniform(8, 12)
-        x, z, heading = plan.track.at(s + width / 2, side * (plan.line + setback))
+        x, z, heading = plan.track.at(s + width / 2, side * (plan.line + setback + rng.uniform(0, 2)))
         yaw = heading + side * np.pi / 2
         points = np.stack([x + width * across * np.cos(yaw) + depth * along * np.sin(yaw),
                            z - width * across * np.sin(yaw) + depth * along * np.cos(yaw)], axis=1)

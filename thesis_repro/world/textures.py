@@ -207,24 +207,26 @@ def _facade(rng, kind):
     shape = (512, 1024)
     base = (172.0, 128.0, 200.0, 150.0, 112.0)[kind]
     width, height = ((92, 128), (84, 140), (120, 120), (100, 150), (150, 110))[kind]
-    image = base + 6 * noise(rng, shape, 256, 4) + 4 * _grain(rng, shape)
+    image = base + 14 * noise(rng, shape, 256, 4) + 4 * _grain(rng, shape)
     if kind in (1, 4):
         image += _slabs(rng, shape, 64, 64, 2)
     frame = 225.0 if base < 165 else 95.0
     for floor in range(2):
         for bay in range(4):
-            left = bay * 256 + 128 - width // 2 + int(rng.integers(-4, 5))
-            _window(rng, image, left, floor * 256 + 70, width, height, frame)
+            # No two windows alike: in a turn, rows of equal ones are tracked to their neighbours.
+            wide, high = int(width * rng.uniform(0.55, 1.2)), int(height * rng.uniform(0.7, 1.1))
+            left = bay * 256 + 128 - wide // 2 + int(rng.integers(-36, 37))
+            _window(rng, image, left, floor * 256 + 200 - high, wide, high, frame)
         image[floor * 256:floor * 256 + 12] = base + 26  # cornice
         image[floor * 256 + 12:floor * 256 + 20] *= 0.72
     stain = np.maximum(noise(rng, shape, 64, 4), 0) * np.linspace(0, 1, 512, dtype=np.float32)[:, None]
-    return image - 7 * stain
+    return image - 14 * stain
 
 
 def _window(rng, image, x, y, width, height, frame):
     """Paint one window into a facade: frame, sill, and glass with a curtain, a reflection or a blind."""
     cv2.rectangle(image, (x - 5, y - 5), (x + width + 5, y + height + 5), frame, -1)
-    pane = np.tile(45 + 25 * rng.random() + np.linspace(18, -12, height)[:, None], (1, width))
+    pane = np.tile(35 + 110 * rng.random() ** 2 + np.linspace(18, -12, height)[:, None], (1, width))
     content, depth = rng.random(), int(height * rng.uniform(0.3, 1.0))
     if content < 0.3:  # curtain
         pane[:depth] = 135 + 12 * np.sin(np.arange(width) * rng.uniform(0.4, 0.8))
