@@ -208,8 +208,7 @@ def _facade(rng, kind):
     base = (172.0, 128.0, 200.0, 150.0, 112.0)[kind]
     width, height = ((92, 128), (84, 140), (120, 120), (100, 150), (150, 110))[kind]
     image = base + 14 * noise(rng, shape, 256, 4) + 4 * _grain(rng, shape)
-    if kind in (1, 4):
-        image += _slabs(rng, shape, 64, 64, 2)
+    image += _slabs(rng, shape, 64, 64, 2) if kind in (1, 4) else _slabs(rng, shape, 16, 32, 2, spread=6)
     frame = 225.0 if base < 165 else 95.0
     for floor in range(2):
         for bay in range(4):
