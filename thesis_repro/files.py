@@ -74,8 +74,8 @@ def _read(path, mode, flag):
             raise OSError
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)  # faster than Pillow's decoder
         if pixels is None:
-            Image.open(BytesIO(data)).load()  # raises where the file is corrupt; OpenCV does not say why it fails
-            raise MemoryError
+            Image.open(BytesIO(data)).load()  # OpenCV does not say why; this raises MemoryError for short memory
+            raise OSError
         return pixels
 
 

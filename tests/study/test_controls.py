@@ -112,7 +112,8 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(small_wor
     assert {job.dilation_width for job in jobs if job.method in controls.MASKS} == {5}
     runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
     left = compare.keypoints_left(runs)
-    jobs += reduced_jobs(thesis_tables.best_widths(runs)) + keypoint_control_jobs(left, kitti, 5, width=5)
+    masked = compare.of_method(runs, "masked")
+    jobs += reduced_jobs(thesis_tables.best_widths(masked)) + keypoint_control_jobs(left, kitti, 5, width=5)
     assert len({job.name for job in jobs}) == len(jobs)
     runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5).set_index("run")
     assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5

@@ -8,7 +8,7 @@ from thesis_repro import InputError, odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, MaskSettings
 from thesis_repro.odometry import metrics
-from thesis_repro.study import controls, runner, thesis_tables, timing
+from thesis_repro.study import compare, controls, runner, thesis_tables, timing
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
 
@@ -20,7 +20,7 @@ def finished(small_world, small_labels, tmp_path_factory):
     folder = tmp_path_factory.mktemp("odometry")
     jobs = first_jobs(small_world / "kitti", ["00", "01"], {"thesis": WIDTHS})
     summary = runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
-    jobs += reduced_jobs(thesis_tables.best_widths(summary))
+    jobs += reduced_jobs(thesis_tables.best_widths(compare.of_method(summary, "masked")))
     return folder, jobs, runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
 
 
@@ -38,7 +38,7 @@ def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finish
 
 def test_reduced_runs_have_the_keypoints_of_the_best_width(finished):
     _, _, summary = finished
-    best = thesis_tables.best_widths(summary)
+    best = thesis_tables.best_widths(compare.of_method(summary, "masked"))
     for name in ("00", "01"):
         of_name = summary[(summary["sequence"] == name) & (summary["method"] == "masked")]
         assert best.loc[name, "rmse"] == of_name["rmse"].min()

@@ -14,8 +14,10 @@ REPORTED = json.loads((Path(captions.__file__).parent / "reported.json").read_te
 ELEVEN = [f"{number:02d}" for number in range(11)]
 
 
-def runs_of(error, sequences=ELEVEN, widths=range(1, 16), repetitions=5, noise=0.0):
-    """Runs with made-up errors: error(sequence, width) in metres, width None for all keypoints; MAE is half of it."""
+def parts_of(error, sequences=ELEVEN, widths=range(1, 16), repetitions=5, noise=0.0):
+    """(masked, baseline) runs with made-up errors: error(sequence, width) in metres, width None for all keypoints.
+
+    MAE is half of it."""
     random, rows = np.random.default_rng(0), []
     for name in sequences:
         for width in (None, *widths):
@@ -24,18 +26,19 @@ def runs_of(error, sequences=ELEVEN, widths=range(1, 16), repetitions=5, noise=0
                 rows.append({"sequence": name, "method": "masked" if width else "baseline", "source": "",
                              "dilation_width": width, "estimator": "thesis", "repetition": repetition, "frames": 100,
                              "rmse": value, "mae": value / 2, "mean_keypoints": 500.0 + (width or 1500)})
-    return pd.DataFrame(rows).astype({"dilation_width": float})
+    runs = pd.DataFrame(rows).astype({"dilation_width": float})
+    return runs[runs["method"] == "masked"], runs[runs["method"] == "baseline"]
 
 
 @pytest.mark.parametrize("key, total, mean, median, improved", [
     ("table_4_2_rmse_percent_change", -13.2, -1.2, -5.27, 6), ("table_4_3_mae_percent_change", -25.65, -2.33, 1.76, 4)])
 def test_the_thesis_tables_come_out_of_the_thesis_numbers(key, total, mean, median, improved):
     reported = pd.Series(REPORTED[key])
-    runs = runs_of(lambda name, width: 2 * (1 + (reported[name] / 100 if width else 0)) + (width not in (None, 10)),
-                   widths=(5, 10, 15))
-    best = thesis_tables.best_widths(runs)
+    masked, baseline = parts_of(lambda name, width: 2 * (1 + (reported[name] / 100 if width else 0))
+                                + (width not in (None, 10)), widths=(5, 10, 15))
+    best = thesis_tables.best_widths(masked)
     assert set(best["dilation_width"]) == {10} and set(best["mean_keypoints"]) == {510}
-    changes = thesis_tables.changes(thesis_tables.of_chosen_width(runs), runs, "mae")
+    changes = thesis_tables.changes(thesis_tables.of_chosen_width(masked), baseline, "mae")
     assert changes.round(2).tolist() == reported.tolist()
     # what the thesis calls aggregate is the sum
     assert (changes.sum(), changes.mean(), changes.median()) == pytest.approx((total, mean, median), abs=0.01)
@@ -48,36 +51,37 @@ def own_optimum(name, width):
 
 
 def test_the_best_width_looks_good_where_the_left_out_one_shows_that_it_is_not():
-    runs = runs_of(own_optimum)
-    chosen = thesis_tables.chosen_widths(runs)
+    masked, baseline = parts_of(own_optimum)
+    chosen = thesis_tables.chosen_widths(masked, baseline)
     assert chosen["best"].tolist() == list(range(1, 12)) and chosen["fixed"].nunique() == 1
     for choice, better in (("best", 11), ("fixed", 1), ("left_out", 0)):
-        changes = thesis_tables.changes(thesis_tables.of_chosen_width(runs, chosen[choice]), runs, "rmse")
+        changes = thesis_tables.changes(thesis_tables.of_chosen_width(masked, chosen[choice]), baseline, "rmse")
         assert (changes < 0).sum() == better
 
 
 def test_leaving_one_out_never_sees_its_own_sequence():
-    runs = runs_of(own_optimum, noise=0.3)
-    chosen = thesis_tables.chosen_widths(runs)["left_out"]
-    other = runs.copy()
-    own = (other["sequence"] == "04") & (other["method"] == "masked")
+    masked, baseline = parts_of(own_optimum, noise=0.3)
+    chosen = thesis_tables.chosen_widths(masked, baseline)["left_out"]
+    other, own = masked.copy(), masked["sequence"] == "04"
     other.loc[own, "rmse"] = np.random.default_rng(5).uniform(0.01, 50, own.sum())
-    assert thesis_tables.chosen_widths(other)["left_out"]["04"] == chosen["04"]
-    assert thesis_tables.chosen_widths(runs[runs["sequence"] != "04"])["fixed"].iloc[0] == chosen["04"]
+    assert thesis_tables.chosen_widths(other, baseline)["left_out"]["04"] == chosen["04"]
+    rest = thesis_tables.chosen_widths(masked[~own], baseline[baseline["sequence"] != "04"])
+    assert rest["fixed"].iloc[0] == chosen["04"]
 
 
 def test_a_width_that_failed_in_one_sequence_is_not_chosen_for_all():
-    runs = runs_of(lambda name, width: 0.1 if width == 15 else 1.0, ["00", "01", "02"], (5, 10, 15))
-    chosen = thesis_tables.chosen_widths(runs[~((runs["sequence"] == "01") & (runs["dilation_width"] == 15))])
+    masked, baseline = parts_of(lambda name, width: 0.1 if width == 15 else 1.0, ["00", "01", "02"], (5, 10, 15))
+    failed = (masked["sequence"] == "01") & (masked["dilation_width"] == 15)
+    chosen = thesis_tables.chosen_widths(masked[~failed], baseline)
     assert set(chosen["fixed"]) == {5} and chosen["left_out"].tolist() == [5, 15, 5]
 
 
 def test_a_real_optimum_is_found_again_in_other_repetitions_and_luck_is_not():
-    real = thesis_tables.stability(runs_of(own_optimum, noise=0.05))
+    real = thesis_tables.stability(*parts_of(own_optimum, noise=0.05))
     assert (real["same_best"] == 100).all() and np.allclose(real["elsewhere"], 0.5, atol=0.06)
-    luck = thesis_tables.stability(runs_of(lambda *_: 1.0, noise=0.2))
+    luck = thesis_tables.stability(*parts_of(lambda *_: 1.0, noise=0.2))
     assert luck["same_best"].mean() < 20 and luck["elsewhere"].mean() == pytest.approx(1, abs=0.1)
-    assert thesis_tables.stability(runs_of(own_optimum, repetitions=1)).isna().all(axis=None)
+    assert thesis_tables.stability(*parts_of(own_optimum, repetitions=1)).isna().all(axis=None)
 
 
 def test_time_saved_is_negative_over_all_sequences_together():

@@ -109,7 +109,7 @@ def _arm(table, estimator, method, widths):
     if estimator and "estimator" in table:
         table = table[table["estimator"] == estimator]
     if widths == "best":
-        return thesis_tables.of_chosen_width(table)
+        return thesis_tables.of_chosen_width(compare.of_method(table, "masked"))
     if widths is not None:
         widths = [compare.tested_width(table)] if widths == "tested" else widths
         table = table[table["dilation_width"].isin(widths)]
@@ -154,12 +154,13 @@ def of_tables():
 
 def of_study(runs):
     """Rows 2, 11, 26, 31 to 33, 35 and 38, from the runs of notebook 08."""
-    best, stability = thesis_tables.of_chosen_width(runs), thesis_tables.stability(runs).dropna()
-    by_width = compare.of_method(runs, "masked").groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
+    masked, baseline = (compare.of_method(runs, method) for method in ("masked", "baseline"))
+    best, stability = thesis_tables.of_chosen_width(masked), thesis_tables.stability(masked, baseline).dropna()
+    by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
     chosen = {metric: by_width[metric].groupby("sequence").idxmin() for metric in ("rmse", "mae")}
     errors = {metric: by_width["rmse"].loc[keys].to_numpy() for metric, keys in chosen.items()}
     widths = chosen["rmse"].map(lambda key: key[1])
-    of_best = compare.ratios(best, compare.of_method(runs, "baseline"), "rmse")
+    of_best = compare.ratios(best, baseline, "rmse")
     measurements = [
         ratio("31", "mae chooses", errors["mae"] / errors["rmse"], metric="RMSE"),
         measurement("31", "other width", (chosen["rmse"] != chosen["mae"]).sum(), "sequences"),

@@ -186,8 +186,8 @@ def _lines(axes, table):
 
 def _of_methods(runs, metric):
     """(sequences, {method: mean, lowest, highest, one row a sequence}) of the three methods of the thesis."""
-    rows = {"baseline": compare.of_method(runs, "baseline"), "masked": thesis_tables.of_chosen_width(runs),
-            "reduced": compare.of_method(runs, "reduced")}
+    rows = {method: compare.of_method(runs, method) for method in ("baseline", "masked", "reduced")}
+    rows["masked"] = thesis_tables.of_chosen_width(rows["masked"])
     names = sorted(rows["baseline"]["sequence"].unique())
     return names, {method: compare.spread(own, metric).reindex(names) for method, own in rows.items()}
 

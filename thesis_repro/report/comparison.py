@@ -183,24 +183,26 @@ def table_widths(runs):
     tables = {}
     for source in compare.sources(runs) or [""]:
         own = compare.of_source(runs, source)
-        if compare.of_method(own, "masked")["dilation_width"].nunique() > 1:
-            tables[source] = _widths(own)
+        masked = compare.of_method(own, "masked")
+        if masked["dilation_width"].nunique() > 1:
+            tables[source] = _widths(masked, compare.of_method(own, "baseline"))
     if len(compare.sources(runs)) > 1 and tables:
         return pd.concat(tables, names=["masks"]).reset_index("masks")
     return next(iter(tables.values()), pd.DataFrame())
 
 
-def _widths(runs):
-    chosen, baseline = thesis_tables.chosen_widths(runs), compare.of_method(runs, "baseline")
-    metrics = [name for name in ("rmse", "rmse_boresight_corrected") if name in runs and runs[name].notna().any()]
+def _widths(masked, baseline):
+    chosen, again = thesis_tables.chosen_widths(masked, baseline), thesis_tables.stability(masked, baseline)
+    metrics = [name for name in ("rmse", "rmse_boresight_corrected")
+               if name in masked and masked[name].notna().any()]
     columns, ratios = {}, {}
     for choice, words in CHOICES.items():
         columns[words] = chosen[choice]
-        rows = thesis_tables.of_chosen_width(runs, chosen[choice])
+        rows = thesis_tables.of_chosen_width(masked, chosen[choice])
         for metric in metrics:
             name = f"{words}: {compare.METRICS[metric]}"
             columns[name] = ratios[name] = compare.ratios(rows, baseline, metric)
-    again, name = thesis_tables.stability(runs), "best width of one repetition, in the others: RMSE"
+    name = "best width of one repetition, in the others: RMSE"
     columns[name] = ratios[name] = again["elsewhere"]
     columns["same best width in two repetitions (%)"] = again["same_best"].round()
     table = pd.DataFrame(columns, index=chosen.index).astype(object)

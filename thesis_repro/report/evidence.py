@@ -90,7 +90,7 @@ def _runs(root, names, build, frames, repetitions, processes):
     listed += [jobs.Job(name, method, width, estimator="refined", repetition=repetition) for name in names
                for method in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
     runs = run()
-    listed += jobs.reduced_jobs(thesis_tables.best_widths(runs), repetitions)
+    listed += jobs.reduced_jobs(thesis_tables.best_widths(compare.of_method(runs, "masked")), repetitions)
     listed += jobs.keypoint_control_jobs(compare.keypoints_left(runs), root, frames, repetitions,
                                          width=jobs.CONTROL_WIDTH)
     for width in OTHER_WIDTHS:

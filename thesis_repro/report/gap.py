@@ -50,7 +50,7 @@ def figure(gap):
     ious = common.pivot(index=["id", "class"], columns=["model", "domain"], values="iou").droplevel("id")
     drawn, axes = new_figure(len(models), 1, height=2.1 * len(models) + 0.6, squeeze=False, sharex=True, sharey=True)
     for panel, model in zip(axes[:, 0], models):
-        ious[model].reindex(columns=domains).plot.bar(ax=panel, width=0.8, color=COLOURS, legend=False)
+        ious[model].reindex(columns=domains).plot.bar(ax=panel, width=0.8, color=COLOURS[:len(domains)], legend=False)
         for color, mean in zip(COLOURS, gap.scores.loc[gap.scores["model"] == model, "mean_iou"]):
             panel.axhline(mean, color=color, linewidth=1, linestyle="--")
         panel.set(title=model, xlabel="", ylabel="IoU", ylim=(0, 1))

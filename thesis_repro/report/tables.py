@@ -14,7 +14,7 @@ from thesis_repro.study.jobs import ESTIMATORS
 
 def table_4_1(runs, reported_as):
     """Best dilation width and mean number of keypoints of each sequence, the thesis's numbers beside them."""
-    best = thesis_tables.best_widths(runs)
+    best = thesis_tables.best_widths(compare.of_method(runs, "masked"))
     reported = pd.DataFrame(REPORTED["table_4_1"]).set_index("sequence").reindex(best.index).astype("Int64")
     return pd.DataFrame({
         "frames": best["frames"], "dilation width (pixels)": best["dilation_width"],
@@ -30,7 +30,7 @@ def table_of_change(best, runs, metric, reported_as):
     of the sequences' percentages; mean, its bootstrap interval and median stand below it.
     """
     reported = pd.Series(REPORTED[f"table_4_{2 if metric == 'rmse' else 3}_{metric}_percent_change"])
-    changes = thesis_tables.changes(best, runs, metric)
+    changes = thesis_tables.changes(best, compare.of_method(runs, "baseline"), metric)
     rows = {f"{metric.upper()}, all keypoints (m)": compare.of_method(runs, "baseline"),
             f"{metric.upper()}, best mask (m)": best}
     table = pd.DataFrame({name: own.groupby("sequence")[metric].mean().map(lambda value: float(f"{value:.3g}"))

@@ -84,8 +84,9 @@ def _of_source(runs, table, source):
     judging = rows["metric"].isin(compare.JUDGING_METRICS) & (rows["estimator"] == compare.judging_estimator(table))
     controls = compare.against_controls(table, source)
     controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)["verdict"]
-    widths = compare.of_method(runs, "masked")["dilation_width"].nunique()
-    same_best = thesis_tables.stability(runs)["same_best"].mean() if widths > 1 else None
+    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    widths = masked["dilation_width"].nunique()
+    same_best = thesis_tables.stability(masked, baseline)["same_best"].mean() if widths > 1 else None
     return {"name": source, "judged": judged.to_dict("records"), "verdict": compare.overall(judged["verdict"]),
             "width": compare.tested_width(runs), "masked": rows[rows["method"] == "masked"].to_dict("records"),
             "corrected": rows[judging & (rows["method"] == "corrected")].to_dict("records"),
