@@ -183,15 +183,15 @@ def table_widths(runs):
     tables = {}
     for source in compare.sources(runs) or [""]:
         own = compare.of_source(runs, source)
-        masked = compare.of_method(own, "masked")
-        if masked["dilation_width"].nunique() > 1:
-            tables[source] = _widths(masked, compare.of_method(own, "baseline"))
+        if own["dilation_width"][own["method"] == "masked"].nunique() > 1:
+            tables[source] = _widths(own)
     if len(compare.sources(runs)) > 1 and tables:
         return pd.concat(tables, names=["masks"]).reset_index("masks")
     return next(iter(tables.values()), pd.DataFrame())
 
 
-def _widths(masked, baseline):
+def _widths(runs):
+    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     chosen, again = thesis_tables.chosen_widths(masked, baseline), thesis_tables.stability(masked, baseline)
     metrics = [name for name in ("rmse", "rmse_boresight_corrected")
                if name in masked and masked[name].notna().any()]

@@ -16,8 +16,8 @@ def write(study, runs, folder):
     """Write everything that the runs of a `series.Study` show into a folder; returns the page's path."""
     runs = runner.with_boresight_correction(runs, study.kitti, folder / "runs", study.frames)
     table, note = compare.comparisons(runs), data_note(study)
-    style.save_table(runs.round(DIGITS), folder, "runs", note)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
+    style.save_table(runs.round(DIGITS), folder, "runs", note)
     names = style.save_all(comparison.figures(table, runs), {
         "comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
         "errors": tables.table_errors(runs)}, folder, note)

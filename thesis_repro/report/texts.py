@@ -65,6 +65,8 @@ def findings(runs, table, data, label_maps=()):
     pairs = table[(table["method"] == "masked") & (table["reference"] == "masked")
                   & table["metric"].isin(compare.JUDGING_METRICS) & (table["source"] < table["reference_source"])
                   & (table["estimator"] == compare.judging_estimator(table))]  # each pair of sources once
+    sources = [_of_source(runs, table, source) for source in compare.sources(runs) or [""]
+               if (of_masks["source"] == source).any()]
     spread = compare.shuffle_spread(runs).groupby("estimator")["factor"].agg(["median", "max"])
     return render(
         "findings.md.j2", label_maps=label_maps, data=data,
@@ -72,9 +74,7 @@ def findings(runs, table, data, label_maps=()):
         repetitions=baseline["repetition"].nunique(), spread=spread.reindex(list(ESTIMATORS)).dropna().T.to_dict(),
         estimators=ESTIMATORS, methods=compare.METHODS, metrics=compare.METRICS, fewest=compare.MIN_SEQUENCES,
         least=compare.MIN_FOR_INTERVAL, level=compare.LEVEL, thesis_width=CONTROL_WIDTH,
-        sources=[_of_source(runs, table, source) for source in compare.sources(runs) or [""]
-                 if (of_masks["source"] == source).any()],
-        against_each_other=pairs.to_dict("records"))
+        sources=sources, against_each_other=pairs.to_dict("records"))
 
 
 def _of_source(runs, table, source):
@@ -85,10 +85,10 @@ def _of_source(runs, table, source):
     controls = compare.against_controls(table, source)
     controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)["verdict"]
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
-    widths = masked["dilation_width"].nunique()
+    tested, widths = compare.tested_width(runs), masked["dilation_width"].nunique()
     same_best = thesis_tables.stability(masked, baseline)["same_best"].mean() if widths > 1 else None
     return {"name": source, "judged": judged.to_dict("records"), "verdict": compare.overall(judged["verdict"]),
-            "width": compare.tested_width(runs), "masked": rows[rows["method"] == "masked"].to_dict("records"),
+            "width": tested, "masked": rows[rows["method"] == "masked"].to_dict("records"),
             "corrected": rows[judging & (rows["method"] == "corrected")].to_dict("records"),
             "controls": controls.agg(compare.overall).to_dict(), "widths": widths,
             "same_best": None if pd.isna(same_best) else float(same_best)}
