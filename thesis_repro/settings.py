@@ -44,7 +44,7 @@ class Profile:
     repetitions: int  # of each run, each with the matched points shuffled in another way
     # the embedded world
     world_sequences: int
-    world_frames: int | None  # of each sequence; None for as many as show all of its drive, 46 to 156
+    world_frames: int | None  # of each sequence; None for as many as show all of its drive, 41 to 132
     world_training_images: int
     world_validation_images: int
 
