@@ -55,9 +55,8 @@ GRAYS = bytes(value for value in range(256) for _ in range(3))
     (png(interlaced(IMAGE), 60, 40, 8, 0, interlaced=1), True),
     (png(IMAGE, 60, 40, 8, 3, palette=GRAYS), False),  # of its colours; numbers are not those of a palette
     (png(np.repeat(IMAGE, 3, axis=1), 60, 40, 8, 2), True),  # three equal channels
-    (png(np.dstack([IMAGE] * 3 + [np.full_like(IMAGE, 255)]).reshape(40, 240), 60, 40, 8, 6), True),
     (png(np.dstack([IMAGE, np.full_like(IMAGE, 9)]).reshape(40, 120), 60, 40, 8, 4), True),
-], ids=["interlaced", "palette", "colours", "colours and transparency", "transparency"])
+], ids=["interlaced", "palette", "colours", "transparency"])
 def test_harmless_kinds_of_png_have_the_right_pixels(tmp_path, data, ids):
     path = tmp_path / "a.png"
     path.write_bytes(data)
@@ -87,9 +86,8 @@ def test_too_little_memory_is_not_taken_for_damage(tmp_path, monkeypatch):
 
 
 def test_one_bit_is_black_and_white(tmp_path):
-    path = tmp_path / "mask.png"
-    path.write_bytes(png([[0b10100000], [0b01100000]], 3, 2, 1, 0))
-    assert np.array_equal(read_gray(path), [[255, 0, 255], [0, 255, 255]])
+    (tmp_path / "mask.png").write_bytes(png([[0b10100000], [0b01100000]], 3, 2, 1, 0))
+    assert np.array_equal(read_gray(tmp_path / "mask.png"), [[255, 0, 255], [0, 255, 255]])
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path):

@@ -39,17 +39,14 @@ def read(function, path, text, *arguments):
         return None
 
 
-def sound_poses(poses):
-    assert poses.shape[1:] == (4, 4) and len(poses) and np.isfinite(poses).all()
-    assert np.abs(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() <= kitti.ROTATION_TOLERANCE
-    assert (np.linalg.det(poses[:, :3, :3]) > 0).all() and (poses[:, 3] == [0, 0, 0, 1]).all()
-
-
 @given(TEXTS | st.binary() | st.lists(WORDS, min_size=12, max_size=12).map(" ".join))
 def test_any_text_as_poses(path, text):
     poses = read(kitti.read_poses, path, text)
     if poses is not None:
-        sound_poses(poses)
+        rotations = poses[:, :3, :3]
+        assert poses.shape[1:] == (4, 4) and len(poses) and np.isfinite(poses).all()
+        assert np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max() <= kitti.ROTATION_TOLERANCE
+        assert (np.linalg.det(rotations) > 0).all() and (poses[:, 3] == [0, 0, 0, 1]).all()
 
 
 @given(TEXTS | st.binary())

@@ -7,8 +7,7 @@ from thesis_repro.settings import PROFILES, read_settings
 def test_default_run_keeps_its_figures_at_the_top():
     settings = read_settings({})
     assert settings.run == "embedded-demo" and settings.figures.name == "figures"
-    assert settings.kitti_is_embedded and settings.kitti == settings.world / "kitti"
-    assert "embedded world" in settings.data_note
+    assert settings.kitti_is_embedded and settings.kitti == settings.world / "kitti" and not settings.shipped
 
 
 def test_thesis_profile_has_the_thesis_sizes():
@@ -26,7 +25,6 @@ def test_runs_of_other_data_and_profiles_never_meet(tmp_path):
         for more in ({}, {"THESIS_REPRO_PROFILE": "smoke"}, {"THESIS_REPRO_CITYSCAPES": str(one)})]
     runs = [read_settings(environment) for environment in environments]
     assert len({settings.build for settings in runs}) == len({settings.figures for settings in runs}) == len(runs)
-    assert "embedded" not in runs[4].data_note
 
 
 def test_street_scenes_to_judge_by_are_a_run_of_their_own(tmp_path):
@@ -39,7 +37,7 @@ def test_street_scenes_to_judge_by_are_a_run_of_their_own(tmp_path):
     assert read_settings({}).kitti_semantic is None
 
 
-def test_sizes_one_by_one_are_part_of_the_name_and_of_every_note():
+def test_sizes_one_by_one_are_part_of_the_name():
     given = {"EPOCHS": "3", "FRAMES": "all", "WIDTHS": "5,10", "IMAGE_SIZE": "64",
              "REPETITIONS": str(PROFILES["demo"].repetitions)}
     settings = read_settings({f"THESIS_REPRO_{name}": value for name, value in given.items()})
@@ -47,7 +45,6 @@ def test_sizes_one_by_one_are_part_of_the_name_and_of_every_note():
     assert (sizes.epochs, sizes.frames, sizes.widths, sizes.image_size) == (3, None, (5, 10), 64)
     # what is the profile's anyway changes nothing, and all else is the profile's
     assert settings.run == "embedded-demo-image-size-64-epochs-3-frames-all-widths-5_10"
-    assert settings.data_note.endswith("profile demo, image size 64, epochs 3, frames all, widths 5, 10")
     assert sizes.batch_size == PROFILES["demo"].batch_size and settings.figures != read_settings({}).figures
     assert read_settings({"THESIS_REPRO_FRAMES": "200", "THESIS_REPRO_WIDTHS": "1-15"}).run == "embedded-demo"
     many = read_settings({"THESIS_REPRO_WIDTHS": "1-40"})
@@ -56,22 +53,15 @@ def test_sizes_one_by_one_are_part_of_the_name_and_of_every_note():
 
 def test_real_frames_alone_take_the_model_in_the_package(tmp_path):
     settings = read_settings({"THESIS_REPRO_KITTI": str(tmp_path)})
-    assert settings.shipped and "model in the package" in settings.data_note and "no training" in settings.data_note
-    assert "embedded" not in settings.data_note
-    assert not read_settings({}).shipped
+    assert settings.shipped and "embedded" not in settings.data_note
     assert not read_settings({"THESIS_REPRO_KITTI": str(tmp_path), "THESIS_REPRO_CITYSCAPES": str(tmp_path)}).shipped
 
 
 @pytest.mark.parametrize("setting", [
     "EPOCHS=0", "IMAGE_SIZE=100", "FRAMES=some", "FRAMES=4", "WIDTHS=5-1", "WIDTHS=5,x", "WIDTHS=1-1000000000",
     "BATCH_SIZE=-1", "BASE_FILTERS=nan", "REPETITIONS=0", "PROFILE=huge", "KITTI=/no/such/folder",
-    "KITTI_SEMANTIC=/no/such/folder", "JOBS=0", "JOBS=many", "JOBS=999999999"])
+    "KITTI_SEMANTIC=/no/such/folder", "JOBS=0", "JOBS=many", "JOBS=999999999", "PROFIL=demo"])
 def test_bad_settings_are_named(setting):
     name, value = setting.split("=")
-    with pytest.raises(InputError, match=f"^{setting}: "):
+    with pytest.raises(InputError, match=f"{name}.*: "):
         read_settings({f"THESIS_REPRO_{name}": value})
-
-
-def test_an_unknown_setting_is_named():
-    with pytest.raises(InputError, match="THESIS_REPRO_PROFIL: "):
-        read_settings({"THESIS_REPRO_PROFIL": "demo"})

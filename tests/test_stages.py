@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, files, stages
 
 
 def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
@@ -20,6 +20,9 @@ def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
     with pytest.raises(InputError, match="letter.txt: "):
         stages.stage(tmp_path / "letter.txt", data="one")
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+    (tmp_path / stages.RECORD).write_text("[1, 2")  # a damaged record
+    with pytest.raises(InputError, match="made-from.json: "):
+        stages.stage(tmp_path, data="one")
 
 
 def test_results_of_other_settings_are_refused_where_they_must_not_be_deleted(tmp_path):
@@ -27,12 +30,6 @@ def test_results_of_other_settings_are_refused_where_they_must_not_be_deleted(tm
     with pytest.raises(InputError, match="a: .*size"):
         stages.stage(tmp_path / "a", replace=False, size=4)
     assert (tmp_path / "a" / "result").exists()
-
-
-def test_a_damaged_record_is_one_clear_line(tmp_path):
-    (tmp_path / stages.RECORD).write_text("[1, 2")
-    with pytest.raises(InputError, match="made-from.json: "):
-        stages.stage(tmp_path, data="one")
 
 
 def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):
@@ -51,20 +48,14 @@ def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):
         stages.resume(file)
 
 
-def write_package(root, **modules):
-    for name, text in modules.items():
-        path = root / "package" / f"{name.replace('__', '/')}.py"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-
-
 def test_code_ignores_comments_and_docstrings_and_follows_imports(tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "_PACKAGE", tmp_path / "package")
     plain = {"room__table": "from package.room import chair\n", "room__chair": "from package import house\n",
              "house": "def f():\n    return 1\n", "garden": "x = 1\n"}
 
     def version(place="room", **changed):
-        write_package(tmp_path, **{**plain, **changed})
+        for name, text in {**plain, **changed}.items():
+            files.write_text(tmp_path / "package" / f"{name.replace('__', '/')}.py", text)
         stages.code.cache_clear()
         return stages.code(place)
 

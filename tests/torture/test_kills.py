@@ -8,7 +8,6 @@ import time
 
 import nbformat
 import pytest
-import trials
 from trials import ROOT, TIMEOUT, contents, finish, kill, nothing_stray, same, snapshot, start, succeed
 
 from thesis_repro import longrun
@@ -20,7 +19,7 @@ def look(folder):
     return {path: about for path, about in snapshot(folder).items() if path.name != longrun.LOG}
 
 
-def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: None, **environment):
+def torture(command, where, results, kills, seed, prepare=lambda: None, **environment):
     """Kill a command `kills` times, each time a while after it has begun to write; then let it end.
 
     command: what is run in the folder `where`; results: the folder below it that is compared, made anew by `prepare`
@@ -48,29 +47,28 @@ def torture(ledger, what, command, where, results, kills, seed, prepare=lambda: 
     started = time.monotonic()
     assert finish(process).returncode == 0
     seconds, wanted = time.monotonic() - started, contents(results)
-    moments = [(number + random.Random(f"{what} {seed} {number}").random()) / kills * seconds
+    moments = [(number + random.Random(f"{seed} {number}").random()) / kills * seconds
                for number in range(kills)]
     random.Random(seed).shuffle(moments)
     anew()
-    with ledger("kills", what, times=kills):
-        tries = 0
-        while moments:
-            tries += 1
-            process = start(command, where, **environment)
-            if begun(process):
-                time.sleep(moments[0] if tries < 3 * kills else 0)
-            if process.poll() is None:
-                kill(process)
-                moments.pop(0)
-                continue
-            result = finish(process)
-            trials.lost_unless(result.returncode == 0, f"does not go on: {result.stdout}\n{result.stderr}")
-            same(contents(results), wanted)
-            moments[0] /= 2  # a resumed run is shorter
-            anew()
-        succeed(command, where, timeout=2 * TIMEOUT, **environment)
+    tries = 0
+    while moments:
+        tries += 1
+        process = start(command, where, **environment)
+        if begun(process):
+            time.sleep(moments[0] if tries < 3 * kills else 0)
+        if process.poll() is None:
+            kill(process)
+            moments.pop(0)
+            continue
+        result = finish(process)
+        assert result.returncode == 0, f"does not go on: {result.stdout}\n{result.stderr}"
         same(contents(results), wanted)
-        nothing_stray(where)
+        moments[0] /= 2  # a resumed run is shorter
+        anew()
+    succeed(command, where, timeout=2 * TIMEOUT, **environment)
+    same(contents(results), wanted)
+    nothing_stray(where)
 
 
 WORLD = "from thesis_repro import world; world.write('out', sequences=['00'], frames=20, scale=0.2, " \
@@ -79,12 +77,12 @@ WORLD = "from thesis_repro import world; world.write('out', sequences=['00'], fr
 
 @pytest.mark.parametrize("name, kills", [
     ("synthesize", 3), ("world", 7), ("training", 5), ("predict", 5), ("study", 9)])
-def test_a_command_that_writes(ledger, words, tmp_path, name, kills):
+def test_a_command_that_writes(words, tmp_path, name, kills):
     command = [sys.executable, "-c", WORLD] if name == "world" else words(name)
-    torture(ledger, name, command, tmp_path, "out", kills, 1)
+    torture(command, tmp_path, "out", kills, 1)
 
 
-def test_the_drawing_of_a_study(ledger, words, tmp_path):
+def test_the_drawing_of_a_study(words, tmp_path):
     succeed(words("study"), tmp_path)
     shutil.copytree(tmp_path / "out", tmp_path / "runs")
 
@@ -95,7 +93,7 @@ def test_the_drawing_of_a_study(ledger, words, tmp_path):
             if path.is_file() and path.name != longrun.RECORD:
                 path.unlink()
 
-    torture(ledger, "the drawing of figures and a study's page", words("study"), tmp_path, "out", 6, 5, prepare)
+    torture(words("study"), tmp_path, "out", 6, 5, prepare)
 
 
 DRAWING = """
@@ -116,7 +114,7 @@ def own_folders(folder):
     return changes, read_settings(changes)
 
 
-def test_the_figures_of_a_notebook(ledger, tmp_path):
+def test_the_figures_of_a_notebook(tmp_path):
     """As `make figures` executes one, and makes the page after the last."""
     changes, settings = own_folders(tmp_path)
     done = settings.build / "notebooks"
@@ -130,11 +128,11 @@ def test_the_figures_of_a_notebook(ledger, tmp_path):
                "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
                f"--Execution.log_file={done}/one.log", f"--output-dir={done}", "--output=one.ipynb", "one.ipynb"]
     command = ["bash", "-c", f"{shlex.join(execute)} && {shlex.join(PAGE)}"]
-    torture(ledger, "a notebook that draws", command, tmp_path, ".", 4, 6, prepare, **changes)
+    torture(command, tmp_path, ".", 4, 6, prepare, **changes)
 
 
 @pytest.mark.short
-def test_the_page(ledger, tmp_path):
+def test_the_page(tmp_path):
     changes, settings = own_folders(tmp_path)
 
     def prepare():
@@ -149,4 +147,4 @@ def test_the_page(ledger, tmp_path):
         for path in (ROOT / "figures").glob("*.csv"):
             shutil.copy(path, settings.figures)
 
-    torture(ledger, "the page", PAGE, tmp_path, ".", 5, 7, prepare, **changes)
+    torture(PAGE, tmp_path, ".", 5, 7, prepare, **changes)

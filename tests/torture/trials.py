@@ -18,18 +18,8 @@ from thesis_repro import longrun
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 300  # seconds; a command that takes longer hangs
-KINDS, OUTCOMES = ("kills", "faults", "bad inputs"), ("clear", "unclear", "lost")
 # what tests/conftest.py sets for the tests' own process and a user does not have
 NOT_THE_USERS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
-
-
-class Lost(AssertionError):
-    """Worse than an unclear error: results are lost or wrong, or bad input is accepted."""
-
-
-def lost_unless(condition, what):
-    if not condition:
-        raise Lost(what)
 
 
 @dataclass
@@ -83,7 +73,7 @@ def run(command, where, timeout=TIMEOUT, **options):
 
 def succeed(command, where, **options):
     result = run(command, where, **options)
-    lost_unless(result.returncode == 0, f"fails: {result.stdout}\n{result.stderr}")
+    assert result.returncode == 0, f"{result.stdout}\n{result.stderr}"
     return result
 
 
@@ -115,7 +105,6 @@ def refused(result, named, code=1, left=()):
     Nothing in its folder may be new or changed but what the patterns `left` allow ("out/*").
     """
     output = f"exit {result.returncode}\n{result.stdout}\n{result.stderr}"
-    lost_unless(result.returncode != 0, f"bad input or a fault is accepted: {output}")
     assert result.returncode == code and "Traceback" not in result.stdout + result.stderr, output
     lines = [line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))]
     assert len(lines) == 1 and str(named) in lines[0], f"not one line that names {named}: {output}"
@@ -145,9 +134,17 @@ def _content(path):
 
 def same(results, wanted):
     other = sorted(path for path in results.keys() | wanted.keys() if results.get(path) != wanted.get(path))
-    lost_unless(not other, f"not what an undisturbed run leaves: {', '.join(other)}")
+    assert not other, f"not what an undisturbed run leaves: {', '.join(other)}"
+
+
+def whole_again(words, name, where, output="out"):
+    """What was disturbed now ends well, with nothing stray, and leaves what an undisturbed run does."""
+    for folder in (output, "whole"):
+        succeed(words(name, folder), where)
+    nothing_stray(where)
+    same(contents(where / output), contents(where / "whole"))
 
 
 def nothing_stray(where):
     stray = [path for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)]
-    lost_unless(not stray, f"left half written: {', '.join(map(str, stray))}")
+    assert not stray, f"left half written: {', '.join(map(str, stray))}"
