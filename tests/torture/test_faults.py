@@ -80,7 +80,8 @@ def wait_for(condition, seconds=120):
 def test_a_process_that_dies(words, tmp_path, name):
     """As the system ends one where memory runs out."""
     def workers(process):
-        listed = subprocess.run(["ps", "--ppid", str(process.pid), "-o", "pid=,args="], capture_output=True, text=True)
+        listed = subprocess.run(["ps", "-ww", "--ppid", str(process.pid), "-o", "pid=,args="], capture_output=True,
+                                text=True)  # -ww: however long the path of the interpreter is
         return [int(line.split()[0]) for line in listed.stdout.splitlines() if "popen_loky" in line]
 
     process = start(words(name), tmp_path)
