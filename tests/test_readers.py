@@ -6,7 +6,7 @@ import string
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from thesis_repro import InputError, files, kitti
@@ -159,6 +159,7 @@ PICTURE = cv2.imencode(".png", np.random.default_rng(0).integers(0, 35, (20, 30)
 
 
 @given(st.integers(0, len(PICTURE) - 1), st.integers(1, 255))
+@example(place=len(PICTURE) - 12, change=1)  # the length of the last chunk
 def test_no_changed_byte_of_a_png_goes_unnoticed(path, place, change):
     data = bytearray(PICTURE)
     data[place] ^= change
