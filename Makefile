@@ -48,7 +48,7 @@ help:
 	@echo "                 BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS"
 	@echo "make plan        what that would take, KITTI=/path, with the same settings"
 	@echo "make test        unit tests, and every notebook on the smallest profile"
-	@echo "make torture     faults and bad input tried on purpose, some minutes: what is clear, unclear, lost"
+	@echo "make torture     kills, faults and bad input tried on purpose, some minutes"
 	@echo "make lint        style (Ruff) and types (mypy)"
 	@echo "make lab         JupyterLab on the notebooks"
 	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from thesis_repro import InputError, longrun
 
 BAR_DELAY = 1  # seconds before a bar shows: what is over sooner needs none
-END_MARKS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # the last bytes of a whole file
+END_MARKS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # the last bytes of a whole file
 TAIL = 4096  # bytes at the end of a file, where a quick look expects its end mark
 
 
@@ -74,8 +74,8 @@ def _read(path, mode, flag):
             raise OSError
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)  # faster than Pillow's decoder
         if pixels is None:
-            Image.open(BytesIO(data)).load()  # OpenCV does not say why; this raises MemoryError for short memory
-            raise OSError
+            Image.open(BytesIO(data)).load()  # raises where the file is corrupt; OpenCV does not say why it fails
+            raise MemoryError
         return pixels
 
 
