@@ -164,8 +164,9 @@ plan: setup
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS)
 
+# (a file's tests stay with one process, for they share what takes seconds to make)
 test: setup
-	@$(BIN)/python -m pytest -q
+	@$(BIN)/python -m pytest -q -n $(shell nproc) --dist loadfile
 
 torture: setup
 	@$(BIN)/python -m pytest -q --torture tests/torture
