@@ -44,16 +44,6 @@ def test_resizing_invents_no_label(tiny_cityscapes):
     assert set(np.unique(labels)) == {7, 11, 23}
 
 
-def test_split_is_the_appendix_split():
-    # numpy's legacy generator with seed 0 is what scikit-learn's random_state=0 stands for
-    train, validation = cityscapes.split_train_validation(list(range(2975)))
-    order = np.random.RandomState(0).permutation(2975)
-    assert (len(train), len(validation)) == (2380, 595)
-    assert validation == order[:595].tolist() and train == order[595:].tolist()
-    with pytest.raises(InputError):
-        cityscapes.split_train_validation([0])
-
-
 def test_faults_are_named(tiny_cityscapes):
     cv2.imwrite(str(tiny_cityscapes / "trainannot" / "street_0.png"), np.full((16, 32), 35, np.uint8))
     with pytest.raises(InputError, match="trainannot/street_0.png: label id 35"):

@@ -150,12 +150,3 @@ def load(image_pairs, size, channels=1, description="reading images"):
         images[index] = read_image(pair.image, size, size, channels)
         labels[index] = cv2.resize(read_label_map(pair.label), (size, size), interpolation=cv2.INTER_NEAREST)
     return images, labels
-
-
-def split_train_validation(image_pairs):
-    """The appendix's split of the training folder: 80 % and 20 %, random state 0 (A.2.3)."""
-    from sklearn.model_selection import train_test_split  # a second to load, and every command loads this module
-
-    if len(image_pairs) < 2:
-        raise InputError(f"{len(image_pairs)} training image: at least 2 are needed to split off a validation set")
-    return train_test_split(image_pairs, test_size=0.2, random_state=0)
