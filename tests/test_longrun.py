@@ -64,8 +64,9 @@ def test_what_a_killed_run_left_half_written_is_deleted_and_nothing_else(tmp_pat
 def test_results_are_deleted_with_their_records_last_and_the_log_is_kept(tmp_path, monkeypatch):
     folder, gone = stages.stage(tmp_path / "out", size=3), []
     stages.stage(folder / "in", size=3)
-    for path in (folder / "result", folder / "in" / "result", folder / longrun.LOG):
-        path.touch()
+    for path in (folder / "result", folder / "in" / "result"):
+        files.write_text(path, "")
+    (folder / longrun.LOG).touch()
     unlink = type(folder).unlink
 
     def noted(path, **options):

@@ -6,7 +6,7 @@ from thesis_repro import InputError, files, stages
 
 def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
     folder = stages.stage(tmp_path / "a", data="one", size=3)
-    (folder / "result").write_text("kept")
+    files.write_text(folder / "result", "kept")
     assert stages.stage(tmp_path / "a", size=3, data="one") == folder and (folder / "result").exists()
     before = stages.made_from(folder)
     stages.stage(tmp_path / "a", data="other", size=3)
@@ -26,7 +26,7 @@ def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
 
 
 def test_results_of_other_settings_are_refused_where_they_must_not_be_deleted(tmp_path):
-    (stages.stage(tmp_path / "a", size=3) / "result").write_text("kept")
+    files.write_text(stages.stage(tmp_path / "a", size=3) / "result", "kept")
     with pytest.raises(InputError, match="a: .*size"):
         stages.stage(tmp_path / "a", replace=False, size=4)
     assert (tmp_path / "a" / "result").exists()

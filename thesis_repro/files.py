@@ -1,9 +1,13 @@
 """Reading images, writing files whole or not at all, and showing progress."""
 
+import hashlib
+import json
 import os
 import re
+import stat
 import struct
 import sys
+import tempfile
 from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
@@ -40,7 +44,7 @@ def read_ids(path):
     Raises what `read_gray` raises, and InputError where reading as gray would change them: a palette, less than 8
     bits, colours (but for three equal channels), another format.
     """
-    with _errors_named(path), open(path, "rb") as file:
+    with _opened(path) as file:
         image = _header(path, file)
         stored = str(image.tile)  # with Pillow's name of the mode in the file: "L;4" is gray of 4 bits
     channels = np.atleast_3d(read_gray(path) if image.mode == "L" else read_color(path))
@@ -54,7 +58,7 @@ def glance(path):
 
     Raises InputError where `read_gray` would, but for damage in the middle.
     """
-    with _errors_named(path), open(path, "rb") as file:
+    with _opened(path) as file:
         image = _header(path, file)
         file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
         if END_MARKS["PNG" if image.format == "PNG" else "JPEG"] not in file.read():
@@ -63,8 +67,8 @@ def glance(path):
 
 
 def _read(path, mode, flag):
-    with _errors_named(path):
-        data = Path(path).read_bytes()
+    with _opened(path) as file:
+        data = file.read()
         image = _header(path, BytesIO(data))
         if image.format != "PNG":
             image.draft(mode, image.size)  # gray without converting colours first, as OpenCV does
@@ -87,10 +91,14 @@ def _header(path, file):
 
 
 @contextmanager
-def _errors_named(path):
-    """Raise an InputError that names the image where the system, Pillow or OpenCV raise another error."""
+def _opened(path):
+    """The file of an image. Raises an InputError that names it where the system, Pillow or OpenCV raise another error,
+    and for what is no file: a pipe or device may have nothing to read, or no end."""
     try:
-        yield
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise InputError(f"{path}: is no file; an image must be one")
+            yield file
     except InputError:
         raise
     except Image.DecompressionBombError:
@@ -125,15 +133,38 @@ def numbers_of(paths):
     return [int(match[2]) for match in matches]
 
 
+def is_whole(path):
+    """Whether an image is there, and both ends of its file are."""
+    try:
+        return bool(glance(path))
+    except InputError:
+        return False
+
+
 @contextmanager
 def atomic(path):
-    """Yield a temporary path beside `path`; rename it when the block ends well, delete it when it does not."""
+    """Yield a temporary path beside `path`; rename it when the block ends well, delete it when it does not.
+
+    A link is followed to its file. In a folder of results the file is entered in its list, so that it is known to be
+    ours (see `stages.stage`). A stream (see `is_stream`) cannot be renamed to: it is written to when the block ends.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = longrun.temporary(path)
+    if is_stream(path):
+        with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(folder, f"written{path.suffix}")
+            yield temporary
+            _pour(temporary.read_bytes(), path)
+        return
+    target = path.resolve() if path.is_symlink() else path
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = longrun.temporary(target)
     try:
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_WRONLY, 0o666))
         yield temporary
-        os.replace(temporary, path)
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())  # or a crash could leave an empty file under the new name
+            _enter(target, file)
+        os.replace(temporary, target)
     except Exception as error:
         number, name = longrun.number_of(error), getattr(error, "filename", None)
         if number is None or name not in (None, str(temporary), temporary):
@@ -144,11 +175,46 @@ def atomic(path):
         temporary.unlink(missing_ok=True)
 
 
+def _enter(path, file):
+    """Enter a file that is about to appear in the list of the folder of results that it lies in, if it does."""
+    folder = next((folder for folder in path.absolute().parents if (folder / longrun.RECORD).exists()), None)
+    if folder is not None and path.name != longrun.RECORD:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        with open(folder / longrun.LIST, "a", encoding="utf-8") as entries:  # one short line: whole beside others'
+            entries.write(f"{digest} {json.dumps(str(path.absolute().relative_to(folder)))}\n")
+
+
+def is_stream(path):
+    """Whether a path is no file to be replaced: a device or a pipe; "-" and the like, whatever is behind them."""
+    if str(path) == "-" or str(path).startswith(("/dev/std", "/dev/fd/", "/proc/self/fd/")):
+        return True
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def is_stdout(path):
+    return str(path) in ("-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1")
+
+
+def _pour(data, path):
+    if is_stdout(path):
+        sys.stdout.flush()
+        sys.stdout.buffer.write(data)
+        return
+    with open(path, "wb") as file:
+        file.write(data)
+
+
 def check_output(path):
-    """Raise InputError where a file that is to be written is a folder, or where no folder for it can be made."""
-    parent = next(folder for folder in path.absolute().parents if folder.exists())
+    """Raise InputError where a file that is to be written is a folder or one among results (which may be deleted with
+    them), or where no folder for it can be made."""
+    if is_stream(path):
+        return
+    path = path.resolve() if path.is_symlink() else path.absolute()
+    parent = next(folder for folder in path.parents if folder.exists())
     if path.is_dir() or not parent.is_dir() or not os.access(parent, os.W_OK):
         raise InputError(f"{path}: cannot be written; name a file in a folder that you may write to")
+    if any((folder / longrun.RECORD).exists() for folder in path.parents):
+        raise InputError(f"{path}: lies in a folder of results, which are deleted together; name a file elsewhere")
 
 
 def write_text(path, text):

@@ -140,6 +140,12 @@ class Sequence:
         return np.concatenate([[0.0], self.speed * np.diff(self.times)])
 
     @property
+    def files(self) -> list[Path]:
+        """All that is read of the sequence: frames, calibration, and times and true poses where there are any."""
+        texts = (self.folder / "calib.txt", self.folder / "times.txt", self.poses_path)
+        return [*self.frame_paths, *(path for path in texts if path.is_file())]
+
+    @property
     def label_names(self) -> list[str]:
         """What the label map or mask of each frame is called: as the frame, but always .png."""
         return [f"{path.stem}.png" for path in self.frame_paths]

@@ -9,6 +9,7 @@ import logging
 import os
 import re
 import resource
+import secrets
 import sys
 import time
 from contextlib import contextmanager, suppress
@@ -19,7 +20,8 @@ from thesis_repro import InputError, one_line
 
 LOG = "log.txt"
 RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
-TEMPORARY = re.compile(r"\..+\.\d+(\.\w+)?")  # the names that `temporary` gives
+LIST = "written.log"  # beside the record: what was written there, see `files.atomic`
+TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")  # the names that `temporary` gives
 # what a user can do about an error of the system, by its number
 ROOM, ACCESS = "make room on its disk, or name a folder on another", "name a folder that you may write to"
 REMEDIES = {errno.ENOSPC: ROOM, errno.EDQUOT: ROOM, errno.EFBIG: "allow larger files (ulimit -f)", errno.EROFS: ACCESS,
@@ -90,8 +92,8 @@ def report_error(error):
 
 
 def temporary(path):
-    """The path beside `path` under which this process writes it."""
-    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    """A path beside `path` that nobody can foresee, under which it is written."""
+    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
 
 
 def sweep(folder):

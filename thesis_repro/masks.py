@@ -12,7 +12,7 @@ import numpy as np
 
 from thesis_repro import InputError, longrun, stages
 from thesis_repro.cityscapes import ID, read_label_map
-from thesis_repro.files import listed, progress, read_gray, write_png
+from thesis_repro.files import is_whole, listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence
 
 CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
@@ -164,7 +164,7 @@ class LabelMasks:
 
     def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int,
                  settings: MaskSettings = MaskSettings()) -> None:
-        self.paths = _files_of_frames(folder, sequence, "label map")
+        self.paths, self.frame_paths = _files_of_frames(folder, sequence, "label map"), sequence.frame_paths
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
@@ -199,9 +199,10 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
     """
     with longrun.claimed(folder):
         folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, **asdict(masks.settings),
-                              dilation_width=masks.dilation_width, code=stages.code("masks"))
+                              dilation_width=masks.dilation_width, frames=stages.listing(masks.frame_paths),
+                              code=stages.code("masks"), **stages.made_with("opencv-python-headless"))
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
-            if not (folder / path.name).is_file():
+            if not is_whole(folder / path.name):
                 write_png(folder / path.name, masks[index])
 
 

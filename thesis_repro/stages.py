@@ -1,21 +1,29 @@
 """Results on disk that know what they were made from, and going on after a stop.
 
-A *stage* is a folder with a record of what its results were made from (`stage`). A *state* is one file with what a long
-job needs to go on, written whole or not at all (`store`, `resume`). A digest names an input in twelve letters.
+A *stage* is a folder with a record of what its results were made from, and with a list of them (`stage`). A *state* is
+one file with what a long job needs to go on, written whole or not at all (`store`, `resume`). A digest names an input
+in twelve letters.
 """
 
 import ast
 import hashlib
+import importlib.metadata
 import json
+import os
+import sqlite3
+import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from thesis_repro import InputError, longrun
-from thesis_repro.files import atomic, write_text
-from thesis_repro.longrun import LOG, RECORD
+from thesis_repro.files import atomic, progress, write_text
+from thesis_repro.longrun import LIST, LOG, RECORD
 
 _PACKAGE = Path(__file__).parent
 
@@ -24,8 +32,9 @@ def stage(folder, *, replace=True, **inputs):
     """The folder of one stage, holding only results that were made from `inputs` (JSON values).
 
     What an earlier run with the same inputs finished is kept; half-written files of a killed run are deleted, and so
-    are results of other inputs. Raises InputError for those if `replace` is False, for results of another kind (most of
-    whose inputs have other names), for files that this project did not make, and for a folder that another run holds.
+    are results of other inputs, after a line that says so. Raises InputError for those if `replace` is False, for
+    results of another kind (most of whose inputs have other names), for a folder that another run holds, and for files
+    that would have to be deleted and are not on the list of what was written here, or have changed since.
     """
     folder = Path(folder)
     with longrun.claimed(folder):
@@ -40,7 +49,8 @@ def stage(folder, *, replace=True, **inputs):
             if 2 * len(earlier.keys() & wanted.keys()) <= len(earlier.keys() | wanted.keys()):
                 raise InputError(f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
                                  "choose another folder")
-            _empty(folder)
+            changed = ", ".join(sorted(key for key in {**wanted, **earlier} if wanted.get(key) != earlier.get(key)))
+            _empty(folder, changed)
         longrun.sweep(folder)
         if earlier != wanted:
             write_text(folder / RECORD, json.dumps(wanted, indent=1, sort_keys=True))
@@ -48,19 +58,42 @@ def stage(folder, *, replace=True, **inputs):
 
 
 def _own(path):
-    """Whether a file may lie in a folder that is going to be a stage: the log, or a record that was half written."""
-    return path.name == LOG or (path.name.startswith(f".{Path(RECORD).stem}.")
+    """Whether a file may lie in a folder that is going to be a stage: a log, or a record that was half written."""
+    return path.name in (LOG, LIST) or (path.name.startswith(f".{Path(RECORD).stem}.")
                                 and longrun.TEMPORARY.fullmatch(path.name) is not None)
 
 
-def _empty(folder):
-    """Delete all but the log, records last: what is left when this is killed is known to be ours."""
-    for path in sorted(folder.iterdir(), key=lambda path: path.name == RECORD):
-        if path.is_dir() and not path.is_symlink():
-            _empty(path)
-            path.rmdir()
-        elif path.name != LOG:
-            path.unlink()
+def _empty(folder, changed):
+    """Delete what is on the lists of a folder and of those in it, the records last: what is left when this is killed is
+    known to be ours. Raises InputError, before anything is deleted, for a file that is not ours."""
+    listed, results, records = {}, [], []
+    for path in folder.rglob(LIST):
+        listed |= _listed(path.parent)
+    for path in (Path(where, name) for where, _, names in os.walk(folder) for name in names):
+        if path.name in (RECORD, LIST):
+            records.append(path)
+        elif path.name != LOG and not longrun.TEMPORARY.fullmatch(path.name):
+            if path not in listed or path.is_symlink() or _sha256(path) not in listed[path]:
+                raise InputError(f"{folder}: its results have to go, for {changed} changed; but {path} was not "
+                                 "written here, or was changed since; move it away, or name another folder")
+            results.append(path)
+    if results:
+        longrun.say(f"{folder}: deleting {len(results):,} files, the results of another {changed}")
+    for path in (*results, *sorted(records, key=lambda path: (-len(path.parts), path.name == RECORD))):
+        path.unlink()
+        with suppress(OSError):  # not empty
+            path.parent.rmdir()
+    folder.mkdir(exist_ok=True)
+
+
+def _listed(folder):
+    """What was written into a folder of results, {path: its digests}; see `files.atomic`."""
+    digests, path = {}, folder / LIST
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+        with suppress(ValueError):  # a line that was cut off
+            digest, name = line.split(" ", 1)
+            digests.setdefault(folder / json.loads(name), set()).add(digest)
+    return digests
 
 
 def record(folder):
@@ -77,6 +110,21 @@ def record(folder):
 def made_from(folder):
     """A digest of what the results in a stage's folder were made from."""
     return content(Path(folder) / RECORD)
+
+
+def kept_table(path, rows=None, text=("sequence", "run", "method", "estimator", "stage", "flag"), **options):
+    """The table that an earlier run left in a file, or None: where there is none, and where it is empty, cut off, has
+    another number of rows or holds text in another column than those named `text`."""
+    path = Path(path)
+    if not path.is_file():
+        return None
+    with suppress(ValueError, UnicodeError):  # pandas' errors are ValueErrors
+        table = pd.read_csv(path, **options)
+        plain = all(name in text or pd.api.types.is_numeric_dtype(table[name]) for name in table)
+        if plain and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
+            return table
+    longrun.say(f"{path}: is damaged, and made again", warning=True)
+    return None
 
 
 # The state of a long job
@@ -146,12 +194,77 @@ def _imported(tree):
                             if path.is_file())
 
 
+def made_with(*packages):
+    """What bits depend on beside the data and the code: versions, and how TensorFlow is told to calculate."""
+    versions = {name: importlib.metadata.version(name) for name in packages}
+    return {"versions": versions, "onednn": os.environ.get("TF_ENABLE_ONEDNN_OPTS")}
+
+
 def listing(paths):
-    """A digest of files by name and size: enough to notice other data without reading gigabytes."""
-    lines = [f"{path.parent.name}/{path.name}:{path.stat().st_size}\n" for path in map(Path, paths)]
+    """A digest of files by name and content."""
+    paths = [Path(path) for path in paths]
+    lines = [f"{path.name}:{digest}\n" for path, digest in zip(paths, contents(paths), strict=True)]
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
 
 
 def content(path):
     """A digest of one file's bytes."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]
+    return contents([path])[0]
+
+
+SETTLED = 0.1  # seconds: a file that is younger may change again within one tick of the file system's clock
+MOST_DIGESTS = 1_000_000  # that are remembered
+
+
+def contents(paths):
+    """Digests of the bytes of files. They are remembered (in ~/.cache/thesis-repro), so a file is read again only where
+    its path, size, dates or inode are others: gigabytes cost their reading once."""
+    paths = [Path(path).absolute() for path in paths]
+    keys = [(json.dumps(str(path)), json.dumps(_identity(path))) for path in paths]
+    with closing(_remembered()) as database:
+        known = _known(database, keys)
+        unknown = {key: path for key, path in zip(keys, paths, strict=True) if key not in known}
+        with ThreadPoolExecutor(4) as pool:
+            digests = pool.map(_sha256, unknown.values())
+            fresh = dict(zip(unknown, progress(digests, "looking at the data once", len(unknown), unit="file")))
+        settled = [(*key, digest) for key, digest in fresh.items()
+                   if max(json.loads(key[1])[1:3]) < time.time_ns() - SETTLED * 1e9]
+        with suppress(sqlite3.Error), database:
+            if settled and database.execute("SELECT count(*) FROM digests").fetchone()[0] > MOST_DIGESTS:
+                database.execute("DELETE FROM digests")
+            database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", settled)
+    every = known | fresh
+    return [every[key][:12] for key in keys]
+
+
+def _identity(path):
+    status = os.stat(path)
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
+
+
+def _remembered():
+    """The database of digests; one in memory where none can be kept."""
+    table = "CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)"
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "thesis-repro")
+        folder.mkdir(parents=True, exist_ok=True)
+        database = sqlite3.connect(folder / "digests.sqlite", timeout=2)
+        database.execute(table)
+    except (OSError, RuntimeError, sqlite3.Error):
+        database = sqlite3.connect(":memory:")
+        database.execute(table)
+    return database
+
+
+def _known(database, keys):
+    try:
+        query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
+        rows = ((key, database.execute(query, key).fetchone()) for key in keys)
+        return {key: row[0] for key, row in rows if row}
+    except sqlite3.Error:
+        return {}
+
+
+def _sha256(path):
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

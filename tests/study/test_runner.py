@@ -86,7 +86,7 @@ def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small
             runner.run(jobs, small_world / "kitti", small_labels, tmp_path)
     else:
         assert set(runner.run(jobs, small_world / "kitti", small_labels, tmp_path)["sequence"]) == {"00"}
-    assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".npz"}
+    assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".log", ".npz"}
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
     read.clear()
     # by however many processes: what has a checkpoint goes on as it was

@@ -41,7 +41,7 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     Raises InputError where the files are larger than LARGEST together.
     """
     root, build, folder = Path(root).absolute(), Path(build).absolute(), Path(folder)
-    stages.stage(build, root=str(root), frames=frames)
+    stages.stage(build, results="evidence")  # whose parts know what they were made from
     sequences = [kitti.Sequence(root, name).subset(frames) for name in kitti.sequences(root)]
     names = [sequence.name for sequence in sequences]
     _predict(sequences, build / "labels")

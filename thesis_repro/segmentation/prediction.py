@@ -71,11 +71,16 @@ def _open(weights, paths, output_dir, batch_size):
     if len(set(targets)) < len(targets):
         raise InputError(f"{paths[0].parent}: two images share a name, so their label maps would; rename one")
     # The batch size counts, because the network's arithmetic may round differently for another one.
-    stages.stage(output_dir, model=weights, images=stages.listing(paths), batch_size=batch_size,
-                 code=stages.code("segmentation/prediction"))
+    stages.stage(output_dir, model=weights, frames=stages.listing(paths), batch_size=batch_size, **_arithmetic())
     pairs = list(zip(paths, targets))
     batches = [pairs[start:start + batch_size] for start in range(0, len(pairs), batch_size)]
-    return [batch for batch in batches if not all(target.exists() for _, target in batch)]
+    return [batch for batch in batches if not all(files.is_whole(target) for _, target in batch)]
+
+
+def _arithmetic():
+    """What the bits of label maps depend on beside the model and the images."""
+    return stages.made_with("tensorflow", "keras", "opencv-python-headless") | {
+        "code": stages.code("segmentation/prediction")}
 
 
 def _write_batches(model, batches, done):
@@ -179,7 +184,7 @@ def _write_part(model_files, folder, record, batches):
             raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
                              "folders under the same paths")
         model = load(model_files)
-        here = {"model": training.weights_digest(model), "code": stages.code("segmentation/prediction")}
+        here = {"model": training.weights_digest(model), **_arithmetic()}
         if record | here != record:
             raise InputError(f"{', '.join(model_files)}: this worker has another model, or another version of "
                              "thesis_repro; give all of them the same, and start them again")

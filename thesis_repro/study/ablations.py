@@ -92,12 +92,13 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, *, fr
 
 def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | None, **settings) -> Path:
     sequence = Sequence(kitti, name).subset(frames)
-    stages.stage(folder, settings=settings, code=stages.code("study/ablations"), opencv=cv2.__version__,
-                 frames=stages.listing(sequence.frame_paths), poses=stages.content(kitti / "poses" / f"{name}.txt"),
+    stages.stage(folder, settings=settings, code=stages.code("study/ablations"),
+                 **stages.made_with("opencv-python-headless", "numpy", "numba"),
+                 sequence=stages.listing(sequence.files),
                  labels=stages.listing([labels / path.name for path in sequence.frame_paths]),
                  model=stages.made_from(labels))
     path = folder / "runs.csv"
-    if not path.is_file():
+    if stages.kept_table(path) is None:
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **settings)
         key_of = {" ".join(map(str, key)): key for key in runs}

@@ -24,6 +24,8 @@ from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
 
+STATES = f"pass-{'[0-9a-f]' * 12}.npz"  # the names that `_Study.state` gives
+
 
 @dataclass(frozen=True)
 class _Study:
@@ -72,6 +74,10 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
 
 def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) -> pd.DataFrame:
     sequences = _open(jobs, study)
+    for job in jobs:
+        path = study.result(job)
+        if path.is_file() and stages.kept_table(path, len(sequences[job.sequence])) is None:
+            path.unlink()
     finished = sum(study.result(job).is_file() for job in jobs)
     failures: dict[Job, str] = {}
     with cluster.open_pool(processes, scheduler) as pool:
@@ -123,20 +129,20 @@ def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
                              "errors to compare; leave it out (the odometry command runs it)")
         true_labels, folder = controls.true_labels(study.kitti, name), study.folder / name
         records = {source.name: source.record(name) for source in study.sources.values()}
-        stages.stage(folder, **_versions(), frames=stages.listing(sequence.frame_paths),
-                     poses=stages.content(sequence.poses_path),
+        stages.stage(folder, **_versions(), sequence=stages.listing(sequence.files),
                      true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None,
                      **records.pop("", {}))
         for source, record in records.items():
             if stages.record(folder / source) != record:  # so a state may have masks of other files
-                for state in folder.glob("pass-*.npz"):
+                for state in folder.glob(STATES):
                     state.unlink()
             stages.stage(folder / source, **record)
     return sequences
 
 
-def _versions() -> dict[str, str]:
-    return {"code": stages.code("odometry", "study/jobs"), "opencv": cv2.__version__}
+def _versions() -> dict[str, Any]:
+    return {"code": stages.code("odometry", "study/jobs"),
+            **stages.made_with("opencv-python-headless", "numpy", "numba")}
 
 
 def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: int) -> list[list[Job]]:
@@ -149,7 +155,7 @@ def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: 
     for name in frames:
         of_name = {job.name: job for job in jobs if job.sequence == name}
         waiting = {key: job for key, job in of_name.items() if not study.result(job).is_file()}
-        for state in sorted((study.folder / name).glob("pass-*.npz")):
+        for state in sorted((study.folder / name).glob(STATES)):
             keys = _jobs_in(state)
             if not of_name.keys() >= set(keys):
                 continue  # somebody may ask for these again

@@ -55,8 +55,9 @@ def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source],
 
 
 def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path) -> pd.DataFrame:
-    if path.is_file() and {job.name for job in jobs} <= set(pd.read_csv(path)["run"]):
-        return pd.read_csv(path, dtype={"sequence": str})
+    kept = stages.kept_table(path, dtype={"sequence": str})
+    if kept is not None and {job.name for job in jobs} <= set(kept["run"]):
+        return kept
     scales = odometry.scales(sequence)
     masks_by_job, _ = masks_of(jobs, sequence, sources)
     followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
@@ -84,9 +85,9 @@ def frame_times(folder: Path, sequence: Sequence, model_file: Path, *, frames: i
     """`measure` with the model in a file. The folder keeps the table until frames, masks, model or code change."""
     short = sequence.subset(frames + WARM_UP)
     path = stages.stage(folder, code=stages.code("study/timing"), model=stages.content(model_file),
-                        opencv=cv2.__version__, frames=stages.listing(short.frame_paths), width=width,
+                        opencv=cv2.__version__, sequence=stages.listing(short.files), width=width,
                         boundaries=boundaries) / "budget.csv"
-    if not path.is_file():
+    if stages.kept_table(path) is None:
         from thesis_repro.segmentation import training  # here and below: TensorFlow takes seconds to load
 
         table = measure(short, training.load_model(model_file), frames=frames, width=width, boundaries=boundaries)

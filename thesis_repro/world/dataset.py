@@ -13,7 +13,7 @@ import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
 
 from thesis_repro import InputError, kitti, longrun, stages
-from thesis_repro.files import progress, write_png, write_text
+from thesis_repro.files import is_whole, progress, write_png, write_text
 from thesis_repro.world import drives, street, textures
 from thesis_repro.world.raster import compile_for_all
 
@@ -117,7 +117,7 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
         stages.stage(out, replace=replace, code=stages.code("world"), **parameters)
         pictures = [picture for picture in _pictures(out, **parameters)
                     if only in (None, picture[1].relative_to(out).parts[0])]
-        missing = [picture for picture in pictures if not all(path.is_file() for path in picture[1:])]
+        missing = [picture for picture in pictures if not all(map(is_whole, picture[1:]))]
         workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
         if workers > 1:
             compile_for_all()
