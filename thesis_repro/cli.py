@@ -51,7 +51,7 @@ def check_data(options):
 
 def predict(options):
     """write label maps (8-bit ids, 320x320 PNG, named like the frames) for folders of images or sequences"""
-    from thesis_repro.segmentation import archive, quietly
+    from thesis_repro.segmentation import quietly
     from thesis_repro.settings import scheduler_address
     from thesis_repro.study import cluster
 
@@ -62,8 +62,6 @@ def predict(options):
     sequences = [(_images_in(folder), output) for folder, output in zip(options.images, outputs)]
     for output in outputs:
         _check_result_folder(output, *options.images, *(paths[0].parent for paths, _ in sequences), *options.model)
-    for path in options.model:
-        archive.check(path)
     scheduler_address(options.dask)
     with quietly():  # takes seconds, so files are checked before
         from thesis_repro.segmentation import prediction

@@ -20,7 +20,7 @@ import tensorflow as tf
 
 from thesis_repro import InputError, files, longrun, stages
 from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
-from thesis_repro.segmentation import archive, augmentation
+from thesis_repro.segmentation import augmentation
 
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
 
@@ -219,16 +219,18 @@ def _save_whole(model, path, **options):
 def load_model(path):
     """Read a model saved by Keras, `.keras` or HDF5, for prediction: without loss and metrics.
 
-    Nothing that the file carries is executed: `archive.check` refuses code before, and Keras reads in its safe mode.
+    Nothing that the file carries is executed: in its safe mode, Keras refuses code and what is not its own.
     Raises InputError for that, where the file is missing, truncated or no model, where it is no network from square
     images to the 35 classes, and where its weights are not finite.
     """
-    path = Path(path)
-    archive.check(path)
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such model; train one or name another file")
     try:
         model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile each raise their own
-        raise archive.unreadable(path, error) from None
+        reason = str(error).strip().partition("\n")[0][:200] or type(error).__name__
+        raise InputError(f"{path}: not a model that Keras reads, a truncated one, or one that holds code ({reason}); "
+                         "build it of Keras' own layers, or copy it again") from None
     inputs, outputs = getattr(model, "input_shape", ()), getattr(model, "output_shape", ())
     square = len(inputs) == 4 and inputs[1] is not None and inputs[1] == inputs[2] and inputs[3] in (1, 3)
     if not square or outputs != (*inputs[:3], N_CLASSES):
