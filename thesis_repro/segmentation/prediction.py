@@ -36,7 +36,6 @@ def predict(model, images, batch_size=16):
     """
     if images.shape[1:] != model.input_shape[1:]:
         raise InputError(f"images of {images.shape[1:]}: the model takes {model.input_shape[1:]}; resize them first")
-    memory.require(model, _call_size(min(batch_size, len(images))))
     run = _compiled(model)
     labels = np.empty(images.shape[:3], np.uint8)
     for start in files.progress(range(0, len(images), batch_size), "predicting", unit="batch"):
@@ -53,8 +52,8 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     The folder is a stage (see stages): label maps of another model or of other images in it are deleted.
 
     Returns how many images were predicted.
-    Raises InputError for an unreadable image, two images of one name, a batch that does not fit into memory, and a
-    folder with files that this project did not make, or that another run is at work in.
+    Raises InputError for an unreadable image, two images of one name, and a folder with files that this
+    project did not make, or that another run is at work in.
     """
     with longrun.claimed(output_dir):
         batches = _open(training.weights_digest(model), paths, output_dir, batch_size)
@@ -85,7 +84,6 @@ def _arithmetic():
 
 def _write_batches(model, batches, done):
     """Predict and write batches of (image, label map) paths; done: called with the length of each that is written."""
-    memory.require(model, _call_size(max(map(len, batches), default=1)))
     run, paths = _compiled(model), [[path for path, _ in batch] for batch in batches]
     with ThreadPoolExecutor(2) as pool:
         predicted = map(run, _ahead(pool, partial(_decode, model.input_shape), paths))
@@ -194,10 +192,6 @@ def _write_part(model_files, folder, record, batches):
     return None
 
 
-def _call_size(batch_size):
-    return batch_size if tf.config.list_physical_devices("GPU") else min(batch_size, CALL)
-
-
 @lru_cache(maxsize=4)
 def _compiled(model):
     """A function from uint8 images to uint8 label maps, with the bits of `model.predict` and argmax.
@@ -214,7 +208,7 @@ def _compiled(model):
         return tf.cast(tf.argmax(probabilities, axis=-1, output_type=tf.int32), tf.uint8)
 
     def run(images):
-        step = _call_size(len(images))
+        step = len(images) if tf.config.list_physical_devices("GPU") else CALL
         return np.concatenate([call(images[start:start + step]).numpy() for start in range(0, len(images), step)])
 
     return run

@@ -11,7 +11,7 @@ import tensorflow as tf
 
 from thesis_repro import InputError, files
 from thesis_repro.cityscapes import LABELS, N_CLASSES
-from thesis_repro.segmentation import memory, training
+from thesis_repro.segmentation import training
 
 # The ids that the Cityscapes benchmark evaluates; pixels of all others are left out of its confusion matrix.
 EVALUATED = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)
@@ -40,7 +40,6 @@ def quality(model, images, labels, batch_size=16):
     if images.shape[1:] != model.input_shape[1:] or images.shape[:3] != labels.shape:
         raise InputError(f"quality: images {images.shape} and label maps {labels.shape}; the model takes "
                          f"{model.input_shape[1:]} and one label map for each image")
-    memory.require(model, min(batch_size, len(images)))
     scores = training.metrics()
 
     @tf.function(reduce_retracing=True)
