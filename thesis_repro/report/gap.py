@@ -17,8 +17,6 @@ FLICKER = "pixels that flicker (%)"
 MEASURES = {  # column: what the table calls it, factor, digits
     "images": ("images", 1, 0), "classes": ("classes present", 1, 0), "mean_iou": ("mean IoU over these", 1, 3),
     "accuracy": ("pixel accuracy", 1, 3), "sky_recall": ("sky found (%)", 100, 1),
-    "found": ("true boundaries found (%)", 100, 1), "chance": ("found by chance (%)", 100, 1),
-    "right": ("predicted boundaries that are true (%)", 100, 1),
     "dark": ("ground that is dark (%)", 100, 1), "dark_wrong": ("dark ground taken for something else (%)", 100, 1),
     "lit_wrong": ("lit ground taken for something else (%)", 100, 1),
 }

@@ -1,4 +1,4 @@
-"""The gap between domains (Section 4.1): label maps measured at boundaries, in shadows and from frame to frame."""
+"""The gap between domains (Section 4.1): label maps measured by class, in shadows and from frame to frame."""
 
 from typing import NamedTuple
 
@@ -8,13 +8,10 @@ import pandas as pd
 
 from thesis_repro import cityscapes, files
 from thesis_repro.segmentation import prediction, quality
-from thesis_repro.segmentation.quality import EVALUATED
 
-SIZE = prediction.SIZE  # pixels, both ways, at which boundaries are compared
-NEAR = 2  # pixels of SIZE; a boundary this near to another one has found it
 GROUND = tuple(cityscapes.ID[name] for name in ("road", "sidewalk", "terrain"))  # where shadows fall
 DARK = 0.6  # of the median gray of its class in its image; ground below that counts as shadow
-AWAY = 4  # pixels of SIZE; nearer to a true boundary errors have other causes
+AWAY = 4 / 320  # of an image; nearer to a true boundary errors have other causes
 CONSISTENT = 1.0  # pixels; forward and backward flow must cancel to this, or the pixel is not compared
 
 IMAGES = 100  # of a domain at most, spread evenly
@@ -46,7 +43,7 @@ def measure(models, domains, drives):
             where = {"model": model_name, "domain": domain}
             scores.append({**where, "images": len(pairs), "classes": len(table), "mean_iou": mean_iou,
                            "accuracy": accuracy, "sky_recall": table["recall"].get("sky", np.nan),
-                           **boundary_scores(true, predicted), **shadow_errors(images, true, predicted)})
+                           **shadow_errors(images, true, predicted)})
             share = (table["pixels"] / table["pixels"].sum()).to_numpy()
             classes.append(table.reset_index().assign(**where, share=share))
     shares = []
@@ -73,38 +70,6 @@ def labelled_frames(drives):
     return pairs
 
 
-def boundary_scores(true, predicted):
-    """How well boundaries between evaluated classes are met, label maps (n, h, w) uint8 of both stretched to SIZE.
-
-    Returns shares from 0 to 1. `found`: true boundary pixels with a predicted one within NEAR pixels. `right`:
-    predicted ones with a true one as near. `chance`: all pixels with a predicted boundary as near, which is what
-    boundaries drawn without looking at the image would find.
-    """
-    hits, totals = np.zeros(3), np.zeros(3)
-    for label_maps in zip(true, predicted, strict=True):
-        true_map, predicted_map = (cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
-                                   for label_map in label_maps)
-        counted = np.isin(true_map, EVALUATED)
-        true_edges, predicted_edges = _boundary(true_map, counted), _boundary(predicted_map, counted)
-        near_true, near_predicted = _widen(true_edges, NEAR), _widen(predicted_edges, NEAR)
-        hits += [(true_edges & near_predicted).sum(), (predicted_edges & near_true).sum(),
-                 (counted & near_predicted).sum()]
-        totals += [true_edges.sum(), predicted_edges.sum(), counted.sum()]
-    return dict(zip(("found", "right", "chance"), (hits / np.maximum(totals, 1)).tolist()))
-
-
-def _boundary(label_map, counted):
-    """Pixels whose right or lower neighbour has another class, both of them counted."""
-    edges = np.zeros(label_map.shape, bool)
-    edges[:, :-1] |= (label_map[:, :-1] != label_map[:, 1:]) & counted[:, :-1] & counted[:, 1:]
-    edges[:-1] |= (label_map[:-1] != label_map[1:]) & counted[:-1] & counted[1:]
-    return edges
-
-
-def _widen(edges, reach):
-    return cv2.dilate(edges.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
-
-
 def shadow_errors(images, true, predicted):
     """Whether ground in shadow is taken for another class more often than ground in light (Section 4.1).
 
@@ -115,13 +80,12 @@ def shadow_errors(images, true, predicted):
     Returns `dark`, the share of these pixels that are dark, and `dark_wrong` and `lit_wrong`, the shares of dark and
     of lit ones that are given another class (NaN where there are none).
     """
-    away = max(1, round(AWAY * true.shape[1] / SIZE))
+    away = np.ones((2 * max(1, round(AWAY * true.shape[1])) + 1,) * 2, np.uint8)
     pixels, wrong = np.zeros(2), np.zeros(2)  # lit, dark
     for image, true_map, predicted_map in zip(images, true, predicted, strict=True):
         gray = image.mean(axis=-1)
-        inside = ~_widen(_boundary(true_map, np.ones(true_map.shape, bool)), away)
         for label in GROUND:
-            ground = (true_map == label) & inside
+            ground = cv2.erode((true_map == label).astype(np.uint8), away) > 0
             if ground.any():
                 dark = (gray[ground] < DARK * np.median(gray[true_map == label])).astype(int)
                 pixels += np.bincount(dark, minlength=2)
