@@ -75,7 +75,7 @@ def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation
 
 
 def figure_4_08(views, title):
-    """Figure 4.8: one object in consecutive frames and how its keypoints jump: views of `flicker.follow`."""
+    """Figure 4.8: one place in consecutive frames and how its keypoints jump: views of `flicker.follow`."""
     figure, axes = style.new_figure(1, len(views), height=3.4)
     for panel, view in zip(axes, views, strict=True):
         height, width = view.crop.shape

@@ -20,7 +20,7 @@ from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
-from thesis_repro.odometry.passes import Masks, poses_of
+from thesis_repro.odometry.passes import Masks
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.controls import CORRECTED
 from thesis_repro.study.jobs import CONTROL_WIDTH
@@ -101,12 +101,11 @@ def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | N
     if stages.kept_table(path) is None:
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **settings)
-        key_of = {" ".join(map(str, key)): key for key in runs}
-        results = odometry.run_many(sequence, {text: runs[key] for text, key in key_of.items()})
-        rows = [dict(zip(("method", "estimator", "repetition"), key_of[text], strict=True))
+        results = odometry.run_many(sequence, {" ".join(map(str, key)): run for key, run in runs.items()})
+        rows = [{"method": method, "estimator": estimator, "repetition": repetition}
                 | measures(result.frames, sequence.poses)
-                | {"sim3": metrics.ate(poses_of(result.frames), sequence.poses, "sim3")["rmse"]}
-                for text, result in results.items()]
+                | {"sim3": metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]}
+                for (method, estimator, repetition), result in zip(runs, results.values(), strict=True)]
         write_text(path, pd.DataFrame(rows).assign(sequence=name).to_csv(index=False))
     return path
 
@@ -157,8 +156,7 @@ SEQUENCES, WIDTHS = 11, 15  # of the thesis
 STUDIES = 4000  # that are simulated
 
 
-def null_distribution(runs: pd.DataFrame, reported: pd.Series | None = None, *, sequences: int = SEQUENCES,
-                      widths: int = WIDTHS, seed: int = 0) -> pd.DataFrame:
+def null_distribution(runs: pd.DataFrame, reported: pd.Series, widths: int = WIDTHS) -> pd.DataFrame:
     """What the thesis's procedure reports where masks do nothing: rows mean, median and sum of the changes (%).
 
     The thesis runs all keypoints once and masks of 15 widths once each, takes the best width of each sequence and
@@ -167,19 +165,18 @@ def null_distribution(runs: pd.DataFrame, reported: pd.Series | None = None, *, 
 
     runs: with all keypoints under one estimator, several repetitions of each sequence, columns sequence and rmse.
     reported: changes (%) of a study by sequence. Columns expected (mean of the studies), low, high (their middle LEVEL
-    percent), and with `reported` share_as_low (percent of the studies that report as low a number or a lower one).
+    percent), and share_as_low (percent of the studies that report as low a number or a lower one).
     Errors are drawn with replacement, so the best of 15 is never better than the best error that was measured.
     """
-    errors = np.random.default_rng(seed).choice(deviations(runs), (STUDIES, sequences, widths + 1))
+    errors = np.random.default_rng(0).choice(deviations(runs), (STUDIES, SEQUENCES, widths + 1))
     changes = metrics.percent_change(np.exp(errors[..., 1:].min(axis=-1)), np.exp(errors[..., 0]))
     tail = (100 - LEVEL) / 2
     rows = {}
     for name, summarize in (("mean", np.mean), ("median", np.median), ("sum", np.sum)):
         values = summarize(changes, axis=1)
         rows[name] = {"expected": values.mean(), "low": np.percentile(values, tail),
-                      "high": np.percentile(values, 100 - tail)}
-        if reported is not None:
-            rows[name]["share_as_low"] = 100 * (values <= summarize(reported.to_numpy())).mean()
+                      "high": np.percentile(values, 100 - tail),
+                      "share_as_low": 100 * (values <= summarize(reported.to_numpy())).mean()}
     return pd.DataFrame(rows).T
 
 
@@ -188,12 +185,11 @@ def deviations(runs: pd.DataFrame) -> np.ndarray:
 
     They are widened by sqrt(n / (n - 1)), since the mean was taken from the same n errors. Columns sequence, rmse.
     """
-    pieces = [np.empty(0)]
-    for _, errors in runs.groupby("sequence")["rmse"]:
-        logarithms = np.log(errors.to_numpy())
-        if len(logarithms) > 1:
-            pieces.append((logarithms - logarithms.mean()) * np.sqrt(len(logarithms) / (len(logarithms) - 1)))
-    return np.concatenate(pieces)
+    logarithms = np.log(runs["rmse"])
+    of_sequence = logarithms.groupby(runs["sequence"])
+    count = of_sequence.transform("size")
+    widened = (logarithms - of_sequence.transform("mean")) * np.sqrt(count / (count - 1))
+    return widened[count > 1].to_numpy()
 
 
 # Where keypoints lie, and what becomes of boundaries

@@ -3,21 +3,16 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from thesis_repro import masks
-from thesis_repro.cityscapes import ID
 from thesis_repro.odometry import THESIS, keypoints
 
-OBJECTS = [ID[name] for name in ("pole", "traffic light", "traffic sign", "vegetation", "person", "rider", "car",
-                                 "truck", "bus", "motorcycle", "bicycle")]
 SAME = 2.0  # pixels; a keypoint this near to where it was tracked to is the same one
-FEW = 8  # keypoints; an object with fewer shows nothing
 
 
 class View(NamedTuple):
-    """One object in one frame: crop (h, w), its edges (h, w), and points (n, 2) in pixels of the crop."""
+    """One place in one frame: crop (h, w), its edges (h, w), and points (n, 2) in pixels of the crop."""
 
     frame: int
     crop: np.ndarray
@@ -29,54 +24,38 @@ class View(NamedTuple):
 
 def follow(frames: Sequence[np.ndarray], label_maps: Sequence[np.ndarray], dilation_width: int,
            first: int = 0) -> list[View]:
-    """How the masked keypoints of one object jump between consecutive frames (Figure 4.8): a View of each frame.
+    """How the masked keypoints of one place jump between consecutive frames (Figure 4.8): a View of each frame.
 
     frames: (height, width) uint8 each; label_maps: (h, w) uint8 each, any size, as many; first: number of the first
-    frame. The object is the connected patch of a label, away from the image's border, from which most keypoints jump
-    between the first two frames. A window follows the median motion of its keypoints. Where the first label map has no
-    such patch, the window starts in the middle of the frame.
+    frame. The place is a window of half the frame's height around the keypoint that jumps between the first two frames
+    with most others around it, or the frame's middle where none does. It follows the median motion of its keypoints.
     """
     size = np.array(frames[0].shape[::-1])
+    half = size.min() // 4
     edge_images = [masks.edges(label_map, frames[0].shape) for label_map in label_maps]
     points = [keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
               for frame, edge_image in zip(frames, edge_images, strict=True)]
-    tracks = [_track(before, after, corners) for before, after, corners in zip(frames, frames[1:], points)]
-    tracked, followed = tracks[0]
-    low, high = _most_jumping(label_maps[0], size, points[0], followed & _far(tracked, points[1]))
-    center, half = (low + high) / 2, int(np.clip(0.65 * (high - low).max(), size.min() // 8, size.min() // 2))
+    tracked, followed = _track(frames[0], frames[1], points[0])
+    jumping = points[0][followed & _far(tracked, points[1])]
+    near = np.abs(jumping[:, None] - jumping).max(axis=-1) < half
+    center = jumping[near.sum(axis=1).argmax()] if len(jumping) else size / 2
     views: list[View] = []
     expected = None  # where the keypoints in the window of the frame before are now
     for index, (frame, edge_image) in enumerate(zip(frames, edge_images, strict=True)):
         low = np.clip(np.round(center - half).astype(int), 0, size - 2 * half)
-        inside = _inside(points[index], low, low + 2 * half)
         crop = np.s_[low[1]:low[1] + 2 * half, low[0]:low[0] + 2 * half]
+        here = _inside(points[index], low, low + 2 * half)
         if expected is not None:
-            expected = expected[_inside(expected, low, low + 2 * half)]
-        views.append(View(first + index, frame[crop], edge_image[crop], points[index][inside] - low,
+            expected = _inside(expected, low, low + 2 * half)
+        views.append(View(first + index, frame[crop], edge_image[crop], here - low,
                           None if expected is None else expected - low,
                           0 if expected is None else int(_far(expected, points[index]).sum())))
-        if index < len(tracks):
-            tracked, followed = tracks[index]
-            used = inside & followed
-            expected = tracked[used]
-            if used.any():
-                center = center + np.median(expected - points[index][used], axis=0)
+        if index + 1 < len(frames):
+            tracked, followed = _track(frame, frames[index + 1], here)
+            expected = tracked[followed]
+            if len(expected):
+                center = center + np.median(expected - here[followed], axis=0)
     return views
-
-
-def _most_jumping(label_map: np.ndarray, size: np.ndarray, points: np.ndarray, jumping: np.ndarray) -> np.ndarray:
-    """The corners [(left, top), (right, bottom)] of the object from which most points jump, or the frame's middle."""
-    best, most = np.array([size, size]) / 2, -1
-    enlarged = cv2.resize(label_map, size, interpolation=cv2.INTER_NEAREST)
-    for label in OBJECTS:
-        for *low, width, height, _ in cv2.connectedComponentsWithStats((enlarged == label).astype(np.uint8))[2][1:]:
-            corners = np.array([low, np.add(low, (width, height))])
-            inside = _inside(points, *corners)
-            whole = (corners[0] > 0).all() and (corners[1] < size).all()
-            if (whole and size.min() // 8 <= max(width, height) <= 0.7 * size.min() and inside.sum() >= FEW
-                    and (inside & jumping).sum() > most):
-                best, most = corners, (inside & jumping).sum()
-    return best
 
 
 def _track(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +64,8 @@ def _track(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[
 
 
 def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    return np.all((points >= low) & (points < high), axis=1)
+    """The points between two corners of a window."""
+    return points[((points >= low) & (points < high)).all(axis=1)]
 
 
 def _far(points: np.ndarray, others: np.ndarray) -> np.ndarray:
