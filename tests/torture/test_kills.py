@@ -124,9 +124,7 @@ def test_the_figures_of_a_notebook(tmp_path):
         cell = nbformat.v4.new_code_cell(DRAWING, id="drawing")
         nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "one.ipynb")
 
-    execute = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--log-level=CRITICAL",
-               "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
-               f"--Execution.log_file={done}/one.log", f"--output-dir={done}", "--output=one.ipynb", "one.ipynb"]
+    execute = [sys.executable, "-m", "thesis_repro.report.execute", "one.ipynb", str(done / "one.ipynb")]
     command = ["bash", "-c", f"{shlex.join(execute)} && {shlex.join(PAGE)}"]
     torture(command, tmp_path, ".", 4, 6, prepare, **changes)
 

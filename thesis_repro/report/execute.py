@@ -1,111 +1,83 @@
-"""How `make figures` executes a notebook: as nbconvert does, with progress, one line on failure and clean outputs.
+"""How `make figures` executes a notebook: with progress, one line on failure and outputs without libraries' logs.
 
-The Makefile calls `jupyter nbconvert --to notebook --execute` and names `Execution` as the preprocessor that does it.
+`python -m thesis_repro.report.execute NOTEBOOK EXECUTED` writes the executed notebook and, beside it, a log of what the
+kernel says outside of cells and of a failure's whole report.
 """
 
 import logging
 import os
 import re
 import signal
-import subprocess
 import sys
-import tempfile
 import time
 import traceback
-from contextlib import contextmanager
 from pathlib import Path
 
+import nbformat
+from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError, DeadKernelError
-from nbclient.util import run_sync
-from nbconvert.preprocessors import ExecutePreprocessor
-from traitlets import Unicode
 
 from thesis_repro import longrun
+from thesis_repro.files import atomic
 from thesis_repro.settings import PREFIX
 
-# Whole lines that libraries log: segmentation-models on import, absl and TensorFlow with the place in their sources.
-LOGGED = re.compile(r"""^(?:
-    Segmentation\ Models:\ using\ .*\ framework\.
-  | (?:WARNING:\ )?All\ log\ messages\ before\ absl::InitializeLog\(\)\ .*
-  | (?:[IWEF]\d{4}|\d{4}-\d\d-\d\d)\ \d\d:\d\d:[\d.]+(?:\ +\d+|:\ [IWEF])\ \S+:\d+\]\ .*
-  | To\ enable\ the\ following\ instructions:\ .*,\ rebuild\ TensorFlow\ with\ the\ appropriate\ compiler\ flags\.
-)$\n?""", re.MULTILINE | re.VERBOSE)
+# Lines that segmentation-models, absl and TensorFlow print whatever TF_CPP_MIN_LOG_LEVEL says.
+LOGGED = re.compile(r"^(?:Segmentation Models: using .* framework\.|WARNING: All log messages before absl::"
+                    r"|[IWEF]\d{4} \d\d:\d\d:|To enable the following instructions: ).*\n?", re.MULTILINE)
 COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 
-class Execution(ExecutePreprocessor):
-    """Executes all cells of a notebook; where one fails, ends the program with one line that says why."""
+def executed_notebook(path, log):
+    """The notebook of a file with the outputs of all its cells, run in its folder; log: a file for the kernel's words.
 
-    kernel_name = Unicode("python3").tag(config=True)  # not what the last editor of the notebook called it
-    log_file = Unicode("execution.log", help="what the kernel says outside of cells, and a failure's whole report"
-                       ).tag(config=True)
+    Raises nbclient's CellExecutionError and DeadKernelError. However it ends, its kernel does too.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    # python3: not what the last editor of the notebook called the kernel
+    client = NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": path.parent}})
+    # bars of progress (`files.progress`) go to this program's own standard error
+    environment = os.environ | {f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2"}
+    with client.setup_kernel(env=environment, stdout=log, stderr=log):
+        for index, cell in enumerate(notebook.cells):
+            client.execute_cell(cell, index)
+            for output in cell.get("outputs", []):
+                if output.output_type == "stream":
+                    output.text = LOGGED.sub("", output.text)
+            if "outputs" in cell:
+                cell.outputs = [output for output in cell.outputs if output.get("text") != ""]
+    return notebook
 
-    def preprocess(self, nb, resources=None, km=None):
-        name, log = resources["metadata"]["name"], Path(self.log_file)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
-        sys.excepthook = self._say_why  # where its result cannot be written
-        log.parent.mkdir(parents=True, exist_ok=True)
-        log.touch()
-        with longrun.locked(log), longrun.logged(log.parent, f"make figures, {name}", ours=True), \
-                open(log, "w", encoding="utf-8") as self._log:
+
+def main(path, executed):
+    """Execute a notebook; returns the exit status: 0, 1 where it failed, 130 where it was interrupted."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
+    path, executed = Path(path).absolute(), Path(executed)
+    name, log_path, started = path.stem, executed.with_suffix(".log"), time.monotonic()
+    try:
+        log_path.parent.mkdir(parents=True, exist_ok=True)
+        log_path.touch()
+        with longrun.locked(log_path), longrun.logged(log_path.parent, f"make figures, {name}", ours=True), \
+                open(log_path, "w", encoding="utf-8") as log:
             longrun.say(name)
-            started = time.monotonic()
             try:
-                executed = super().preprocess(nb, resources, km)
-            except KeyboardInterrupt:
-                print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
-                sys.exit(130)
+                notebook = executed_notebook(path, log)
             except Exception as error:
-                self._log.write(COLORS.sub("", traceback.format_exc()))
+                log.write(COLORS.sub("", traceback.format_exc()))
                 reason = f"{name} failed: {_reason(error)}"
                 longrun.note(reason)
-                print(f"{reason}\nthe whole report: {os.path.relpath(log)}; the same command goes on from here",
+                print(f"{reason}\nthe whole report: {os.path.relpath(log_path)}; the same command goes on from here",
                       file=sys.stderr)
-                sys.exit(1)
+                return 1
+            with atomic(executed) as temporary:
+                nbformat.write(notebook, temporary)
             longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
-        return executed
-
-    def _say_why(self, kind, error, trace):
-        if isinstance(error, OSError) and error.filename is None:
-            error.filename = str(Path(self.log_file).parent)
-        print(longrun.explain(error) or "".join(traceback.format_exception(error)), file=sys.stderr)
-
-    @contextmanager
-    def setup_kernel(self, **options):
-        with _progress_path() as path, super().setup_kernel(env=os.environ | {f"{PREFIX}PROGRESS": path},
-                                                            stdout=self._log, stderr=self._log, **options):
-            try:
-                yield
-            except KeyboardInterrupt:
-                logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
-                run_sync(self.km.interrupt_kernel)()  # so that the cell tidies up before its kernel ends,
-                time.sleep(1)  # for which it needs a moment
-                raise
-
-    def preprocess_cell(self, cell, resources, index):
-        cell, resources = super().preprocess_cell(cell, resources, index)
-        for output in cell.get("outputs", []):
-            if output.output_type == "stream":
-                output.text = LOGGED.sub("", output.text)
-        if "outputs" in cell:
-            cell.outputs = [output for output in cell.outputs if output.get("text") != ""]
-        return cell, resources
-
-
-@contextmanager
-def _progress_path():
-    """The path that a kernel writes its progress to (`files.progress`), to be seen on this standard error.
-
-    A terminal has a path of its own. Anything else, such as a file, is reached through a named pipe.
-    """
-    if os.isatty(2):
-        yield os.ttyname(2)
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        path = os.path.join(folder, "progress")
-        os.mkfifo(path)
-        with subprocess.Popen(["cat", path], stdout=2, start_new_session=True), open(path, "r+b", buffering=0):
-            yield path  # held open, since the last writer that closes it would end the copying
+    except KeyboardInterrupt:
+        logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
+        print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+    except Exception as error:
+        return longrun.report_error(error)
+    return 0
 
 
 def _reason(error):
@@ -115,5 +87,8 @@ def _reason(error):
     name, text = type(error).__name__, str(error)
     if isinstance(error, CellExecutionError):
         name, text = error.ename, error.evalue
-    lines = COLORS.sub("", f"{name}: {text}").strip().splitlines()
-    return lines[0] + longrun.remedy(text)
+    return f"{name}: {text}".splitlines()[0] + longrun.remedy(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
