@@ -77,7 +77,6 @@ DRAWN = {
     "2.8": lambda: chapter2.figure_2_08(turning(), "sequence 00"),
     "2.9": lambda: chapter2.figure_2_09(FRAME, LATER, "sequence 00"),
     "2.9 without corners": lambda: chapter2.figure_2_09(MASK, np.zeros_like(MASK), "sequence 00"),
-    "2.10": lambda: chapter2.figure_2_10(turning()[:, :3, 3] * 1.1, turning()[:, :3, 3], "sequence 00"),
     "2.11": lambda: chapter2.figure_2_11(FRAME, LATER, (POINTS, POINTS), POINTS[:0], POINTS, ("frame 0", "frame 5")),
     "2.12": lambda: chapter2.figure_2_12(FRAME, POINTS, LABEL_MAP, POINTS, ("frame 0", "its label map")),
     "3.3": lambda: chapter3.figure_3_03(FRAME, LABEL_MAP, np.roll(LABEL_MAP, 9), LABELS[ID["car"]]),

@@ -16,10 +16,10 @@ from thesis_repro.report import style
 def test_a_ratio_axis_has_a_few_round_ticks_within_it(low, high):
     axis = plt.figure().add_subplot().yaxis
     style.ratio_axis(axis, [low, high])
-    ticks, (bottom, top) = axis.get_ticklocs(), axis.get_view_interval()
-    assert axis.get_scale() == "log" and 2 <= len(ticks) <= 8 and all((bottom <= ticks) & (ticks <= top))
+    bottom, top = axis.get_view_interval()
+    ticks = [tick for tick in axis.get_ticklocs() if bottom <= tick <= top]
+    assert axis.get_scale() == "log" and 2 <= len(ticks) <= 8
     assert all(bottom <= value <= top for value in (low, high) if 0 < value < np.inf)
     assert not len(axis.get_ticklocs(minor=True))
-    for tick, label in zip(ticks, axis.get_ticklabels(), strict=True):
-        assert float(label.get_text()) == pytest.approx(tick, rel=1e-9)
+    assert all(float(axis.get_major_formatter()(tick)) == pytest.approx(tick, rel=1e-5) for tick in ticks)
     plt.close("all")

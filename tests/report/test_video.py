@@ -1,4 +1,4 @@
-"""The video and the still sheet of the odometry."""
+"""The video of the odometry."""
 
 import av
 import cv2
@@ -76,8 +76,3 @@ def test_a_video_that_fails_leaves_nothing(tmp_path):
     with pytest.raises(InputError, match="frame 2: shape"):
         video.write_video(tmp_path / "drive.mp4", drive)
     assert not list(tmp_path.iterdir())
-
-
-def test_the_sheet_shows_frames_side_by_side(tmp_path):
-    video.write_sheet(tmp_path / "sheet.png", TimedStreet())
-    assert cv2.imread(str(tmp_path / "sheet.png")).shape == (560, 960, 3)

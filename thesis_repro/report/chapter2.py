@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgba_array
 from matplotlib.lines import Line2D
@@ -9,25 +10,27 @@ from matplotlib.patches import Patch, Rectangle
 
 from thesis_repro.odometry import metrics
 from thesis_repro.report import style
-from thesis_repro.report.style import BASELINE, BLUE, GREEN, KEYPOINT, ORANGE, PINK, RED, SKY, TRUTH
+from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, PINK, RED, SKY
 
 GRAY, LIGHT_GRAY = "#777777", "#bbbbbb"
 
 
 def figure_2_01():
     """Figure 2.1: a basic convolutional network as a diagram."""
-    figure, axes = _diagram((0, 18.6), (0, 5.6), height=2.3)
+    figure, axes = style.new_figure(height=2.3)
+    axes.set(xlim=(0, 18.6), ylim=(0, 5.6))
+    axes.set_axis_off()
     middle = 3.1
+    inputs, outputs = (middle + 0.62 * (np.arange(count) - (count - 1) / 2) for count in (6, 4))
     for name, left, side, maps, color in (
             ("input\nimage", 0.2, 3.2, 1, "#aaaaaa"), ("convolution\none map per kernel", 3.5, 2.8, 5, BLUE),
             ("activation\nReLU", 6.9, 2.8, 5, SKY), ("pooling\n2x2, largest", 10.3, 1.4, 5, ORANGE)):
         for offset in np.arange(maps) * 0.15:
             axes.add_patch(Rectangle((left + offset, middle - side / 2 - offset + 0.3), 0.65 * side, side,
                                      facecolor=color, edgecolor="white", linewidth=0.8))
-        axes.text(left + 0.325 * side + 0.075 * (maps - 1), 0.45, name, ha="center", va="center", fontsize=8)
-    for start, end in ((2.4, 3.5), (5.95, 6.9), (9.35, 10.3), (11.85, 13.3)):
-        _arrow(axes, (start, middle), (end, middle))
-    inputs, outputs = (middle + 0.62 * (np.arange(count) - (count - 1) / 2) for count in (6, 4))
+        right = left + 0.65 * side + 0.15 * (maps - 1)
+        axes.text((left + right) / 2, 0.45, name, ha="center", va="center", fontsize=8)
+        _arrow(axes, (right + 0.1, middle), (right + 0.8, middle))
     axes.plot([[13.6], [16.3]], [np.repeat(inputs, 4), np.tile(outputs, 6)], color=LIGHT_GRAY, linewidth=0.5, zorder=0)
     for x, heights, color, name in ((13.6, inputs, GREEN, "dense\nall, weighted"),
                                     (16.3, outputs, RED, "softmax\nclass scores")):
@@ -66,17 +69,17 @@ def figure_2_02(patch, kernel, bias, feature_map, activated, where):
 
 def figure_2_03():
     """Figure 2.3: sigmoid against ReLU, with their derivatives."""
-    x = np.linspace(-4, 4, 161)
+    x = np.linspace(-4, 4, 162)  # without 0, where ReLU has no derivative
     sigmoid = 1 / (1 + np.exp(-x))
     figure, axes = style.new_figure(1, 2, height=2.2)
-    axes[0].plot(x, sigmoid, color=BLUE)
-    axes[0].plot(x, sigmoid * (1 - sigmoid), color=RED, linestyle="--")
-    axes[1].plot(x, np.maximum(x, 0), color=BLUE, label="activation")
-    axes[1].plot([-4, 0, np.nan, 0, 4], [0, 0, np.nan, 1, 1], color=RED, linestyle="--", label="its derivative")
-    axes[1].plot([0, 0], [0, 1], "o", color=RED, markersize=4, markerfacecolor="white")  # at 0 there is none
-    for panel, title in zip(axes, ("sigmoid, 1 / (1 + exp(-x))", "ReLU, max(0, x)"), strict=True):
+    for panel, title, values, slope in (
+            (axes[0], "sigmoid, 1 / (1 + exp(-x))", sigmoid, sigmoid * (1 - sigmoid)),
+            (axes[1], "ReLU, max(0, x)", np.maximum(x, 0), np.where(x > 0, 1, 0))):
+        for side in (x < 0, x > 0):
+            panel.plot(x[side], values[side], color=BLUE, label="activation")
+            panel.plot(x[side], slope[side], color=RED, linestyle="--", label="its derivative")
         panel.set(title=title, xlabel="x (no unit)", ylabel="value (no unit)")
-    axes[1].legend()
+    style.legend_below(figure, axes, 2)
     return figure
 
 
@@ -97,53 +100,41 @@ def figure_2_04():
 
 
 def figure_2_05():
-    """Figure 2.5: a feature vector through a dense layer and softmax to class scores."""
+    """Figure 2.5: a feature vector x through a dense layer, W x, and softmax to class scores."""
     rng = np.random.default_rng(0)
-    features, weights = rng.normal(size=5).round(1), rng.normal(size=(5, 3)).round(1)
-    logits = features @ weights
-    scores = np.exp(logits) / np.exp(logits).sum()
-    figure, axes = _diagram((0.4, 10.3), (-0.5, 5.0), height=2.4, width=5.4)
-    heights = np.array([3.0, 2.0, 1.0])
-    for (row, column), weight in np.ndenumerate(weights):
-        axes.plot((1.0, 4.4), (row, heights[column]), color=RED if weight < 0 else BLUE,
-                  linestyle="--" if weight < 0 else "-", linewidth=0.3 + 1.2 * abs(weight), alpha=0.7)
-    for x, ys, numbers, digits in ((1.0, range(5), features, 1), (4.4, heights, logits, 2)):
-        axes.scatter([x] * len(numbers), ys, s=560, facecolor="white", edgecolor="black", zorder=3)
-        for y, number in zip(ys, numbers, strict=True):
-            axes.text(x, y, f"{number:.{digits}f}", ha="center", va="center", fontsize=7.5, zorder=4)
-    axes.barh(heights, 2.6 * scores, height=0.56, left=6.4, color=GREEN)
-    for number, (y, score) in enumerate(zip(heights, scores, strict=True), 1):
-        _arrow(axes, (4.9, y), (6.3, y))
-        axes.text(6.55 + 2.6 * score, y, f"class {number}: {score:.2f}", va="center", fontsize=8)
-    for x, text in ((1.0, "features"), (4.4, "dense layer"), (7.4, "softmax")):
-        axes.text(x, 4.7, text, ha="center")
-    axes.legend(handles=[Line2D([], [], color=BLUE, label="positive weight"),
-                         Line2D([], [], color=RED, linestyle="--", label="negative weight")], loc="lower right")
+    weights, features = rng.normal(size=(3, 5)).round(1), rng.normal(size=(5, 1)).round(1)
+    sums = weights @ features
+    scores = (np.exp(sums) / np.exp(sums).sum()).ravel()
+    figure, axes = style.new_figure(1, 4, height=2.1, width_ratios=[5, 1.5, 2, 4])
+    _numbers(axes[0], weights, "dense layer: weights W,\none row a class", ".1f")
+    _numbers(axes[1], features, "features x", ".1f")
+    _numbers(axes[2], sums, "scores W x", ".2f")
+    axes[3].barh(["class 1", "class 2", "class 3"], scores, color=GREEN)
+    axes[3].bar_label(axes[3].containers[0], fmt="%.2f", padding=3)
+    axes[3].invert_yaxis()
+    axes[3].set(title="softmax: exp(score) / sum of all", xlim=(0, 1), xlabel="probability")
     return figure
 
 
 def figure_2_06():
     """Figure 2.6: steps of stochastic gradient descent on a loss surface with two valleys."""
-    rng = np.random.default_rng(0)
-    steps, rate, noise = 40, 0.1, 1.2
+    random, steps, rate, noise = np.random.default_rng(0), 40, 0.1, 1.2
 
     def loss(x, y):
         return 0.5 * (x**2 - 1.5) ** 2 + 0.6 * y**2 + 0.35 * x
 
-    def gradient(x, y):
-        return np.array([2 * x * (x**2 - 1.5) + 0.35, 1.2 * y])
-
-    path = [np.array([0.35, 1.5])]
-    for _ in range(steps):
-        path.append(path[-1] - rate * (gradient(*path[-1]) + noise * rng.normal(size=2)))
+    path = np.tile([0.35, 1.5], (steps + 1, 1))
+    for step, (x, y) in enumerate(path[:-1]):
+        slope = np.array([2 * x * (x**2 - 1.5) + 0.35, 1.2 * y])
+        path[step + 1] = path[step] - rate * (slope + noise * random.normal(size=2))
     x, y = np.meshgrid(np.linspace(-1.8, 1.8, 200), np.linspace(-1.2, 1.7, 160))
-    figure, axes = style.new_figure(height=2.7, width=5.4)
+    figure, axes = style.new_figure(height=3)
     levels = axes.contourf(x, y, loss(x, y), 20, cmap="cividis")
-    axes.plot(*np.transpose(path), color="white", linewidth=1, marker="o", markersize=3)
+    axes.plot(*path.T, color="white", linewidth=1, marker="o", markersize=3)
     for point, marker, size, label in ((path[0], "s", 9, "start"), (path[-1], "*", 14, f"after {steps} steps")):
         axes.plot(*point, marker, color=RED, markersize=size, markeredgecolor="white", label=label)
     for valley in (-1.28, 1.16):  # along y = 0, where the slope vanishes
-        axes.text(valley, -0.7, f"loss {loss(valley, 0):.2f}", color="white", fontsize=8, ha="center")
+        axes.text(valley, -0.9, f"loss {loss(valley, 0):.2f}", color="white", fontsize=8, ha="center")
     axes.set(xlabel="first weight (no unit)", ylabel="second weight (no unit)")
     axes.grid(visible=False)
     axes.legend(loc="upper left", labelcolor="white")
@@ -180,7 +171,7 @@ def figure_2_07(model):
             axes.plot((before[1], x), (before[2], y), color=LIGHT_GRAY, linewidth=0.8, zorder=0)
         if kind == "Concatenate":
             _, right, level = min(boxes[tensor._keras_history.operation.name] for tensor in layer.input)
-            _arrow(axes, (right, level), (x, y), GRAY, zorder=0)
+            _arrow(axes, (right, level), (x, y), GRAY)
         before = boxes[layer.name] = x, x + width, y
         x += width + 0.32
     axes.autoscale_view()
@@ -190,6 +181,7 @@ def figure_2_07(model):
     return figure
 
 
+@rc_context({"text.parse_math": True})
 def figure_2_08(poses, title):
     """Figure 2.8: camera poses C of a sequence from above, and the motions T between them (Equations 2.2, 2.3).
 
@@ -197,24 +189,25 @@ def figure_2_08(poses, title):
     """
     poses = np.linalg.inv(poses[0]) @ poses  # the first camera is where the path starts, and looks up the page
     positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
+    name = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": 10}
     figure, axes = style.new_figure(height=3.8)
     axes.plot(*positions.T, "o", markersize=4, color="black")
     axes.quiver(*positions.T, *ahead.T, color=BLUE, angles="xy", scale=18, width=0.006, zorder=3)
-    for index, (position, sideways) in enumerate(zip(positions, right)):
-        _formula(axes, position, f"$C_{{{index}}}$", 16 * sideways, "black")
+    for index, position in enumerate(positions):
+        axes.annotate(f"$C_{{{index}}}$", position, 16 * right[index], **name)
     for index, (start, end) in enumerate(zip(positions, positions[1:]), 1):
         motion = np.linalg.inv(poses[index - 1]) @ poses[index]  # Equation 2.3, for T
-        name, length = f"$T_{{{index},{index - 1}}}$", np.linalg.norm(motion[:3, 3])
-        axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": RED, "shrinkA": 3, "shrinkB": 3,
-                                                  "connectionstyle": "arc3,rad=-0.3"})
+        formula, length = f"$T_{{{index},{index - 1}}}$", np.linalg.norm(motion[:3, 3])
+        _arrow(axes, start, end, RED, shrinkA=3, shrinkB=3, connectionstyle="arc3,rad=-0.3")
         to_the_left = (end - start)[::-1] * (-1, 1)
-        _formula(axes, (start + end) / 2 + 0.15 * to_the_left, name, 11 * to_the_left / max(length, 1e-9), RED)
-        axes.plot([], [], color=RED, label=f"{name}: {length:.1f} m, {metrics.angles(motion):.1f}°")
-    axes.set(xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)", title=title)
+        axes.annotate(formula, (start + end) / 2 + 0.15 * to_the_left, 11 * to_the_left / max(length, 1e-9), color=RED,
+                      **name)
+        axes.plot([], [], color=RED, label=f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°")
+    axes.set(xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)")
+    axes.set_title(title, parse_math=False)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.2)
-    for text in axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=0.8).get_texts():
-        text.set_parse_math(True)
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=0.8)
     return figure
 
 
@@ -238,23 +231,6 @@ def figure_2_09(first, second, title):
         axes.plot((u, x), (v, y + first.shape[0] + gap.shape[0]), linewidth=0.8, color=scale.to_rgba(match.distance),
                   marker="o", markersize=2)
     figure.colorbar(scale, ax=axes, shrink=0.7, pad=0.01, label="bits of 256 that differ")
-    return figure
-
-
-def figure_2_10(estimated, true, title):
-    """Figure 2.10: drift of an estimated path (n, 3), metres, from the true one, and the distance between them."""
-    figure, axes = style.new_figure(1, 2, height=3.2)
-    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
-    axes[0].plot(true[:, 0], true[:, 2], color=TRUTH, label="true path")
-    axes[0].plot(estimated[:, 0], estimated[:, 2], color=BASELINE, linestyle="--", label="estimated path")
-    pairs = np.stack([true, estimated])[:, np.linspace(0, len(true) - 1, 12).astype(int)]
-    axes[0].plot(pairs[..., 0], pairs[..., 2], color="#aaaaaa", linewidth=0.8, zorder=0)
-    axes[0].set(xlabel="x (m)", ylabel="z (m)", title=title)
-    axes[0].set_aspect("equal", adjustable="datalim")
-    axes[1].plot(travelled, np.linalg.norm(estimated - true, axis=1), color=RED)
-    axes[1].set(xlabel="distance travelled (m)", ylabel="distance from the true position (m)", ylim=(0, None),
-                title="error along the path")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
@@ -286,21 +262,9 @@ def figure_2_12(frame, frame_keypoints, label_map, label_keypoints, titles):
     return figure
 
 
-def _diagram(xlim, ylim, **size):
-    figure, axes = style.new_figure(**size)
-    axes.set(xlim=xlim, ylim=ylim)
-    axes.set_axis_off()
-    return figure, axes
-
-
-def _arrow(axes, start, end, color="black", zorder=1):
-    axes.annotate("", end, start, zorder=zorder, arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 0.9})
-
-
-def _formula(axes, point, text, offset, color):
-    """A formula `offset` points of the page away from a point of the plot."""
-    axes.annotate(text, point, offset, textcoords="offset points", ha="center", va="center", color=color, fontsize=10,
-                  parse_math=True)
+def _arrow(axes, start, end, color="black", **options):
+    looks = {"arrowstyle": "-|>", "color": color, "linewidth": 0.9} | options
+    axes.annotate("", end, start, zorder=0, arrowprops=looks)
 
 
 def _numbers(axes, values, title, form, colors=None):

@@ -154,7 +154,8 @@ def _sequences(table):
 def table_comparison(table):
     """Every method over all keypoints and masks over every control, a column an error: "1.09 (0.98-1.32)".
 
-    The last column is the verdict of the errors that judge together (`compare.overall`).
+    The last columns are the verdict of the errors that judge together (`compare.overall`), and each sequence's ratio of
+    the first error.
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
     rows = rows.assign(what=_labels(rows))
@@ -166,9 +167,11 @@ def table_comparison(table):
             "estimator": ESTIMATORS[first["estimator"]], "keypoints": first["what"],
             "number": round(first["keypoints"]), "over": other_source + compare.METHODS[first["reference"]],
             "sequences": pair["n"].max(), **{compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()},
-            "verdict": compare.overall(judging["verdict"]) if len(judging) else pd.NA})
-    table = pd.DataFrame(shown)
-    return table[[*(name for name in table if name != "verdict"), "verdict"]]
+            "verdict": compare.overall(judging["verdict"]) if len(judging) else pd.NA,
+            **first[_sequences(table)].dropna().map(texts.number).add_prefix("sequence ")})
+    last = ["verdict", *(f"sequence {name}" for name in _sequences(table))]
+    shown = pd.DataFrame(shown)
+    return shown.reindex(columns=[*(name for name in shown if name not in last), *last])
 
 
 def _short(row):

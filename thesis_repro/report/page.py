@@ -1,11 +1,10 @@
 """One page with every table and figure of a run or a study: index.html beside them, to be opened from disk.
 
-`python -m thesis_repro.report.page` turns the executed notebooks into HTML where they have changed, and writes the page
-where anything it shows has. Neither needs a network, a server or scripts to be read. This module says what is shown,
-templates/page.html.j2 says how.
+`python -m thesis_repro.report.page` writes the page, and turns executed notebooks that are newer than their HTML into
+HTML. Neither needs a network, a server or scripts to be read. This module says what is shown, templates/page.html.j2
+says how.
 """
 
-import hashlib
 import importlib.metadata
 import itertools
 import json
@@ -16,24 +15,22 @@ import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
-from pathlib import Path
 
 from markupsafe import Markup
 
-from thesis_repro import longrun, stages
+from thesis_repro import longrun
 from thesis_repro.files import write_text
 from thesis_repro.report import captions, gap, tables, texts
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
 EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
-HERE = Path(__file__).parent
 ENDINGS = {"figure": (".svg", ".webp"), "table": (".csv", ".md"), "text": (".md",)}
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # what numbers depend on most
 
 
 def update(settings):
-    """Write the notebooks' HTML and the page where what they show has changed; True if the page was written.
+    """Write the page of a run, and the HTML of each executed notebook that has changed since.
 
     What killed runs left half written in the run's folders is deleted. Raises InputError where another run is at work.
     """
@@ -42,12 +39,11 @@ def update(settings):
         if settings.figures.is_dir():
             longrun.sweep(settings.figures)
         page = settings.figures / PAGE
-        write_notebooks(_executed(settings), page)
-        html = build(settings)
-        if page.is_file() and page.read_bytes() == html.encode():
-            return False
-        write_text(page, html)
-    return True
+        for path in _executed(settings):
+            html = path.with_suffix(".html")
+            if not html.is_file() or html.stat().st_mtime < path.stat().st_mtime:
+                write_text(html, notebook_html(path, page))
+        write_text(page, build(settings))
 
 
 def _executed(settings):
@@ -55,27 +51,16 @@ def _executed(settings):
     return sorted((settings.build / "notebooks").glob("[!.]*.ipynb"))
 
 
-def write_notebooks(paths, page):
-    """Write each executed notebook as HTML beside it, with a link back to the page, where that is not done yet.
+def notebook_html(path, page):
+    """An executed notebook as HTML, with a link to the page."""
+    from nbconvert import HTMLExporter  # slow to import, and seldom needed
 
-    The last line of the HTML says what it was made from: dates would not do, since a machine's clock can jump.
-    """
-    parts = [Path(__file__), *(HERE / "templates").iterdir()]
-    for path in paths:
-        digests = [f"{part.name} {stages.content(part)}\n" for part in sorted([*parts, path])]
-        made_from = f"<!-- made from {hashlib.sha256(''.join(digests).encode()).hexdigest()[:12]} -->\n"
-        html = path.with_suffix(".html")
-        if html.is_file() and html.read_bytes().endswith(made_from.encode()):
-            continue
-        from nbconvert import HTMLExporter  # slow to import, and seldom needed
-
-        # nbconvert's whole pages load scripts from the network; the bare content needs none
-        content, resources = HTMLExporter(
-            template_name="basic", embed_images=True, exclude_input_prompt=True, exclude_output_prompt=True,
-            exclude_anchor_links=True).from_filename(str(path))
-        write_text(html, texts.render("notebook.html.j2", title=path.stem, content=Markup(content),
-                                      style=Markup("\n".join(resources["inlining"]["css"])),
-                                      page=os.path.relpath(page, path.parent)) + made_from)
+    # nbconvert's whole pages load scripts from the network; the bare content needs none
+    content, resources = HTMLExporter(
+        template_name="basic", embed_images=True, exclude_input_prompt=True, exclude_output_prompt=True,
+        exclude_anchor_links=True).from_filename(str(path))
+    return texts.render("notebook.html.j2", title=path.stem, content=Markup(content),
+                        style=Markup("\n".join(resources["inlining"]["css"])), page=os.path.relpath(page, path.parent))
 
 
 def build(settings):
@@ -137,34 +122,27 @@ def _makers():
     """The notebooks in whose code a table or figure is named, {name: [notebooks]}."""
     makers = {}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        code = "\n".join("".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "code")
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
         for name in sorted(set(re.findall(r'"(\w+)(?:\.\w+)?"', code))):
             makers.setdefault(name, []).append(path.stem)
     return makers
 
 
 def _made(executed=(), in_git=False):
-    """Day of the results, commit, machine and packages; a page in git is that of its commit, made anywhere, any day."""
-    def git(*arguments):
-        command = ["git", "--git-dir", ROOT / ".git", "--work-tree", ROOT, *arguments]  # of no checkout around this one
-        return subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout.strip()
-
-    made = dict.fromkeys(("day", "commit", "changed", "python", "machine"))
-    made["packages"] = {name: importlib.metadata.version(name) for name in PACKAGES}
+    """Packages, machine, commit and day of the results; a page in git is that of its commit, made anywhere, any day."""
+    made = {"packages": {name: importlib.metadata.version(name) for name in PACKAGES}}
     if in_git:
         return made
+    made |= {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
     with suppress(OSError, subprocess.CalledProcessError):
-        made["commit"] = git("rev-parse", "--short=12", "HEAD")
-        made["changed"] = bool(git("status", "--porcelain", "--", ".", ":!figures"))
-    times = [time for path in executed for cell in _cells(path)
-             if (time := cell["metadata"].get("execution", {}).get("iopub.execute_input"))]
-    if times:
-        made["day"] = f"{datetime.fromisoformat(max(times)).astimezone(UTC):%d %B %Y}"
-    return made | {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
-
-
-def _cells(path):
-    return json.loads(path.read_text(encoding="utf-8"))["cells"]
+        made["commit"] = subprocess.run(  # not that of a checkout around this folder
+            ["git", f"--git-dir={ROOT / '.git'}", f"--work-tree={ROOT}", "describe", "--always", "--dirty",
+             "--exclude=*", "--abbrev=12"], capture_output=True, text=True, check=True).stdout.strip()
+    if executed:
+        latest = max(path.stat().st_mtime for path in executed)
+        made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"
+    return made
 
 
 def main():

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from PIL import ExifTags, Image
 
 from thesis_repro.cityscapes import LABELS, colorize
@@ -122,10 +122,10 @@ def ratio_axis(axis, values):
     low, high = low / margin, high * margin
     # within a factor of five, ticks at equal differences are rounder than ticks at equal ratios
     locator = MaxNLocator(5) if high < 5 * low else LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,), numticks=6)
-    ticks = [tick for tick in locator.tick_values(low, high) if low <= tick <= high]
     axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
-    axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-    axis.set_ticks([], minor=True)
+    axis.set_major_locator(locator)
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_locator(NullLocator())
 
 
 def save_figure(figure, folder, name, note):

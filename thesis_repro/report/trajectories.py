@@ -1,6 +1,5 @@
 """Trajectories against the truth: one table of errors and one picture of several of them."""
 
-from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
@@ -24,16 +23,15 @@ COLUMNS = {"rmse_m": "RMSE m", "mae_m": "MAE m", "ate_rmse_m": "ATE m", "ate_max
 def read(files, true):
     """Trajectories in KITTI's form by name, (n, 4, 4) each, n being that of the true poses.
 
-    The name is that of the file without its ending, or the path where two would have the same.
+    The names are those of the files without their endings, or the paths where two would have the same.
     """
-    stems = Counter(Path(file).stem for file in files)
-    paths = {}
-    for file in files:
-        poses = read_poses(file)
+    names = [Path(file).stem for file in files]
+    names = names if len(set(names)) == len(names) else map(str, files)
+    paths = dict(zip(names, map(read_poses, files)))
+    for file, poses in zip(files, paths.values()):
         if len(poses) != len(true):
             raise InputError(f"{file}: {len(poses)} poses, but the sequence has {len(true)} true ones; one a frame is "
                              "needed in both")
-        paths[Path(file).stem if stems[Path(file).stem] == 1 else str(file)] = poses
     return paths
 
 
@@ -47,15 +45,14 @@ def evaluate(paths, true, alignment="none"):
     for name, poses in paths.items():
         ate = metrics.ate(poses, true, alignment)
         row = {"trajectory": name, "poses": len(poses), "alignment": alignment, "rmse_m": metrics.rmse(poses, true),
-               "mae_m": metrics.mae(poses, true), "note": ate["note"], "scale": ate["scale"],
-               **{f"ate_{key}_m": ate[key] for key in ("rmse", "mean", "median", "max")}}
+               "mae_m": metrics.mae(poses, true), "note": ate.pop("note"), "scale": ate.pop("scale"),
+               **{f"ate_{key}_m": value for key, value in ate.items()}}
         if name in after:  # else ate's note says why it cannot be aligned
             rpe, segments = metrics.rpe(after[name], true), metrics.kitti_errors(after[name], true)
             row |= {f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value for key, value in rpe.items()}
             row |= {"t_rel_percent": segments["translation_percent"], "segments": segments["segments"],
                     "r_rel_deg_per_100m": 100 * segments["rotation_deg_per_m"], "note": row["note"] or segments["note"]}
-        rows.append({key: None if isinstance(value, float) and np.isnan(value) else value
-                     for key, value in row.items()})
+        rows.append({key: None if value != value else value for key, value in row.items()})
     return rows
 
 

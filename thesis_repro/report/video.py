@@ -5,7 +5,7 @@ from fractions import Fraction
 import cv2
 import numpy as np
 
-from thesis_repro.files import atomic, progress, write_png
+from thesis_repro.files import atomic, progress
 from thesis_repro.kitti import FRAME_TIME
 from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pose
 
@@ -13,8 +13,8 @@ from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pos
 KEPT, DISCARDED, OUTLINE = (255, 140, 30), (60, 60, 230), (0, 220, 255)
 INLIER, OUTLIER = (120, 220, 0), (0, 140, 255)
 TRUE, ESTIMATED, TEXT, PAPER = (90, 90, 90), (200, 80, 0), (40, 40, 40), (255, 255, 255)
-QUALITY = 20  # x264's constant rate factor: less is better and larger; 18 to 23 look like the original
 MAP_SHARE = 0.75  # height of the map below the frame, in heights of the frame
+MARGIN = 14  # pixels around the map
 
 
 def draw_frame(frame, step, settings=THESIS, mask=None):
@@ -51,25 +51,18 @@ def draw_map(size, true, estimated):
     """
     height, width = size
     image = np.full((height, width, 3), PAPER, np.uint8)
-    paths = {ESTIMATED: estimated} if true is None else {TRUE: true, ESTIMATED: estimated}
-    points = np.concatenate([poses[:, [0, 2], 3] for poses in paths.values()])
+    paths = {} if true is None else {"ground truth": (TRUE, true)}
+    paths["estimate"] = ESTIMATED, estimated
+    points = np.concatenate([poses[:, [0, 2], 3] for _, poses in paths.values()])
     centre, extent = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
-    extent = np.maximum(extent, max(1.0, 0.2 * extent.max()))  # a straight path is not a hairline
-    margin = 14
-    metre = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
-
-    def pixels(poses):
-        xz = (poses[:, [0, 2], 3] - centre) * metre
-        return np.rint(np.stack([width / 2 + xz[:, 0], height / 2 - xz[:, 1]], axis=1)).astype(np.int32)
-
-    for color, poses in paths.items():
-        cv2.polylines(image, [pixels(poses)], False, color, 2, cv2.LINE_AA)
-    cv2.circle(image, pixels(estimated)[-1].tolist(), 4, ESTIMATED, -1, cv2.LINE_AA)
-    bar = 10.0 ** np.floor(np.log10((width - 2 * margin) / metre / 2))
-    cv2.line(image, (margin, height - margin), (round(margin + bar * metre), height - margin), TEXT, 2)
-    _write(image, f"{bar:g} m", (margin, height - margin - 6), TEXT)
-    _write(image, "no ground truth" if true is None else "ground truth", (margin, 18), TRUE)
-    _write(image, "estimate", (margin, 36), ESTIMATED)
+    metre = ((np.array([width, height]) - 2 * MARGIN) / np.maximum(extent, max(1, 0.2 * extent.max()))).min()  # pixels
+    for row, (name, (color, poses)) in enumerate(paths.items(), 1):
+        pixels = np.array([width, height]) / 2 + (poses[:, [0, 2], 3] - centre) * metre * (1, -1)
+        cv2.polylines(image, [np.rint(pixels).astype(np.int32)], False, color, 2, cv2.LINE_AA)
+        _write(image, name, (MARGIN, 18 * row), color)
+    bar = 10.0 ** np.floor(np.log10((width - 2 * MARGIN) / metre / 2))
+    cv2.line(image, (MARGIN, height - MARGIN), (round(MARGIN + bar * metre), height - MARGIN), TEXT, 2)
+    _write(image, f"{bar:g} m", (MARGIN, height - MARGIN - 6), TEXT)
     return image
 
 
@@ -100,6 +93,7 @@ def pictures(sequence, settings=THESIS, masks=None):
 
 
 def _describe(image, step, true, masked):
+    """Write onto the map what happened in a step, in the colours of the frame."""
     row = step.row() | {"masked": masked, "error": 0.0}
     if true is not None:
         row["error"] = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
@@ -118,17 +112,10 @@ def write_video(path, sequence, settings=THESIS, masks=None):
 
     pace = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 1 / FRAME_TIME
     with atomic(path) as temporary, av.open(str(temporary), "w", options={"movflags": "+faststart"}) as video:
-        stream = video.add_stream("libx264", rate=Fraction(pace).limit_denominator(1000), options={"crf": str(QUALITY)})
+        stream = video.add_stream("libx264", rate=Fraction(pace).limit_denominator(1000))
         stream.pix_fmt = "yuv420p"  # the one that every browser knows
         for picture in pictures(sequence, settings, masks):
             if not stream.codec_context.is_open:
                 stream.height, stream.width = picture.shape[:2]
             video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         video.mux(stream.encode())
-
-
-def write_sheet(path, sequence, masks=None):
-    """Write a still of four evenly spaced frames, two beside each other."""
-    wanted = np.linspace(min(1, len(sequence) - 1), len(sequence) - 1, 4).round().astype(int).tolist()
-    chosen = {index: picture for index, picture in enumerate(pictures(sequence, masks=masks)) if index in wanted}
-    write_png(path, np.vstack([np.hstack([chosen[index] for index in row]) for row in (wanted[:2], wanted[2:])]))
