@@ -166,7 +166,7 @@ test: setup
 	@$(BIN)/python -m pytest -q -n $(shell nproc) --dist loadfile
 
 torture: setup
-	@$(BIN)/python -m pytest -q --torture tests/torture
+	@$(BIN)/python -m pytest -q -m torture
 
 lint: setup
 	@$(BIN)/ruff check .

@@ -18,13 +18,10 @@ SHARED = Path(__file__).resolve().parent.parent.parent / "shared"
 SLOW_FIXTURES = {"small_world", "small_labels", "kitti_real", "camvid_real", "reference"}
 
 
-def pytest_addoption(parser):
-    parser.addoption("--torture", action="store_true", help="also the long trials of faults and bad input")
-
-
 def pytest_collection_modifyitems(items):
     for item in items:
-        if SLOW_FIXTURES & set(item.fixturenames):
+        marked = item.get_closest_marker("notebooks") or item.get_closest_marker("torture")
+        if marked or SLOW_FIXTURES & set(item.fixturenames):
             item.add_marker(pytest.mark.slow)
 
 

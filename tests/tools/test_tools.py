@@ -93,7 +93,6 @@ def test_a_view_has_the_look_of_another_camera():
 
 
 @pytest.mark.torture
-@pytest.mark.skipif("not config.getoption('--torture')", reason="takes a minute")
 def test_the_shipped_training_ends_with_a_model_and_its_card(camvid_real, tmp_path):
     kitti_semantic = camvid_real.parent / "kitti_semantic"
     arguments = [str(camvid_real), str(kitti_semantic), str(tmp_path), "--epochs", "1", "--last-epochs", "1",
@@ -104,7 +103,6 @@ def test_the_shipped_training_ends_with_a_model_and_its_card(camvid_real, tmp_pa
 
 
 @pytest.mark.torture
-@pytest.mark.skipif("not config.getoption('--torture')", reason="takes a minute")
 def test_all_proposals_are_trained_and_measured(camvid_real):
     table = proposals.compare(camvid_real, seconds=0.1, seeds=(0,), images=8)
     assert len(table) == 3 and (table["images seen"] > 0).all()  # CamVid is gray here

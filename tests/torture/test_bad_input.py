@@ -1,11 +1,10 @@
 """Bad input: an exit code that is not 0, one line that names the file or option, and nothing left behind.
 
-All but one are called in the tests' own process.
+The commands are called in the tests' own process.
 """
 
 import json
 import pickle
-import sys
 import zipfile
 from pathlib import Path
 
@@ -16,6 +15,8 @@ import trials
 
 from thesis_repro.cli import build_parser, main
 from thesis_repro.masks import forget_edges
+
+pytestmark = pytest.mark.slow
 
 FRAMES = "kitti/sequences/00/image_0"
 FRAME, POSES, CALIB, TIMES = (f"{FRAMES}/000002.png", "kitti/poses/00.txt", "kitti/sequences/00/calib.txt",
@@ -28,20 +29,6 @@ STUDY, STUDY_ALL = "study --kitti kitti --labels labels --output out", "study --
 EVALUATE, PREDICT = "evaluate --kitti kitti --sequence 00 path.txt", "predict --images kitti/sequences/00 --output out"
 MODEL = f"{PREDICT} --model a.keras"
 NOISE = np.random.default_rng(0).integers(0, 256, (48, 64), np.uint8)
-
-
-@pytest.fixture
-def folder(tmp_path, tiny_kitti, tiny_cityscapes):
-    """kitti, cityscapes, label maps and masks of sequence 00, and a file that is somebody's."""
-    for name, picture in (("labels", np.repeat([[7], [23]], 16, axis=0).repeat(40, axis=1)),
-                          ("masks", np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1))):
-        (tmp_path / name).mkdir()
-        for index in range(4):
-            cv2.imwrite(str(tmp_path / name / f"{index:06d}.png"), picture.astype(np.uint8))
-    (tmp_path / "path.txt").write_text((tiny_kitti / "poses/00.txt").read_text())
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/letter.txt").write_text("mine")
-    return tmp_path
 
 
 @pytest.fixture
@@ -94,6 +81,14 @@ def archive(**parts):
     return harm
 
 
+def nan_model(path):
+    import keras
+
+    images = keras.Input((64, 64, 1))
+    nan = keras.initializers.Constant(float("nan"))
+    keras.Model(images, keras.layers.Conv2D(35, 1, kernel_initializer=nan)(images)).save(path)
+
+
 def layer(module, name, **config):
     return json.dumps({"module": module, "class_name": name, "config": config})
 
@@ -126,6 +121,7 @@ BROKEN = [
     (EVALUATE, POSES, {"missing": Path.unlink}),
     (ODOMETRY, TIMES, {"too few": holding("0\n1\n"), "two columns": holding("0 0\n1 1\n2 2\n3 3\n")}),
     (MODEL, "a.keras", {
+        "no numbers": nan_model,
         "a pickle": holding(pickle.dumps({"a": 1})),
         "code": archive(metadata_json="{}", config_json=layer("keras.layers", "Lambda", function="x")),
         "foreign": archive(metadata_json="{}", config_json=layer("os", "system", command="touch harmed"))}),
@@ -165,29 +161,19 @@ predict --images labels --output out --dask inproc://1 -> inproc://1
 """.strip().splitlines()]
 
 
-@pytest.mark.short
 @pytest.mark.parametrize("words, path, harm", [
     pytest.param(words, path, harm, id=f"{words.split()[0]} {path} {what}")
     for words, path, harms in BROKEN for what, harm in harms.items()])
 def test_a_broken_file_is_named(words, path, harm, folder, inside):
     harm(folder / path)
-    trials.refused(inside(words.split()), Path(path).name, left=["out", "out/*"] if words == MASKS else [])
+    trials.refused(inside(words.split()), Path(path).name, left=["out", "out/*"] if words in (MASKS, MODEL) else [])
 
 
-@pytest.mark.short
 @pytest.mark.parametrize("words, named", REFUSED)
 def test_what_cannot_be_run_is_named(words, named, inside):
     trials.refused(inside(words.split()), named)
 
 
-def test_a_model_whose_weights_are_no_numbers_is_named(folder):
-    code = ("import keras; a = keras.Input((64, 64, 1)); nan = keras.initializers.Constant(float('nan')); "
-            "keras.Model(a, keras.layers.Conv2D(35, 1, kernel_initializer=nan)(a)).save('a.keras')")
-    trials.succeed([sys.executable, "-c", code], folder)
-    trials.refused(trials.run(trials.thesis(*MODEL.split()), folder), "a.keras", left=["out", "out/*"])
-
-
-@pytest.mark.short
 def test_every_option_of_every_command_refuses_what_it_cannot_be(inside):
     """Exit code 2, and the option is named: without its value, and with what its kind of value cannot be."""
     commands = next(action for action in build_parser()._actions if action.dest == "command").choices
@@ -204,13 +190,3 @@ def test_every_option_of_every_command_refuses_what_it_cannot_be(inside):
     for words, named in ((["nonsense"], "'nonsense'"), (f"{LABELLED} --masks masks".split(), "--masks"),
                          (f"{STUDY} --jobs 0".split(), "--jobs")):
         trials.refused(inside(words), named, code=2)
-
-
-@pytest.mark.short
-def test_these_trials_notice_an_error_that_is_not_clear():
-    clear = "error: a.png: truncated; copy it again\n"
-    trials.refused(trials.Result(1, "", clear, ["out", "out/log.txt"]), "a.png", left=["out", "out/*"])
-    for code, error, left in ((0, "", []), (-9, clear, []), (1, "", []), (1, 2 * clear, []), (1, "error: failed", []),
-                              (1, clear + "Traceback (most recent call last)", []), (1, clear, ["out"])):
-        with pytest.raises(AssertionError):
-            trials.refused(trials.Result(code, "", error, left), "a.png")

@@ -6,26 +6,14 @@ import os
 import shutil
 import subprocess
 
-import cv2
-import numpy as np
+import pytest
 import trials
+
+pytestmark = pytest.mark.torture
 
 ODD = "it's \"50%\" <script>&$x$_ é漢\n{b} #[1]*"
 SEQUENCE = "<b>&\"'$_$ %s é"
 CLONE_NEWNET = 0x40000000  # Linux's word for a network of one's own
-
-
-def sequence(root, name, count=8):
-    """A sequence of noise that moves, and its label maps in a folder with a name as odd as its own."""
-    images, labels = root / "kitti" / "sequences" / name / "image_0", root / "labels <i>&"
-    noise = np.random.default_rng(0).integers(0, 256, (48, 80), np.uint8)
-    for folder in (images, labels, root / "kitti/poses"):
-        folder.mkdir(parents=True)
-    for index in range(count):
-        cv2.imwrite(str(images / f"{index:06d}.png"), noise[:, index:index + 64])
-        cv2.imwrite(str(labels / f"{index:06d}.png"), np.full((32, 40), [[7]] * 16 + [[23]] * 16).astype(np.uint8))
-    (images.parent / "calib.txt").write_text("P0: 50 0 32 0 0 50 24 0 0 0 1 0\n")
-    (root / f"kitti/poses/{name}.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {index}\n" for index in range(count)))
 
 
 def digests(*folders):
@@ -47,11 +35,14 @@ def without_roots_rights():
             ctypes.CDLL(None).prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
 
 
-def test_odd_names_and_no_network_work_and_data_is_only_read(tmp_path):
+def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
     """Every command that reads or makes data."""
     root = tmp_path / ODD
-    sequence(root, SEQUENCE)
-    out, labels = root / 'out %d "x"', root / "labels <i>&"
+    root.mkdir()
+    out, labels = root / 'out %d "x"', (folder / "labels").rename(root / "labels <i>&")
+    (folder / "kitti").rename(root / "kitti")
+    (root / "kitti/sequences/00").rename(root / "kitti/sequences" / SEQUENCE)
+    (root / "kitti/poses/00.txt").rename(root / f"kitti/poses/{SEQUENCE}.txt")
     where, before = ["--kitti", root / "kitti", "--sequence", SEQUENCE], digests(root / "kitti", labels)
     for words in (
             ["odometry", *where, "--labels", labels, "--dilation", 3, "--output", out / "p'$_$.txt", "--tum",
@@ -82,11 +73,11 @@ def make(*words):
                           env=trials.environment())
 
 
-def test_make_takes_folders_of_any_name_and_refuses_what_it_does_not_know(tmp_path):
-    odd = ODD.replace("$x$_", "").replace("\n", " ")  # make has its own idea of dollars, and none of lines
-    sequence(tmp_path / odd, "00")
-    assert make("check-data", f"KITTI={tmp_path / odd / 'kitti'}").returncode == 0
-    planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={tmp_path / odd}", f"BUILD={tmp_path / 'build'}")
+def test_make_takes_folders_of_any_name_and_refuses_what_it_does_not_know(tiny_kitti, tmp_path):
+    odd = tmp_path / ODD.replace("$x$_", "").replace("\n", " ")  # make has its own idea of dollars, and none of lines
+    tiny_kitti.rename(odd)
+    assert make("check-data", f"KITTI={odd}").returncode == 0
+    planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={odd}", f"BUILD={tmp_path / 'build'}")
     assert planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout, planned
     for word, named in (("EPOCHS=0", "EPOCHS=0: "), ("EPOCH=3", "EPOCH: "), ("DASK_SCHEDULER=mine", "mine")):
         refused = make("figures", word, f"BUILD={tmp_path / 'other'}")

@@ -1,8 +1,6 @@
 """Trials by the real command line: start a command as a process, and demand that it fails as it should."""
 
 import fnmatch
-import io
-import json
 import os
 import signal
 import subprocess
@@ -85,12 +83,13 @@ def kill(process):
 
 
 def snapshot(where):
-    """What lies below a folder, {relative path: size and date}; None for folders. It may be in use meanwhile."""
+    """What lies below a folder but logs, {relative path: size and date}; None for folders. It may be in use."""
     versions = {}
     for path in (Path(folder, name) for folder, folders, names in os.walk(where) for name in (*folders, *names)):
         with suppress(FileNotFoundError):
             status = path.lstat()
-            versions[path.relative_to(where)] = None if path.is_dir() else (status.st_size, status.st_mtime_ns)
+            if path.name != longrun.LOG:
+                versions[path.relative_to(where)] = None if path.is_dir() else (status.st_size, status.st_mtime_ns)
     return versions
 
 
@@ -113,9 +112,9 @@ def refused(result, named, code=1, left=()):
 
 
 def contents(folder):
-    """Everything below a folder by path, without what no two runs share: times, dates and the log."""
+    """Every file below a folder by path, without what no two runs share: times, dates and the log."""
     return {str(path.relative_to(folder)): _content(path) for path in sorted(Path(folder).rglob("*"))
-            if path.is_file() and path.name != longrun.LOG and path.suffix != ".log"}
+            if path.is_file() and path.name != longrun.LOG}
 
 
 def _content(path):
@@ -123,12 +122,8 @@ def _content(path):
         table = pd.read_csv(path, dtype=str)
         return table[[name for name in table if not name.endswith("_seconds")]].to_csv()
     if path.suffix == ".keras":
-        with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as file:
+        with zipfile.ZipFile(path) as file:
             return {name: file.read(name) for name in file.namelist() if name.endswith(".h5")}
-    if path.suffix == ".ipynb":
-        return [cell.get("outputs") for cell in json.loads(path.read_text())["cells"]]
-    if path.suffix == ".html":  # the executed notebooks that it was made from hold times
-        return path.read_text().partition("<!-- made from")[0]
     return path.read_bytes()
 
 
