@@ -27,11 +27,11 @@ def follow(frames: Sequence[np.ndarray], label_maps: Sequence[np.ndarray], dilat
     """How the masked keypoints of one place jump between consecutive frames (Figure 4.8): a View of each frame.
 
     frames: (height, width) uint8 each; label_maps: (h, w) uint8 each, any size, as many; first: number of the first
-    frame. The place is a window of half the frame's height around the keypoint that jumps between the first two frames
-    with most others around it, or the frame's middle where none does. It follows the median motion of its keypoints.
+    frame. The place is a window of a quarter of the frame's height, around the keypoint that jumps between the first
+    two frames with most others around it, or the frame's middle where none does. It follows its keypoints' median.
     """
     size = np.array(frames[0].shape[::-1])
-    half = size.min() // 4
+    half = size.min() // 8
     edge_images = [masks.edges(label_map, frames[0].shape) for label_map in label_maps]
     points = [keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
               for frame, edge_image in zip(frames, edge_images, strict=True)]
