@@ -33,12 +33,12 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
 @pytest.mark.parametrize("amount, low, high", [(300, 280, 300), (0.5, 0.48, 0.5)])
 def test_random_keypoints_are_keypoints_and_as_many_as_asked_for(small_world, amount, low, high):
     sequence = Sequence(small_world / "kitti", "00").subset(2)
-    drawn = ablations.RandomKeypoints(sequence, amount)
-    points = keypoints.detect(sequence.frame(0), THESIS, drawn[0])
+    drawn = ablations.random_keypoints(sequence, amount, 0)
+    points = keypoints.detect(sequence.frame(0), THESIS, drawn)
     every = {tuple(point) for point in keypoints.detect(sequence.frame(0), THESIS).astype(int)}
     count = len(points) if isinstance(amount, int) else len(points) / len(every)
     assert low <= count <= high and {tuple(point) for point in points.astype(int)} <= every
-    assert np.array_equal(drawn[0], ablations.RandomKeypoints(sequence, amount)[0])
+    assert np.array_equal(drawn, ablations.random_keypoints(sequence, amount, 0))
 
 
 def test_runs_are_kept_and_not_made_again(small_world, small_labels, tmp_path, monkeypatch):

@@ -95,7 +95,7 @@ def test_the_table_sets_masks_against_all_keypoints_and_every_control():
     assert compare.overall(primary["verdict"]) == "lower"
     of_thesis = compare.primary_comparison(table[table["estimator"] == "thesis"])
     assert set(of_thesis["estimator"]) == {"thesis"}  # where the refined one was not run
-    against = compare.against_controls(table).set_index(["reference", "metric"])["verdict"]
+    against = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS).set_index(["reference", "metric"])["verdict"]
     assert set(against["mirrored"]) == {"lower"} and set(against["fewer"]) == {"higher"}
     assert compare.overall(["lower", "higher"]) == compare.overall([]) == "no clear difference"
 
@@ -106,7 +106,7 @@ def test_sources_are_compared_with_each_other_and_share_all_keypoints():
     runs = pd.concat([one, other])
     assert compare.sources(runs) == ["net", "other"]
     assert set(compare.of_source(runs, "other")["method"]) == {"baseline", "masked"}
-    table = compare.comparisons(runs, ["rmse"])
+    table = compare.comparisons(runs)
     row = table[(table["source"] == "net") & (table["reference_source"] == "other")].iloc[0]
     assert row["ratio"] == pytest.approx(2)
 

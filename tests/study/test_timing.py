@@ -23,14 +23,15 @@ def model():
 
 
 @pytest.fixture
-def sequence(small_world):
+def sequence(small_world, monkeypatch):
+    monkeypatch.setattr(timing, "FRAMES", 2)
     return Sequence(small_world / "kitti", "00")
 
 
 def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
     keypoint_mask = masks.keypoint_mask
     monkeypatch.setattr(masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0])
-    table = timing.measure(sequence, model, frames=4, width=5)
+    table = timing.measure(sequence, model, width=5)
     assert list(table.columns) == ["method", "stage", "milliseconds"] and (table["milliseconds"] > 0).all()
     stages_of = table.groupby("method")["stage"].agg(list)
     assert stages_of["masked, width 5"] == list(timing.STAGES)
@@ -44,7 +45,7 @@ def test_its_masks_and_steps_are_those_of_a_run(sequence, model, tmp_path, monke
     steps = []
     step = odometry.Odometry.step
     monkeypatch.setattr(odometry.Odometry, "step", lambda *given: steps.append(step(*given)) or steps[-1])
-    timing.measure(sequence, model, frames=2, width=width, boundaries=boundaries)
+    timing.measure(sequence, model, width, boundaries)
     short = sequence.subset(5)
     prediction.write_label_maps(model, short.frame_paths, tmp_path)
     made = masks.LabelMasks(tmp_path, short, width, masks.MaskSettings(boundaries))
@@ -56,14 +57,14 @@ def test_its_masks_and_steps_are_those_of_a_run(sequence, model, tmp_path, monke
 def test_it_is_measured_once_for_a_model(sequence, model, tmp_path, monkeypatch):
     training_file = tmp_path / "model.keras"
     model.save(training_file)
-    first = timing.frame_times(tmp_path / "timing", sequence, training_file, frames=2)
+    first = timing.frame_times(tmp_path / "timing", sequence, training_file)
     monkeypatch.setattr(training, "load_model", lambda path: pytest.fail("measured again"))
-    assert first.equals(timing.frame_times(tmp_path / "timing", sequence, training_file, frames=2))
+    assert first.equals(timing.frame_times(tmp_path / "timing", sequence, training_file))
     with pytest.raises(pytest.fail.Exception, match="measured again"):
-        timing.frame_times(tmp_path / "timing", sequence, training_file, frames=2, width=5)
+        timing.frame_times(tmp_path / "timing", sequence, training_file, width=5)
     monkeypatch.setattr(stages, "content", lambda path: "another model")
     with pytest.raises(pytest.fail.Exception, match="measured again"):
-        timing.frame_times(tmp_path / "timing", sequence, training_file, frames=2)
+        timing.frame_times(tmp_path / "timing", sequence, training_file)
 
 
 def test_too_few_frames_are_refused(sequence, model):

@@ -82,7 +82,7 @@ def _of_source(runs, table, source):
     runs, judged = compare.of_source(runs, source), compare.primary_comparison(table, source)
     rows = table[(table["source"] == source) & (table["reference"] == "baseline") & table["tested"]]
     judging = rows["metric"].isin(compare.JUDGING_METRICS) & (rows["estimator"] == compare.judging_estimator(table))
-    controls = compare.against_controls(table, source)
+    controls = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS, source)
     controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)["verdict"]
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     tested, widths = compare.tested_width(runs), masked["dilation_width"].nunique()

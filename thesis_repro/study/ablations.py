@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import joblib
@@ -36,15 +37,14 @@ FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesi
 # Masks that differ from the thesis's in one thing
 
 
-class EnlargedNearest:
-    """Masks made by a function of each frame's label map enlarged by nearest neighbours: masks[i] for frame i."""
+class MadeMasks:
+    """Masks made by a function of the frame's number: masks[i] for frame i."""
 
-    def __init__(self, folder: Path, sequence: Sequence, make: Callable[[np.ndarray], np.ndarray]) -> None:
-        self.folder, self.sequence, self.make = Path(folder), sequence, make
+    def __init__(self, make: Callable[[int], np.ndarray]) -> None:
+        self.make = make
 
     def __getitem__(self, index: int) -> np.ndarray:
-        label_map = read_label_map(self.folder / self.sequence.frame_paths[index].name)
-        return self.make(cv2.resize(label_map, self.sequence.size[::-1], interpolation=cv2.INTER_NEAREST))
+        return self.make(index)
 
 
 def without_classes(ids: Iterable[int], label_map: np.ndarray) -> np.ndarray:
@@ -52,47 +52,39 @@ def without_classes(ids: Iterable[int], label_map: np.ndarray) -> np.ndarray:
     return np.where(np.isin(label_map, list(ids)), np.uint8(0), np.uint8(255))
 
 
-class RandomKeypoints:
-    """Masks of single pixels: some of a frame's keypoints, drawn at random: a number (int), or a share (float)."""
-
-    def __init__(self, sequence: Sequence, amount: int | float) -> None:
-        self.sequence, self.amount = sequence, amount
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        points = keypoints.detect(self.sequence.frame(index), THESIS).astype(int)
-        number = self.amount if isinstance(self.amount, int) else round(self.amount * len(points))
-        chosen = np.random.default_rng((0, index)).permutation(len(points))[:number]
-        mask = np.zeros(self.sequence.size, np.uint8)
-        mask[points[chosen, 1], points[chosen, 0]] = 255
-        return mask
+def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.ndarray:
+    """A mask of single pixels: some of a frame's keypoints, drawn at random: a number (int), or a share (float)."""
+    points = keypoints.detect(sequence.frame(index), THESIS).astype(int)
+    number = amount if isinstance(amount, int) else round(amount * len(points))
+    chosen = np.random.default_rng((0, index)).permutation(len(points))[:number]
+    mask = np.zeros(sequence.size, np.uint8)
+    mask[points[chosen, 1], points[chosen, 0]] = 255
+    return mask
 
 
 # The runs
 
 
 def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, *, frames: int | None = None,
-            repetitions: int = REPETITIONS, baseline_repetitions: int = BASELINE_REPETITIONS,
-            dilation_width: int = CONTROL_WIDTH, boundaries: str = "canny", processes: int = 1) -> pd.DataFrame:
+            processes: int = 1, **options: Any) -> pd.DataFrame:
     """Run every ablation on every sequence; returns a table with one row a run.
 
     kitti: the odometry root. labels: a folder with one folder of label maps a sequence. folder: keeps the runs of each
     sequence, so that a stopped call goes on where it was. frames: of each sequence, None for all.
-    repetitions, baseline_repetitions: of every method and of all keypoints, see `runs_of`.
+    options: of `runs_of`.
 
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in metres after an
     alignment that may scale).
     """
-    settings = {"frames": frames, "repetitions": repetitions, "baseline_repetitions": baseline_repetitions,
-                "dilation_width": dilation_width, "boundaries": boundaries}
-    calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, **settings) for name in names]
+    calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, frames, options) for name in names]
     work = joblib.Parallel(n_jobs=processes, return_as="generator")(calls)
     paths = list(progress(work, "ablations", total=len(calls), unit="sequence"))
     return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in paths], ignore_index=True)
 
 
-def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | None, **settings) -> Path:
+def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | None, options: dict[str, Any]) -> Path:
     sequence = Sequence(kitti, name).subset(frames)
-    stages.stage(folder, settings=settings, code=stages.code("study/ablations"),
+    stages.stage(folder, options=options, code=stages.code("study/ablations"),
                  **stages.made_with("opencv-python-headless", "numpy", "numba"),
                  sequence=stages.listing(sequence.files),
                  labels=stages.listing([labels / path.name for path in sequence.frame_paths]),
@@ -100,7 +92,7 @@ def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | N
     path = folder / "runs.csv"
     if stages.kept_table(path) is None:
         cv2.setNumThreads(1)  # the processes already use every core
-        runs = runs_of(sequence, labels, **settings)
+        runs = runs_of(sequence, labels, **options)
         results = odometry.run_many(sequence, {" ".join(map(str, key)): run for key, run in runs.items()})
         rows = [{"method": method, "estimator": estimator, "repetition": repetition}
                 | measures(result.frames, sequence.poses)
@@ -120,6 +112,11 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
     `baseline_repetitions` under the thesis's estimator, from which `null_distribution` draws.
     """
     from_labels = partial(masks.LabelMasks, labels, sequence, dilation_width)
+
+    def enlarged(index: int) -> np.ndarray:
+        label_map = read_label_map(labels / sequence.frame_paths[index].name)
+        return cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
+
     own = from_labels(MaskSettings(boundaries))
     sample = range(0, len(sequence), max(1, len(sequence) // 8))
     number = round(np.mean([len(keypoints.detect(sequence.frame(index), THESIS, own[index])) for index in sample]))
@@ -127,16 +124,16 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
         "baseline": (THESIS, None),
         "masked": (THESIS, own),
         "filter": (replace(THESIS, mask_mode="filter"), own),
-        "nearest": (THESIS, EnlargedNearest(labels, sequence, lambda label_map: masks.dilate(
-            cv2.Canny(label_map, masks.CANNY_LOW, masks.CANNY_HIGH), dilation_width))),
+        "nearest": (THESIS, MadeMasks(lambda index: masks.dilate(
+            cv2.Canny(enlarged(index), masks.CANNY_LOW, masks.CANNY_HIGH), dilation_width))),
         "symmetric": (THESIS, from_labels(MaskSettings(boundaries, symmetric=True))),
         "corrected": (THESIS, from_labels(CORRECTED)),
         "masked-static": (THESIS, from_labels(MaskSettings(boundaries, movable=0))),
-        **{method: (THESIS, EnlargedNearest(labels, sequence, partial(without_classes, ids)))
+        **{method: (THESIS, MadeMasks(lambda index, ids=ids: without_classes(ids, enlarged(index))))  # type: ignore
            for method, ids in WITHOUT.items()},
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
-        "random": (THESIS, RandomKeypoints(sequence, number)),
-        "dropout": (THESIS, RandomKeypoints(sequence, 0.9)),
+        "random": (THESIS, MadeMasks(partial(random_keypoints, sequence, number))),
+        "dropout": (THESIS, MadeMasks(partial(random_keypoints, sequence, 0.9))),
         **{f"strongest-{few}": (replace(THESIS, max_keypoints=few), None) for few in FEW_KEYPOINTS},
         "orb": (replace(THESIS, detector="orb"), None),
     }
@@ -199,7 +196,7 @@ NEAR = 2  # pixels: a boundary this near to an edge has been found
 PAIRS = (("road", "sidewalk"), ("vegetation", "sky"), ("building", "fence"))
 
 
-def tracks(sequence: Sequence, chosen: dict[str, Masks | None], pairs: int = 6) -> pd.DataFrame:
+def tracks(sequence: Sequence, chosen: dict[str, Masks | None], pairs: int) -> pd.DataFrame:
     """How well keypoints can be tracked and how they are spread: one row a kind of mask and pair of frames.
 
     chosen: {name: masks, None for all keypoints}. pairs: frames, spread evenly, that are tracked to the next one.

@@ -16,6 +16,7 @@ How a ratio is formed:
 """
 
 from collections.abc import Iterable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -101,22 +102,23 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
     return np.exp((logarithms(rows) - logarithms(reference)).dropna())
 
 
-def comparisons(runs: pd.DataFrame, metrics: Iterable[str] | None = None) -> pd.DataFrame:
+def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
     """Every method against all keypoints, and masks against every control and every other source.
 
     Columns: source, method, dilation_width (pixels), keypoints (mean number); reference_source, reference,
     reference_keypoints; metric, estimator; tested (whether the width is the one put to the test, `tested_width`);
     ratio, low, high, n, verdict; then the ratio of each sequence, in a column with its name.
-    metrics: of METRICS, by default all that the runs have.
     """
-    names = [name for name in (metrics or METRICS) if name in runs and runs[name].notna().any()]
+    metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
     for estimator in ESTIMATORS:
-        of_estimator = runs[runs["estimator"] == estimator]
-        for (own, own_rows), (other, other_rows) in _pairs(_arms(of_estimator)):
+        arms = _arms(runs[runs["estimator"] == estimator])
+        for (own, own_rows), (other, other_rows) in product(arms, arms):
+            if not _is_compared(own, other):
+                continue
             row = {**own, "reference_source": other["source"], "reference": other["method"],
                    "reference_keypoints": other["keypoints"], "estimator": estimator}
-            for metric in names:
+            for metric in metrics:
                 by_sequence = ratios(own_rows, other_rows, metric)
                 rows.append({**row, "metric": metric, **geometric_mean(by_sequence), **by_sequence})
     columns = ["source", "method", "dilation_width", "keypoints", "reference_source", "reference",
@@ -126,28 +128,22 @@ def comparisons(runs: pd.DataFrame, metrics: Iterable[str] | None = None) -> pd.
 
 def _arms(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
     """What is compared: (source, method, dilation_width, keypoints, tested) with its rows; all keypoints first."""
-    arms: list[tuple[dict[str, Any], pd.DataFrame]] = []
-    order = {name: place for place, name in enumerate(METHODS)}
+    order = list(METHODS)
     known = runs[runs["method"].isin(order)]
     widths = {source: tested_width(of_source(runs, source)) for source in known["source"].unique()}
-    for (source, method, width), rows in known.groupby(["source", "method", "dilation_width"], dropna=False,
-                                                       sort=False):
-        tested = pd.isna(width) or width == widths[source]
-        keypoints = rows.groupby("sequence")["mean_keypoints"].mean().mean()
-        arms.append(({"source": source, "method": method, "dilation_width": width, "keypoints": keypoints,
-                      "tested": bool(tested)}, rows))
-    return sorted(arms, key=lambda arm: order[arm[0]["method"]])
+    arms = [({"source": source, "method": method, "dilation_width": width,
+              "keypoints": rows.groupby("sequence")["mean_keypoints"].mean().mean(),
+              "tested": bool(pd.isna(width) or width == widths[source])}, rows)
+            for (source, method, width), rows in known.groupby(["source", "method", "dilation_width"], dropna=False,
+                                                               sort=False)]
+    return sorted(arms, key=lambda arm: order.index(arm[0]["method"]))
 
 
-def _pairs(arms: list) -> Iterable[tuple]:
-    """What is set against what: (arm, reference arm)."""
-    for arm in arms:
-        for other in arms:
-            is_all, masks_over = other[0]["method"] == "baseline", arm[0]["method"] == "masked" and arm[0]["tested"]
-            same = arm[0]["source"] == other[0]["source"]
-            if is_all or masks_over and other[0]["tested"] and other is not arm and (
-                    same or other[0]["method"] == "masked"):
-                yield arm, other
+def _is_compared(own: dict[str, Any], other: dict[str, Any]) -> bool:
+    """All against all keypoints; masks of the tested width also against their controls and other sources' masks."""
+    are_tested = own["method"] == "masked" and own["tested"] and other["tested"] and other is not own
+    return other["method"] == "baseline" or are_tested and (own["source"] == other["source"]
+                                                            or other["method"] == "masked")
 
 
 def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
@@ -156,17 +152,13 @@ def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.Dat
     Masks of the tested width against all keypoints, under the refined estimator where it was run, by JUDGING_METRICS.
     Under the thesis's estimator, shuffling the matched points moves errors by more than the effect in question.
     Masks help where both verdicts are LOWER; the segmentation helps where masks are LOWER than each of
-    SEGMENTATION_FREE_CONTROLS too (`against_controls`).
+    SEGMENTATION_FREE_CONTROLS too (`against`).
     """
-    return _judging(table[table["tested"]], ["baseline"], source)
+    return against(table[table["tested"]], ["baseline"], source)
 
 
-def against_controls(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
-    """The rows of `comparisons` that set masks against the controls without segmentation, as `primary_comparison`."""
-    return _judging(table, SEGMENTATION_FREE_CONTROLS, source)
-
-
-def _judging(table: pd.DataFrame, references: Iterable[str], source: str | None) -> pd.DataFrame:
+def against(table: pd.DataFrame, references: Iterable[str], source: str | None = None) -> pd.DataFrame:
+    """The rows of `comparisons` that set masks against some references, judged as `primary_comparison` is."""
     rows = table[(table["method"] == "masked") & table["reference"].isin(list(references))
                  & table["metric"].isin(JUDGING_METRICS)]
     rows = rows if source is None else rows[rows["source"] == source]
@@ -184,12 +176,12 @@ def judging_estimator(table: pd.DataFrame) -> str:
     return "refined" if (table["estimator"] == "refined").any() else "thesis"
 
 
-def shuffle_spread(runs: pd.DataFrame, metric: str = "rmse") -> pd.DataFrame:
-    """How much shuffling the matched points before RANSAC changes an error, with all keypoints.
+def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
+    """How much shuffling the matched points before RANSAC changes the RMSE, with all keypoints.
 
     One row for each estimator and sequence: repetitions, lowest, highest, factor (highest over lowest).
     """
-    rows = runs[runs["method"] == "baseline"].groupby(["estimator", "sequence"])[metric]
+    rows = runs[runs["method"] == "baseline"].groupby(["estimator", "sequence"])["rmse"]
     table = rows.agg(repetitions="size", lowest="min", highest="max").reset_index()
     return table.assign(factor=table["highest"] / table["lowest"])
 

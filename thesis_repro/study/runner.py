@@ -291,8 +291,3 @@ def paths(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]
 def _poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
     return {(name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
             for name, run in zip(runs["sequence"], runs["run"], strict=True)}
-
-
-def true_paths(kitti: Path, names: Iterable[str], frames: int | None = None) -> dict[str, np.ndarray]:
-    """True positions (n, 3) in metres of each sequence."""
-    return {name: Sequence(kitti, name).subset(frames).poses[:, :3, 3] for name in names}

@@ -24,7 +24,8 @@ from thesis_repro.study.runner import by_name, masks_of
 from thesis_repro.study.sources import Source
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
-WARM_UP = 3  # frames that load compiled code and fill caches, not counted
+FRAMES = 20  # on which a whole frame is timed
+WARM_UP = 3  # frames before them that load compiled code and fill caches
 
 
 @contextmanager
@@ -80,23 +81,22 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
     return pd.read_csv(path, dtype={"sequence": str})
 
 
-def frame_times(folder: Path, sequence: Sequence, model_file: Path, *, frames: int = 20, width: int = CONTROL_WIDTH,
+def frame_times(folder: Path, sequence: Sequence, model_file: Path, width: int = CONTROL_WIDTH,
                 boundaries: str = "canny") -> pd.DataFrame:
     """`measure` with the model in a file. The folder keeps the table until frames, masks, model or code change."""
-    short = sequence.subset(frames + WARM_UP)
+    short = sequence.subset(FRAMES + WARM_UP)
     path = stages.stage(folder, code=stages.code("study/timing"), model=stages.content(model_file),
                         opencv=cv2.__version__, sequence=stages.listing(short.files), width=width,
                         boundaries=boundaries) / "budget.csv"
     if stages.kept_table(path) is None:
         from thesis_repro.segmentation import training  # here and below: TensorFlow takes seconds to load
 
-        table = measure(short, training.load_model(model_file), frames=frames, width=width, boundaries=boundaries)
+        table = measure(short, training.load_model(model_file), width, boundaries)
         write_text(path, table.to_csv(index=False))
     return pd.read_csv(path)
 
 
-def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CONTROL_WIDTH,
-            boundaries: str = "canny") -> pd.DataFrame:
+def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH, boundaries: str = "canny") -> pd.DataFrame:
     """Milliseconds a frame of each stage, with all keypoints and with masks: method, stage, milliseconds (medians).
 
     Stages: read (the frame's file), segmentation (stretch to the model's input, network, class of every pixel), mask
@@ -104,7 +104,7 @@ def measure(sequence: Sequence, model: Any, *, frames: int = 20, width: int = CO
     translation). model: a Keras model of `segmentation`. width (pixels), boundaries: of the masks, see `masks.edges`.
     The methods take turns. Raises InputError for a sequence with too few frames.
     """
-    sequence = sequence.subset(frames + WARM_UP)
+    sequence = sequence.subset(FRAMES + WARM_UP)
     if len(sequence) < WARM_UP + 2:
         raise InputError(f"sequence {sequence.name}: {len(sequence)} frames; timing needs {WARM_UP + 2} or more")
     plain, masked = "all keypoints", f"masked, width {width}"
