@@ -91,6 +91,8 @@ def test_the_commands_estimate_and_apply(small_world, tmp_path, capsys):
     assert set(record["sequences"]) == {"00", "01"}
     for angle in boresight.ANGLES:
         assert (record[f"{angle}_deg"] is None) == (record[f"{angle}_interval_deg"] is None)
+    assert main(["boresight", *kitti, "--sequences", "00", "01"]) == 0
+    assert {"pitch", "yaw", "roll", "rmse_own", "truth_sway"} <= set(capsys.readouterr().out.split())
     raw, turned = tmp_path / "raw.txt", tmp_path / "turned.txt"
     summaries = []
     for options in (["--output", str(raw)], ["--output", str(turned), "--boresight", *map(str, KNOWN)]):

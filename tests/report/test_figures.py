@@ -1,29 +1,19 @@
 """Figures of chapters 2 and 3, and of frames in chapter 4: they show what the data says, and all can be read."""
 
-import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
 from drawn import problems
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
+from matplotlib.text import Text
 
 from thesis_repro.cityscapes import ID, LABELS
 from thesis_repro.report import chapter2, chapter3, chapter4_frames, style, trajectories
 from thesis_repro.study import flicker
 
 
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
 def texts(figure):
     # without the labels of ticks, which only exist once drawn
-    return [item.get_text() for item in figure.findobj(matplotlib.text.Text) if item.get_text()]
+    return [item.get_text() for item in figure.findobj(Text) if item.get_text()]
 
 
 def textured(shift=0, size=(120, 400)):

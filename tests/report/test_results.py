@@ -1,10 +1,5 @@
 """Chapter 4's figures and tables, the comparison and the findings: their numbers are those of the runs."""
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,12 +15,6 @@ CONTROLS = compare.SEGMENTATION_FREE_CONTROLS
 
 def best_of(runs):
     return thesis_tables.of_chosen_width(compare.of_method(runs, "masked"))
-
-
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
 
 
 def runs_of(names, errors, repetitions=3, noise=0.0, widths=(5, 10, 15), sources=("",), seed=0):

@@ -1,12 +1,8 @@
 """Axes, files and tables that every figure shares."""
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 
 from thesis_repro.report import style
 
@@ -22,4 +18,3 @@ def test_a_ratio_axis_has_a_few_round_ticks_within_it(low, high):
     assert all(bottom <= value <= top for value in (low, high) if 0 < value < np.inf)
     assert not len(axis.get_ticklocs(minor=True))
     assert all(float(axis.get_major_formatter()(tick)) == pytest.approx(tick, rel=1e-5) for tick in ticks)
-    plt.close("all")

@@ -61,10 +61,7 @@ def table(measurements, data="this run"):
 
 def rounded(value):
     """A number to four significant digits, or more where it would become 1."""
-    digits = 4
-    while digits < 9 and float(f"{value:.{digits}g}") == 1 != value:
-        digits += 1
-    return float(f"{value:.{digits}g}")
+    return float(f"{value:.{8 if abs(value - 1) < 5e-4 else 4}g}")
 
 
 def missing(audit):

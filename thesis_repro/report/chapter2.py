@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_rgba_array
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgba_array
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
@@ -51,16 +51,14 @@ def figure_2_02(patch, kernel, bias, feature_map, activated, where):
     style.show_image(axes[0, 0], patch[..., 0], f"input x, {patch.shape[0]}x{patch.shape[1]}", vmin=0, vmax=255)
     style.show_image(axes[0, 1], feature_map, "feature map y", cmap="PuOr", vmin=-limit, vmax=limit)
     style.show_image(axes[0, 2], activated, f"normalised, ReLU: {activated[row, column]:.2f}", vmin=0)
-    for panel, radius, text in zip(axes[0], (reach + 0.5, 0.5, 0.5), ("gray value", "response", "activation"),
-                                   strict=True):
-        figure.colorbar(panel.images[0], ax=panel, shrink=0.85, pad=0.03, label=text)
-        panel.add_patch(Rectangle((column - radius, row - radius), 2 * radius, 2 * radius, fill=False, edgecolor=RED,
-                                  linewidth=1.4))
+    for panel, side, unit in zip(axes[0], (2 * reach + 1, 1, 1), ("gray value", "response", "activation")):
+        figure.colorbar(panel.images[0], ax=panel, shrink=0.85, pad=0.03, label=unit)
+        panel.add_patch(Rectangle((column - side / 2, row - side / 2), side, side, fill=False, edgecolor=RED))
     field = patch[row - reach:row + reach + 1, column - reach:column + reach + 1]
+    sums = (field * kernel).sum(axis=(0, 1))
     _numbers(axes[1, 0], field[..., 0], "its receptive field x (marked)", ".0f")
     _numbers(axes[1, 1], kernel[..., 0], "times the kernel's weights w", ".4f")
     _numbers(axes[1, 2], (field * kernel)[..., 0], "is w x", ".2f")
-    sums = (field * kernel).sum(axis=(0, 1))
     first = "" if len(sums) == 1 else " (above: the first channel)"
     figure.supxlabel(f"y = b + Σ w x = {bias:.2f} + {' + '.join(f'{term:.2f}' for term in sums)} = "
                      f"{bias + sums.sum():.2f}{first}", fontsize=9)
@@ -154,15 +152,14 @@ def figure_2_07(model):
     """
     figure, axes = style.new_figure(height=4.0)
     axes.set_axis_off()
-    largest = model.input_shape[2]
     x, boxes, before = 0.0, {}, None  # layer's name: left, right and middle height of its box
     for layer in model.layers:
         kind = "output" if layer is model.layers[-1] else type(layer).__name__
         if kind not in UNET_PARTS:
             continue
         side, channels = layer.output.shape[2:]
-        width, half = 0.09 + 0.045 * np.log2(channels), 0.175 + 0.525 * side / largest
-        y = -1.5 * np.log2(largest / side)
+        share = side / model.input_shape[2]
+        width, half, y = 0.09 + 0.045 * np.log2(channels), 0.175 + 0.525 * share, 1.5 * np.log2(share)
         axes.add_patch(Rectangle((x, y - half), width, 2 * half, color=UNET_PARTS[kind][1], linewidth=0))
         axes.text(x + width / 2, y + half + 0.06, channels, ha="center", va="bottom", fontsize=6)
         if kind in ("InputLayer", "MaxPooling2D", "Concatenate"):
@@ -221,16 +218,15 @@ def figure_2_09(first, second, title):
         matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors, other_descriptors)
     best = sorted(matches, key=lambda match: match.distance)[:60]
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
-    both = np.vstack([first, gap, second])
-    figure, (axes,) = style.frame_panels(both)
-    style.show_image(axes, both, f"{title}: the {len(best)} best of {len(matches)} ORB matches")
-    distances = [match.distance for match in best] or [0, 1]
-    scale = ScalarMappable(Normalize(min(distances), max(distances)), "plasma")
-    for match in reversed(best):  # the best on top
-        (u, v), (x, y) = points[match.queryIdx].pt, others[match.trainIdx].pt
-        axes.plot((u, x), (v, y + first.shape[0] + gap.shape[0]), linewidth=0.8, color=scale.to_rgba(match.distance),
-                  marker="o", markersize=2)
-    figure.colorbar(scale, ax=axes, shrink=0.7, pad=0.01, label="bits of 256 that differ")
+    below = (0, first.shape[0] + gap.shape[0])
+    figure, (axes,) = style.frame_panels(np.vstack([first, gap, second]))
+    style.show_image(axes, np.vstack([first, gap, second]),
+                     f"{title}: the {len(best)} best of {len(matches)} ORB matches")
+    lines = LineCollection([(points[match.queryIdx].pt, np.add(others[match.trainIdx].pt, below)) for match in best],
+                           array=[match.distance for match in best], cmap="plasma", linewidth=0.8)
+    lines.set_clim(0, max((match.distance for match in best), default=1))
+    axes.add_collection(lines)
+    figure.colorbar(lines, ax=axes, shrink=0.7, pad=0.01, label="bits of 256 that differ")
     return figure
 
 

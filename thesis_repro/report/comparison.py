@@ -196,24 +196,17 @@ def table_widths(runs):
 def _widths(runs):
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     chosen, again = thesis_tables.chosen_widths(masked, baseline), thesis_tables.stability(masked, baseline)
-    metrics = [name for name in ("rmse", "rmse_boresight_corrected")
-               if name in masked and masked[name].notna().any()]
-    columns, ratios = {}, {}
-    for choice, words in CHOICES.items():
-        columns[words] = chosen[choice]
-        rows = thesis_tables.of_chosen_width(masked, chosen[choice])
-        for metric in metrics:
-            name = f"{words}: {compare.METRICS[metric]}"
-            columns[name] = ratios[name] = compare.ratios(rows, baseline, metric)
-    name = "best width of one repetition, in the others: RMSE"
-    columns[name] = ratios[name] = again["elsewhere"]
-    columns["same best width in two repetitions (%)"] = again["same_best"].round()
-    table = pd.DataFrame(columns, index=chosen.index).astype(object)
-    table[list(ratios)] = table[list(ratios)].map(texts.number, na_action="ignore")
-    below = {"geometric mean": {name: _short(compare.geometric_mean(values)) for name, values in ratios.items()},
-             "lower in": {name: f"{(values < 1).sum()} of {values.notna().sum()}" for name, values in ratios.items()}}
-    table = pd.concat([table, pd.DataFrame(below).T]).reindex(columns=table.columns)
-    return table.rename_axis("sequence").reset_index()
+    ratios = {f"{words}: {compare.METRICS[metric]}": compare.ratios(
+        thesis_tables.of_chosen_width(masked, chosen[choice]), baseline, metric)
+        for choice, words in CHOICES.items() for metric in ("rmse", "rmse_boresight_corrected") if metric in masked}
+    ratios["best width of one repetition, in the others: RMSE"] = again["elsewhere"]
+    table = pd.DataFrame(ratios, index=chosen.index).dropna(axis=1, how="all")
+    shown = table.map(texts.number, na_action="ignore").astype(object)
+    shown.loc["geometric mean"] = {name: _short(compare.geometric_mean(table[name])) for name in table}
+    shown.loc["lower in"] = {name: f"{(table[name] < 1).sum()} of {table[name].count()}" for name in table}
+    numbers = chosen[list(CHOICES)].rename(columns=CHOICES).assign(
+        **{"same best width in two repetitions (%)": again["same_best"].round()})
+    return numbers.convert_dtypes().join(shown, how="right").rename_axis("sequence").reset_index()
 
 
 def figures(table, runs):

@@ -10,15 +10,9 @@ import os
 import sys
 from pathlib import Path
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-
-import matplotlib
-
-matplotlib.use("Agg")
-
 import pandas as pd
 
-from thesis_repro import InputError, kitti, longrun, masks, stages
+from thesis_repro import kitti, longrun, masks, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
@@ -26,7 +20,7 @@ from thesis_repro.report import audit, comparison, style, texts
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
-LARGEST = 3_000_000  # bytes, of everything together
+BUILD = Path("build/evidence")  # label maps and runs
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
 # Beside the tested width, for the lines of error against number of keypoints: under the refined estimator alone.
 OTHER_WIDTHS, OTHER_REPETITIONS = (5, 15), 3
@@ -38,7 +32,6 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     """Run what is missing and write everything into a folder; returns its files.
 
     root: of KITTI. build: folder for label maps and runs. frames: of each sequence, None for all.
-    Raises InputError where the files are larger than LARGEST together.
     """
     root, build, folder = Path(root).absolute(), Path(build).absolute(), Path(folder)
     stages.stage(build, results="evidence")  # whose parts know what they were made from
@@ -64,11 +57,7 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
         # six digits are more than shuffling the matched points leaves alone
         write_text(folder / f"{name}.csv", content.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
     write_text(folder / "README.md", texts.render("evidence.md.j2", findings=texts.findings(runs, table, note)))
-    files = sorted(path for path in folder.iterdir() if path.is_file())
-    size = sum(path.stat().st_size for path in files)
-    if size > LARGEST:
-        raise InputError(f"{folder}: {size:,} bytes, more than the {LARGEST:,} that may go into the repository")
-    return files
+    return sorted(path for path in folder.iterdir() if path.is_file())
 
 
 def _predict(sequences, labels):
@@ -121,15 +110,14 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description="tables, plots and findings on real frames, without any frame")
     parser.add_argument("kitti", type=Path, help="folder that holds sequences and poses")
     parser.add_argument("folder", type=Path, help="where to write")
-    parser.add_argument("--build", type=Path, default=Path("build/evidence"), help="label maps and runs")
     parser.add_argument("--frames", type=int, help="from the start of each sequence (all)")
     parser.add_argument("--repetitions", type=int, default=5, help="of every run (5)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once")
     options = parser.parse_args(arguments)
     try:
-        with longrun.claimed(options.build), longrun.logged(options.build, "tables, plots and findings") as run:
-            files = write(options.kitti, options.folder, options.build, frames=options.frames,
-                          repetitions=options.repetitions, processes=options.jobs)
+        with longrun.claimed(BUILD), longrun.logged(BUILD, "tables, plots and findings") as run:
+            files = write(options.kitti, options.folder, BUILD, frames=options.frames, repetitions=options.repetitions,
+                          processes=options.jobs)
             run.end(f"{options.folder}: {len(files)} files, {sum(path.stat().st_size for path in files):,} bytes")
     except Exception as error:
         return longrun.report_error(error)

@@ -2,6 +2,8 @@
 
 from datetime import timedelta
 
+import pandas as pd
+
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import texts
@@ -45,9 +47,13 @@ def angles(rotation, table):
 
 def angles_text(rotation, table):
     """The same as lines."""
-    of_day = dict(zip(boresight.ANGLES, zip(rotation.angles, rotation.low, rotation.high, strict=True), strict=True))
-    return texts.render("angles.txt.j2", of_day=of_day, steps=rotation.steps,
-                        rows=table.to_dict("records")).rstrip()
+    angles = pd.DataFrame({"degrees": rotation.angles, "from": rotation.low, "to": rotation.high}, boresight.ANGLES)
+    return f"""{angles.to_string(float_format="{:+.3f}".format, na_rep="-")}
+from {rotation.steps} steps
+
+Each sequence: angles in degrees with their intervals; RMSE in metres as it is, with its own angles, and with those of
+the others of its recording day; sway, how much the sideways direction of motion varies on straight steps, in degrees
+{table.set_index("sequence").T.to_string(float_format="{:.3f}".format, na_rep="-")}"""
 
 
 def plan_text(plan):
