@@ -115,10 +115,10 @@ $(RUN)/checked: .venv/ready $(DATA)
 
 # What a notebook needs of others, by their numbers: they hand results on through files. One that is not listed needs
 # the one before it. Two that do not need each other are executed beside each other, for most are at times at work with
-# one core alone, and the training all the time. (03 needs nothing, but at first both would compile TensorFlow's modules.)
+# one core alone, and the training all the time.
 NEEDS_01 :=
 NEEDS_02 := 01
-NEEDS_03 := 01
+NEEDS_03 :=
 NEEDS_04 := 01 02 03
 NEEDS_05 := 01 04
 NEEDS_06 := 05

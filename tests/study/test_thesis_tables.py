@@ -82,6 +82,9 @@ def test_a_real_optimum_is_found_again_in_other_repetitions_and_luck_is_not():
     luck = thesis_tables.stability(*parts_of(lambda *_: 1.0, noise=0.2))
     assert luck["same_best"].mean() < 20 and luck["elsewhere"].mean() == pytest.approx(1, abs=0.1)
     assert thesis_tables.stability(*parts_of(own_optimum, repetitions=1)).isna().all(axis=None)
+    masked, baseline = parts_of(own_optimum)  # one width that is repeated cannot say which width is best
+    repeated = masked[(masked["repetition"] == 0) | (masked["dilation_width"] == 10)]
+    assert thesis_tables.stability(repeated, baseline).isna().all(axis=None)
 
 
 def test_time_saved_is_negative_over_all_sequences_together():

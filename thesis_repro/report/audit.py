@@ -74,11 +74,11 @@ def measured(table, kind):
     """The measurements that audit.json lists for one kind of table, each with the number of frames of a sequence.
 
     kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (those of `ablations`),
-    "shares" (of pixels, a row a frame), "boresight" (`boresight.explained`), "trials" (`ablations_training.trials`).
+    "shares" (of pixels, a row a frame), "boresight" (`boresight.explained`).
     With a unit it is the mean over sequences, less that of the reference if there is one. Without, it is a ratio: to
     the reference, or to another column ("over") of the same rows.
     """
-    measurements, table = [], table.rename(columns={"seed": "sequence"})  # of trials
+    measurements = []
     for spec in (spec for spec in WORDS["measured"] if spec["runs"] == kind):
         for metric in (metric for metric in spec["metrics"] if metric in table):
             of_each = "estimator" in table and metric != "mean_keypoints"
@@ -159,12 +159,12 @@ def of_study(runs):
     widths = chosen["rmse"].map(lambda key: key[1])
     of_best = compare.ratios(best, baseline, "rmse")
     measurements = [
+        ratio("2", "best same", of_best, metric="RMSE"),
         ratio("31", "mae chooses", errors["mae"] / errors["rmse"], metric="RMSE"),
         measurement("31", "other width", (chosen["rmse"] != chosen["mae"]).sum(), "sequences"),
         measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences")]
     if len(stability):
-        measurements += [ratio("2", "best same", of_best, metric="RMSE"),
-                         ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
+        measurements += [ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
                          measurement("2", "same best", stability["same_best"], "%")]
     return [*({**each, "frames": frames_of(runs)} for each in measurements), *measured(runs, "study")]
 

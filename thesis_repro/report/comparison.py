@@ -205,7 +205,7 @@ def _widths(runs):
     shown.loc["geometric mean"] = {name: _short(compare.geometric_mean(table[name])) for name in table}
     shown.loc["lower in"] = {name: f"{(table[name] < 1).sum()} of {table[name].count()}" for name in table}
     numbers = chosen[list(CHOICES)].rename(columns=CHOICES).assign(
-        **{"same best width in two repetitions (%)": again["same_best"].round()})
+        **{"same best width in two repetitions (%)": again["same_best"].round()}).dropna(axis=1, how="all")
     return numbers.convert_dtypes().join(shown, how="right").rename_axis("sequence").reset_index()
 
 

@@ -147,7 +147,7 @@ def save_figure(figure, folder, name, note):
     if any(axes.images for axes in figure.axes):
         ending, other, note_in_file = ".webp", ".svg", Image.Exif()
         note_in_file[ExifTags.Base.ImageDescription] = note
-        options = {"pil_kwargs": {"quality": 90, "method": 6, "exif": note_in_file}}
+        options = {"pil_kwargs": {"quality": 90, "exif": note_in_file}}
     else:
         ending, other = ".svg", ".webp"
         options = {"metadata": {"Date": None, "Creator": None, "Description": note}}

@@ -66,13 +66,14 @@ def stability(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     """Whether the width that is best in one repetition is best in another: one row a sequence.
 
     same_best: percent of the pairs of repetitions that agree on the best width. elsewhere: the ratio of the RMSE in
-    the other repetitions, with the width that is best in one, to that of all keypoints. NaN with one repetition.
+    the other repetitions, with the width that is best in one, to that of all keypoints. Both are NaN where
+    fewer than two widths were repeated.
     """
     of_all, rows = baseline.groupby("sequence")["rmse"].mean(), {}
     for name, runs in masked.groupby("sequence"):
         errors = runs.pivot(index="repetition", columns="dilation_width", values="rmse").dropna(axis=1)
-        count = len(errors)
-        if count < 2 or errors.empty:
+        count, widths = errors.shape
+        if count < 2 or widths < 2:
             rows[name] = (np.nan, np.nan)
             continue
         best = errors.to_numpy().argmin(axis=1)
