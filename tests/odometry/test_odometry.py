@@ -133,6 +133,37 @@ def test_gives_the_stored_numbers(drive):
     np.testing.assert_allclose(frames[["x", "y", "z"]], expected[["x", "y", "z"]], rtol=0, atol=1e-7)
 
 
+# Keypoints
+
+
+@pytest.mark.parametrize("mask", [None, "stripes", "nothing", "specks"])
+def test_keypoints_are_opencvs_to_the_last_bit(drive, mask):
+    frame = drive.frame(3)
+    masks = {"stripes": Stripes(20)[0], "nothing": np.zeros_like(frame),
+             "specks": (np.random.RandomState(0).rand(*frame.shape) < 0.02).astype(np.uint8)}
+    for image in (frame, frame // 64 * 64, np.full_like(frame, 7)):  # the second has many corners of equal strength
+        corners = keypoints.find_corners(image)
+        np.testing.assert_array_equal(corners[0], cv2.cornerMinEigenVal(image, keypoints.BLOCK_SIZE))
+        for distance in (0, 1, 2.4, 3, 7):
+            for limit in (10, 2000, 0):
+                settings = replace(THESIS, min_distance=distance, max_keypoints=limit)
+                expected = cv2.goodFeaturesToTrack(image, limit, keypoints.QUALITY, distance, mask=masks.get(mask),
+                                                   blockSize=keypoints.BLOCK_SIZE)
+                np.testing.assert_array_equal(keypoints.detect(image, settings, masks.get(mask), corners),
+                                              np.empty((0, 2)) if expected is None else expected[:, 0])
+
+
+def test_tracks_are_opencvs_to_the_last_bit(drive):
+    frame = drive.frame(3)
+    points = keypoints.detect(frame, THESIS)
+    for shift in (3, 12, -40):  # at the last one a window leaves the frame
+        moved = np.roll(frame, shift, axis=1)
+        expected, status, _ = cv2.calcOpticalFlowPyrLK(frame, moved, points, None, **keypoints.TRACKER)
+        tracked, success = keypoints.track(frame, moved, points)
+        np.testing.assert_array_equal(tracked, expected)
+        np.testing.assert_array_equal(success, status.ravel() == 1)
+
+
 # The pose vote
 
 
@@ -375,20 +406,6 @@ def test_runs_that_differ_after_the_tracking_share_masks_keypoints_and_essential
         assert_same(together[name], odometry.run(few, settings, masks))
     # they do differ, but for the refined ones, which make the same of every order here
     assert len({together[name].poses.tobytes() for name in runs}) == 3
-
-
-@pytest.mark.parametrize("mask", [None, "stripes", "nothing", "specks"])
-def test_shared_detection_is_opencvs_to_the_last_bit(drive, mask):
-    frame = drive.frame(3)
-    masks = {"stripes": Stripes(20)[0], "nothing": np.zeros_like(frame),
-             "specks": (np.random.RandomState(0).rand(*frame.shape) < 0.02).astype(np.uint8)}
-    shared = keypoints.SharedKeypoints()
-    for image in (frame, frame // 64 * 64, np.full_like(frame, 7)):  # the second has many corners of equal strength
-        for distance in (1, 2.4, 3, 7):
-            for limit in (10, 2000, 0):
-                settings = replace(THESIS, min_distance=distance, max_keypoints=limit)
-                np.testing.assert_array_equal(shared.detect(image, settings, masks.get(mask)),
-                                              keypoints.detect(image, settings, masks.get(mask)))
 
 
 class Recorded(Changed):

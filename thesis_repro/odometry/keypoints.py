@@ -11,33 +11,37 @@ from thesis_repro.odometry.settings import OdometrySettings
 
 QUALITY = 0.01  # of the strongest corner (inside the mask)
 BLOCK_SIZE = 5
-TRACKER = {"winSize": (21, 21), "maxLevel": 3,
+WINDOW = 21
+TRACKER = {"winSize": (WINDOW, WINDOW), "maxLevel": 3,
            "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)}
 
 NO_POINTS = np.empty((0, 2), np.float32)
 
+Corners = tuple[np.ndarray, np.ndarray]  # see find_corners
 Start = tuple[np.ndarray | None, np.ndarray]  # what a run tracks from: the previous frame, and its points there (N, 2)
 
 
-def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
+def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None,
+           corners: Corners | None = None) -> np.ndarray:
     """Keypoints of a frame (height, width), strongest first: (N, 2) float32, N = 0 where there are none.
 
     `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the detector looks
     inside the mask only and finds up to max_keypoints there; with "filter" it looks everywhere and what lies
-    outside is dropped.
+    outside is dropped. corners: what `find_corners` gives for the frame, where it was asked before.
+
+    Shi-Tomasi has the bits of cv2.goodFeaturesToTrack.
     """
     inside = mask if settings.mask_mode == "detect" else None
     if settings.detector == "orb":
         points = cv2.KeyPoint_convert(_orb(settings.max_keypoints).detect(frame, inside))
+        points = np.reshape(points, (-1, 2)).astype(np.float32, copy=False)
     else:
-        points = cv2.goodFeaturesToTrack(frame, settings.max_keypoints, QUALITY, settings.min_distance, mask=inside,
-                                         blockSize=BLOCK_SIZE)
-    return _inside(NO_POINTS if points is None else np.reshape(points, (-1, 2)).astype(np.float32, copy=False),
-                   settings, mask)
-
-
-def _inside(points, settings, mask):
-    if mask is None or settings.mask_mode == "detect" or not len(points):
+        strength, ranked = corners or find_corners(frame)
+        # As OpenCV compares: the limit in double precision, rounded to single.
+        limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * QUALITY)
+        points = _spread(strength, ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
+                         settings.max_keypoints, float(settings.min_distance))
+    if mask is None or settings.mask_mode == "detect":
         return points
     columns, rows = np.rint(points).astype(int).T
     return points[mask[rows, columns] > 0]
@@ -49,9 +53,19 @@ def _orb(max_keypoints):
 
 
 def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: success."""
-    tracked, status, _ = cv2.calcOpticalFlowPyrLK(previous, current, points, None, **TRACKER)
-    return tracked, status.ravel() == 1
+    """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: success.
+
+    The bits of a plain call of OpenCV, for less: points close to each other follow one another, so that their pixels
+    are still in the processor's cache, and the matching error that nobody reads is not computed. Computing it, OpenCV
+    also gives up points whose window has left the frame, which therefore is done here.
+    """
+    order = np.argsort(points[:, 1])
+    tracked, success = np.empty_like(points), np.empty(len(points), bool)
+    tracked[order], status, _ = cv2.calcOpticalFlowPyrLK(previous, current, points[order], None,
+                                                         flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, **TRACKER)
+    corner = tracked - WINDOW // 2
+    success[order] = status.ravel() == 1
+    return tracked, success & ((corner >= -WINDOW) & (corner < current.shape[::-1])).all(axis=1)
 
 
 class SharedKeypoints:
@@ -63,7 +77,7 @@ class SharedKeypoints:
 
     def __init__(self) -> None:
         self._tracks: tuple[np.ndarray, ...] = ()  # both frames, the sorted keys of all points, what `track` returns
-        self._corners: tuple | None = None  # the frame, its corner strength, and its _ranked_maxima
+        self._corners: tuple[np.ndarray, Corners] | None = None  # the frame and what `find_corners` gives for it
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
         """Track to `frame` the points of all runs that come from the same previous frame (nearly always all)."""
@@ -82,51 +96,78 @@ class SharedKeypoints:
         return tracked[where], success[where]
 
     def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
-        if settings.detector != "shi-tomasi" or settings.min_distance < 1:
-            return detect(frame, settings, mask)
         if self._corners is None or frame is not self._corners[0]:
-            strength = cv2.cornerMinEigenVal(frame, BLOCK_SIZE)
-            self._corners = frame, strength, _ranked_maxima(strength, cv2.dilate(strength, None))
-        _, strength, ranked = self._corners
-        inside = mask if settings.mask_mode == "detect" else None
-        # As OpenCV compares: the limit in double precision, rounded to single.
-        limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * QUALITY)
-        chosen = _spread(*ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
-                         settings.max_keypoints, settings.min_distance, *frame.shape)
-        return _inside(chosen, settings, mask)
+            self._corners = frame, find_corners(frame)
+        return detect(frame, settings, mask, self._corners[1])
 
 
 def _key(points):
     return np.ascontiguousarray(points).view(np.int64).ravel()
 
 
-def _ranked_maxima(strength, largest_near):
-    """Rows, columns and strength of the local maxima inside the border, strongest first, of equals the last first."""
-    inner = np.flatnonzero((strength[1:-1, 1:-1] == largest_near[1:-1, 1:-1]) & (strength[1:-1, 1:-1] > 0))
-    rows, columns = np.divmod(inner, strength.shape[1] - 2)
-    values = strength[rows + 1, columns + 1]
-    order = np.argsort(values, kind="stable")[::-1]
-    return rows[order] + 1, columns[order] + 1, values[order]
+def find_corners(frame: np.ndarray) -> Corners:
+    """The strength of each pixel of a frame, cv2.cornerMinEigenVal to the bit, and where its local maxima are.
+
+    These are indices of the flattened image, strongest first, of equals the last first; none lies on the border.
+    """
+    scale = 1 / (4 * BLOCK_SIZE * 255)  # 4: the sum of a smoothing of (1, 2, 1)
+    dx, dy = (cv2.copyMakeBorder(cv2.Sobel(frame, cv2.CV_32F, *order, scale=scale), *[BLOCK_SIZE // 2] * 4,
+                                 cv2.BORDER_REFLECT_101) for order in ((1, 0), (0, 1)))
+    strength = _min_eigenvalues(dx, dy)
+    is_peak = (strength == cv2.dilate(strength, None)) & (strength > 0)
+    is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
+    peaks = np.flatnonzero(is_peak)
+    # The bits of positive numbers are ordered as the numbers are, so one sort of integers ranks by both.
+    return strength, np.sort(strength.ravel()[peaks].view(np.int32).astype(np.int64) << 32 | peaks)[::-1] & 0xFFFFFFFF
 
 
 @fast
-def _spread(rows, columns, values, limit, mask, max_keypoints, min_distance, height, width):
+def _min_eigenvalues(dx, dy):
+    """The smaller eigenvalue of the sums of dx dx, dx dy, dy dy over a square of BLOCK_SIZE; the border is cut off.
+
+    Sums are in double precision and in OpenCV's order: along the row first, then down, adding a row and taking one off.
+    """
+    height, width = dx.shape[0] - BLOCK_SIZE + 1, dx.shape[1] - BLOCK_SIZE + 1
+    smaller = np.empty((height, width), np.float32)
+    products, half = np.empty((3, dx.shape[1]), np.float32), np.float32(0.5)
+    rows, sums = np.zeros((BLOCK_SIZE, 3, width)), np.zeros((3, width))
+    for y in range(dx.shape[0]):
+        for x in range(dx.shape[1]):
+            products[0, x] = dx[y, x] * dx[y, x]
+            products[1, x] = dx[y, x] * dy[y, x]
+            products[2, x] = dy[y, x] * dy[y, x]
+        for k in range(3):
+            product, row, total = products[k], rows[y % BLOCK_SIZE, k], sums[k]
+            for x in range(width):
+                along = np.float64(product[x]) + product[x + 1] + product[x + 2] + product[x + 3] + product[x + 4]
+                total[x] = total[x] - row[x] + along
+                row[x] = along
+        if y >= BLOCK_SIZE - 1:
+            for x in range(width):
+                xx, xy, yy = np.float32(sums[0, x]) * half, np.float32(sums[1, x]), np.float32(sums[2, x]) * half
+                smaller[y - BLOCK_SIZE + 1, x] = xx + yy - np.sqrt((xx - yy) * (xx - yy) + xy * xy)
+    return smaller
+
+
+@fast
+def _spread(strength, ranked, limit, mask, max_keypoints, min_distance):
     """The strongest corners above `limit` inside the mask (if any) that keep `min_distance` from stronger ones.
 
     Distances are looked at within the neighbouring cells of a grid of about min_distance, as in OpenCV; for a
     fractional min_distance that is not quite the same as looking at all of them.
     """
-    cell = int(np.rint(min_distance))
+    height, width = strength.shape
+    cell = max(int(np.rint(min_distance)), 1)
     grid_rows, grid_columns = height // cell + 1, width // cell + 1
     head = np.empty((grid_rows, grid_columns), np.int32)  # last corner taken in a cell
     head[:] = -1
-    below = np.empty(len(rows), np.int32)  # the one taken before it in the same cell
-    taken = np.empty((len(rows) if max_keypoints <= 0 else min(len(rows), max_keypoints), 2), np.float32)
+    below = np.empty(len(ranked), np.int32)  # the one taken before it in the same cell
+    taken = np.empty((len(ranked) if max_keypoints <= 0 else min(len(ranked), max_keypoints), 2), np.float32)
     count = 0
-    for index in range(len(rows)):
-        if values[index] <= limit or count == len(taken):
+    for index in ranked:
+        y, x = index // width, index % width
+        if strength[y, x] <= limit or count == len(taken):
             break
-        y, x = rows[index], columns[index]
         if mask.size and mask[y, x] == 0:
             continue
         cell_y, cell_x = y // cell, x // cell
@@ -134,11 +175,9 @@ def _spread(rows, columns, values, limit, mask, max_keypoints, min_distance, hei
         for near_y in range(max(cell_y - 1, 0), min(cell_y + 2, grid_rows)):
             for near_x in range(max(cell_x - 1, 0), min(cell_x + 2, grid_columns)):
                 other = head[near_y, near_x]
-                while other >= 0:
+                while free and other >= 0:
                     dx, dy = x - taken[other, 0], y - taken[other, 1]
-                    if dx * dx + dy * dy < min_distance * min_distance:
-                        free = False
-                        break
+                    free = dx * dx + dy * dy >= min_distance * min_distance
                     other = below[other]
         if free:
             taken[count, 0], taken[count, 1] = x, y

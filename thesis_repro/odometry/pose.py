@@ -77,17 +77,19 @@ def recover_pose(matrix: np.ndarray, current: np.ndarray,
     points, and for both signs of the translation at once. OpenCV itself triangulates the few points close to a limit.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
-    direction = translation.ravel()
-    votes = np.zeros(4, np.int64)
+    motions = [(rotation, sign * translation) for sign in (1.0, -1.0) for rotation in (first, second)]
+    votes, doubtful = np.zeros(4, np.int64), []
     for index, rotation in enumerate((first, second)):
-        forward, backward, doubtful = _count_in_front(current, previous, rotation, direction)
-        for sign, count, slot in ((1.0, forward, index), (-1.0, backward, index + 2)):
-            if len(doubtful):
-                count += _triangulate_and_count(current[doubtful], previous[doubtful], rotation, sign * translation)
-            votes[slot] = count
-    candidates = ((first, direction), (second, direction), (first, -direction), (second, -direction))
+        votes[index], votes[index + 2], points = _count_in_front(current, previous, rotation, translation.ravel())
+        doubtful.append(points)
+    most_sure = votes.max()
+    for index, motion in enumerate(motions):
+        points = doubtful[index % 2]
+        if len(points) and votes[index] + len(points) >= most_sure:  # it may be the winner
+            votes[index] += _triangulate_and_count(current[points], previous[points], *motion)
     best = int(np.argmax(votes))  # the first of equals, as in OpenCV
-    return int(votes[best]), *candidates[best]
+    rotation, translation = motions[best]
+    return int(votes[best]), rotation, translation.ravel()
 
 
 def _triangulate_and_count(current, previous, rotation, translation):
