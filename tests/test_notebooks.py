@@ -98,7 +98,7 @@ def test_only_what_changed_is_made_again(executed, changed, again):
     """What make would do, asked of it without doing it."""
     planned = make_figures(executed, "-n", "-W", changed)
     assert planned.returncode == 0
-    assert re.findall(r"nbconvert .* --output \.(\d\d)_", planned.stdout) == again, planned.stdout
+    assert re.findall(r"report\.execute notebooks/(\d\d)_", planned.stdout) == again, planned.stdout
 
 
 @pytest.mark.notebooks
