@@ -163,7 +163,7 @@ check-data: setup
 
 # (a file's tests stay with one process, for they share what takes seconds to make)
 test: setup
-	@$(BIN)/python -m pytest -q -n $(shell nproc) --dist loadfile
+	@$(BIN)/python -m pytest -q -n $(shell nproc) --dist loadfile --no-loadscope-reorder
 
 torture: setup
 	@$(BIN)/python -m pytest -q -m torture

@@ -23,6 +23,8 @@ def pytest_collection_modifyitems(items):
         marked = item.get_closest_marker("notebooks") or item.get_closest_marker("torture")
         if marked or SLOW_FIXTURES & set(item.fixturenames):
             item.add_marker(pytest.mark.slow)
+    # what takes minutes begins first, so that no process is left alone with it at the end
+    items.sort(key=lambda item: item.path.name != "test_notebooks.py")
 
 
 def _shared(*parts):
