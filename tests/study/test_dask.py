@@ -14,7 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from thesis_repro import InputError
+from thesis_repro import InputError, longrun
 from thesis_repro.study import cluster, runner
 from thesis_repro.study.jobs import first_jobs
 
@@ -170,7 +170,7 @@ def test_label_maps_of_workers_have_the_bits_of_one_process(workers, scheduler, 
 
     def contents(folder):
         return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*.*"))
-                if path.name != "log.txt"}
+                if path.name not in (longrun.LOG, longrun.LIST)}
 
     assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)
     assert contents(tmp_path / "spread") == contents(tmp_path / "alone")

@@ -114,7 +114,7 @@ def refused(result, named, code=1, left=()):
 def contents(folder):
     """Every file below a folder by path, without what no two runs share: times, dates and the log."""
     return {str(path.relative_to(folder)): _content(path) for path in sorted(Path(folder).rglob("*"))
-            if path.is_file() and path.name != longrun.LOG}
+            if path.is_file() and path.name not in (longrun.LOG, longrun.LIST)}
 
 
 def _content(path):
