@@ -2,6 +2,9 @@
 
 import fcntl
 import os
+import signal
+import subprocess
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,7 +16,8 @@ import cv2
 import numpy as np
 import pytest
 
-SHARED = Path(__file__).resolve().parent.parent.parent / "shared"
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared"
 # what these make or read takes seconds
 SLOW_FIXTURES = {"small_world", "small_labels", "kitti_real", "camvid_real", "reference"}
 
@@ -50,6 +54,21 @@ def camvid_real():
 def reference():
     """What PySLAM itself did on the real frames."""
     return _shared("reference")
+
+
+@pytest.fixture
+def kill_when():
+    """kill_when(command, condition): start a command, and kill it with all that it started once the condition holds."""
+    def start(command, condition):
+        process = subprocess.Popen(list(map(str, command)), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True)
+        end = time.monotonic() + 600
+        while not condition():
+            assert process.poll() is None and time.monotonic() < end, "it ended before it could be killed"
+            time.sleep(0.002)
+        os.killpg(process.pid, signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+
+    return start
 
 
 @contextmanager

@@ -159,7 +159,7 @@ def study(options):
     widths = options.widths or (ALL_WIDTHS if has_labels else ())
     scheduler_address(options.dask)
     planned = series.Study(
-        options.kitti.absolute(), tuple(options.sequences or kitti.sequences(options.kitti)),
+        options.kitti.absolute(), tuple(dict.fromkeys(options.sequences or kitti.sequences(options.kitti))),
         sources.named(options.sources, options.name, _mask_settings(options, has_labels)), tuple(sorted(set(widths))),
         options.controls, tuple(dict.fromkeys(options.estimator)), options.repetitions, options.frames)
     planned.check()

@@ -1,9 +1,5 @@
 import os
-import signal
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import cv2
 import keras
@@ -71,20 +67,15 @@ def test_written_label_maps_are_the_predictions_at_320_and_replace_another_model
         assert written.shape == (320, 320) and np.array_equal(written, np.kron(label_map, np.ones((5, 5), np.uint8)))
 
 
-def test_a_killed_prediction_goes_on_and_ends_with_the_same_bytes(model, frames, tmp_path):
+def test_a_killed_prediction_goes_on_and_ends_with_the_same_bytes(model, frames, tmp_path, kill_when):
     model.save(tmp_path / "model.keras")
     code = ("import time, sys; from thesis_repro import files; from thesis_repro.segmentation import prediction, "
             "training; "
             "write = files.write_png; files.write_png = lambda *a: (time.sleep(0.05), write(*a)); "
             "prediction.write_label_maps(training.load_model(sys.argv[1]), sys.argv[3:], sys.argv[2], batch_size=2)")
     output = tmp_path / "killed"
-    process = subprocess.Popen([sys.executable, "-c", code, tmp_path / "model.keras", output, *frames],
-                               stderr=subprocess.DEVNULL, cwd=Path(__file__).parents[2])
-    deadline = time.monotonic() + 120
-    while len(contents(output)) < 3 and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"
+    kill_when([sys.executable, "-c", code, tmp_path / "model.keras", output, *frames],
+              lambda: len(contents(output)) >= 3)
     left = {name: (output / name).stat().st_mtime_ns for name in contents(output)}
     assert 0 < len(left) < len(frames)
 

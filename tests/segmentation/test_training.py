@@ -1,8 +1,6 @@
 import json
-import signal
 import subprocess
 import sys
-import time
 from copy import copy
 from pathlib import Path
 
@@ -137,15 +135,10 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
     assert fresh.tobytes() in changed[1]
 
 
-def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path):
+def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path, kill_when):
     code = (f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
             f"t.train(t.Path({str(tmp_path)!r}))")
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, cwd=ROOT)
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "state.npz").exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.002)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"
+    kill_when([sys.executable, "-c", code], (tmp_path / "state.npz").exists)
     assert len(pd.read_csv(tmp_path / "history.csv")) < 3
 
     assert train(tmp_path).history["epoch"].tolist() == [1, 2, 3]

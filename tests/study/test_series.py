@@ -1,12 +1,7 @@
 """Studies with masks of one's own: what is run, what is kept, and what is refused."""
 
-import os
 import shutil
-import signal
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import cv2
 import pytest
@@ -17,7 +12,6 @@ from thesis_repro.masks import LabelMasks
 from thesis_repro.study import compare, runner, series
 from thesis_repro.study.sources import Source
 
-ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 6
 
 
@@ -87,20 +81,14 @@ def test_the_same_again_runs_nothing_and_another_source_runs_only_its_own(done, 
     assert changed and {path.parent.name for path in changed} == {"net"}
 
 
-def test_a_killed_study_goes_on_and_ends_as_an_undisturbed_one(done, study, small_world, small_labels, masks, tmp_path):
+def test_a_killed_study_goes_on_and_ends_as_an_undisturbed_one(done, study, small_world, small_labels, masks, tmp_path,
+                                                               kill_when):
     folder = tmp_path / "out"
     command = [sys.executable, "-m", "thesis_repro", "study", "--kitti", small_world / "kitti",
                "--labels", small_labels, "--masks", masks, "--name", "net", "--name", "by-hand", "--widths", 5, 7,
-               "--controls", 7,
-               "--repetitions", 2, "--frames", FRAMES, "--estimator", "thesis", "--jobs", 2, "--output", folder]
-    process = subprocess.Popen([str(word) for word in command], env=os.environ | {"PYTHONPATH": str(ROOT)},
-                               stderr=subprocess.DEVNULL, start_new_session=True)
-    end = time.monotonic() + 600
-    while not files(folder):
-        assert time.monotonic() < end and process.poll() is None
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+               "--controls", 7, "--repetitions", 2, "--frames", FRAMES, "--estimator", "thesis", "--jobs", 2,
+               "--output", folder]
+    kill_when(command, lambda: files(folder))
     finished = files(folder)
     assert study.run(folder).equals(done[1])  # and so do one process and two
     assert finished == {path: path.stat().st_mtime_ns for path in finished}

@@ -35,8 +35,6 @@ class Study:
             raise InputError(f"--frames {self.frames}: must be 3 or more")
         if not 1 <= self.repetitions <= MOST_REPETITIONS:
             raise InputError(f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}")
-        if len(set(self.sequences)) < len(self.sequences):
-            raise InputError(f"--sequences {' '.join(self.sequences)}: one is named twice")
         sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
         for sequence in sequences:
             if len(sequence) < 3:
