@@ -89,8 +89,8 @@ def test_the_commands_estimate_and_apply(small_world, tmp_path, capsys):
     assert main(["boresight", *kitti, "--sequences", "00", "01", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     assert set(record["sequences"]) == {"00", "01"}
-    for angle in boresight.ANGLES:
-        assert (record[f"{angle}_deg"] is None) == (record[f"{angle}_interval_deg"] is None)
+    assert set(record["angles"]) == set(boresight.ANGLES) and record["steps"] > 0
+    assert all((angle["degrees"] is None) == (angle["low"] is None) for angle in record["angles"].values())
     assert main(["boresight", *kitti, "--sequences", "00", "01"]) == 0
     assert {"pitch", "yaw", "roll", "rmse_own", "truth_sway"} <= set(capsys.readouterr().out.split())
     raw, turned = tmp_path / "raw.txt", tmp_path / "turned.txt"

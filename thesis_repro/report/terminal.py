@@ -1,5 +1,6 @@
 """What commands print: a run's errors and a camera's angles, as JSON's records and as text, and plans."""
 
+import json
 from datetime import timedelta
 
 import pandas as pd
@@ -10,7 +11,6 @@ from thesis_repro.report import texts
 from thesis_repro.settings import cores
 
 ERRORS = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_m")
-METRES = ("rmse", "rmse_own", "rmse_others")
 
 
 def run(result, sequence, alignment):
@@ -19,7 +19,7 @@ def run(result, sequence, alignment):
     errors = dict.fromkeys(ERRORS)
     if sequence.has_truth:
         values = metrics.errors(result.poses, sequence.poses, alignment).values()
-        errors = {name: _number(value) for name, value in zip(ERRORS, values, strict=True)}
+        errors = {name: None if value != value else value for name, value in zip(ERRORS, values, strict=True)}
     detected = result.frames["detected"].dropna()  # none where every frame is without structure
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
     return {"sequence": sequence.name, "frames": len(sequence), **errors,
@@ -35,20 +35,14 @@ def run_text(record, sequence, speed=None):
 
 
 def angles(rotation, table):
-    """The record of `boresight.estimate` and of the table of `boresight.explained`."""
-    record = {f"{name}_deg": _number(float(angle)) for name, angle in zip(boresight.ANGLES, rotation.angles)}
-    record |= {f"{name}_interval_deg": None if low != low else [float(low), float(high)]
-               for name, low, high in zip(boresight.ANGLES, rotation.low, rotation.high)}
-    units = dict.fromkeys(("steps", "others"), "") | dict.fromkeys(METRES, "_m")
-    sequences = {row.pop("sequence"): {f"{key}{units.get(key, '_deg')}": _number(value) for key, value in row.items()}
-                 for row in table.to_dict("records")}
-    return record | {"steps": rotation.steps, "sequences": sequences}
+    """The record of `boresight.estimate` (degrees) and of the table of `boresight.explained` (metres and degrees)."""
+    return {"angles": _records(_intervals(rotation)), "steps": rotation.steps,
+            "sequences": _records(table.set_index("sequence"))}
 
 
 def angles_text(rotation, table):
     """The same as lines."""
-    angles = pd.DataFrame({"degrees": rotation.angles, "from": rotation.low, "to": rotation.high}, boresight.ANGLES)
-    return f"""{angles.to_string(float_format="{:+.3f}".format, na_rep="-")}
+    return f"""{_intervals(rotation).to_string(float_format="{:+.3f}".format, na_rep="-")}
 from {rotation.steps} steps
 
 Each sequence: angles in degrees with their intervals; RMSE in metres as it is, with its own angles, and with those of
@@ -56,11 +50,15 @@ the others of its recording day; sway, how much the sideways direction of motion
 {table.set_index("sequence").T.to_string(float_format="{:.3f}".format, na_rep="-")}"""
 
 
+def _intervals(rotation):
+    return pd.DataFrame({"degrees": rotation.angles, "low": rotation.low, "high": rotation.high}, boresight.ANGLES)
+
+
+def _records(table):
+    return json.loads(table.to_json(orient="index", double_precision=15))  # which has null where a number is missing
+
+
 def plan_text(plan):
     """A plan of `study.plan` as lines."""
     return texts.render("plan.txt.j2", plan=plan, cores=cores(),
                         duration=lambda seconds: timedelta(seconds=round(seconds))).rstrip()
-
-
-def _number(value):
-    return None if value != value else value  # JSON knows no NaN
