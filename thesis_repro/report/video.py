@@ -4,17 +4,19 @@ from fractions import Fraction
 
 import cv2
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from thesis_repro.files import atomic, progress
 from thesis_repro.kitti import FRAME_TIME
 from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pose
+from thesis_repro.report.style import BASELINE, TRUTH
 
 # blue, green, red, as OpenCV draws; blue and orange can be told apart by most people
 KEPT, DISCARDED, OUTLINE = (255, 140, 30), (60, 60, 230), (0, 220, 255)
 INLIER, OUTLIER = (120, 220, 0), (0, 140, 255)
-TRUE, ESTIMATED, TEXT, PAPER = (90, 90, 90), (200, 80, 0), (40, 40, 40), (255, 255, 255)
 MAP_SHARE = 0.75  # height of the map below the frame, in heights of the frame
-MARGIN = 14  # pixels around the map
+DPI = 128  # a power of two, so that inches and pixels are the same to the bit
 
 
 def draw_frame(frame, step, settings=THESIS, mask=None):
@@ -43,67 +45,50 @@ def _dots(image, points, color):
         cv2.circle(image, point, 2, color, -1, cv2.LINE_AA)
 
 
-def draw_map(size, true, estimated):
-    """The path from above, x to the right and z upwards: an image of size (height, width).
-
-    true, estimated: (n, 4, 4) poses, metres; the true path is drawn whole (None: not known), the estimated one as far
-    as it goes.
-    """
-    height, width = size
-    image = np.full((height, width, 3), PAPER, np.uint8)
-    paths = {} if true is None else {"ground truth": (TRUE, true)}
-    paths["estimate"] = ESTIMATED, estimated
-    points = np.concatenate([poses[:, [0, 2], 3] for _, poses in paths.values()])
-    centre, extent = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0)
-    metre = ((np.array([width, height]) - 2 * MARGIN) / np.maximum(extent, max(1, 0.2 * extent.max()))).min()  # pixels
-    for row, (name, (color, poses)) in enumerate(paths.items(), 1):
-        pixels = np.array([width, height]) / 2 + (poses[:, [0, 2], 3] - centre) * metre * (1, -1)
-        cv2.polylines(image, [np.rint(pixels).astype(np.int32)], False, color, 2, cv2.LINE_AA)
-        _write(image, name, (MARGIN, 18 * row), color)
-    bar = 10.0 ** np.floor(np.log10((width - 2 * MARGIN) / metre / 2))
-    cv2.line(image, (MARGIN, height - MARGIN), (round(MARGIN + bar * metre), height - MARGIN), TEXT, 2)
-    _write(image, f"{bar:g} m", (MARGIN, height - MARGIN - 6), TEXT)
-    return image
-
-
-def _write(image, text, where, color):
-    cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, 1, cv2.LINE_AA)
-
-
 def pictures(sequence, settings=THESIS, masks=None):
     """Run the odometry over a kitti.Sequence and yield one picture a frame, (h, w, 3) blue, green, red.
 
-    Above the frame, below it what happened in numbers and the path beside the true one, growing.
+    Above the frame, below it the path from above beside the true one, growing, and what happened in numbers.
     """
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence))
+    height, width = sequence.size
+    figure = Figure((width / DPI, round(MAP_SHARE * height) / DPI), DPI)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.08, 0.2, 0.6, 0.75), xlabel="x (m)", ylabel="z (m)")
+    axes.set_aspect("equal", adjustable="datalim")
     # The true path starts at frame 1 for the errors; here both start where the odometry does.
     true = sequence.poses.copy() if sequence.has_truth else None
     if true is not None:
         true[:, :3, 3] += odometry.pose[:3, 3] - true[0, :3, 3]
-    metres, poses = scales(sequence), []
+        axes.plot(true[:, 0, 3], true[:, 2, 3], color=TRUTH, label="ground truth")
+    (path,) = axes.plot([], [], color=BASELINE, label="estimate")
+    figure.legend(loc="lower right")
+    words, metres, poses = figure.text(0.7, 0.95, "", va="top"), scales(sequence), []
     for index in progress(range(len(sequence)), "video"):
         frame, mask = sequence.frame(index), None if masks is None else masks[index]
         step = odometry.step(frame, metres[index], mask)
         poses.append(step.pose)
-        upper = draw_frame(frame, step, settings, mask)
-        height, width = frame.shape
-        lower = draw_map((int(MAP_SHARE * height), width), true, np.array(poses))
-        _describe(lower, step, true, mask is not None)
-        yield np.vstack([upper, lower])[:(height + len(lower)) // 2 * 2, :width // 2 * 2]  # video wants even sizes
+        path.set_data(*np.array(poses)[:, [0, 2], 3].T)
+        axes.relim()
+        axes.autoscale_view()
+        words.set_text(_description(step, true, mask is not None))
+        canvas.draw()
+        picture = np.vstack([draw_frame(frame, step, settings, mask), np.asarray(canvas.buffer_rgba())[..., 2::-1]])
+        yield picture[:len(picture) // 2 * 2, :width // 2 * 2]  # video wants even sizes
 
 
-def _describe(image, step, true, masked):
-    """Write onto the map what happened in a step, in the colours of the frame."""
-    row = step.row() | {"masked": masked, "error": 0.0}
+def _description(step, true, masked):
+    """What happened in a step, in lines that name the colours of the frame."""
+    row, lines = step.row(), [f"frame {step.frame}"]
     if true is not None:
-        row["error"] = np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3])
-    lines = [("frame {frame}", TEXT, True), ("{error:.2f} m from the truth", TEXT, true is not None),
-             ("{detected} keypoints", KEPT, step.detected is not None),
-             ("keypoints the mask discards", DISCARDED, masked),
-             ("{inliers} of {tracked} tracks agree", (60, 150, 0), row["tracked"] is not None),
-             ("{flag}", DISCARDED, row["flag"])]
-    for number, (text, color) in enumerate([(text, color) for text, color, shown in lines if shown], 1):
-        _write(image, text.format(**row), (image.shape[1] - 275, 20 * number), color)
+        lines.append(f"{np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3]):.2f} m from the truth")
+    if step.detected is not None:
+        lines.append(f"{step.detected} keypoints (blue)")
+    if masked:
+        lines.append("discarded by the mask: red")
+    if row["tracked"] is not None:
+        lines.append(f"{row['inliers']} of {row['tracked']} tracks agree (green)")
+    return "\n".join([*lines, *step.flags])
 
 
 def write_video(path, sequence, settings=THESIS, masks=None):
