@@ -10,6 +10,7 @@ from street import Street
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, metrics, pose
+from thesis_repro.odometry.odometry import ALL_KEYPOINTS
 from thesis_repro.odometry.refined import fit as refine
 from thesis_repro.odometry.refined import motion_prior
 from thesis_repro.odometry.refined.guided import ransac_with_prior
@@ -17,6 +18,18 @@ from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED
 
 AHEAD = np.array([0.0, 0.0, 1.0])
 REFINED = replace(THESIS, estimator="refined")
+
+
+class Few:
+    """Masks of one small square: too few keypoints for any motion, but for frames that are named."""
+
+    def __init__(self, size, everywhere=()):
+        self.size, self.everywhere = size, everywhere
+
+    def __getitem__(self, index):
+        mask = np.zeros(self.size, np.uint8)
+        mask[:, :None if index in self.everywhere else 4] = 255
+        return mask
 
 
 def turn(degrees):
@@ -271,3 +284,24 @@ def test_a_second_start_leaves_a_poor_minimum(kitti_real):
         follower.step(sequence.frame(0))
         directions.append(follower.step(sequence.frame(1), 1.0).motion.translation)
     assert np.degrees(np.arccos(np.min(np.array(directions) @ np.transpose(directions)))) < 4
+
+
+# All keypoints where masked ones do not determine the motion
+
+
+@pytest.mark.parametrize("estimator", ["thesis", "refined"])
+def test_the_fallback_uses_all_keypoints_where_masks_leave_too_few(small_world, estimator):
+    drive = Sequence(small_world / "kitti", "00")
+    plain = replace(THESIS, estimator=estimator)
+    settings = replace(plain, fallback=True)
+    few, last = Few(drive.size), Few(drive.size, range(len(drive) - 2))
+    runs = {"few": (settings, few), "last": (settings, last), "without": (plain, last), "no mask": (settings, None)}
+    results = odometry.run_many(drive, runs)
+    every = odometry.run(drive, plain)
+    assert np.array_equal(results["few"].poses, every.poses) and np.array_equal(results["no mask"].poses, every.poses)
+    assert results["few"].flagged[ALL_KEYPOINTS] == len(drive) - 1 and ALL_KEYPOINTS not in results["no mask"].flagged
+    assert results["last"].flagged[ALL_KEYPOINTS] == 1  # only the last step starts from a frame with such a mask
+    assert np.array_equal(results["last"].poses, every.poses)
+    assert ALL_KEYPOINTS not in results["without"].flagged
+    assert not np.array_equal(results["without"].poses[-1], every.poses[-1])
+    assert np.array_equal(odometry.run(drive, settings, few).poses, results["few"].poses)

@@ -14,7 +14,8 @@ their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What 
 | agreement no better than chance (scene cut) | "no agreement"                                                       |
 | moved less than the gate (PySLAM's rule)    | "stationary"                                                         |
 
-With estimator="refined" there are two more, and the pose moves on (see refined.motion_prior):
+With settings.fallback and masks, "all keypoints used": the masked ones do not determine the motion, or it is far from
+the step's before. With estimator="refined" there are two more, and the pose moves on (see refined.motion_prior):
 
 | motion                                        | flag and rule                                                      |
 |-----------------------------------------------|--------------------------------------------------------------------|

@@ -10,13 +10,14 @@ import numpy as np
 from thesis_repro import InputError
 from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refined.fit import fit, smaller_rotation
+from thesis_repro.odometry.refined.fit import RefinedMotion, fit, measured, smaller_rotation
 from thesis_repro.odometry.refined.guided import ransac_with_prior
-from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency
+from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency, is_consistent
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 TIMED_PARTS = ("detect", "track", "essential", "pose")
 ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
+ALL_KEYPOINTS = "all keypoints used"  # flag of a step that fell back on them
 MIN_CONTRAST = 4.0  # gray levels: a standard deviation below it is no picture of a street (real frames: above 50)
 
 
@@ -35,6 +36,7 @@ class Step:
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres; see compose
     updated: bool = False
     flags: list[str] = field(default_factory=list)
+    frames: tuple[np.ndarray, np.ndarray] | None = None  # previous and current, until a fallback is out of question
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
@@ -74,7 +76,7 @@ class Odometry:
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
-        self.prior = MotionPrior()  # of the refined estimator alone
+        self.prior = MotionPrior()  # of the refined estimator and the fallback alone
         self.keypoints: Any = shared or keypoints  # both have `detect` and `track`
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame that self.points belong to
@@ -98,6 +100,8 @@ class Odometry:
             step.flags.append("flat frame")
             self._gap = step.scale
             return step
+        if self.settings.fallback and mask is not None and self.previous is not None:
+            step.frames = self.previous, frame
         started, self._gap = time.perf_counter(), 0.0
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
@@ -150,7 +154,10 @@ class Odometry:
 
     def compose(self, step: Step) -> Step:
         """Move the pose by the step's motion, unless a rule keeps it; see the package's table."""
-        motion, settings = step.motion, self.settings
+        settings = self.settings
+        if step.frames is not None and step.scale > settings.scale_gate and self._in_doubt(step):
+            self._use_all_keypoints(step)
+        step.frames, motion = None, step.motion
         if step.points:
             if motion.rotation is None:
                 step.flags.append(motion.problem)
@@ -162,14 +169,39 @@ class Odometry:
             else:
                 if settings.estimator == "refined":
                     self._check_consistency(step)
+                elif settings.fallback and motion.translation is not None:
+                    self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
                 self.pose = self._moved(step.motion, step.scale)
                 step.updated = True
         step.pose = self.pose
         return step
 
+    def _in_doubt(self, step):
+        motion = step.motion
+        if motion.rotation is None or _by_chance(motion.inliers):
+            return True
+        if not isinstance(motion, RefinedMotion):
+            current, previous = self._normalised(step)
+            of_points = measured(motion.rotation, motion.translation, current, previous, motion.inliers,
+                                 self.settings.threshold)
+            motion = replace(of_points, translation=motion.translation)
+        return not is_consistent(motion, step.scale, self.prior)
+
+    def _use_all_keypoints(self, step):
+        before, frame = step.frames
+        points = keypoints.detect(before, self.settings)
+        if len(points):
+            current, was_tracked = keypoints.track(before, frame, points)
+            step.points, step.previous, step.current = len(points), points[was_tracked], current[was_tracked]
+            step.flags.append(ALL_KEYPOINTS)
+            self.estimate(step)
+
+    def _normalised(self, step):
+        return tuple(pose.normalise(points, self.intrinsics) for points in (step.current, step.previous))
+
     def _check_consistency(self, step):
         started = time.perf_counter()
-        current, previous = (pose.normalise(points, self.intrinsics) for points in (step.current, step.previous))
+        current, previous = self._normalised(step)
         step.motion, self.prior, flag = check_consistency(step.motion, current, previous, step.scale,
                                                             self.settings.threshold, self.prior)
         if flag:

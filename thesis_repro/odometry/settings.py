@@ -26,6 +26,8 @@ class OdometrySettings:
     is the right one, as in PySLAM. "inliers": the inliers alone vote (audit rows 13, 29). "refined": RANSAC's motion is
     refitted by least squares to all points near it, the rotation is the smaller of the two possible ones, and a motion
     that no car can make from one frame to the next is searched again (refined.motion_prior).
+    fallback: a step whose motion the masked keypoints do not determine, or that differs too much from the step before
+    (refined.motion_prior), is estimated from all keypoints. It does nothing without masks.
     scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
     points, pixels.
     rotate_first: turn the pose before moving it.
@@ -41,6 +43,7 @@ class OdometrySettings:
     threshold: float = 0.0003
     shuffle_seed: int | None = None
     estimator: str = "thesis"
+    fallback: bool = False
     scale_gate: float = 0.1
     shift_gate: float = 0.0
     rotate_first: bool = False

@@ -29,6 +29,7 @@ class RefinedMotion(Motion):
     support: int = 0  # correspondences near the motion
     rotation_std_deg: float = 0.0  # standard deviation of the rotation in its least certain direction, degrees
     heading_std_deg: float = 0.0  # the same of the translation's direction
+    condition: float = 1.0  # number of the normal equations
 
 
 def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -47,13 +48,20 @@ def fit(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, prev
 
     The points near it vote on the sign: see `cheirality_votes`.
     """
-    rotation, heading = refine(rotation, translation, current, previous, inliers, threshold)
+    return measured(*refine(rotation, translation, current, previous, inliers, threshold), current, previous, inliers,
+                    threshold)
+
+
+def measured(rotation: np.ndarray, heading: np.ndarray, current: np.ndarray, previous: np.ndarray,
+             inliers: np.ndarray, threshold: float) -> RefinedMotion:
+    """A motion as it is, with the sign of its translation and how far the points near it determine it."""
     support = near(rotation, heading, current, previous, SUPPORT_THRESHOLDS * threshold)
     current, previous = current[support], previous[support]
     forward, backward = cheirality_votes(rotation, heading, current, previous, threshold)
-    rotation_std_deg, heading_std_deg = _deviations(rotation, heading, current, previous, threshold / 2)
+    rotation_std, heading_std, condition = _deviations(rotation, heading, current, previous, threshold / 2)
     return RefinedMotion(rotation, heading if forward >= backward else -heading, inliers, max(forward, backward),
-                         support=len(current), rotation_std_deg=rotation_std_deg, heading_std_deg=heading_std_deg)
+                         support=len(current), rotation_std_deg=rotation_std, heading_std_deg=heading_std,
+                         condition=condition)
 
 
 def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
@@ -94,7 +102,8 @@ def _rounds(motion, current, previous, chosen, threshold):
 
 
 def _deviations(rotation, translation, current, previous, scale):
-    """Standard deviations, degrees, of the rotation and of the translation's direction, each where it is largest.
+    """Standard deviations, degrees, of the rotation and of the translation's direction, each where it is largest; and
+    the condition number.
 
     From the inverse of the Gauss-Newton matrix, for residuals whose own is `scale`. Points that leave the motion open,
     all on one line in space, say, make them large.
@@ -102,10 +111,10 @@ def _deviations(rotation, translation, current, previous, scale):
     hessian = _normal_equations(rotation, translation, current, previous, scale)[1]
     values, vectors = np.linalg.eigh(hessian)
     if len(current) < MIN_CORRESPONDENCES or not values[0] > 1e-12 * values[-1]:
-        return np.inf, np.inf
+        return np.inf, np.inf, np.inf
     covariance = scale * scale * (vectors / values) @ vectors.T
-    return tuple(float(np.degrees(np.sqrt(np.linalg.eigvalsh(part)[-1])))
-                 for part in (covariance[:3, :3], covariance[3:, 3:]))
+    return *(float(np.degrees(np.sqrt(np.linalg.eigvalsh(part)[-1])))
+             for part in (covariance[:3, :3], covariance[3:, 3:])), float(values[-1] / values[0])
 
 
 @fast

@@ -50,9 +50,8 @@ def check_consistency(motion: RefinedMotion, current: np.ndarray, previous: np.n
 
     current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers. scale: metres.
 
-    A motion is consistent if its points determine it and if it differs from the prior by at most MAX_ROTATION_CHANGE
-    and MAX_HEADING_CHANGE. It is then fitted once more from the expected motion. All shuffles of the correspondences
-    start alike there, so little of RANSAC's chance is left.
+    A consistent motion (`is_consistent`) is fitted once more from the expected motion. All shuffles of the
+    correspondences start alike there, so little of RANSAC's chance is left.
 
     Otherwise the best consistent motion is searched for. In a scene that stands still the true motion has nearly as
     many correspondences near it as any other. So this motion is used if it has at least MIN_SUPPORT times as many; if
@@ -60,29 +59,37 @@ def check_consistency(motion: RefinedMotion, current: np.ndarray, previous: np.n
     neither is determined, the step is NOT_DETERMINED and repeats the motion of the prior.
     """
     rotation, translation = prior.expected_rotation(scale), prior.translation
-    max_rotation = MAX_ROTATION_CHANGE if prior.scale else MAX_FIRST_ROTATION
-
-    def consistent(candidate):
-        return (_determined(candidate) and _degrees((np.trace(rotation.T @ candidate.rotation) - 1) / 2) <= max_rotation
-                and _degrees(translation @ candidate.translation) <= MAX_HEADING_CHANGE)
-
     flag = ""
-    if consistent(motion):
+    if is_consistent(motion, scale, prior):
         near_prior = near(rotation, translation, current, previous, PRIOR_FIT_THRESHOLDS * threshold)
         again = fit(rotation, translation, current, previous, near_prior, threshold)
-        if consistent(again) and again.support >= SAME_SUPPORT * motion.support:
+        if is_consistent(again, scale, prior) and again.support >= SAME_SUPPORT * motion.support:
             motion = replace(again, inliers=motion.inliers)
     else:
         flag = AMBIGUOUS
-        start = ransac_with_prior(current, previous, threshold, rotation, translation, max_rotation, MAX_HEADING_CHANGE)
+        start = ransac_with_prior(current, previous, threshold, rotation, translation, _max_rotation(prior),
+                                  MAX_HEADING_CHANGE)
         if start:
             other = fit(*start, current, previous, near(*start, current, previous, threshold), threshold)
-            if consistent(other) and (other.support >= MIN_SUPPORT * motion.support or not _determined(motion)):
+            if is_consistent(other, scale, prior) and (other.support >= MIN_SUPPORT * motion.support
+                                                       or not _determined(motion)):
                 motion = other
     if _determined(motion):
         assert motion.rotation is not None and motion.translation is not None  # a fitted motion has both
         return motion, MotionPrior(motion.rotation, motion.translation, scale), flag
     return replace(motion, rotation=rotation, translation=translation), prior, NOT_DETERMINED
+
+
+def is_consistent(motion: RefinedMotion, scale: float, prior: MotionPrior) -> bool:
+    """Whether a step's points determine its motion, and it is within the limits of the prior's; scale: metres."""
+    assert motion.rotation is not None and motion.translation is not None
+    turned = _degrees((np.trace(prior.expected_rotation(scale).T @ motion.rotation) - 1) / 2)
+    return bool(_determined(motion) and turned <= _max_rotation(prior)
+                and _degrees(prior.translation @ motion.translation) <= MAX_HEADING_CHANGE)
+
+
+def _max_rotation(prior):
+    return MAX_ROTATION_CHANGE if prior.scale else MAX_FIRST_ROTATION
 
 
 def _determined(motion):
