@@ -108,6 +108,22 @@ def test_no_keypoints_on_movable_classes_and_within_the_margin():
     assert not masks.keypoint_mask(streets(), SIZE, 5, MaskSettings(margin=200)).any()
 
 
+@pytest.mark.parametrize("boundaries", masks.BOUNDARIES)
+def test_where_the_literature_keeps_keypoints(boundaries):
+    label_map = bands("road", "building", "car").repeat(2, axis=1)  # bands of 32 pixels
+
+    def kept(**options):  # the columns
+        mask = masks.keypoint_mask(label_map, label_map.shape, 5, MaskSettings(boundaries, **options))
+        return set(np.flatnonzero(mask.all(axis=0)))
+
+    own = kept()
+    assert {31, 32, 63, 64} <= own and len(own) < 16
+    assert kept(keep="inverse") == set(range(96)) - own
+    assert kept(keep="static-boundaries") == {column for column in own if column < 40}
+    assert kept(keep="static") == set(range(64 - masks.DYNASLAM_MARGIN))
+    assert kept(keep="static", movable=0) == set(range(64))
+
+
 # Of a sequence
 
 
@@ -135,7 +151,8 @@ def test_label_masks_and_written_ones_are_the_filter_of_each_frame(labelled, tmp
 def test_wrong_settings_and_missing_files_are_named(labelled, tmp_path):
     sequence, folder = labelled
     for settings, name in (({"boundaries": "fuzzy"}, "fuzzy"), ({"classes": ("hedge",)}, "hedge"),
-                           ({"movable": -1}, "movable"), ({"margin": -3}, "margin")):
+                           ({"movable": -1}, "movable"), ({"margin": -3}, "margin"),
+                           ({"keep": "most"}, "most")):
         with pytest.raises(InputError, match=name):
             MaskSettings(**settings)
     with pytest.raises(InputError, match="dilation width 0"):

@@ -240,7 +240,7 @@ def _mask_settings(options, has_labels=True):
     from thesis_repro.masks import MaskSettings
 
     settings = MaskSettings(options.boundaries, options.symmetric, tuple(options.classes), options.without_movable,
-                            options.margin)
+                            options.margin, options.keep)
     if not has_labels and settings != MaskSettings():
         raise InputError(f"{', '.join(MASKS)}: need --labels DIR, the label maps that masks are made from")
     return settings
@@ -327,6 +327,9 @@ MASKS = {
                       help="boundaries of these Cityscapes classes alone"),
     "--without-movable": dict(type=int, nargs="?", const=0, metavar="PIXELS",
                               help="nothing on people and vehicles, nor so many pixels around them (0)"),
+    "--keep": dict(choices=("boundaries", "static", "inverse", "static-boundaries"), default="boundaries",
+                   help="where keypoints may lie: on boundaries, on all but movable things (static), on all but "
+                        "boundaries (inverse), on boundaries of what cannot move"),
     "--margin": dict(type=int, default=0, metavar="PIXELS", help="nothing along the frame's rim (0)"),
 }
 
@@ -381,6 +384,8 @@ def build_parser():
     add("--estimator", metavar="thesis|inliers|refined",
         help="all points vote on the motion (PySLAM); RANSAC's inliers vote; or it is fitted by least squares")
     add("--detector", metavar="shi-tomasi|orb", help="of keypoints; they are tracked all the same")
+    add("--fallback", action="store_true", default=None,
+        help="all keypoints for a step whose motion the masked ones do not determine")
     add("--max-keypoints", type=int, metavar="N", help="most keypoints of a detection (2000)")
     add("--boresight", type=float, nargs=3, metavar=("PITCH", "YAW", "ROLL"),
         help="turn the path by the rotation between camera and truth, degrees; see the command boresight")

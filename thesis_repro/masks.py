@@ -19,16 +19,22 @@ CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's d
 BOUNDARIES = ("canny", "exact")
 CLASS_EDGE_WINDOW = 5  # pixels a side: a Canny edge within two pixels of a change of class belongs to that change
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked ones too
+# Where keypoints may lie: on the thesis's boundaries, or where SLAM systems with a segmentation leave them.
+KEEP = ("boundaries", "static", "inverse", "static-boundaries")
+DYNASLAM_MARGIN = 15  # pixels around movable things that DynaSLAM leaves out too (its Frame.cc), for its mask is rough
 
 
 @dataclass(frozen=True)
 class MaskSettings:
     """How a mask is made from a label map. The defaults are the thesis's way; each field is one correction of it.
 
+    keep: "boundaries"; "static", all but movable things and DYNASLAM_MARGIN around them, whatever the boundaries;
+    "inverse", all but the widened boundaries; "static-boundaries", those between two classes that cannot move.
     boundaries: "canny" finds edges in label ids, "exact" every change of class (see `edges`).
     symmetric: the mask of a mirrored label map is the mirrored mask: no half pixel to one side (see `edges`, `dilate`).
     classes: names of labels; boundaries of these alone, with whatever they touch. Empty: of all classes.
-    movable: no keypoints on people and vehicles, whose areas are first widened by so many pixels. None: allowed.
+    movable: no keypoints on people and vehicles, whose areas are first widened by so many pixels. None: allowed (but
+    for "static").
     margin: no keypoints within so many pixels of the frame's border. Points there are lost in the next frame, and
     networks that pad with zeros predict boundaries there that do not exist.
     Raises InputError for an unknown name and a negative number.
@@ -39,10 +45,12 @@ class MaskSettings:
     classes: tuple[str, ...] = ()
     movable: int | None = None
     margin: int = 0
+    keep: str = "boundaries"
 
     def __post_init__(self) -> None:
-        if self.boundaries not in BOUNDARIES:
-            raise InputError(f"boundaries={self.boundaries!r}: unknown; choose one of {', '.join(BOUNDARIES)}")
+        for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP)):
+            if getattr(self, name) not in known:
+                raise InputError(f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(known)}")
         for name in self.classes:
             if name not in ID:
                 raise InputError(f"classes: {name!r} is no label; known are {', '.join(ID)}")
@@ -55,27 +63,29 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
     """Boundaries between classes at the frame's size.
 
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
-    Of the settings, movable and margin do not matter here.
+    Of the settings, movable and margin do not matter here, and of keep only "static-boundaries" does.
 
     boundaries "canny" is the thesis: enlarge bilinearly (which invents ids along every boundary), then Canny (5, 15)
     on the ids themselves, so that a boundary shows only where two ids are far enough apart. "exact" is the correction:
     enlarge with nearest neighbour and mark every pixel whose right or lower neighbour has another class.
     symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary. OpenCV's plain nearest
     neighbour looks half a pixel to the upper left, and a mark on one side lies half a pixel beside the boundary.
-    classes: names of labels; only boundaries of these. Canny knows no classes, so a Canny edge belongs to them where it
-    lies within two pixels of such a boundary.
+    classes, "static-boundaries": only some boundaries. Canny knows no classes, so a Canny edge belongs to them where
+    it lies within two pixels of such a boundary.
     """
     if settings.boundaries == "canny":
         canny = cv2.Canny(cv2.resize(label_map, size[::-1]), CANNY_LOW, CANNY_HIGH)
-        if not settings.classes:
+        if not settings.classes and settings.keep != "static-boundaries":
             return canny
         of_classes = edges(label_map, size, replace(settings, boundaries="exact", symmetric=True))
         return canny & dilate(of_classes, CLASS_EDGE_WINDOW)
     enlarged = _enlarged(label_map, size, settings.symmetric)
     chosen = np.isin(enlarged, [ID[name] for name in settings.classes]) if settings.classes else np.ones(size, bool)
+    allowed = ~np.isin(enlarged, MOVABLE) if settings.keep == "static-boundaries" else np.ones(size, bool)
     different = np.zeros(size, bool)
     for pixel, neighbour in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         change = (enlarged[pixel] != enlarged[neighbour]) & (chosen[pixel] | chosen[neighbour])
+        change &= allowed[pixel] & allowed[neighbour]
         different[pixel] |= change
         if settings.symmetric:
             different[neighbour] |= change
@@ -127,6 +137,9 @@ def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: 
 
 def _edges_and_forbidden(label_map, size, settings):
     """The parts of a mask that do not depend on its width; None where nothing is forbidden."""
+    if settings.keep == "static":
+        movable = DYNASLAM_MARGIN if settings.movable is None else settings.movable
+        return np.full(size, 255, np.uint8), forbidden(label_map, size, replace(settings, movable=movable))
     everywhere = settings.movable is None and not settings.margin
     return (edges(label_map, size, settings),
             None if everywhere else forbidden(label_map, size, settings))
@@ -135,6 +148,8 @@ def _edges_and_forbidden(label_map, size, settings):
 def _widened(parts, dilation_width, settings):
     edge_image, never = parts
     mask = dilate(edge_image, dilation_width, settings.symmetric)
+    if settings.keep == "inverse":
+        mask = cv2.bitwise_not(mask)
     if never is not None:
         mask[never] = 0
     return mask

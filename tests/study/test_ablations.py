@@ -26,8 +26,8 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
         other = runs[method, "thesis", 0][1][0]
         assert not np.array_equal(other, own[0]) and 0.5 < (other > 0).sum() / (own[0] > 0).sum() < 2
     label_map = cv2.imread(str(small_labels / "00" / sequence.frame_paths[0].name), 0)
-    movable = np.isin(cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST), masks.MOVABLE)
-    assert np.array_equal(runs["static", "thesis", 0][1][0] == 0, movable)
+    vegetation = np.isin(cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST), (21, 22))
+    assert np.array_equal(runs["no-vegetation", "thesis", 0][1][0] == 0, vegetation)
 
 
 @pytest.mark.parametrize("amount, low, high", [(300, 280, 300), (0.5, 0.48, 0.5)])

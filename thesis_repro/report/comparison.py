@@ -17,7 +17,7 @@ from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
 
 SHOWN = (*compare.JUDGING_METRICS, "rmse")
-MARKERS = "oDsh^v<>PpX"
+MARKERS = "oDsh^v<>PX"  # one fewer than colours, so that no two lines look alike
 COLORS = (BASELINE, MASKED, GREEN, "#7fb800", ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b", "#5d3a9b")
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
 KEYS = ["source", "method", "dilation_width", "estimator"]
@@ -172,6 +172,16 @@ def table_comparison(table):
     last = ["verdict", *(f"sequence {name}" for name in _sequences(table))]
     shown = pd.DataFrame(shown)
     return shown.reindex(columns=[*(name for name in shown if name not in last), *last])
+
+
+def table_sequences(table):
+    """Ratios to all keypoints of each sequence and of all by the first error that judges: a row a method."""
+    rows = _tested(_over_all_keypoints(table[table["metric"] == next(iter(compare.JUDGING_METRICS))]))
+    names = _sequences(table)
+    shown = [{"estimator": ESTIMATORS[row["estimator"]], "keypoints": label, "number": round(row["keypoints"]),
+              **row[names].map(texts.number, na_action="ignore"), "all": _short(row)}
+             for label, (_, row) in zip(_labels(rows), rows.iterrows())]
+    return pd.DataFrame(shown)
 
 
 def _short(row):

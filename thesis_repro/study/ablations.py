@@ -30,7 +30,7 @@ from thesis_repro.study.runner import measures
 Runs = dict[tuple[str, str, int], tuple[OdometrySettings, Masks | None]]  # by method, estimator, repetition
 ESTIMATORS = ("thesis", "inliers", "refined")
 REPETITIONS, BASELINE_REPETITIONS = 3, 8  # of every method, and of all keypoints under the thesis's estimator
-WITHOUT = {"static": masks.MOVABLE, "no-vegetation": (ID["vegetation"], ID["terrain"])}  # ids with no keypoint
+VEGETATION = (ID["vegetation"], ID["terrain"])
 FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesis's 2000
 
 
@@ -48,7 +48,7 @@ class MadeMasks:
 
 
 def without_classes(ids: Iterable[int], label_map: np.ndarray) -> np.ndarray:
-    """No boundaries: all of the frame but some classes (Section 5.2.2: static objects, trees and bushes)."""
+    """No boundaries: all of the frame but some classes (Section 5.2.2: trees and bushes)."""
     return np.where(np.isin(label_map, list(ids)), np.uint8(0), np.uint8(255))
 
 
@@ -128,9 +128,7 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
             cv2.Canny(enlarged(index), masks.CANNY_LOW, masks.CANNY_HIGH), dilation_width))),
         "symmetric": (THESIS, from_labels(MaskSettings(boundaries, symmetric=True))),
         "corrected": (THESIS, from_labels(CORRECTED)),
-        "masked-static": (THESIS, from_labels(MaskSettings(boundaries, movable=0))),
-        **{method: (THESIS, MadeMasks(lambda index, ids=ids: without_classes(ids, enlarged(index))))  # type: ignore
-           for method, ids in WITHOUT.items()},
+        "no-vegetation": (THESIS, MadeMasks(lambda index: without_classes(VEGETATION, enlarged(index)))),
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
         "random": (THESIS, MadeMasks(partial(random_keypoints, sequence, number))),
         "dropout": (THESIS, MadeMasks(partial(random_keypoints, sequence, 0.9))),

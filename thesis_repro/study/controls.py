@@ -4,6 +4,7 @@ If the odometry gains as much from them, it is not the segmentation that helps. 
 those of `masks`.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -113,8 +114,12 @@ class ImageEdges(OtherFrame):
 
 
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-OF_MASKS = {"other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges}
-OF_LABEL_MAPS = ("exact-boundaries", "corrected", "true-labels")  # ask what label maps are good for
+OF_MASKS: dict[str, Callable[[Source, Sequence, int | None], ControlMasks]] = {
+    "fallback": Source.masks,  # the masks themselves: it is the odometry that does without them (OdometrySettings)
+    "other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges}
+LITERATURE = ("static", "inverse", "static-boundaries")  # other places to keep keypoints in, of masks.KEEP
+# These ask what label maps are good for.
+OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
 MASKS = (*OF_MASKS, *OF_LABEL_MAPS)
 
 
@@ -127,9 +132,12 @@ def masks(method: str, source: Source, sequence: Sequence, dilation_width: int |
         return OF_MASKS[method](source, sequence, dilation_width)
     if method == "true-labels":
         source = replace(source, folder=true_labels(sequence.root, sequence.name))
+    elif method == "corrected":
+        source = replace(source, settings=CORRECTED)
+    elif method in LITERATURE:
+        source = replace(source, settings=replace(source.settings, keep=method))
     else:
-        source = replace(source, settings=CORRECTED if method == "corrected" else
-                         replace(source.settings, boundaries="exact"))
+        source = replace(source, settings=replace(source.settings, boundaries="exact"))
     return source.masks(sequence, dilation_width)
 
 

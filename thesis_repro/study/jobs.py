@@ -63,7 +63,8 @@ class Job:
     def settings(self) -> OdometrySettings:
         """The settings of the odometry: the thesis's, but for what the job itself says."""
         changes: dict[str, Any] = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
-                                   "shuffle_seed": self.repetition or None, "estimator": self.estimator}
+                                   "shuffle_seed": self.repetition or None, "estimator": self.estimator,
+                                   "fallback": self.method == "fallback"}
         return replace(THESIS, **{name: value for name, value in changes.items() if value is not None})
 
     def masks(self, sequence: Sequence, sources: Mapping[str, Source]) -> controls.ControlMasks | None:
