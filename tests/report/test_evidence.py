@@ -23,7 +23,14 @@ def test_a_folder_of_evidence_has_every_method_and_error_and_no_frame(small_worl
     files = evidence.write(*given, frames=6, repetitions=1)
     assert {path.suffix for path in files} == {".csv", ".md", ".svg"}
     assert {path.stem for path in files} == {"README", "audit", "comparison", "comparison_keypoints",
-                                             "comparison_sequences", "runs", "switches", "widths"}
+                                             "comparison_sequences", "failures", "runs", "sequences", "switches",
+                                             "widths"}
+    failures = pd.read_csv(tmp_path / "out" / "failures.csv")
+    of_sequences, of_numbers = failures[:2], failures[2:]
+    assert list(of_sequences["steps"]) == ["00", "01"]
+    assert of_sequences["number"].sum() == of_numbers["number"].sum() == 10
+    assert (failures["tracked, masks"] < failures["tracked, all keypoints"]).all()
+    assert (failures["agreeing, masks"] <= failures["tracked, masks"]).all()
     runs = pd.read_csv(tmp_path / "out" / "runs.csv", dtype={"sequence": str})
     assert set(runs["sequence"]) == {"00", "01"} and set(runs["frames"]) == {6}
     assert set(compare.METHODS) <= set(runs["method"]) and {*compare.JUDGING_METRICS, "rmse"} <= set(runs)

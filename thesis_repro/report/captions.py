@@ -14,5 +14,6 @@ _CAPTIONS = json.loads((_HERE / "captions.json").read_text(encoding="utf-8"))
 CHAPTERS = _CAPTIONS["chapters"]  # the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
 ADDED = _CAPTIONS["added"]  # artefacts that are not in the thesis
 OF_STUDIES = _CAPTIONS["of_studies"]  # what studies alone show
+OF_EVIDENCE = _CAPTIONS["of_evidence"]  # what the evidence on real frames alone shows
 THESIS = [artefact["name"] for artefacts in CHAPTERS.values() for artefact in artefacts]
 CARD = "thesis_repro/segmentation/weights/README.md"  # of the model in the package

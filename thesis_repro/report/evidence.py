@@ -10,13 +10,15 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
+import joblib
 import pandas as pd
 
 from thesis_repro import kitti, longrun, masks, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
-from thesis_repro.report import audit, comparison, style, texts
+from thesis_repro.report import audit, captions, comparison, failures, style, texts
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
@@ -46,17 +48,20 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
                 *audit.measured(angles, "boresight"),
                 *audit.measured(_boundaries(sequences, build / "labels"), "boundaries"),
                 *audit.measured(_tracks(sequences, build / "labels"), "tracks")]
+    steps, failing = _failures(sequences, build / "labels", processes)
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
     longrun.sweep(folder)
-    style.save_all(comparison.figures(table, runs), {
-        "comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
-        "audit": audit.table(measured)}, folder, note)
+    style.save_all(comparison.figures(table, runs) | {"failures": failing}, {
+        "comparison": comparison.table_comparison(table), "sequences": comparison.table_sequences(table),
+        "failures": failures.table(steps), "widths": comparison.table_widths(runs), "audit": audit.table(measured)},
+        folder, note)
     for name, content in {"runs": runs, "switches": switches}.items():
         # six digits are more than shuffling the matched points leaves alone
         write_text(folder / f"{name}.csv", content.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
-    write_text(folder / "README.md", texts.render("evidence.md.j2", findings=texts.findings(runs, table, note)))
+    write_text(folder / "README.md", texts.render(
+        "evidence.md.j2", findings=texts.findings(runs, table, note), failures=captions.OF_EVIDENCE))
     return sorted(path for path in folder.iterdir() if path.is_file())
 
 
@@ -104,6 +109,18 @@ def _tracks(sequences, labels):
                  "random lines": controls.masks("random-lines", Source(labels), sequence, width)}
         rows.append(ablations.tracks(sequence, kinds, LOOKED_AT))
     return pd.concat(rows, ignore_index=True)
+
+
+def _failures(sequences, labels, processes):
+    """The steps of `failures.measure` of all sequences, and the figure of them."""
+    own = [masks.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH) for sequence in sequences]
+    steps = pd.concat(joblib.Parallel(processes)(map(joblib.delayed(_steps), sequences, own)), ignore_index=True)
+    return steps, failures.figure(steps, sequences, own)
+
+
+def _steps(sequence, its_masks):
+    cv2.setNumThreads(1)  # the processes already use every core
+    return failures.measure(sequence, its_masks)
 
 
 def main(arguments=None):

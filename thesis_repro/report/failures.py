@@ -1,0 +1,149 @@
+"""Where masks fail, step by step: how many keypoints they leave a step, and how well these determine its motion."""
+
+from dataclasses import replace
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+
+from thesis_repro.odometry import THESIS, Odometry, metrics, pose, scales, start_pose
+from thesis_repro.odometry.keypoints import SharedKeypoints
+from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, measured, near
+from thesis_repro.report import style
+
+SETTINGS = replace(THESIS, estimator="refined")
+KINDS = {"all": ("all keypoints", style.BASELINE), "masks": ("masks", style.MASKED)}
+CELLS = 4  # of a frame, across and down
+CLEARLY = 0.15  # degrees by which one of two rotations of a step is more wrong
+BINS = (0, 100, 200, 300, 500, 10**6)  # of keypoints that agree with the motion
+PANELS = {"agreeing": "agreeing\nkeypoints", "direction_std": "uncertainty of\ndirection (degrees)",
+          "rotation_error": "rotation error\n(degrees)"}
+
+
+def measure(sequence, masks):
+    """One row a step and kind of keypoints, "all" or "masks", of the refined estimator over a kitti.Sequence.
+
+    tracked, agreeing: keypoints, and those near the motion that all keypoints give (the best that is known of it).
+    Of the tracked ones cells, the share of 4x4 cells that hold one, and spread_u, spread_v, standard deviations in
+    pixels. Of the agreeing ones depth_spread, the ratio of upper to lower quartile; condition, of the normal equations,
+    and direction_std, how well they determine the direction of motion, degrees. Of the estimate rotation_error,
+    degrees, and flag.
+    """
+    shared, rows, scale = SharedKeypoints(), [], scales(sequence)
+    odometries = {kind: Odometry(sequence.intrinsics, SETTINGS, start_pose(sequence), shared) for kind in KINDS}
+    for index in range(len(sequence)):
+        frame = sequence.frame(index)
+        shared.expect(frame, [(odometry.previous, odometry.points) for odometry in odometries.values()])
+        steps = {kind: odometry.step(frame, scale[index], masks[index] if kind == "masks" else None)
+                 for kind, odometry in odometries.items()}
+        reference = steps["all"].motion
+        if scale[index] <= SETTINGS.scale_gate or any(step.motion.rotation is None for step in steps.values()):
+            continue
+        true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
+        for kind, step in steps.items():
+            current, previous, agreeing = _agreeing(step, reference, sequence)
+            of_agreeing = measured(reference.rotation, reference.translation, current[agreeing], previous[agreeing],
+                                   agreeing, SETTINGS.threshold)
+            wrong = np.eye(4)
+            wrong[:3, :3] = true[:3, :3].T @ step.motion.rotation
+            cells = (step.previous // [sequence.size[1] / CELLS, sequence.size[0] / CELLS]).astype(int)
+            rows.append({
+                "sequence": sequence.name, "frame": index, "kind": kind, "tracked": len(current),
+                "agreeing": int(agreeing.sum()), "cells": len(np.unique(cells, axis=0)) / CELLS**2,
+                "spread_u": step.previous[:, 0].std(), "spread_v": step.previous[:, 1].std(),
+                "depth_spread": _depth_spread(current[agreeing], previous[agreeing], reference),
+                "condition": of_agreeing.condition, "direction_std": of_agreeing.heading_std_deg,
+                "rotation_error": metrics.angles(wrong[None])[0], "flag": "; ".join(step.flags)})
+    return pd.DataFrame(rows)
+
+
+def _agreeing(step, motion, sequence):
+    """A step's normalised correspondences, current and previous, and which of them are near a motion."""
+    current, previous = (pose.normalise(points, sequence.intrinsics) for points in (step.current, step.previous))
+    limit = SUPPORT_THRESHOLDS * SETTINGS.threshold
+    return current, previous, near(motion.rotation, motion.translation, current, previous, limit)
+
+
+def _depth_spread(current, previous, motion):
+    """Upper over lower quartile of the depths of correspondences, as far as these lie in front of the camera."""
+    projection = np.column_stack([motion.rotation, motion.translation])
+    points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T, previous.T)
+    ahead = points[2] * points[3] > 0
+    return np.divide(*np.percentile(points[2, ahead] / points[3, ahead], [75, 25])) if ahead.any() else np.nan
+
+
+def table(steps):
+    """Medians of each sequence, all keypoints beside masks, then the steps by how many keypoints agree with masks."""
+    wide = steps.pivot(index=["sequence", "frame"], columns="kind").reset_index(level="sequence")
+    by_number = pd.cut(wide["agreeing", "masks"], BINS, right=False).map(
+        lambda bin: f"{bin.left} to {bin.right - 1} agreeing" if bin.right < BINS[-1] else f"{bin.left} or more")
+    rows = []
+    for name, group in [*wide.groupby("sequence"), *wide.groupby(by_number, observed=True)]:
+        medians = {f"{column}, {KINDS[kind][0]}": f"{group[column, kind].median():.3g}"
+                   for column in steps.columns[3:-1] for kind in KINDS}
+        worse = group["rotation_error", "masks"] - group["rotation_error", "all"]
+        rows.append({"steps": name, "number": len(group), **medians,
+                     f"masks worse by {CLEARLY} degrees": int((worse > CLEARLY).sum()),
+                     f"masks better by {CLEARLY} degrees": int((worse < -CLEARLY).sum()),
+                     "flagged, masks": int((group["flag", "masks"] != "").sum())})
+    return pd.DataFrame(rows)
+
+
+def figure(steps, sequences, masks):
+    """The worst step as a drawing, and below it what masks leave the worst two sequences, frame by frame.
+
+    sequences, masks: lists, as long as each other; the steps are theirs. Worst are those sequences whose mean rotation
+    error masks raise the most, and the first one's step whose error they raise the most.
+    """
+    error = steps.pivot(index=["sequence", "frame"], columns="kind", values="rotation_error")
+    means = error.groupby("sequence").mean()
+    names = list((means["masks"] / means["all"]).sort_values(ascending=False).index[:2])
+    index = (error["masks"] - error["all"])[names[0]].idxmax()
+    place = [sequence.name for sequence in sequences].index(names[0])
+    axes = plt.figure(figsize=(style.PAGE_WIDTH, 7), layout="constrained").subplot_mosaic(
+        [["drawing"] * len(names), *([f"{column} {name}" for name in names] for column in PANELS)],
+        height_ratios=[2.0, 1, 1, 1])
+    _draw(axes["drawing"], sequences[place], masks[place], index)
+    for name in names:
+        for column, label in PANELS.items():
+            panel = axes[f"{column} {name}"]
+            for kind, (words, color) in KINDS.items():
+                rows = steps[(steps["sequence"] == name) & (steps["kind"] == kind)]
+                panel.plot(rows["frame"], rows[column], color=color, label=words, linewidth=1)
+            for frame in rows.loc[rows["flag"] != "", "frame"]:
+                panel.axvspan(frame - 0.5, frame + 0.5, color=style.ORANGE, alpha=0.3, linewidth=0,
+                              label="flag: ambiguous motion")
+            panel.set_ylabel(label if name == names[0] else "")
+            panel.tick_params(labelsize=7)
+            style.ratio_axis(panel.yaxis, np.concatenate([line.get_ydata() for line in panel.lines]))
+        axes[f"agreeing {name}"].set_title(f"sequence {name}")
+        panel.set_xlabel("frame")
+    style.legend_below(axes["drawing"].figure, list(axes.values()), 4)
+    return axes["drawing"].figure
+
+
+def _draw(panel, sequence, masks, index):
+    """The keypoints of the frame before a step, without the frame: kept by the mask or not, near the motion or not."""
+    steps = {}
+    for kind in KINDS:
+        odometry = Odometry(sequence.intrinsics, SETTINGS)
+        for number in (index - 1, index):
+            frame, mask = sequence.frame(number), masks[number] if kind == "masks" else None
+            steps[kind] = odometry.step(frame, scales(sequence)[number], mask)
+    motion, mask = steps["all"].motion, masks[index - 1]
+    _, _, agreeing = _agreeing(steps["masks"], motion, sequence)
+    columns, rows = np.rint(steps["all"].previous).astype(int).T
+    for points, color, size, label in (
+            (steps["all"].previous[mask[rows, columns] == 0], "#bbbbbb", 2, "dropped by the mask"),
+            (steps["masks"].previous[agreeing], style.GREEN, 7, "kept, agrees with the motion"),
+            (steps["masks"].previous[~agreeing], style.RED, 7, "kept, does not agree")):
+        panel.plot(*points.T, "o", color=color, markersize=size**0.5, markeredgewidth=0, label=label)
+    for outline in cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]:
+        panel.plot(*np.vstack([outline[:, 0], outline[:1, 0]]).T, color="black", linewidth=0.4)
+    epipole = sequence.intrinsics @ motion.translation
+    panel.plot(*(epipole[:2] / epipole[2]), "+", color="black", markersize=11, label="epipole: where the car goes")
+    height, width = sequence.size
+    panel.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xticks=[], yticks=[],
+              title=f"sequence {sequence.name}, frames {index - 1} to {index}: {agreeing.sum()} of {len(agreeing)} "
+                    f"keypoints in the mask agree with the motion")
