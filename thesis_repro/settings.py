@@ -61,7 +61,7 @@ PROFILES = {
                      patience=5, training_images=16, frames=12, timed_frames=5, widths=(1, 5, 10, 15), repetitions=2,
                      world_sequences=2, world_frames=12, world_training_images=12, world_validation_images=4),
     # The thesis's loss wants many steps: small batches and a higher rate come further in the same minutes.
-    "demo": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, threads=1, epochs=14,
+    "demo": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, threads=1, epochs=16,
                     patience=5, training_images=200, frames=200, timed_frames=5, widths=ALL_WIDTHS, repetitions=2,
                     world_sequences=11, world_frames=None, world_training_images=100, world_validation_images=20),
     "thesis": Profile(image_size=320, base_filters=64, batch_size=16, learning_rate=0.001, threads=8, epochs=100,
