@@ -6,7 +6,6 @@ SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 
 PYTHON ?= python3
-PROFILE ?= demo
 BIN := .venv/bin
 
 # A misspelled setting must not pass for the default.
@@ -16,6 +15,27 @@ GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
 $(error $(firstword $(UNKNOWN)): unknown setting; known are $(KNOWN))
+endif
+# Nor may one that is empty, as of a shell's variable that is not set, or one that a command does not look at.
+EMPTY := $(strip $(foreach name,$(filter $(KNOWN),$(GIVEN)),$(if $(strip $($(name))),,$(name))))
+ifneq (,$(EMPTY))
+$(error $(firstword $(EMPTY))= is empty; give it a value, or leave it out)
+endif
+ifneq (,$(filter evidence,$(MAKECMDGOALS)))
+UNUSED := $(filter-out KITTI FRAMES REPETITIONS JOBS PYTHON,$(filter $(KNOWN),$(GIVEN)))
+ifneq (,$(UNUSED))
+$(error $(firstword $(UNUSED)): make evidence takes KITTI, FRAMES, REPETITIONS and JOBS alone)
+endif
+endif
+# What the environment says to the package directly, it says to make too.
+$(foreach name,KITTI CITYSCAPES KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER $(SIZES),\
+  $(if $($(name)),,$(if $(THESIS_REPRO_$(name)),$(eval $(name) := $$(THESIS_REPRO_$(name))))))
+PROFILE ?= demo
+ifneq (1 1,$(words x$(BUILD)) $(words x$(FIGURES)))
+$(error BUILD and FIGURES: make knows no file with a space in its name; name another folder)
+endif
+ifneq (,$(filter-out 0 1,$(GPU)))
+$(error GPU=$(GPU): must be 1 or 0)
 endif
 
 # notebooks run in their own folder, so relative paths are made absolute here (and may hold spaces)
@@ -100,18 +120,18 @@ EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # (the page shows what the notebooks leave, so they need not run again for it)
 SOURCES := $(shell find thesis_repro -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html.j2' \
              -not -name 'page.css' -not -name 'captions.json')
-DATA := $(if $(KITTI),$(wildcard $(KITTI)/poses/*.txt $(KITTI)/sequences/*/image_0)) \
-        $(if $(CITYSCAPES),$(wildcard $(CITYSCAPES)/*/*)) $(if $(KITTI_SEMANTIC),$(wildcard $(KITTI_SEMANTIC)/*))
 
 figures: $(EXECUTED)
 	@$(BIN)/python -m thesis_repro.report.page
 	@$(BIN)/python -m thesis_repro.settings figures
 	@for notebook in $(EXECUTED); do [ -e $$notebook ] || exit 1; done
 
-$(RUN)/checked: .venv/ready $(DATA)
+# (It is written anew where a byte of the data has changed, and only then is what follows made anew.)
+$(RUN)/checked: .venv/ready FORCE
 	@mkdir -p $(@D)
-	@$(if $(KITTI)$(CITYSCAPES)$(KITTI_SEMANTIC),$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS),true)
-	@touch $@
+	@$(if $(strip $(DATA_OPTIONS)),$(BIN)/python -m thesis_repro.check $@,[ -e $@ ] || touch $@)
+
+FORCE:
 
 # What a notebook needs of others, by their numbers: they hand results on through files. One that is not listed needs
 # the one before it. Two that do not need each other are executed beside each other, for most are at times at work with

@@ -1,14 +1,19 @@
-"""What is there, missing or wrong in the user's KITTI and Cityscapes folders, and what can be run with it.
+"""What is there, missing or wrong in the user's KITTI and Cityscapes folders, and what can be run with it; and what can
+be read, but is hardly what it is taken for.
 
-The readers say what is wrong with a file; here all that they say about a folder is collected.
+The readers say what is wrong with a file; here all that they say about a folder is collected. What is odd is a line
+with the number that was seen. It is a warning: somebody may mean it.
 """
 
+import sys
 from pathlib import Path
 
 import joblib
 import numpy as np
+import pandas as pd
 
-from thesis_repro import InputError, cityscapes, files, kitti
+from thesis_repro import InputError, cityscapes, files, kitti, masks, one_line, stages
+from thesis_repro.settings import read_settings
 
 MAX_NAMED = 10  # problems of one kind that a quick look names; a deep one names all
 
@@ -85,10 +90,6 @@ def _check_sequence(root, name, needs_truth, deep):
     size, _ = problems.of(files.glance, paths[0]) or (None, None)
     if size and matrix is not None:
         problems.of(kitti.check_camera, folder / "calib.txt", matrix, paths[0], size)
-        camera = kitti.CAMERAS.get(name)
-        if camera and size == (camera.height, camera.width) and not np.allclose(
-                matrix[[0, 1, 0, 1], [0, 1, 2, 2]], [camera.fx, camera.fy, camera.cx, camera.cy], rtol=0, atol=1e-3):
-            problems.append(f"{folder / 'calib.txt'}: is not the camera of sequence {name}")
 
     def check_frame(path):
         its_size = files.read_gray(path).shape if deep or path in (paths[0], paths[-1]) else files.glance(path)[0]
@@ -146,3 +147,161 @@ def check_cityscapes(root, deep=False, splits=("train", "val"), used="make figur
 def check_kitti_semantic(root, deep=False):
     """Check KITTI's street scenes with label maps, which have a training split alone."""
     return check_cityscapes(root, deep, ("train",), "make figures KITTI_SEMANTIC")
+
+
+def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=False):
+    """Print what is in the folders, what is wrong and what is odd; returns whether nothing is wrong."""
+    wrong = False
+    for root, check in ((kitti_root, check_kitti), (cityscapes_root, check_cityscapes),
+                        (kitti_semantic, check_kitti_semantic)):
+        facts, problems = check(root, deep) if root else ((), ())
+        print("\n".join([*([str(root)] if root else []), *(f"  {fact}" for fact in facts)]), end="\n" * bool(root))
+        for problem in problems:
+            print(f"wrong: {one_line(problem)}", file=sys.stderr)
+        wrong = wrong or bool(problems)
+    for name in kitti.sequences(kitti_root) + kitti.without_truth(kitti_root) if kitti_root and not wrong else ():
+        for line in oddities(kitti.Sequence(kitti_root, name)):
+            print(f"warning: {one_line(line)}", file=sys.stderr)
+    return not wrong
+
+
+# What is odd
+
+FRAME_SECONDS = 0.005, 2  # between frames: less or more are hardly seconds
+MAX_SPEED = 60  # metres a second; KITTI's cars drive up to 27
+AHEAD = 0.5  # of a step, along the camera's axis; KITTI's have 0.97 and more
+OFF_CENTRE = 0.1, 0.15  # of the frame's width and height; KITTI's principal points are within 0.04
+SAMPLE = 8  # frames whose masks are looked at
+MIN_COVERAGE, MAX_COVERAGE = 0.005, 0.99
+# Of the mean gradient where a mask keeps to that where it does not. The thesis's masks keep less than half of a frame
+# and have 0.98 to 1.6; turned round, they keep more and have 0.64 to 1.02.
+MIN_CONTRAST, MIN_CONTRAST_OF_MOST = 0.7, 0.9
+TURNING = 0.3  # degrees a frame to either side, from which turns can be compared
+MIN_CORRELATION, MAX_TURN_DIFFERENCE = 0.4, 0.5  # of the turns; degrees. Right ones have 0.79 and more, at most 0.04
+
+
+def oddities(sequence):
+    """Lines that say why a sequence's times, poses, camera or frames are hardly its own."""
+    lines, where = [], f"sequence {sequence.name}: "
+    seconds = np.diff(sequence.times)
+    if len(seconds) and not FRAME_SECONDS[0] <= np.median(seconds) <= FRAME_SECONDS[1]:
+        lines.append(f"{where}frames are {np.median(seconds):g} s apart; times.txt must be in seconds")
+    elif sequence.has_truth and len(seconds):
+        motion = np.linalg.inv(sequence.poses[:-1]) @ sequence.poses[1:]
+        metres = np.linalg.norm(motion[:, :3, 3], axis=1)
+        speed, ahead = metres / seconds, motion[metres > 0.1, 2, 3] / metres[metres > 0.1]
+        if speed.max() > MAX_SPEED:
+            lines.append(f"{where}at frame {speed.argmax() + 1} the car drives {speed.max():.0f} m/s, "
+                         f"{np.median(speed):.3g} in the middle of all; positions must be in metres, one line a frame")
+        if len(ahead) and np.median(ahead) < AHEAD:
+            lines.append(f"{where}{np.median(ahead):.2f} of a step lies along the camera's axis; poses must be camera "
+                         "to world (inverted?), x right, y down, z ahead")
+    height, width = sequence.size
+    (fx, _, u), (_, fy, v), _ = sequence.intrinsics
+    camera = kitti.CAMERAS.get(sequence.name)
+    if camera and (height, width) == (camera.height, camera.width):
+        if not np.allclose((fx, fy, u, v), (camera.fx, camera.fy, camera.cx, camera.cy), rtol=0, atol=1e-3):
+            lines.append(f"{where}calib.txt has the focal length {fx:g} and centre {u:g}, {v:g}; KITTI's camera has "
+                         f"{camera.fx:g} and {camera.cx:g}, {camera.cy:g}")
+    elif abs(u / width - 0.5) > OFF_CENTRE[0] or abs(v / height - 0.5) > OFF_CENTRE[1]:
+        lines.append(f"{where}calib.txt has the centre {u:g}, {v:g}, frames have {width}x{height} pixels; it must be "
+                     "that of these frames, at their size")
+    digests = pd.Series(stages.contents(sequence.frame_paths))
+    if digests.duplicated().any():
+        again = int(digests.duplicated().argmax())
+        lines.append(f"{where}{digests.duplicated().sum()} frames are copies of others, the first "
+                     f"{sequence.frame_paths[again].name}; every frame must be there once")
+    return lines
+
+
+def path_oddities(name, estimated, true):
+    """Lines that say why estimated and true poses, (n, 4, 4) each, are hardly those of one drive."""
+    turns = pd.DataFrame({key: [np.degrees(np.arctan2(step[0, 2], step[2, 2]))
+                                for step in np.linalg.inv(poses[:-1]) @ poses[1:]]
+                          for key, poses in (("estimated", estimated), ("true", true))})
+    spread = (turns.quantile(0.95) - turns.quantile(0.05)) / 2
+    if len(turns) < 20 or not spread["estimated"]:
+        return []
+    correlation = turns.corr("spearman").iloc[0, 1] if spread.max() > TURNING and spread["true"] else 1
+    difference = (turns["estimated"] - turns["true"]).abs().median()
+    if correlation >= MIN_CORRELATION and difference <= MAX_TURN_DIFFERENCE:
+        return []
+    return [f"sequence {name}: turns from frame to frame differ by {difference:.2g} degrees (median) from the true "
+            f"poses', correlation {correlation:.2f}; are frames, their order and poses those of one drive?"]
+
+
+def of_masks(source, sequence):
+    """What `masks.LabelMasks` or a `masks.MaskFolder` of a sequence hold, on SAMPLE frames: (a line, [what is odd])."""
+    chosen = np.unique(np.linspace(0, len(source) - 1, SAMPLE).round().astype(int))
+    made = [source[index] for index in chosen]
+    coverage = np.array([masks.coverage(mask) for mask in made])
+    line, lines = f"masks keep {coverage.mean():.1%} of sequence {sequence.name}", []
+    folder, has_labels = source.paths[0].parent, isinstance(source, masks.LabelMasks)
+    if has_labels:
+        label_maps = [masks.label_map_of(source, index) for index in chosen]
+        shares = np.mean([np.bincount(each.ravel(), minlength=cityscapes.N_CLASSES) / each.size for each in label_maps],
+                         axis=0)
+        largest = [index for index in np.argsort(-shares, kind="stable") if shares[index] >= 0.005]
+        line += f" (width {source.dilation_width}); label maps hold " + ", ".join(
+            f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest)
+        lines = _label_oddities(folder, label_maps, np.flatnonzero(shares), sequence, source.settings)
+    record = stages.record(folder) or {}
+    present = len(files.listed(folder))
+    if record.get("frames", None) not in (None, stages.listing(sequence.frame_paths)):
+        lines.append("were made from other frames than these")
+    elif present not in (1, len(files.images(sequence.frame_paths[0].parent))):
+        lines.append(f"are {present} files for {len(files.images(sequence.frame_paths[0].parent))} frames")
+    option = "" if has_labels else "; --invert takes masks the other way round"
+    if coverage.min() < MIN_COVERAGE or coverage.mean() > MAX_COVERAGE:
+        lines.append(f"leave {coverage.min():.1%} to {coverage.max():.1%} of the frames{option}")
+    elif not has_labels:
+        contrast = np.median([_contrast(sequence.frame(index), mask) for index, mask in zip(chosen, made, strict=True)])
+        if contrast < (MIN_CONTRAST_OF_MOST if coverage.mean() > 0.5 else MIN_CONTRAST):
+            lines.append(f"keep what has {contrast:.2f} times the contrast of what they leave out{option}")
+    return line, [f"{folder}: label maps {lines[0]}" if has_labels else f"{folder}: masks {lines[0]}"] if lines else []
+
+
+def _label_oddities(folder, label_maps, ids, sequence, settings):
+    height, width = label_maps[0].shape
+    lines = []
+    if len(ids) == 1:
+        lines.append(f"hold nothing but {cityscapes.LABELS[ids[0]].name} {ids[0]}")
+    elif settings.ids == "labels" and ids.max() < len(cityscapes.TRAINED):
+        lines.append(f"hold no id above {ids.max()}, so no sky, vegetation or cars; --ids train reads train ids")
+    if (height - width) * (sequence.size[0] - sequence.size[1]) < 0:
+        lines.append(f"have {width}x{height} pixels, the frames {sequence.size[1]}x{sequence.size[0]}; turned?")
+    return lines
+
+
+def _contrast(frame, mask):
+    gradient = np.abs(np.diff(frame.astype(np.int16), axis=1))
+    return gradient[mask[:, 1:] > 0].mean() / max(gradient[mask[:, 1:] == 0].mean(), 1e-9)
+
+
+def main(path):
+    """Check the data of the settings in the environment, unless `path` says that just these bytes were checked."""
+    settings, texts = read_settings(), []
+    roots = (None if settings.kitti_is_embedded else settings.kitti,
+             None if settings.cityscapes_is_embedded else settings.cityscapes, settings.kitti_semantic)
+    try:
+        if roots[0]:
+            texts = [path for name in kitti.sequences(roots[0])
+                     for path in kitti.Sequence(roots[0], name).subset(settings.sizes.frames).files]
+        for root, splits in ((roots[1], ("train", "val")), (roots[2], ("train",))):
+            texts += [path for split in splits if root for by_name in cityscapes.listing(root, split)[:2]
+                      for path in by_name.values()]
+        digest = stages.listing(texts)
+    except InputError:  # the report says more
+        digest = None
+    if digest is None or not path.is_file() or path.read_text(encoding="utf-8") != digest:
+        if not report(*roots):
+            return 1
+        files.write_text(path, digest or "")
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(Path(sys.argv[1])))
+    except InputError as error:
+        sys.exit(f"error: {error}")

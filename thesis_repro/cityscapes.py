@@ -64,7 +64,12 @@ N_CLASSES = 35  # Figure A.1: ids 0 to 34
 CLASS_WEIGHTS = np.array([label.weight for label in LABELS[:N_CLASSES]], np.float32)
 COLORS = np.array([label.color for label in LABELS], np.uint8)
 ID = {label.name: label.id for label in LABELS}
-
+# Cityscapes' train ids, 0 to 18 in this order and 255 for all else, which many networks are trained with
+TRAINED = ("road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation",
+           "terrain", "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")
+LABEL_OF_TRAIN_ID = np.full(256, 255, np.uint8)
+LABEL_OF_TRAIN_ID[:len(TRAINED)] = [ID[name] for name in TRAINED]
+LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
 
 
 @dataclass(frozen=True)
@@ -131,11 +136,20 @@ def read_image(path, height, width, channels=1):
     return cv2.resize(image, (width, height)).reshape(height, width, channels)
 
 
-def read_label_map(path):
-    """One label map of Cityscapes ids, uint8. Raises InputError where an id is 35 or more, and what `read_ids` does."""
+def read_label_map(path, train_ids=False):
+    """One label map of Cityscapes label ids, uint8. train_ids: the file holds train ids, which are translated.
+
+    Raises InputError for a number that is no such id, and what `read_ids` does.
+    """
     label_map = read_ids(path)
-    if label_map.max() >= N_CLASSES:
-        raise InputError(f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; take the labelIds.png files")
+    if train_ids:
+        label_map = LABEL_OF_TRAIN_ID[label_map]
+        if label_map.max() >= N_CLASSES:
+            raise InputError(f"{path}: holds an id that is no train id (0 to {len(TRAINED) - 1}, 255); leave out --ids "
+                             "train, or --ids labels says the same")
+    elif label_map.max() >= N_CLASSES:
+        raise InputError(f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; take the labelIds.png files, "
+                         "or give --ids train for train ids (0 to 18, 255)")
     return label_map
 
 

@@ -4,7 +4,9 @@ import argparse
 import json
 import os
 import shlex
+import signal
 import sys
+from contextlib import suppress
 from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -34,19 +36,10 @@ def check_data(options):
     """say what is there, missing or wrong in folders of KITTI, Cityscapes, KITTI's street scenes, and what can run"""
     from thesis_repro import check
 
-    folders = ((options.kitti, check.check_kitti), (options.cityscapes, check.check_cityscapes),
-               (options.kitti_semantic, check.check_kitti_semantic))
-    if not any(root for root, _ in folders):
+    roots = options.kitti, options.cityscapes, options.kitti_semantic
+    if not any(roots):
         raise InputError("nothing to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic")
-    problems = []
-    for root, check_folder in folders:
-        if root:
-            facts, its_problems = check_folder(root, options.deep)
-            print("\n".join([str(root), *(f"  {fact}" for fact in facts)]))
-            problems += its_problems
-    for problem in problems:
-        print(f"wrong: {one_line(problem)}", file=sys.stderr)
-    return 1 if problems else 0
+    return 0 if check.report(*roots, options.deep) else 1
 
 
 def predict(options):
@@ -85,6 +78,7 @@ def masks(options):
     sequence, widths = _sequence(options), sorted(set(options.dilation))
     masks_by_width = [LabelMasks(options.labels, sequence, width, _mask_settings(options)) for width in widths]
     _check_result_folder(options.output, options.labels, sequence.folder)
+    _look_at(sequence, masks_by_width)
     for width, its_masks in zip(widths, masks_by_width):
         folder = options.output if len(widths) == 1 else options.output / f"mask{width}"
         write_masks(its_masks, folder)
@@ -93,7 +87,8 @@ def masks(options):
 
 def odometry(options):
     """run the visual odometry over one sequence and print its errors, keypoints and time"""
-    from thesis_repro import odometry
+    from thesis_repro import check, odometry
+    from thesis_repro.files import is_stdout
     from thesis_repro.kitti import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
     from thesis_repro.odometry.refined import boresight
@@ -108,14 +103,17 @@ def odometry(options):
     masks = _masks(options, sequence)
     _check_new_files(options, sequence.poses_path, sequence.folder / "calib.txt", sequence.folder / "times.txt",
                      sequence.frame_paths[0].parent, options.masks, options.labels)
+    _look_at(sequence, [masks] if masks else [])
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.boresight:
         result = result.with_poses(boresight.corrected(result.poses, options.boresight))
-    record = terminal.run(result, sequence, settings.alignment)
     if options.output:
         write_kitti_poses(options.output, result.poses)
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
+    for line in check.path_oddities(sequence.name, result.poses, sequence.poses) if sequence.has_truth else ():
+        longrun.remark(line, warning=True)
+    record = terminal.run(result, sequence, settings.alignment)
     if options.video:
         from thesis_repro.report import video
 
@@ -126,19 +124,21 @@ def odometry(options):
         true = sequence.poses if sequence.has_truth else None
         paths = {"estimate": result.poses if true is None else metrics.shifted(result.poses, true, settings.alignment)}
         trajectories.write(options.plot, trajectories.figure(paths, true, f"sequence {sequence.name}"))
-    print(json.dumps(record) if options.json else terminal.run_text(record, sequence, options.speed))
+    print(json.dumps(record) if options.json else terminal.run_text(record, sequence, options.speed),
+          file=sys.stderr if any(map(is_stdout, (options.output, options.tum))) else None)
 
 
 def boresight(options):
     """estimate the constant rotation between camera and ground truth (degrees; for odometry --boresight)"""
-    from thesis_repro import odometry
+    from thesis_repro import kitti, odometry
     from thesis_repro.kitti import Sequence
     from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import terminal
 
     paths = {}
-    for name in dict.fromkeys(options.sequences):
+    for name in dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences):
         sequence = Sequence(options.kitti, name)
+        _look_at(sequence, [])
         result = odometry.run(sequence, replace(odometry.THESIS, estimator="refined"), description=f"sequence {name}")
         paths[name] = result.poses, sequence.poses
     rotation, table = boresight.estimate(list(paths.values())), boresight.explained(paths)
@@ -159,8 +159,10 @@ def study(options):
     widths = options.widths or (ALL_WIDTHS if has_labels else ())
     scheduler_address(options.dask)
     planned = series.Study(
-        options.kitti.absolute(), tuple(dict.fromkeys(options.sequences or kitti.sequences(options.kitti))),
-        sources.named(options.sources, options.name, _mask_settings(options, has_labels)), tuple(sorted(set(widths))),
+        options.kitti.absolute(), tuple(dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences))
+        or tuple(kitti.sequences(options.kitti)),
+        sources.named(options.sources, options.name, _mask_settings(options, has_labels), options.invert),
+        tuple(sorted(set(widths))),
         options.controls, tuple(dict.fromkeys(options.estimator)), options.repetitions, options.frames)
     planned.check()
     if options.plan:
@@ -174,8 +176,12 @@ def study(options):
     from thesis_repro.report import study  # loads all that draws, so the input is checked before
 
     with longrun.logged(folder, options.command_line) as run, longrun.claimed(folder):
+        warnings = [line for sequence, of_sequence in planned.masks() for line in _look_at(sequence, of_sequence)]
         summary = planned.run(folder, options.jobs or cores(), options.dask)
-        counts, page = summary.attrs, study.write(planned, summary, folder)
+        for line in planned.path_oddities(summary, folder):
+            longrun.remark(line, warning=True)
+            warnings.append(line)
+        counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
         failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
         run.end(f"{len(summary):,} runs{_from_before(counts['kept'])}{failed}; open {page} in a browser")
     return 1 if failed else 0
@@ -183,6 +189,7 @@ def study(options):
 
 def evaluate(options):
     """compare trajectories with the true poses: the thesis's RMSE and MAE, ATE, RPE, KITTI's t_rel and r_rel"""
+    from thesis_repro import check
     from thesis_repro.kitti import true_poses
     from thesis_repro.report import trajectories
 
@@ -190,6 +197,8 @@ def evaluate(options):
     true = true_poses(options.kitti, options.sequence)
     _check_new_files(options, *options.poses)
     paths = trajectories.read(options.poses, true)
+    for line in (line for name, poses in paths.items() for line in check.path_oddities(name, poses, true)):
+        longrun.remark(line, warning=True)
     rows = trajectories.evaluate(paths, true, options.align)
     if options.plot:
         aligned = trajectories.aligned(paths, true, options.align)
@@ -223,6 +232,20 @@ def _sequence(options):
     return Sequence(options.kitti, options.sequence, options.camera, getattr(options, "speed", None))
 
 
+def _look_at(sequence, of_sequence):
+    """Print what masks of a sequence hold, and a warning for what is odd in them and in it; returns the warnings."""
+    from thesis_repro import check
+
+    warnings = check.oddities(sequence)
+    for masks in of_sequence:
+        line, odd = check.of_masks(masks, sequence)
+        longrun.remark(line)
+        warnings += odd
+    for line in warnings:
+        longrun.remark(line, warning=True)
+    return warnings
+
+
 def _images_in(folder):
     """The images of a folder, or of a KITTI sequence folder, which must be complete."""
     from thesis_repro import files, kitti
@@ -240,7 +263,7 @@ def _mask_settings(options, has_labels=True):
     from thesis_repro.masks import MaskSettings
 
     settings = MaskSettings(options.boundaries, options.symmetric, tuple(options.classes), options.without_movable,
-                            options.margin, options.keep)
+                            options.margin, options.keep, options.ids)
     if not has_labels and settings != MaskSettings():
         raise InputError(f"{', '.join(MASKS)}: need --labels DIR, the label maps that masks are made from")
     return settings
@@ -255,7 +278,9 @@ def _masks(options, sequence):
         raise InputError("--labels DIR, --dilation W: one needs the other")
     if options.labels:
         return LabelMasks(options.labels, sequence, options.dilation, settings)
-    return MaskFolder(options.masks, sequence) if options.masks else None
+    if options.invert and not options.masks:
+        raise InputError("--invert: is for masks; name them with --masks DIR")
+    return MaskFolder(options.masks, sequence, options.invert) if options.masks else None
 
 
 def _check_result_folder(output, *inputs):
@@ -330,8 +355,13 @@ MASKS = {
     "--keep": dict(choices=("boundaries", "static", "inverse", "static-boundaries"), default="boundaries",
                    help="where keypoints may lie: on boundaries, on all but movable things (static), on all but "
                         "boundaries (inverse), on boundaries of what cannot move"),
+    "--ids": dict(choices=("labels", "train"), default="labels", help="what label maps hold: Cityscapes' label ids, or "
+                  "its train ids, 0 to 18 and 255 (labels)"),
     "--margin": dict(type=int, default=0, metavar="PIXELS", help="nothing along the frame's rim (0)"),
 }
+
+
+INVERT = dict(action="store_true", help="of --masks, keep what is 0 and ignore what is not")
 
 
 def build_parser():
@@ -376,7 +406,8 @@ def build_parser():
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
     add("--speed", type=float, metavar="M_PER_S",
         help="metres a second where there are no true poses to take the length of steps from (without it, 1 m a frame)")
-    either("--masks", type=Path, metavar="DIR", help="one mask a frame, 255 keep, 0 ignore")
+    either("--masks", type=Path, metavar="DIR", help="one mask a frame, or one for all: 255 keep, 0 ignore")
+    add("--invert", **INVERT)
     either("--labels", type=Path, metavar="DIR", help="one label map a frame, with --dilation")
     add("--dilation", type=int, metavar="W", help="dilation width in pixels of masks from label maps")
     add("--pyslam", choices=("2021", "2024"), default="2021",
@@ -397,12 +428,13 @@ def build_parser():
 
     sub = command(study, "--kitti", *MASKS, "--output", kitti=REQUIRED)
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
-    add("--sequences", nargs="+", action="extend", metavar="NN", help="those to run (all that ROOT holds)")
+    add("--sequences", nargs="+", action="extend", default=[], metavar="NN", help="those to run (all that ROOT holds)")
     for kind, what in (("labels", "a folder of label maps (Cityscapes ids, any size, named like the frames) for each "
                                   "sequence, DIR/NN; several times for several networks"),
                        ("masks", "the same with masks of the frames' size, 255 keep, 0 ignore")):
         add(f"--{kind}", dest="sources", action="append", metavar="DIR", help=what,
             type=lambda text, kind=kind: (kind, _path(text)))
+    add("--invert", **INVERT)
     add("--name", action="append", default=[], metavar="NAME", help="of each --labels and --masks (the folder's)")
     add("--widths", type=int, nargs="+", action="extend", metavar="W",
         help="dilation widths of masks from label maps, pixels (1 to 15)")
@@ -430,10 +462,17 @@ def main(arguments=None):
     options = build_parser().parse_args(arguments)
     options.command_line = shlex.join(["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)])
     try:
-        longrun.need_addresses(4 if options.function is predict else 2)
-        return options.function(options) or 0
+        with longrun.stoppable():
+            longrun.need_addresses(4 if options.function is predict else 2)
+            code = options.function(options) or 0
+            sys.stdout.flush()
+            return code
+    except BrokenPipeError:  # whoever read this has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except Exception as error:
         return longrun.report_error(error)
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on where it can", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as stop:
+        with suppress(OSError):  # the terminal may be gone
+            print("stopped; the same command goes on where it can", file=sys.stderr)
+        return 128 + (stop.args[0] if stop.args else signal.SIGINT)

@@ -114,15 +114,15 @@ def listed(folder, pattern="*.png"):
 
 
 def images(folder):
-    """The PNG or JPEG images of a folder, in the order of the numbers that their names end in, or else of the names.
+    """The PNG or JPEG images of a folder, in the order of their names, in which numbers count as numbers: 9 before 10.
 
     Hidden ones are left out. Raises InputError where there are both kinds.
     """
     paths = [path for path in listed(folder, "*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
     if len({path.suffix.lower() == ".png" for path in paths}) > 1:
         raise InputError(f"{folder}: holds PNG and JPEG images; move those of one kind away")
-    numbers = numbers_of(paths)
-    return paths if numbers is None else [path for _, path in sorted(zip(numbers, paths))]
+    return sorted(paths, key=lambda path: ([(letters, int(digits or -1)) for letters, digits in
+                                            re.findall(r"(\D*)(\d*)", path.stem)], path))
 
 
 def numbers_of(paths):

@@ -198,6 +198,11 @@ def _places(root, name):
     return root, root / "sequences" / name, root / "poses" / f"{name}.txt"
 
 
+def name_of(root: str | Path, name: str) -> str:
+    """The name under which a sequence's results go: 06, where "6" may be given."""
+    return _places(root, name)[1].name
+
+
 def true_poses(root: str | Path | None, name: str | Path) -> np.ndarray:
     """The true poses of a sequence, (n, 4, 4), whose frames need not be there; root and name as Sequence takes them."""
     return read_poses(_places(root, name)[2])

@@ -3,6 +3,7 @@
 Nothing here needs another package, so that it works where the memory for one is lacking.
 """
 
+import ctypes
 import errno
 import fcntl
 import logging
@@ -10,7 +11,9 @@ import os
 import re
 import resource
 import secrets
+import signal
 import sys
+import threading
 import time
 from contextlib import contextmanager, suppress
 from datetime import timedelta
@@ -214,6 +217,48 @@ def say(text, warning=False):
     """Print a text and log it."""
     print(text, flush=True)
     note(text, logging.WARNING if warning else logging.INFO)
+
+
+def remark(text, warning=False):
+    """Print a line beside the results, on standard error, and log it."""
+    print(f"warning: {one_line(text)}" if warning else one_line(text), file=sys.stderr, flush=True)
+    note(text, logging.WARNING if warning else logging.INFO)
+
+
+# The end of a process
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal that asks this process to end; its number is the argument."""
+
+
+@contextmanager
+def stoppable():
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that its processes end with it.
+
+    A signal that the caller ignores (nohup) stays ignored.
+    """
+    def stop(number, _):
+        raise Stopped(number)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    ours = [number for number, handler in before.items()
+            if handler == signal.SIG_DFL and threading.current_thread() is threading.main_thread()]
+    for number in ours:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, before[number])
+
+
+def end_with_parent():
+    """Let the system kill this process when the one that started it ends, in whatever way (Linux alone)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+        if os.getppid() == 1:
+            os._exit(1)  # it has ended already
 
 
 def note(text, level=logging.ERROR):

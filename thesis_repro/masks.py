@@ -16,7 +16,7 @@ from thesis_repro.files import is_whole, listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence
 
 CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
-BOUNDARIES = ("canny", "exact")
+BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
 CLASS_EDGE_WINDOW = 5  # pixels a side: a Canny edge within two pixels of a change of class belongs to that change
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked ones too
 # Where keypoints may lie: on the thesis's boundaries, or where SLAM systems with a segmentation leave them.
@@ -37,6 +37,7 @@ class MaskSettings:
     for "static").
     margin: no keypoints within so many pixels of the frame's border. Points there are lost in the next frame, and
     networks that pad with zeros predict boundaries there that do not exist.
+    ids: what the files hold, Cityscapes' label ids or its train ids (`cityscapes.TRAINED`).
     Raises InputError for an unknown name and a negative number.
     """
 
@@ -46,9 +47,10 @@ class MaskSettings:
     movable: int | None = None
     margin: int = 0
     keep: str = "boundaries"
+    ids: str = "labels"
 
     def __post_init__(self) -> None:
-        for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP)):
+        for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP), ("ids", IDS)):
             if getattr(self, name) not in known:
                 raise InputError(f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(known)}")
         for name in self.classes:
@@ -197,9 +199,14 @@ class LabelMasks:
         return _widened(_parts_of_file(self.paths[index], self.size, self.settings), self.dilation_width, self.settings)
 
 
+def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
+    """The label map, in label ids, that the mask of a frame is made from."""
+    return read_label_map(masks.paths[index], masks.settings.ids == "train")
+
+
 @lru_cache(maxsize=8)  # a frame's masks of several widths have these parts in common
 def _parts_of_file(path, size, settings):
-    return _edges_and_forbidden(read_label_map(path), size, settings)
+    return _edges_and_forbidden(read_label_map(path, settings.ids == "train"), size, settings)
 
 
 def forget_edges() -> None:
@@ -222,20 +229,23 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 
 
 class MaskFolder:
-    """Masks of a sequence read from a folder of images named like the frames: masks[i] for frame i.
+    """Masks of a sequence read from a folder of images named like the frames, or from a single image for all frames:
+    masks[i] for frame i. invert: no keypoints where the images are not 0.
 
     Raises InputError when the folder or a frame's mask is missing, and for what `read_mask` refuses.
     """
 
-    def __init__(self, folder: str | Path, sequence: Sequence) -> None:
+    def __init__(self, folder: str | Path, sequence: Sequence, invert: bool = False) -> None:
         self.paths = _files_of_frames(folder, sequence, "mask")
         self.size = sequence.size
+        self.invert = invert
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return read_mask(self.paths[index], self.size)
+        mask = read_mask(self.paths[index], self.size)
+        return np.where(mask, np.uint8(0), np.uint8(255)) if self.invert else mask
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
@@ -260,12 +270,18 @@ def check_mask_size(path: str | Path, mask_size: tuple[int, ...], size: tuple[in
 
 def _files_of_frames(folder, sequence, what):
     folder = Path(folder)
+    if what == "mask" and folder.is_file():
+        return [folder] * len(sequence)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence "
                          f"{sequence.name}")
-    present = {path.name for path in listed(folder)}
-    missing = [name for name in sequence.label_names if name not in present]
+    present = {path.name: path for path in listed(folder)}
+    if what == "mask" and len(present) == 1 and len(sequence) > 1:
+        return list(present.values()) * len(sequence)
+    paths = [present.get(name) or present.get(f"{frame.name}.png")  # as some tools append it
+             for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)]
+    missing = [name for name, path in zip(sequence.label_names, paths, strict=True) if path is None]
     if missing:
         raise InputError(f"{folder / missing[0]}: no such {what} ({len(missing)} of {len(sequence)} frames of sequence "
                          f"{sequence.name} have none); every frame needs one")
-    return [folder / name for name in sequence.label_names]
+    return paths

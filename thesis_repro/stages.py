@@ -11,6 +11,7 @@ import importlib.metadata
 import json
 import os
 import sqlite3
+import stat
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -239,6 +240,8 @@ def contents(paths):
 
 def _identity(path):
     status = os.stat(path)
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: is no file; data must be in files")
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
 
 

@@ -115,7 +115,7 @@ def test_results_of_another_length_are_not_thrown_away(done, study):
     (["--labels", "LABELS", "--name", "a", "--name", "b"], "--name b: 2 names for 1 folders"),
     (["--labels", "LABELS", "--name", "a/b"], "--name a/b: a name may have letters"),
     (["--masks", "MASKS", "--widths", "5"], "--widths: only masks from label maps"),
-    (["--masks", "MASKS", "--symmetric"], "--symmetric, --classes, --without-movable, --margin: need --labels DIR"),
+    (["--masks", "MASKS", "--symmetric"], "--without-movable, --ids, --margin: need --labels DIR"),
     (["--labels", "LABELS", "--margin", "-1"], "margin=-1: must be 0 or more pixels"),
     (["--masks", "LABELS"], "320x320 pixels, but the frames have"),
     (["--masks", "TRUE", "--sequences", "00"], "different values; a mask has 0 and 255 (label maps go with --labels)"),

@@ -169,8 +169,10 @@ class Odometry:
             else:
                 if settings.estimator == "refined":
                     self._check_consistency(step)
-                elif settings.fallback and motion.translation is not None:
-                    self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
+                else:
+                    step.flags += _implausible(step)
+                    if settings.fallback and motion.translation is not None:
+                        self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
                 self.pose = self._moved(step.motion, step.scale)
                 step.updated = True
         step.pose = self.pose
@@ -271,6 +273,16 @@ def _by_chance(inliers):
     # Between frames with nothing in common the estimator finds 7 inliers among 20 points, 9 among 100, 12 among 300,
     # and 1.5 to 2.7 % of 1600 (with PySLAM's threshold); between real neighbours, 45 to 85 % of them.
     return inliers.sum() <= 8 + 0.03 * len(inliers)
+
+
+STILL = 0.3  # pixels, mean shift of the points: in a picture that did not change, noise moves them by less
+MAX_TURN = 6.0  # degrees a frame: KITTI's cars turn by up to 4.8
+
+
+def _implausible(step):
+    """Flags of a motion that is used as it is, and that no car makes."""
+    turn = np.degrees(np.arccos(np.clip((np.trace(step.motion.rotation) - 1) / 2, -1, 1)))
+    return ["still picture"] * bool(_mean_shift(step) < STILL) + ["too large a turn"] * bool(turn > MAX_TURN)
 
 
 def _mean_shift(step):

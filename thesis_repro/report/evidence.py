@@ -6,8 +6,8 @@ switches. A stopped run goes on where it was.
 """
 
 import argparse
-import os
 import sys
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,6 +19,7 @@ from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import audit, captions, comparison, failures, style, texts
+from thesis_repro.settings import cores, number, processes
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
@@ -127,11 +128,11 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description="tables, plots and findings on real frames, without any frame")
     parser.add_argument("kitti", type=Path, help="folder that holds sequences and poses")
     parser.add_argument("folder", type=Path, help="where to write")
-    parser.add_argument("--frames", type=int, help="from the start of each sequence (all)")
-    parser.add_argument("--repetitions", type=int, default=5, help="of every run (5)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once")
-    options = parser.parse_args(arguments)
+    parser.add_argument("--frames", type=partial(number, "FRAMES"), help="from the start of each sequence (all)")
+    parser.add_argument("--repetitions", type=partial(number, "REPETITIONS"), default=5, help="of every run (5)")
+    parser.add_argument("--jobs", type=processes, default=cores(), help="processes at once")
     try:
+        options = parser.parse_args(arguments)
         with longrun.claimed(BUILD), longrun.logged(BUILD, "tables, plots and findings") as run:
             files = write(options.kitti, options.folder, BUILD, frames=options.frames, repetitions=options.repetitions,
                           processes=options.jobs)

@@ -12,8 +12,11 @@ from thesis_repro.study.sources import KINDS
 DIGITS = 6  # of the table of runs
 
 
-def write(study, runs, folder):
-    """Write everything that the runs of a `series.Study` show into a folder; returns the page's path."""
+def write(study, runs, folder, warnings=()):
+    """Write everything that the runs of a `series.Study` show into a folder; returns the page's path.
+
+    warnings: lines that the page opens with.
+    """
     runs = runner.with_boresight_correction(runs, study.kitti, folder / "runs", study.frames)
     table, note = compare.comparisons(runs), data_note(study)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
@@ -22,8 +25,8 @@ def write(study, runs, folder):
         "comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
         "errors": tables.table_errors(runs)}, folder, note)
     write_text(folder / page.PAGE, page.build_study(
-        folder, [("text", "findings"), *names], study=study, embedded=is_embedded(study.kitti), kinds=KINDS,
-        estimators=ESTIMATORS, line_width=controls.LINE_WIDTH,
+        folder, [("text", "findings"), *names], study=study, warnings=warnings,
+        embedded=is_embedded(study.kitti), kinds=KINDS, estimators=ESTIMATORS, line_width=controls.LINE_WIDTH,
         changed={source.name: _changed(source) for source in study.sources},
         widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
         frames=runs.groupby("sequence")["frames"].first().to_dict()))

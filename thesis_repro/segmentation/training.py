@@ -1,9 +1,11 @@
 """Loss, metrics and the input of training (A.5), and what lets a long training go on after a stop."""
 
+import io
 import json
 import os
+import zipfile
 import zlib
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -12,6 +14,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("TF_FORCE_GPU_ALLOW_GROWTH", "true")  # take of a GPU's memory what is needed, not all of it
 os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
 
+import h5py
 import keras
 import numpy as np
 import pandas as pd
@@ -216,6 +219,22 @@ def _save_whole(model, path, **options):
         type(model).save(model, temporary, **options)
 
 
+def _check_unpacked(path):
+    """Raise InputError where a model's file says that it holds far more than its bytes can, before it is unpacked."""
+    most = 10 * Path(path).stat().st_size + 100 * 2**20
+    sizes, source = [0], path
+    with suppress(OSError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile):  # Keras says what is wrong
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                sizes = [part.file_size for part in archive.infolist()]
+                source = io.BytesIO(archive.read("model.weights.h5") if sum(sizes) <= most else b"")
+        with h5py.File(source, "r") as file:
+            file.visititems(lambda _, item: sizes.append(item.nbytes if isinstance(item, h5py.Dataset) else 0))
+    if sum(sizes) > most:
+        raise InputError(f"{path}: would unpack to {sum(sizes) / 1e6:,.0f} MB, more than weights shrink; "
+                         "name another model")
+
+
 def load_model(path):
     """Read a model saved by Keras, `.keras` or HDF5, for prediction: without loss and metrics.
 
@@ -225,6 +244,7 @@ def load_model(path):
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such model; train one or name another file")
+    _check_unpacked(path)
     try:
         model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile each raise their own

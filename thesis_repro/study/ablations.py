@@ -15,7 +15,7 @@ import joblib
 import numpy as np
 import pandas as pd
 
-from thesis_repro import masks, odometry, stages
+from thesis_repro import longrun, masks, odometry, stages
 from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
@@ -77,7 +77,7 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, *, fr
     alignment that may scale).
     """
     calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, frames, options) for name in names]
-    work = joblib.Parallel(n_jobs=processes, return_as="generator")(calls)
+    work = joblib.Parallel(n_jobs=processes, return_as="generator", initializer=longrun.end_with_parent)(calls)
     paths = list(progress(work, "ablations", total=len(calls), unit="sequence"))
     return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in paths], ignore_index=True)
 

@@ -56,7 +56,7 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
 
 
 def _here(size: int, function: Callable, calls: Calls) -> Results:
-    work = joblib.Parallel(n_jobs=size, return_as="generator_unordered")(
+    work = joblib.Parallel(n_jobs=size, return_as="generator_unordered", initializer=longrun.end_with_parent)(
         joblib.delayed(_numbered)(index, function, call) for index, call in enumerate(calls))
     try:
         yield from work

@@ -131,9 +131,10 @@ def masks(method: str, source: Source, sequence: Sequence, dilation_width: int |
     if method in OF_MASKS:
         return OF_MASKS[method](source, sequence, dilation_width)
     if method == "true-labels":
-        source = replace(source, folder=true_labels(sequence.root, sequence.name))
+        source = replace(source, folder=true_labels(sequence.root, sequence.name),
+                         settings=replace(source.settings, ids="labels"))
     elif method == "corrected":
-        source = replace(source, settings=CORRECTED)
+        source = replace(source, settings=replace(CORRECTED, ids=source.settings.ids))
     elif method in LITERATURE:
         source = replace(source, settings=replace(source.settings, keep=method))
     else:

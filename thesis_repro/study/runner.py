@@ -268,7 +268,7 @@ def with_boresight_correction(runs: pd.DataFrame, kitti: Path, folder: Path, fra
     """
     references = refined_paths(runs, kitti, folder, frames)
     angles = {name: boresight.angles_of_day(name, references) for name in references}
-    of_run = _poses(runs[runs["sequence"].isin(angles)], folder)
+    of_run = run_poses(runs[runs["sequence"].isin(angles)], folder)
     corrected = {key: metrics.rmse(boresight.corrected(poses, angles[key[0]]), references[key[0]][1])
                  for key, poses in of_run.items()}
     return runs.assign(rmse_boresight_corrected=[corrected.get(key, np.nan)
@@ -280,14 +280,14 @@ def refined_paths(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | N
     """{sequence: (estimated, true)} of all keypoints under the refined estimator, poses (n, 4, 4), for `boresight`."""
     chosen = runs[(runs["method"] == "baseline") & (runs["estimator"] == "refined") & (runs["repetition"] == 0)]
     return {name: (poses, Sequence(kitti, name).subset(frames).poses)
-            for (name, _), poses in _poses(chosen, folder).items()}
+            for (name, _), poses in run_poses(chosen, folder).items()}
 
 
 def paths(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
     """Estimated positions (n, 3), metres, of each row of a table of runs, keyed by sequence and run."""
-    return {key: poses[:, :3, 3] for key, poses in _poses(runs, folder).items()}
+    return {key: poses[:, :3, 3] for key, poses in run_poses(runs, folder).items()}
 
 
-def _poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
+def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
     return {(name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
             for name, run in zip(runs["sequence"], runs["run"], strict=True)}

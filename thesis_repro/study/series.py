@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro import InputError, longrun, stages
+from thesis_repro import InputError, check, longrun, stages
 from thesis_repro.kitti import Sequence
 from thesis_repro.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
-from thesis_repro.study.sources import Source
+from thesis_repro.study.sources import FileMasks, Source
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,18 @@ class Study:
             if len(sequence) < 3:
                 raise InputError(f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more")
         sources.check(self.sources, sequences, {*self.widths, *([] if self.tested is None else [self.tested])})
+
+    def masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
+        """Each sequence with the masks of each source, of the tested width or else of the middle one."""
+        width = self.tested or (self.widths[len(self.widths) // 2] if self.widths else None)
+        sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
+        return [(sequence, [source.masks(sequence, width) for source in self.sources]) for sequence in sequences]
+
+    def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
+        """`check.path_oddities` of the runs with all keypoints."""
+        chosen = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)].drop_duplicates("sequence")
+        return [line for (name, _), poses in runner.run_poses(chosen, folder / "runs").items()
+                for line in check.path_oddities(name, poses, Sequence(self.kitti, name).poses[:len(poses)])]
 
     def first_jobs(self) -> list[jobs.Job]:
         """The runs that need no result of others."""

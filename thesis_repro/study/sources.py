@@ -23,13 +23,14 @@ class Source:
     folder: holds one folder a sequence; or, where one sequence is all there is, its files.
     kind: "labels", label maps of any size whose boundaries are dilated; "masks", masks of the frames' size.
     name: that its runs are called by; empty where there is only one source and nobody needs to ask.
-    settings: how masks are made from label maps.
+    settings: how masks are made from label maps. invert: of masks, keep what they ignore.
     """
 
     folder: Path
     kind: str = "labels"
     name: str = ""
     settings: MaskSettings = MaskSettings()
+    invert: bool = False
 
     def of(self, sequence: str) -> Path:
         """The folder with the files of one sequence."""
@@ -43,26 +44,27 @@ class Source:
         Raises InputError where a frame has no file.
         """
         if self.kind == "masks":
-            return MaskFolder(self.of(sequence.name), sequence)
+            return MaskFolder(self.of(sequence.name), sequence, self.invert)
         assert dilation_width is not None  # label maps have no masks without one
         return LabelMasks(self.of(sequence.name), sequence, dilation_width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError where a file is no label map, or no mask of a (height, width)."""
-        read_label_map(path) if self.kind == "labels" else read_mask(path, size)
+        read_label_map(path, self.settings.ids == "train") if self.kind == "labels" else read_mask(path, size)
 
     def record(self, sequence: str) -> dict[str, str | None]:
         """What tells results of these files and settings from those of others."""
         folder = self.of(sequence)
         made_from = stages.made_from(folder) if stages.record(folder) is not None else None
-        settings = {"settings": str(self.settings)} if self.kind == "labels" else {}
+        settings = {"settings": str(self.settings)} if self.kind == "labels" else {"invert": str(self.invert)}
         return {self.kind: stages.listing(listed(folder)), "made_from": made_from, **settings}
 
 
-def named(folders: Iterable[tuple[str, Path]], names: Iterable[str], settings: MaskSettings) -> tuple[Source, ...]:
+def named(folders: Iterable[tuple[str, Path]], names: Iterable[str], settings: MaskSettings,
+          invert: bool = False) -> tuple[Source, ...]:
     """Sources from (kind, folder), the first with the first name; those without one are called as their folder.
 
-    settings: of all masks from label maps.
+    settings: of all masks from label maps. invert: all ready-made masks.
     Raises InputError for a name that cannot be a folder's, for two of the same, and for more names than folders.
     """
     places, given = [(kind, folder.absolute()) for kind, folder in folders], list(names)
@@ -77,7 +79,7 @@ def named(folders: Iterable[tuple[str, Path]], names: Iterable[str], settings: M
         if name.lower() in (source.name.lower() for source in sources):  # some file systems do not tell case
             raise InputError(f"--name: two folders of masks would be called {name!r}; give each a --name of its own, "
                              "in the order of --labels and --masks")
-        sources.append(Source(folder, kind, name or "masks", settings))
+        sources.append(Source(folder, kind, name or "masks", settings, invert and kind == "masks"))
     return tuple(sources)
 
 

@@ -15,7 +15,7 @@ import joblib
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry, stages
+from thesis_repro import InputError, longrun, masks, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import MaskSettings
@@ -49,7 +49,7 @@ def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source],
     """
     jobs, sources = list(jobs), by_name(labels)
     names = sorted({job.sequence for job in jobs})
-    work = joblib.Parallel(n_jobs=processes, return_as="generator")(
+    work = joblib.Parallel(n_jobs=processes, return_as="generator", initializer=longrun.end_with_parent)(
         joblib.delayed(_time_jobs)([job for job in jobs if job.sequence == name], Sequence(kitti, name).subset(frames),
                                    sources, folder / name / f"seconds-{frames}.csv") for name in names)
     return pd.concat(progress(work, "timing", total=len(names), unit="sequence"), ignore_index=True)

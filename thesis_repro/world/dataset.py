@@ -124,7 +124,8 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
         with progress(description="rendering the embedded world", total=len(missing), unit="picture") as bar:
             # Ten at a time: pictures of one sequence share its street.
             work = (delayed(_write_some)(missing[k:k + 10]) for k in range(0, len(missing), 10))
-            for count in Parallel(n_jobs=workers, return_as="generator_unordered")(work):
+            for count in Parallel(n_jobs=workers, return_as="generator_unordered",
+                                  initializer=longrun.end_with_parent)(work):
                 bar.update(count)
         for name in parameters["sequences"] if only != "cityscapes" else ():
             if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # the last of them
