@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import nbformat
 import pytest
@@ -13,7 +14,9 @@ from thesis_repro.settings import ROOT
 
 pytestmark = pytest.mark.slow
 
-COMMAND = [sys.executable, "-m", "thesis_repro.report.execute", "one.ipynb", "out/done.ipynb"]
+COMMAND = [str(Path(sys.executable).parent / "jupyter-nbconvert"), "--to", "notebook", "--execute",
+           "--log-level=CRITICAL", "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
+           "--Execution.log_file=out/done.log", "--output-dir", "out", "--output", "done", "one.ipynb"]
 
 
 @pytest.fixture

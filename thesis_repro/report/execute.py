@@ -1,7 +1,6 @@
 """How `make figures` executes a notebook: with progress, one line on failure and outputs without libraries' logs.
 
-`python -m thesis_repro.report.execute NOTEBOOK EXECUTED` writes the executed notebook and, beside it, a log of what the
-kernel says outside of cells and of a failure's whole report.
+The Makefile calls `jupyter nbconvert --to notebook --execute` and names `Execution` as the preprocessor that does it.
 """
 
 import logging
@@ -13,12 +12,11 @@ import time
 import traceback
 from pathlib import Path
 
-import nbformat
-from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError, DeadKernelError
+from nbconvert.preprocessors import ExecutePreprocessor
+from traitlets import Unicode
 
 from thesis_repro import longrun
-from thesis_repro.files import atomic
 from thesis_repro.settings import PREFIX
 
 # Lines that segmentation-models, absl and TensorFlow print whatever TF_CPP_MIN_LOG_LEVEL says.
@@ -27,57 +25,57 @@ LOGGED = re.compile(r"^(?:Segmentation Models: using .* framework\.|WARNING: All
 COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 
-def executed_notebook(path, log):
-    """The notebook of a file with the outputs of all its cells, run in its folder; log: a file for the kernel's words.
+class Execution(ExecutePreprocessor):
+    """Executes all cells of a notebook; ends the program with status 1 where one fails, 130 where it is interrupted."""
 
-    Raises nbclient's CellExecutionError and DeadKernelError. However it ends, its kernel does too.
-    """
-    notebook = nbformat.read(path, as_version=4)
-    # python3: not what the last editor of the notebook called the kernel
-    client = NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": path.parent}})
-    # bars of progress (`files.progress`) go to this program's own standard error
-    environment = os.environ | {f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2"}
-    with client.setup_kernel(env=environment, stdout=log, stderr=log):
-        for index, cell in enumerate(notebook.cells):
-            client.execute_cell(cell, index)
-            for output in cell.get("outputs", []):
-                if output.output_type == "stream":
-                    output.text = LOGGED.sub("", output.text)
-            if "outputs" in cell:
-                cell.outputs = [output for output in cell.outputs if output.get("text") != ""]
-    return notebook
+    kernel_name = Unicode("python3").tag(config=True)  # not what the last editor of the notebook called it
+    log_file = Unicode("execution.log", help="what the kernel says outside of cells, and a failure's whole report"
+                       ).tag(config=True)
+
+    def preprocess(self, nb, resources=None, km=None):
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
+        sys.excepthook = _say_why  # where nbconvert cannot write the result
+        name, path, failure, started = resources["metadata"]["name"], Path(self.log_file), None, time.monotonic()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+            with longrun.locked(path), longrun.logged(path.parent, f"make figures, {name}", ours=True), \
+                    open(path, "w", encoding="utf-8") as self._log:
+                longrun.say(name)
+                try:
+                    nb, resources = super().preprocess(nb, resources, km)
+                    longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
+                except Exception as error:
+                    self._log.write(COLORS.sub("", traceback.format_exc()))
+                    failure = f"{name} failed: {_reason(error)}"
+                    longrun.note(failure)
+        except KeyboardInterrupt:
+            logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
+            print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
+            sys.exit(130)
+        if failure:
+            print(f"{failure}\nthe whole report: {os.path.relpath(path)}; the same command goes on from here",
+                  file=sys.stderr)
+            sys.exit(1)
+        return nb, resources
+
+    def setup_kernel(self, **options):
+        # bars of progress (`files.progress`) go to this program's own standard error
+        environment = os.environ | {f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2"}
+        return super().setup_kernel(env=environment, stdout=self._log, stderr=self._log, **options)
+
+    def preprocess_cell(self, cell, resources, index):
+        cell, resources = super().preprocess_cell(cell, resources, index)
+        for output in cell.get("outputs", []):
+            if output.output_type == "stream":
+                output.text = LOGGED.sub("", output.text)
+        if "outputs" in cell:
+            cell.outputs = [output for output in cell.outputs if output.get("text") != ""]
+        return cell, resources
 
 
-def main(path, executed):
-    """Execute a notebook; returns the exit status: 0, 1 where it failed, 130 where it was interrupted."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
-    path, executed = Path(path).absolute(), Path(executed)
-    name, log_path, started = path.stem, executed.with_suffix(".log"), time.monotonic()
-    try:
-        log_path.parent.mkdir(parents=True, exist_ok=True)
-        log_path.touch()
-        with longrun.locked(log_path), longrun.logged(log_path.parent, f"make figures, {name}", ours=True), \
-                open(log_path, "w", encoding="utf-8") as log:
-            longrun.say(name)
-            try:
-                notebook = executed_notebook(path, log)
-            except Exception as error:
-                log.write(COLORS.sub("", traceback.format_exc()))
-                reason = f"{name} failed: {_reason(error)}"
-                longrun.note(reason)
-                print(f"{reason}\nthe whole report: {os.path.relpath(log_path)}; the same command goes on from here",
-                      file=sys.stderr)
-                return 1
-            with atomic(executed) as temporary:
-                nbformat.write(notebook, temporary)
-            longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
-    except KeyboardInterrupt:
-        logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
-        print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
-    except Exception as error:
-        return longrun.report_error(error)
-    return 0
+def _say_why(kind, error, _trace):
+    print(longrun.explain(error) or f"{kind.__name__}: {error}", file=sys.stderr)
 
 
 def _reason(error):
@@ -89,6 +87,3 @@ def _reason(error):
         name, text = error.ename, error.evalue
     return f"{name}: {text}".splitlines()[0] + longrun.remedy(text)
 
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
