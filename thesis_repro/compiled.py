@@ -44,7 +44,7 @@ def fast(function, **options):
     as well. So callers pass C-contiguous arrays of one type, and loops over single numbers take less time to compile
     than array expressions.
     """
-    options = {"nogil": True, "error_model": "numpy", **options}
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder that numba may write its cache to
@@ -56,4 +56,4 @@ def inner(function):
 
     Without an entry from Python it takes less time to compile, and as part of its callers, less to run.
     """
-    return fast(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    return fast(function, forceinline=True, no_cpython_wrapper=True)

@@ -126,7 +126,7 @@ def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettin
     never = np.ones(size, bool)
     never[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
     if settings.movable is not None:
-        moving = np.isin(_enlarged(label_map, size, True), MOVABLE).astype(np.uint8)
+        moving = _enlarged(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
         never |= dilate(moving, 2 * settings.movable + 1) > 0
     return never
 
@@ -206,12 +206,17 @@ def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
 
 @lru_cache(maxsize=8)  # a frame's masks of several widths have these parts in common
 def _parts_of_file(path, size, settings):
-    return _edges_and_forbidden(read_label_map(path, settings.ids == "train"), size, settings)
+    return _edges_and_forbidden(_read_once(path, settings.ids == "train"), size, settings)
+
+
+# masks of several settings have the label map in common, of a frame and of the one whose masks are a control
+_read_once = lru_cache(maxsize=2)(read_label_map)
 
 
 def forget_edges() -> None:
     """Drop the edges that LabelMasks keeps for its next width, so that the making of a mask can be timed."""
     _parts_of_file.cache_clear()
+    _read_once.cache_clear()
 
 
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:

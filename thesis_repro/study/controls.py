@@ -54,7 +54,7 @@ class Mirrored(OtherFrame):
     """The frame's own mask, left and right exchanged: the layout of a street, but not of this one."""
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return np.ascontiguousarray(self.masks[index][:, ::-1])
+        return cv2.flip(self.masks[index], 1)
 
 
 class RandomLines(OtherFrame):
@@ -65,11 +65,11 @@ class RandomLines(OtherFrame):
         wanted = np.count_nonzero(mask)
         for number in (2**8, 2**11, 2**14):
             first = self._first_segments(index, number, mask.shape)
-            covered = np.cumsum(np.bincount(first.ravel(), minlength=number + 1))[:number]
+            covered = np.cumsum(cv2.calcHist([first], [0], None, [number], [0, number]), dtype=int)
             if covered[-1] >= wanted:
                 break
         count = np.abs(np.concatenate([[0], covered]) - wanted).argmin()
-        return np.where(first < count, np.uint8(255), np.uint8(0))
+        return cv2.compare(first, int(count), cv2.CMP_LT)
 
     def _first_segments(self, index: int, number: int, shape: tuple[int, ...]) -> np.ndarray:
         """The number of the first of the dilated segments that covers a pixel, `number` where none does."""

@@ -119,7 +119,7 @@ def _inlier_mask(e, columns, limit):
     return mask
 
 
-@fast
+@inner
 def draw(state, columns, sample, five):
     """Write five correspondences, drawn as OpenCV does: indices and rows; returns the generator's state."""
     count, taken = columns.shape[1], 0

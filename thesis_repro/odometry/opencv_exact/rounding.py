@@ -94,7 +94,7 @@ def _elimination_errors(a):
     return total
 
 
-@fast
+@inner
 def _determinant_error(b, errors, z, work):
     """By how many units of rounding det B(z) may be wrong, after Wilkinson: the sizes of all terms, whatever cancels.
 

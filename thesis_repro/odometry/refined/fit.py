@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thesis_repro.compiled import fast
+from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
 
@@ -182,7 +182,7 @@ def cheirality_votes(rotation, t, current, previous, parallax):
     return forward, backward
 
 
-@fast
+@inner
 def _skew(v):
     """The matrix [v]x of the cross product with v (Equation 2.5)."""
     matrix = np.zeros((3, 3))
@@ -191,7 +191,7 @@ def _skew(v):
     return matrix
 
 
-@fast
+@inner
 def _normalised(v0, v1, v2):
     """The unit vector (3) in the direction of three numbers."""
     norm, vector = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2), np.empty(3)
@@ -199,7 +199,7 @@ def _normalised(v0, v1, v2):
     return vector
 
 
-@fast
+@inner
 def _tangents(t):
     """Two unit vectors that are perpendicular to the unit vector t and to each other."""
     if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):  # the first is at right angles to the axis t is farthest from
@@ -214,7 +214,7 @@ def _tangents(t):
     return first, second
 
 
-@fast
+@inner
 def _moved(r, t, change):
     """The motion after a change of five parameters: exp([turn]x) R (Rodrigues' formula), t moved along its tangents."""
     angle = np.sqrt(change[0] * change[0] + change[1] * change[1] + change[2] * change[2])
@@ -230,7 +230,7 @@ def _moved(r, t, change):
                                              t[2] + change[3] * first[2] + change[4] * second[2])
 
 
-@fast
+@inner
 def _essential_and_derivatives(r, t):
     """E (6, 9), row by row, and its derivatives: [t]x [unit]x R by the rotation's three, [tangent]x R by t's two."""
     matrices, unit = np.empty((6, 3, 3)), np.zeros((3, 3))
