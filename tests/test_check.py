@@ -2,10 +2,20 @@ import shutil
 
 import cv2
 import numpy as np
+import pytest
 
-from thesis_repro import files
-from thesis_repro.check import check_cityscapes, check_kitti, check_kitti_semantic
+from thesis_repro import cityscapes, files, stages
+from thesis_repro.check import (
+    check_cityscapes,
+    check_kitti,
+    check_kitti_semantic,
+    oddities,
+    of_masks,
+    path_oddities,
+)
 from thesis_repro.cli import main
+from thesis_repro.kitti import Sequence
+from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
 
 IMAGES = "sequences/00/image_0"
 
@@ -97,3 +107,85 @@ def test_nothing_to_check_is_one_line(capsys):
     for options in (["--kitti", "nowhere"], []):
         assert main(["check-data", *options]) == 1
         assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+# What can be read, and is hardly what it is taken for: one line, with the number that was seen
+
+
+def poses(*rows):
+    return "".join(f"1 0 0 0 0 1 0 0 0 0 1 {row}\n" for row in rows)
+
+
+@pytest.mark.parametrize("path, text, seen", [
+    ("poses/00.txt", poses(0, 100, 200, 300), "1000 m/s"),
+    ("poses/00.txt", poses(0, 1, 2, 30), "280 m/s"),
+    ("poses/00.txt", poses(0, -1, -2, -3), "-1.00"), ("sequences/00/times.txt", "0\n100\n200\n300\n", "100 s"),
+    ("sequences/00/calib.txt", "P0: 50 0 20 0 0 50 24 0 0 0 1 0\n", "20, 24"),
+    (f"{IMAGES}/000002.png", None, "000002")])
+def test_odd_data_is_a_line_with_the_number(tiny_kitti, path, text, seen):
+    assert oddities(Sequence(tiny_kitti, "00")) == []
+    if text:
+        (tiny_kitti / path).write_text(text)
+    else:
+        shutil.copy(tiny_kitti / IMAGES / "000001.png", tiny_kitti / path)
+    (line,) = oddities(Sequence(tiny_kitti, "00"))
+    assert seen in line
+
+
+def test_paths_of_two_drives_are_told_apart():
+    def drive(seed):
+        path = np.tile(np.eye(4), (40, 1, 1))
+        for pose, angle in zip(path, np.cumsum(np.random.default_rng(seed).normal(0, 0.02, 40))):
+            pose[:3, :3] = cv2.Rodrigues(np.array([0, angle, 0]))[0]
+        return path
+
+    assert path_oddities("00", drive(0), drive(0)) == [] != path_oddities("00", drive(1), drive(0))
+    assert len(path_oddities("00", np.linalg.inv(drive(0)), drive(0))) == 1
+
+
+STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)
+TRAIN = np.choose(STREET // 8, [0, 2, 10]).astype(np.uint8)
+HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind, picture, count, options, seen", [
+    ("labels", STREET, 4, {}, None), ("labels", TRAIN, 4, {}, "--ids train"),
+    ("labels", TRAIN, 4, {"ids": "train"}, None), ("labels", 0 * STREET, 4, {}, "unlabeled 0"),
+    ("labels", STREET.T, 4, {}, "48x64"), ("labels", STREET, 5, {}, "5 files"),
+    ("masks", HALF, 4, {}, None), ("masks", HALF, 1, {}, None), ("masks", 0 * HALF, 4, {}, "--invert"),
+    ("masks", HALF | 255, 4, {}, "100.0%"), ("masks", HALF, 4, {"flat": True}, "--invert")])
+def test_odd_masks_are_a_line_with_the_option(tiny_kitti, tmp_path, kind, picture, count, options, seen):
+    folder = tmp_path / "masks"
+    for index in range(count):
+        files.write_png(folder / f"{index:06d}.png", picture)
+    for path in (tiny_kitti / IMAGES).iterdir() if options.pop("flat", False) else ():  # where the mask keeps
+        image = cv2.imread(str(path), 0)
+        image[:, 33:] = 100
+        cv2.imwrite(str(path), image)
+    sequence = Sequence(tiny_kitti, "00")
+    made = MaskFolder(folder, sequence) if kind == "masks" else LabelMasks(folder, sequence, 3, MaskSettings(**options))
+    line, odd = of_masks(made, sequence)
+    assert "%" in line and [seen in text for text in odd] == ([True] if seen else [])
+
+
+def test_masks_of_other_frames_and_other_ways_to_name_them(tiny_kitti, tmp_path):
+    sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
+    stages.stage(folder, frames=stages.listing(sequence.frame_paths))
+    for path in sequence.frame_paths:
+        files.write_png(folder / f"{path.name}.png", HALF)
+    made = MaskFolder(folder, sequence)
+    assert of_masks(made, sequence)[1] == []
+    assert np.array_equal(MaskFolder(folder, sequence, invert=True)[2], 255 - HALF)
+    assert np.array_equal(MaskFolder(made.paths[0], sequence)[3], read_mask(made.paths[0], sequence.size))
+    cv2.imwrite(str(sequence.frame_paths[0]), np.zeros((48, 64), np.uint8))
+    assert len(of_masks(made, sequence)[1]) == 1
+
+
+def test_train_ids_are_label_ids_in_another_order(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[*range(19), 255]], np.uint8))
+    names = [cityscapes.LABELS[label].name for label in cityscapes.read_label_map(tmp_path / "a.png", True)[0]]
+    assert names == [*cityscapes.TRAINED, "unlabeled"]
+    for train_ids, value in ((True, 19), (False, 255)):
+        cv2.imwrite(str(tmp_path / "a.png"), np.array([[value]], np.uint8))
+        with pytest.raises(cityscapes.InputError, match="a.png: .*--ids"):
+            cityscapes.read_label_map(tmp_path / "a.png", train_ids)

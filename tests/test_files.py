@@ -6,8 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError
-from thesis_repro.files import atomic, glance, progress, read_color, read_gray, read_ids, write_png
+from thesis_repro import InputError, longrun
+from thesis_repro.files import (
+    atomic,
+    check_output,
+    glance,
+    progress,
+    read_color,
+    read_gray,
+    read_ids,
+    write_png,
+    write_text,
+)
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
 
@@ -97,6 +107,30 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
         temporary.write_text("half of the n")
         raise RuntimeError
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_links_are_followed_and_streams_written_to(tmp_path, capsysbinary):
+    (tmp_path / "link").symlink_to("file")
+    write_text(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "file").read_text() == "new"
+    os.mkfifo(tmp_path / "pipe")
+    with open(os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)) as pipe:
+        write_text(tmp_path / "pipe", "through")
+        assert pipe.read() == "through" and (tmp_path / "pipe").is_fifo()
+    for name in ("-", "/dev/stdout"):
+        write_text(name, "printed")
+    assert capsysbinary.readouterr().out == b"printedprinted"
+    assert sorted(os.listdir(tmp_path)) == ["file", "link", "pipe"]
+    with pytest.raises(InputError, match="pipe: "):
+        read_gray(tmp_path / "pipe")
+
+
+def test_a_result_is_no_place_for_other_output(tmp_path):
+    check_output(tmp_path / "a" / "b.txt")
+    check_output(tmp_path / "-")
+    (tmp_path / longrun.RECORD).touch()
+    with pytest.raises(InputError, match="b.txt: "):
+        check_output(tmp_path / "a" / "b.txt")
 
 
 def test_progress_goes_to_the_named_file(tmp_path, monkeypatch):

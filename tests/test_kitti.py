@@ -6,7 +6,7 @@ import pytest
 from evo.tools import file_interface
 
 from thesis_repro import InputError, odometry
-from thesis_repro.kitti import Sequence, sequences, true_poses, without_truth, write_tum
+from thesis_repro.kitti import Sequence, name_of, sequences, true_poses, without_truth, write_tum
 
 
 def test_reads_a_sequence(tiny_kitti):
@@ -62,7 +62,7 @@ def test_colour_jpeg_frames_are_read_as_gray_with_their_own_camera(tiny_kitti):
         cv2.imwrite(str(path.with_suffix(".JPG")), cv2.GaussianBlur(cv2.imread(str(path)), (0, 0), 2))
         path.unlink()
     sequence = Sequence(tiny_kitti, "0")  # "0" stands for "00"
-    assert sequence.name == "00" and sequences(tiny_kitti) == ["00"]
+    assert sequence.name == name_of(tiny_kitti, "0") == "00" and sequences(tiny_kitti) == ["00"]
     assert np.array_equal(sequence.intrinsics, [[60, 0, 30], [0, 60, 20], [0, 0, 1]])
     assert sequence.frame(3).shape == (48, 64) and sequence.frame(3).dtype == np.uint8
     assert np.abs(sequence.frame(3).astype(int) - cv2.GaussianBlur(before, (0, 0), 2)).max() < 8

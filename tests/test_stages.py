@@ -1,3 +1,6 @@
+import os
+import shutil
+
 import numpy as np
 import pytest
 
@@ -77,11 +80,53 @@ def test_what_a_run_depends_on_is_found():
     assert not {name for name in names if name.startswith(("report", "segmentation", "world", "study/runner"))}
 
 
-def test_listing_notices_other_files(tmp_path):
+def test_listing_notices_other_bytes_and_reads_them_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(stages, "SETTLED", -1)
     paths = [tmp_path / "a", tmp_path / "b"]
     for path in paths:
         path.write_text("12")
     first = stages.listing(paths)
-    assert stages.listing(paths) == first != stages.listing(paths[:1])
-    paths[1].write_text("123")
-    assert stages.listing(paths) != first
+    (tmp_path / "elsewhere").mkdir()
+    assert stages.listing([shutil.copy(path, tmp_path / "elsewhere") for path in paths]) == first
+    date = paths[1].stat().st_mtime_ns
+    paths[1].write_text("21")  # as long, and of the same date
+    os.utime(paths[1], ns=(date, date))
+    changed = stages.listing(paths)
+    assert changed != first
+    monkeypatch.setattr(stages, "_sha256", None)  # nothing may be read
+    assert stages.listing(paths) == changed
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe: "):
+        stages.listing([tmp_path / "pipe"])
+
+
+def harm(path):
+    path.write_text("corrected")
+
+
+@pytest.mark.parametrize("do, named", [
+    (lambda folder: harm(folder / "notes.txt"), "notes.txt"), (lambda folder: harm(folder / "in/.env.1"), "in/.env.1"),
+    (lambda folder: harm(folder / "in/result"), "in/result"),
+    (lambda folder: (folder / "link").symlink_to("/nowhere"), "link")])
+def test_what_is_not_ours_or_was_changed_is_not_deleted(tmp_path, capsys, do, named):
+    folder = stages.stage(tmp_path / "a", size=3)
+    files.write_text(folder / "in" / "result", "ours")
+    do(folder)
+    before = {path: path.is_file() and path.read_text() for path in folder.rglob("*")}
+    stages.stage(folder, size=3)
+    with pytest.raises(InputError, match=named):
+        stages.stage(folder, size=4)
+    assert {path: path.is_file() and path.read_text() for path in folder.rglob("*")} == before
+    (folder / named).unlink()
+    stages.stage(folder, size=4)
+    assert not (folder / "in" / "result").exists()
+    assert (str(folder) in capsys.readouterr().out) == (named != "in/result")
+
+
+@pytest.mark.parametrize("text", ["", "frame,x\n0,1.0\n1,2", "frame,x\n0,1.0\n1,two\n", "frame,x\n0,1.0\n"])
+def test_a_damaged_table_is_made_again(tmp_path, text):
+    for content, whole in (("frame,x\n0,1.0\n1,2.0\n", True), (text, False)):
+        (tmp_path / "a.csv").write_text(content)
+        assert (stages.kept_table(tmp_path / "a.csv", rows=2) is not None) == whole
+    assert stages.kept_table(tmp_path / "b.csv") is None

@@ -246,11 +246,11 @@ def of_masks(source, sequence):
             f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest)
         lines = _label_oddities(folder, label_maps, np.flatnonzero(shares), sequence, source.settings)
     record = stages.record(folder) or {}
-    present = len(files.listed(folder))
-    if record.get("frames", None) not in (None, stages.listing(sequence.frame_paths)):
+    present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)  # a study may take a part
+    if record.get("frames") not in (None, stages.listing(sequence.frame_paths), stages.listing(frames)):
         lines.append("were made from other frames than these")
-    elif present not in (1, len(files.images(sequence.frame_paths[0].parent))):
-        lines.append(f"are {present} files for {len(files.images(sequence.frame_paths[0].parent))} frames")
+    elif present not in (1, len(sequence), len(frames)):
+        lines.append(f"are {present} files for {len(frames)} frames")
     option = "" if has_labels else "; --invert takes masks the other way round"
     if coverage.min() < MIN_COVERAGE or coverage.mean() > MAX_COVERAGE:
         lines.append(f"leave {coverage.min():.1%} to {coverage.max():.1%} of the frames{option}")

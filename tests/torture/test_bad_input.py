@@ -4,6 +4,7 @@ The commands are called in the tests' own process.
 """
 
 import json
+import os
 import pickle
 import zipfile
 from pathlib import Path
@@ -60,6 +61,11 @@ def as_folder(path):
     path.mkdir()
 
 
+def as_pipe(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
 def broken_link(path):
     path.unlink()
     path.symlink_to("/nowhere/000002.png")
@@ -75,7 +81,7 @@ def image(picture, ending=".png"):
 
 def archive(**parts):
     def harm(path):
-        with zipfile.ZipFile(path, "w") as file:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
             for name, content in parts.items():
                 file.writestr(name.replace("_json", ".json"), content)
     return harm
@@ -97,7 +103,8 @@ def layer(module, name, **config):
 BROKEN = [
     (ODOMETRY, FRAME, {
         "truncated": cut, "16 bits": image(NOISE.astype(np.uint16)), "a BMP": image(NOISE, ".bmp"),
-        "a folder": as_folder, "a broken link": broken_link, "another size": image(np.zeros((20, 20), np.uint8)),
+        "a folder": as_folder, "a broken link": broken_link, "a pipe": as_pipe,
+        "another size": image(np.zeros((20, 20), np.uint8)),
         "a bomb": holding(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\xea\x60\0\0\xea\x60\x08\0\0\0\0\xc5\xa4\x12\x7e")}),
     *[(words, FRAME, {"missing": Path.unlink})
       for words in (ODOMETRY, MASKS, STUDY, "plan --kitti kitti", "boresight --kitti kitti --sequences 00", PREDICT)],
@@ -124,6 +131,7 @@ BROKEN = [
         "no numbers": nan_model,
         "a pickle": holding(pickle.dumps({"a": 1})),
         "code": archive(metadata_json="{}", config_json=layer("keras.layers", "Lambda", function="x")),
+        "a bomb": archive(metadata_json="{}", config_json="{}", weights=bytes(300_000_000)),
         "foreign": archive(metadata_json="{}", config_json=layer("os", "system", command="touch harmed"))}),
 ]
 # (command, what the error names): the folder is sound
@@ -147,7 +155,6 @@ odometry --kitti kitti --sequence ../00 -> '../00'
 {MASKS[:-3]}labels -> --output labels
 {MASKS[:-3]}mine -> mine
 {STUDY} --widths 5000 -> 5000
-{STUDY} --sequences 00 00 -> --sequences
 {STUDY} --dask nonsense -> nonsense
 {STUDY[:-3]}mine -> mine
 {STUDY_ALL} -> --labels

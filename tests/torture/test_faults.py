@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
@@ -105,6 +106,25 @@ def test_a_process_that_dies(words, tmp_path, name):
     workers()[0].kill()
     refused(finish(process), "a process was killed")
     whole_again(words, name, tmp_path)
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_a_study_that_is_ended_ends_its_workers(words, tmp_path, number):
+    process = start(words("study"), tmp_path)
+    wait_for(lambda: list((tmp_path / "out").rglob("pass-*")) or process.poll() is not None
+             or len(psutil.Process(process.pid).children()) > 2)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(number)
+    process.communicate(timeout=60)
+    assert process.returncode in (128 + number, -signal.SIGKILL) and workers
+    assert psutil.wait_procs(workers, 20)[1] == []
+    whole_again(words, "study", tmp_path)
+
+
+def test_a_reader_that_has_seen_enough(words, tmp_path):
+    result = run(["bash", "-c", f"{shlex.join(map(str, words('odometry.txt')))} | head -1"], tmp_path)
+    assert "Traceback" not in result.stderr and len(result.stdout.splitlines()) == 1 and (tmp_path / "out.txt").exists()
 
 
 @pytest.mark.torture

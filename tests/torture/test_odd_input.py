@@ -79,7 +79,8 @@ def test_make_takes_folders_of_any_name_and_refuses_what_it_does_not_know(tiny_k
     assert make("check-data", f"KITTI={odd}").returncode == 0
     planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={odd}", f"BUILD={tmp_path / 'build'}")
     assert planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout, planned
-    for word, named in (("EPOCHS=0", "EPOCHS=0: "), ("EPOCH=3", "EPOCH: "), ("DASK_SCHEDULER=mine", "mine")):
+    for word, named in (("EPOCHS=0", "EPOCHS=0: "), ("EPOCH=3", "EPOCH: "), ("KITTI=", "KITTI"),
+                        ("GPU=no", "GPU=no"), ("FIGURES=a b", "FIGURES"), ("DASK_SCHEDULER=mine", "mine")):
         refused = make("figures", word, f"BUILD={tmp_path / 'other'}")
         assert refused.returncode != 0 and not (tmp_path / "other").exists(), refused
         assert named in refused.stderr and "Traceback" not in refused.stderr, refused
