@@ -18,7 +18,6 @@ from thesis_repro.world import drives, street, textures
 from thesis_repro.world.raster import compile_for_all
 
 SEQUENCES = tuple(drives.DRIVES)
-FRAME_TIME = 0.1  # seconds; KITTI records at 10 Hz
 BASELINE = 0.537  # metres between KITTI's cameras, for the calibration file's P1 and P3
 IMAGE_SIZE = (512, 1024)  # of the training images at scale 1
 CITIES = {"train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfeld"),
@@ -64,7 +63,7 @@ def render_image(split, index, scale=0.5, seed=0):
     bend = rng.uniform(-70, 70)
     pieces = ((float(rng.uniform(8, 40)), 0.0), (float(rng.uniform(15, 40)), bend if rng.random() < 0.6 else 0.0),
               (300.0, 0.0))
-    sky = (rng.uniform(120, 190), rng.uniform(175, 235), rng.uniform(0.1, 0.9))
+    sky = (rng.uniform(120, 190), rng.uniform(175, 235))
     style = dataclasses.replace(
         plan.style, leaders=(), crossing=None, sky=sky, sunny=bool(rng.random() < 0.65),
         sun=(rng.uniform(-np.pi, np.pi), rng.uniform(0.45, 1.0)), persons=rng.uniform(0.05, 0.25),
@@ -72,8 +71,8 @@ def render_image(split, index, scale=0.5, seed=0):
     track = drives.Track(pieces, -drives.BEHIND, drives.AHEAD)
     scenery = street.build(rng, textures.build(seed), track, style)
     x, z, heading = track.at(rng.uniform(0, 12), plan.lane * rng.uniform(-0.3, 1.2))
-    camera = drives.pose(x, -rng.uniform(1.2, 1.9), z, heading + np.radians(rng.uniform(-14, 14)),
-                         np.radians(rng.uniform(-2.5, 2)), np.radians(rng.uniform(-1, 1)))
+    camera = drives.poses_of([(x, -rng.uniform(1.2, 1.9), z)],
+                             [(heading, 0, 0) + np.radians(rng.uniform((-14, -2.5, -1), (14, 2, 1)))])[0]
     height, width = round(IMAGE_SIZE[0] * scale), round(IMAGE_SIZE[1] * scale)
     focal = width * rng.uniform(0.6, 1.0)
     intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
@@ -179,11 +178,9 @@ def _write_sequence_texts(root, name, frames, scale, seed):
     _, intrinsics = drives.scaled_camera(name, scale)
     lines = []
     for camera in range(4):
-        projection = np.zeros((3, 4))
-        projection[:, :3] = intrinsics
-        projection[0, 3] = -BASELINE * intrinsics[0, 0] * (camera % 2)
+        projection = np.c_[intrinsics, [-BASELINE * intrinsics[0, 0] * (camera % 2), 0, 0]]
         lines.append(f"P{camera}: " + " ".join(f"{value:.12e}" for value in projection.ravel()))
     write_text(folder / "calib.txt", "\n".join(lines) + "\n")
-    write_text(folder / "times.txt", "".join(f"{FRAME_TIME * k:.6e}\n" for k in range(frames)))
+    write_text(folder / "times.txt", "".join(f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames)))
     _, poses, _ = drives.way(name, frames, seed)
     kitti.write_kitti_poses(root / "kitti" / "poses" / f"{name}.txt", drives.relative_to_first(poses))

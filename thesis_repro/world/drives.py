@@ -6,6 +6,7 @@ A place on a street is (s, d): metres along the road's middle and metres to the 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesis_repro import kitti
 from thesis_repro.world.street import Style
@@ -86,43 +87,43 @@ _CITY, _SUBURB, _GREEN = (0.55, 0.2, 0.15, 0.1), (0.2, 0.55, 0.15, 0.1), (0.0, 0
 DRIVES = {
     # City with right-angled turns both ways.
     "00": Drive(((14, 0), (16, 90), (13, 0), (16, -90), (40, 0)), 1.32, 71,
-                Style(parked=(0, 0.6), sun=(0.7, 0.75), sky=(140, 190, 0.25))),
+                Style(parked=(0, 0.6), sun=(0.7, 0.75), sky=(140, 190))),
     # Highway: fast, wide, little texture, cars that overtake.
     "01": Drive(((120, 0), (90, 14), (60, 0), (80, -18)), 2.24, 41,
-                Style(half=7.5, road="highway", sidewalk=0.0, zones=_GREEN, sun=(-1.0, 0.9), sky=(170, 225, 0.5),
+                Style(half=7.5, road="highway", sidewalk=0.0, zones=_GREEN, sun=(-1.0, 0.9), sky=(170, 225),
                       haze=0.004), lane=0.0, noise=1.6, level=122),
     # Suburb: an S.
     "02": Drive(((8, 0), (28, 65), (6, 0), (34, -85), (15, 0), (26, 45)), 1.32, 54,
-                Style(half=3.6, zones=_SUBURB, trees=0.7, sun=(2.4, 0.7), sky=(150, 200, 0.6)), noise=2.2),
+                Style(half=3.6, zones=_SUBURB, trees=0.7, sun=(2.4, 0.7), sky=(150, 200)), noise=2.2),
     # Lane between fields and gardens in long bends.
     "03": Drive(((8, 0), (40, -38), (30, 22), (45, 40), (30, -28)), 1.38, 48,
-                Style(half=3.3, sidewalk=1.6, zones=_GREEN, trees=0.3, sunny=False, sky=(185, 228, 0.8), haze=0.006,
+                Style(half=3.3, sidewalk=1.6, zones=_GREEN, trees=0.3, sunny=False, sky=(185, 228), haze=0.006,
                       persons=0.02), lane=1.6, noise=2.6),
     # Straight on in much traffic: two cars ahead, many that come towards it.
     "04": Drive(((200, 0),), 1.49, 44,
                 Style(parked=(0.6, 0), zones=(0.4, 0.2, 0.3, 0.1), leaders=(12.0, 26.0), traffic=0.08, sun=(-0.6, 0.6),
-                      sky=(135, 180, 0.3)), noise=1.8),
+                      sky=(135, 180)), noise=1.8),
     # Old town with one turn to the left and one to the right.
     "05": Drive(((12, 0), (16, -90), (34, 0), (15, 90), (25, 0), (24, 50)), 1.21, 61,
                 Style(half=5.0, sidewalk=2.2, parked=(0.6, 0), zones=(0.75, 0.1, 0.1, 0.05), trees=0.2, persons=0.1,
-                      sunny=False, sky=(175, 222, 0.7)), noise=2.4),
+                      sunny=False, sky=(175, 222)), noise=2.4),
     # Up a wide street, round its end and back beside it.
     "06": Drive(((20, 0), (12, -90), (5, 0), (12, -90), (60, 0), (12, -90), (5, 0), (12, -90), (40, 0)), 1.38, 78,
-                Style(half=4.0, zones=(0.1, 0.25, 0.6, 0.05), trees=0.8, sun=(0.2, 0.55), sky=(120, 165, 0.2)),
+                Style(half=4.0, zones=(0.1, 0.25, 0.6, 0.05), trees=0.8, sun=(0.2, 0.55), sky=(120, 165)),
                 noise=1.6),
     # Waits at a light while others cross.
     "07": Drive(((75, 0), (15, 90), (40, 0), (15, 90)), 1.44, 76,
-                Style(parked=(0.45, 0.45), sun=(1.9, 0.8), sky=(150, 205, 0.5), crossing=38.0, traffic=0.004), stop=26),
+                Style(parked=(0.45, 0.45), sun=(1.9, 0.8), sky=(150, 205), crossing=38.0, traffic=0.004), stop=26),
     # Residential streets: a gentle bend, then a sharp one.
     "08": Drive(((10, 0), (20, 30), (10, 0), (15, -90), (20, 0), (22, -35), (25, 0)), 1.21, 62,
-                Style(zones=_SUBURB, parked=(0.7, 0.7), sun=(-2.2, 0.85), sky=(155, 210, 0.6)), noise=2.2),
+                Style(zones=_SUBURB, parked=(0.7, 0.7), sun=(-2.2, 0.85), sky=(155, 210)), noise=2.2),
     # Round a block, back to the start.
     "09": Drive(((8, 0), (15, -90), (8, 0), (15, -90), (14, 0), (15, -90), (8, 0), (15, -90), (6, 0)), 1.15, 132,
-                Style(half=3.4, zones=(0.5, 0.4, 0.1, 0.0), sunny=False, sky=(165, 215, 0.9), haze=0.004), closed=True,
+                Style(half=3.4, zones=(0.5, 0.4, 0.1, 0.0), sunny=False, sky=(165, 215), haze=0.004), closed=True,
                 noise=2.4),
     # A long tightening bend through a narrow street.
     "10": Drive(((10, 0), (30, 35), (24, 50), (10, 0), (40, -60)), 1.38, 47,
-                Style(half=4.4, sidewalk=1.8, parked=(0, 0.5), zones=_CITY, sun=(1.2, 0.65), sky=(130, 175, 0.3)),
+                Style(half=4.4, sidewalk=1.8, parked=(0, 0.5), zones=_CITY, sun=(1.2, 0.65), sky=(130, 175)),
                 lane=1.3, noise=2.8, level=96),
 }
 
@@ -171,16 +172,12 @@ def _driven(drive, track, frames, phase):
     return driven
 
 
-def pose(x, y, z, heading, pitch, roll):
-    """Camera-to-world, 4x4: turned right by heading, up by pitch, clockwise by roll (radians)."""
-    ch, sh, cp, sp, cr, sr = (f(a) for a in (heading, pitch, roll) for f in (np.cos, np.sin))
-    turn = np.array([[ch, 0, sh], [0, 1, 0], [-sh, 0, ch]])
-    nod = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
-    lean = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1.0]])
-    result = np.eye(4)
-    result[:3, :3] = turn @ nod @ lean
-    result[:3, 3] = x, y, z
-    return result
+def poses_of(places, angles):
+    """Camera-to-world, (n, 4, 4); places: (n, 3) metres; angles: (n, 3) radians right, up, and clockwise."""
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("YXZ", angles).as_matrix()
+    poses[:, :3, 3] = places
+    return poses
 
 
 def way(name, frames, seed):
@@ -197,8 +194,7 @@ def way(name, frames, seed):
     pitch = np.radians(0.12) * np.sin(driven / 1.9 + phase[2]) + np.radians(0.08) * np.sin(driven / 0.83 + phase[3])
     roll = np.radians(0.12) * np.sin(driven / 2.7 + phase[4])
     y = -CAMERA_HEIGHT + 0.008 * np.sin(driven / 1.3 + phase[5])
-    poses = np.array([pose(*values) for values in zip(x, y, z, heading, pitch, roll)])
-    return track, poses, driven
+    return track, poses_of(np.stack([x, y, z], axis=1), np.stack([heading, pitch, roll], axis=1)), driven
 
 
 def crossing(track, style):
@@ -211,10 +207,8 @@ def crossing(track, style):
 
 def relative_to_first(poses):
     """The same poses, (n, 4, 4), in the first camera's frame; the first is the identity to the last bit."""
-    rotation, position = poses[0, :3, :3], poses[0, :3, 3]
-    result = np.tile(np.eye(4), (len(poses), 1, 1))
-    for k in range(1, len(poses)):
-        # Sums of products in fixed order, so that no linear algebra library rounds them its own way.
-        result[k, :3, :3] = (rotation[:, :, None] * poses[k, :3, None, :3]).sum(axis=0)
-        result[k, :3, 3] = (rotation * (poses[k, :3, 3] - position)[:, None]).sum(axis=0)
+    result = poses.copy()
+    result[:, :3, 3] -= poses[0, :3, 3]
+    result[:, :3] = np.einsum("ji,njk->nik", poses[0, :3, :3], result[:, :3])
+    result[0] = np.eye(4)
     return result

@@ -34,37 +34,31 @@ U, U_S, U_T = 9, 10, 11  # u = f[U] + f[U_S] s + f[U_T] t, in repeats of the tex
 V, V_S, V_T = 12, 13, 14  # v likewise, downwards
 TEXTURE, LABEL, GAIN = 15, 16, 17
 TRIANGLE = 18  # 1: s + t <= 1; 0: parallelogram
-GROUND = 19  # which ground level the face is part of; only the ground receives shadows, only the rest (0) casts them
+GROUND = 19  # 1: part of the ground, which alone receives shadows; 0: the rest, which alone casts them
 LIT = 20  # 1: shaded by its outward normal (edge_s x edge_t), 0: evenly, as leaves and grass
 COLUMNS = 21
-
-ROAD, SIDEWALK = 1, 2  # ground levels
-GROUND_LEVELS = np.array([0.0, 0.0, -0.12])  # their y; the first entry is a filler
 
 # Columns of the coefficients: w s = c[S] + c[S_X] x + c[S_Y] y at sample (x, y), w t and w likewise.
 S, S_X, S_Y, T, T_X, T_Y, W, W_X, W_Y = range(9)
 
 NEAR = 0.25  # metres
-FAR = 220.0
-SHADOW_FAR = 70.0
+SHADOW_FAR = 70.0  # metres; sky and forest around the street lie farther off, so that they cast none
 LEVELS = 12  # sides up to 2048
 ALPHA_LEVELS = 5  # thinner than that, cut-outs flicker rather than vanish
 SUPERSAMPLING = 2  # samples a pixel, each way
 OPAQUE = 128
-COUNTED = -2  # a sample that is dealt with; -1 is the background
+UNLIT = 0.6  # how much of the sun falls on what has no side, such as leaves
 SHARPNESS = 0.75  # part of a pixel that a texture is averaged over; the rest is contrast against a little aliasing
-SKY, TERRAIN, VEGETATION = ID["sky"], ID["terrain"], ID["vegetation"]
+SKY = ID["sky"]
 
 
 class Textures(NamedTuple):
     """All textures in one array of bytes; those of level (j, i) are reduced j times along v and i times along u."""
 
-    data: np.ndarray  # uint8: gray values and alphas
-    gray: np.ndarray  # (n, LEVELS, LEVELS) where each level of a texture starts
-    alpha: np.ndarray  # the same of its alpha, -1 where it has none
+    data: np.ndarray  # uint8: the gray values of a level and, of cut-outs, their alphas behind them
+    start: np.ndarray  # (n, LEVELS, LEVELS) where each level of a texture starts
     sides: np.ndarray  # (n, 2) log2 of rows and columns
-    clouds: int  # the two that the background shows
-    leaves: int
+    cut_out: np.ndarray  # (n,) whether it has alphas
 
 
 class View(NamedTuple):
@@ -78,17 +72,14 @@ class View(NamedTuple):
 
 
 class Environment(NamedTuple):
-    """The light of a street and what is seen beyond its faces; brightnesses are gray values."""
+    """The light of a street; brightnesses are gray values."""
 
     sun: np.ndarray  # (3,) direction of travel of the light, unit length, y > 0
     ambient: float  # how much of the albedo is seen without the sun
     direct: float  # what the sun adds where it falls straight on a face
     shadow: float  # how much of the ground's brightness is left in shadow
-    zenith: float
-    horizon: float
-    clouds: float  # weight of their texture
+    horizon: float  # what everything fades to with the distance
     haze: float  # extinction, 1/m
-    skyline: np.ndarray  # (n,) elevation (tangent) over the azimuth, from -pi to pi
 
 
 # Textures
@@ -116,19 +107,6 @@ def _mix(data, offset, log_width, x, y):
 
 
 @inner
-def _sample(data, level, u, v):
-    """A texture at (u, v), bilinear and periodic; level: (offset, log2 of rows, log2 of columns)."""
-    offset, log_height, log_width = level
-    return _mix(data, offset, log_width, _between(u, log_width), _between(v, log_height))
-
-
-@inner
-def _whole(textures, index):
-    """The level of a texture that is not reduced."""
-    return textures.gray[index, 0, 0], textures.sides[index, 0], textures.sides[index, 1]
-
-
-@inner
 def _level(step, levels):
     """Which reduced level suits a step of so many texels, and the part of the next one: log2, linear between powers."""
     level = 0
@@ -139,66 +117,54 @@ def _level(step, levels):
 
 
 @inner
-def _filtered(data, gray, texture, log_height, log_width, u, v, u_step, v_step):
+def _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step):
     """Texture value for a sample that covers u_step by v_step repeats; blends neighbouring levels of both axes."""
     i, u_part = _level(u_step * (1 << log_width), log_width)
     j, v_part = _level(v_step * (1 << log_height), log_height)
     rows, columns = log_height - j, log_width - i
     x, y = _between(u, columns), _between(v, rows)
-    value = _mix(data, gray[texture, j, i], columns, x, y)
+    value = _mix(data, start[texture, j, i], columns, x, y)
     if u_part > 0.0:
         half_x = _between(u, columns - 1)
-        value += u_part * (_mix(data, gray[texture, j, i + 1], columns - 1, half_x, y) - value)
+        value += u_part * (_mix(data, start[texture, j, i + 1], columns - 1, half_x, y) - value)
     if v_part > 0.0:
         half_y = _between(v, rows - 1)
-        other = _mix(data, gray[texture, j + 1, i], columns, x, half_y)
+        other = _mix(data, start[texture, j + 1, i], columns, x, half_y)
         if u_part > 0.0:
-            other += u_part * (_mix(data, gray[texture, j + 1, i + 1], columns - 1, half_x, half_y) - other)
+            other += u_part * (_mix(data, start[texture, j + 1, i + 1], columns - 1, half_x, half_y) - other)
         value += v_part * (other - value)
     return value
 
 
 @inner
-def _steps(coefficients, faces, index, s, t, w):
-    """How far u and v move from one sample to the next, the larger of both image directions.
+def _place(coefficients, faces, index, row, x, w):
+    """Where a sample lies on a face's texture, and how far that moves to the next sample: u, v, their steps.
 
-    By the quotient rule ds/dx = (d(w s)/dx - s dw/dx) / w.
+    The steps are the larger of both image directions. By the quotient rule ds/dx = (d(w s)/dx - s dw/dx) / w.
     """
     c, f, n, z = coefficients, faces, index, 1.0 / w
+    s = (c[n, S] + c[n, S_Y] * row + c[n, S_X] * x) * z
+    t = (c[n, T] + c[n, T_Y] * row + c[n, T_X] * x) * z
     s_x, s_y = (c[n, S_X] - s * c[n, W_X]) * z, (c[n, S_Y] - s * c[n, W_Y]) * z
     t_x, t_y = (c[n, T_X] - t * c[n, W_X]) * z, (c[n, T_Y] - t * c[n, W_Y]) * z
     u_step = max(abs(f[n, U_S] * s_x + f[n, U_T] * t_x), abs(f[n, U_S] * s_y + f[n, U_T] * t_y))
     v_step = max(abs(f[n, V_S] * s_x + f[n, V_T] * t_x), abs(f[n, V_S] * s_y + f[n, V_T] * t_y))
-    return u_step, v_step
+    return f[n, U] + f[n, U_S] * s + f[n, U_T] * t, f[n, V] + f[n, V_S] * s + f[n, V_T] * t, u_step, v_step
 
 
 @inner
-def _alpha_level(alpha, sides, coefficients, faces, index, row, x):
-    """The level of a face's alpha that suits one row of it: (offset, log2 of rows, log2 of columns)."""
-    c, n, texture = coefficients, index, int(faces[index, TEXTURE])
+def _alpha_level(start, sides, coefficients, faces, index, row, x):
+    """The level of a face's alpha that suits one row of it: where it starts, rows and columns."""
+    texture = int(faces[index, TEXTURE])
     log_height, log_width = sides[texture, 0], sides[texture, 1]
-    w = c[n, W] + c[n, W_Y] * row + c[n, W_X] * x
-    u_step, v_step = _steps(c, faces, n, (c[n, S] + c[n, S_Y] * row + c[n, S_X] * x) / w,
-                            (c[n, T] + c[n, T_Y] * row + c[n, T_X] * x) / w, w)
-    i = j = 0
-    u_step *= 1 << log_width
-    v_step *= 1 << log_height
-    while u_step > 1.5 and i < min(ALPHA_LEVELS - 1, log_width):
-        u_step *= 0.5
-        i += 1
-    while v_step > 1.5 and j < min(ALPHA_LEVELS - 1, log_height):
-        v_step *= 0.5
-        j += 1
-    return alpha[texture, j, i], log_height - j, log_width - i
-
-
-@inner
-def _opaque(data, level, face, c, row, x, w):
-    """Whether a cut-out is there at a sample, where its inverse depth is w."""
-    ws, wt, z = c[S] + c[S_Y] * row + c[S_X] * x, c[T] + c[T_Y] * row + c[T_X] * x, 1.0 / w
-    u = face[U] + (face[U_S] * ws + face[U_T] * wt) * z
-    v = face[V] + (face[V_S] * ws + face[V_T] * wt) * z
-    return _sample(data, level, u, v) >= OPAQUE
+    w = coefficients[index, W] + coefficients[index, W_Y] * row + coefficients[index, W_X] * x
+    _, _, u_step, v_step = _place(coefficients, faces, index, row, x, w)
+    i, u_part = _level(u_step * (1 << log_width), min(ALPHA_LEVELS - 1, log_width))
+    j, v_part = _level(v_step * (1 << log_height), min(ALPHA_LEVELS - 1, log_height))
+    i += u_part > 0.5
+    j += v_part > 0.5
+    rows, columns = 1 << (log_height - j), 1 << (log_width - i)
+    return start[texture, j, i] + rows * columns, rows, columns
 
 
 # Which samples a face covers
@@ -220,7 +186,6 @@ def _set_up(corner, edge_s, edge_t, view, c):
     """
     focal, centre = view.focal, view.centre
     height, width = view.size
-    far_away = True
     behind = 0
     x_min = y_min = 1e30
     x_max = y_max = -1e30
@@ -229,15 +194,13 @@ def _set_up(corner, edge_s, edge_t, view, c):
         x = corner[0] + s * edge_s[0] + t * edge_t[0]
         y = corner[1] + s * edge_s[1] + t * edge_t[1]
         z = corner[2] + s * edge_s[2] + t * edge_t[2]
-        if z < FAR:
-            far_away = False
         if z < NEAR:
             behind += 1
         else:
             px, py = focal[0] * x / z + centre[0], focal[1] * y / z + centre[1]
             x_min, x_max = min(x_min, px), max(x_max, px)
             y_min, y_max = min(y_min, py), max(y_max, py)
-    if far_away or behind == 4:
+    if behind == 4:
         return 0, -1
     if behind:
         y_min, y_max = 0.0, height - 1.0
@@ -294,9 +257,12 @@ def _span(c, triangle, row, width):
 
 
 @fast
-def _surfaces(faces, textures, view, coefficients, depth, nearest):
-    """The nearest face at each sample: fills `depth` (w), `nearest` (row of `faces`) and the faces' coefficients."""
-    data, alpha, sides = textures.data, textures.alpha, textures.sides
+def _draw(faces, textures, view, coefficients, depth, nearest):
+    """The nearest face at each sample: fills `depth` (w), `nearest` (row of `faces`) and the faces' coefficients.
+
+    Nothing is drawn where `depth` is larger already.
+    """
+    data, start, sides, cut_out = textures.data, textures.start, textures.sides, textures.cut_out
     rotation, position, width = view.rotation, view.position, view.size[1]
     for index in range(faces.shape[0]):
         face, c = faces[index], coefficients[index]
@@ -305,124 +271,56 @@ def _surfaces(faces, textures, view, coefficients, depth, nearest):
         edge_s = _turn(rotation, face[EDGE_S + X], face[EDGE_S + Y], face[EDGE_S + Z])
         edge_t = _turn(rotation, face[EDGE_T + X], face[EDGE_T + Y], face[EDGE_T + Z])
         first_row, last_row = _set_up(corner, edge_s, edge_t, view, c)
-        if last_row < first_row:
-            continue
-        cut_out = alpha[int(face[TEXTURE]), 0, 0] >= 0
-        triangle = face[TRIANGLE] > 0
+        has_alpha, triangle = cut_out[int(face[TEXTURE])], face[TRIANGLE] > 0
         for row in range(first_row, last_row + 1):
-            start, stop = _span(c, triangle, row, width)
-            if stop < start:
+            first, last = _span(c, triangle, row, width)
+            if last < first:
                 continue
             w_row, w_x = c[W] + c[W_Y] * row, c[W_X]
-            if cut_out:
-                level = _alpha_level(alpha, sides, coefficients, faces, index, row, (start + stop) // 2)
-                for x in range(start, stop + 1):
+            if has_alpha:
+                offset, rows, columns = _alpha_level(start, sides, coefficients, faces, index, row, (first + last) // 2)
+                for x in range(first, last + 1):
                     w = w_row + w_x * x
-                    if w > depth[row, x] and _opaque(data, level, face, c, row, x, w):
-                        depth[row, x] = w
-                        nearest[row, x] = index
+                    if w > depth[row, x]:
+                        u, v, _, _ = _place(coefficients, faces, index, row, x, w)
+                        texel_row, texel = math.floor(v * rows) & (rows - 1), math.floor(u * columns) & (columns - 1)
+                        if data[offset + texel_row * columns + texel] >= OPAQUE:
+                            depth[row, x] = w
+                            nearest[row, x] = index
             else:
-                depths, hits = depth[row, start:stop + 1], nearest[row, start:stop + 1]
+                depths, hits = depth[row, first:last + 1], nearest[row, first:last + 1]
                 for k in range(len(depths)):  # from 0, so that many are compared at once
-                    w = w_row + w_x * (start + k)
+                    w = w_row + w_x * (first + k)
                     if w > depths[k]:
                         depths[k] = w
                         hits[k] = index
 
 
-@fast
-def _shadows(faces, textures, view, sun, nearest, shadow):
-    """Mark the ground samples that a face shades: its shadow on each ground level, drawn as a face.
+def _shadows(faces, sun, position):
+    """The shadows of faces on the ground y = 0, as faces.
 
-    A point falls along the sun by (level - y) / sun_y to the level, so an edge e becomes e - sun e_y / sun_y, and the
-    shadow of a face is again corner, edge_s and edge_t, with the same (s, t) and so the same alpha.
+    A point falls along the sun by -y / sun_y to the ground, so an edge e becomes e - sun e_y / sun_y, and the shadow of
+    a face is again corner, edge_s and edge_t, with the same (s, t) and so the same alpha.
     """
-    data, alpha, sides = textures.data, textures.alpha, textures.sides
-    rotation, position, width = view.rotation, view.position, view.size[1]
-    flat_corner, flat_s, flat_t = np.empty(3), np.empty(3), np.empty(3)
-    coefficients = np.empty((faces.shape[0], 9))
-    for index in range(faces.shape[0]):
-        face, c = faces[index], coefficients[index]
-        if face[GROUND] > 0:
-            continue
-        if math.hypot(face[CORNER + X] - position[X], face[CORNER + Z] - position[Z]) > SHADOW_FAR:
-            continue
-        cut_out = alpha[int(face[TEXTURE]), 0, 0] >= 0
-        triangle = face[TRIANGLE] > 0
-        for ground in range(1, len(GROUND_LEVELS)):
-            fall = (GROUND_LEVELS[ground] - face[CORNER + Y]) / sun[Y]
-            for k in range(3):
-                flat_corner[k] = face[CORNER + k] + sun[k] * fall - position[k]
-                flat_s[k] = face[EDGE_S + k] - sun[k] * face[EDGE_S + Y] / sun[Y]
-                flat_t[k] = face[EDGE_T + k] - sun[k] * face[EDGE_T + Y] / sun[Y]
-            first_row, last_row = _set_up(
-                _turn(rotation, flat_corner[X], flat_corner[Y], flat_corner[Z]),
-                _turn(rotation, flat_s[X], flat_s[Y], flat_s[Z]), _turn(rotation, flat_t[X], flat_t[Y], flat_t[Z]),
-                view, c)
-            for row in range(first_row, last_row + 1):
-                start, stop = _span(c, triangle, row, width)
-                if stop < start:
-                    continue
-                if cut_out:
-                    level = _alpha_level(alpha, sides, coefficients, faces, index, row, (start + stop) // 2)
-                for x in range(start, stop + 1):
-                    if shadow[row, x] or nearest[row, x] < 0 or faces[nearest[row, x], GROUND] != ground:
-                        continue
-                    if cut_out:
-                        w = c[W] + c[W_Y] * row + c[W_X] * x
-                        if not _opaque(data, level, face, c, row, x, w):
-                            continue
-                    shadow[row, x] = True
+    away = np.hypot(faces[:, CORNER + X] - position[X], faces[:, CORNER + Z] - position[Z])
+    shadows = faces[(faces[:, GROUND] == 0) & (away < SHADOW_FAR)]
+    for column in (CORNER, EDGE_S, EDGE_T):
+        shadows[:, column:column + 3] -= shadows[:, column + Y, None] / sun[Y] * sun
+    return shadows
 
 
 # From samples to pixels
 
 
 @inner
-def _surface_value(faces, coefficients, index, row, column, w, spread, data, gray, sides):
-    """Texture of a face at a place (in samples), averaged over a square of `spread` samples."""
-    c, f, n, texture = coefficients, faces, index, int(faces[index, TEXTURE])
-    s = (c[n, S] + c[n, S_Y] * row + c[n, S_X] * column) / w
-    t = (c[n, T] + c[n, T_Y] * row + c[n, T_X] * column) / w
-    u_step, v_step = _steps(c, f, n, s, t, w)
-    u = f[n, U] + f[n, U_S] * s + f[n, U_T] * t
-    v = f[n, V] + f[n, V_S] * s + f[n, V_T] * t
-    return _filtered(data, gray, texture, sides[texture, 0], sides[texture, 1], u, v, u_step * spread, v_step * spread)
-
-
-@inner
-def _background(x, y, rotation, environment, skyline, data, clouds, leaves):
-    """Value and label where no face is, in direction (x, y, 1): sky and clouds, the skyline, the ground far away.
-
-    clouds, leaves: the levels of these textures.
-    """
-    right = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0]
-    down = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1]
-    ahead = rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2]
-    azimuth = math.atan2(right, ahead)
-    elevation = -down / math.hypot(right, ahead)
-    place = (azimuth + math.pi) * len(skyline) / (2 * math.pi)
-    first = int(place) % len(skyline)
-    part = place - math.floor(place)
-    sky = environment.horizon
-    if elevation > skyline[first] * (1 - part) + skyline[(first + 1) % len(skyline)] * part:
-        cloud = _sample(data, clouds, azimuth / math.pi, -elevation) - 128.0
-        blue = math.sqrt(min(1.0, elevation / 0.6))
-        return sky + (environment.zenith - sky) * blue + cloud * environment.clouds, SKY
-    if elevation > -0.01:
-        return 0.35 * _sample(data, leaves, azimuth * 3.0, -elevation * 3.0) + 0.42 * sky, VEGETATION
-    return 0.75 * sky, TERRAIN
-
-
-@inner
-def _most(labels, counts, depths, surfaces):
-    """The label of most samples; where two have as many, that of the nearer surface."""
-    best, best_count, best_depth = labels[0], 0.0, -1.0
-    for k in range(surfaces):
-        count, closest = 0.0, 0.0
-        for m in range(surfaces):
+def _most(labels, depths):
+    """The label of most of a pixel's samples; where two have as many, that of the nearer surface."""
+    best, best_count, best_depth = labels[0], 0, -1.0
+    for k in range(4):
+        count, closest = 0, 0.0
+        for m in range(4):
             if labels[m] == labels[k]:
-                count += counts[m]
+                count += 1
                 closest = max(closest, depths[m])
         if count > best_count or (count == best_count and closest > best_depth):
             best, best_count, best_depth = labels[k], count, closest
@@ -445,80 +343,70 @@ def render(faces, textures, pose, intrinsics, size, environment):
         # Sample 0 of pixel 0 lies a quarter pixel before its centre.
         centre=(np.array([intrinsics[0, 2], intrinsics[1, 2]]) + 0.5) * SUPERSAMPLING - 0.5,
         size=(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING))
-    depth = np.full(view.size, 1.0 / FAR, np.float32)
-    nearest = np.full(view.size, -1, np.int32)
-    shadow = np.zeros(view.size, np.bool_)
-    coefficients = np.empty((faces.shape[0], 9))
-    _surfaces(faces, textures, view, coefficients, depth, nearest)
-    _shadows(faces, textures, view, environment.sun, nearest, shadow)
-    return _pixels(faces, _brightness(faces, environment), textures, view, environment, coefficients, nearest, shadow)
+    depth, nearest = np.zeros(view.size, np.float32), np.full(view.size, -1, np.int32)
+    coefficients = np.empty((len(faces), 9))
+    _draw(faces, textures, view, coefficients, depth, nearest)
+    on_ground = np.append(faces[:, GROUND] > 0, False)[nearest]  # the last one for samples without a face
+    shadows, shadow = _shadows(faces, environment.sun, view.position), np.full(view.size, -1, np.int32)
+    _draw(shadows, textures, view, np.empty((len(shadows), 9)), np.where(on_ground, 0, np.inf).astype(np.float32),
+          shadow)
+    return _pixels(faces, _brightness(faces, environment), textures, environment, coefficients, nearest, shadow)
 
 
 def _brightness(faces, environment):
     """What each face's texture is multiplied by, (n,): ambient light, and the sun by the cosine of its angle."""
     normal = np.cross(faces[:, EDGE_S:EDGE_S + 3], faces[:, EDGE_T:EDGE_T + 3])
-    length = np.sqrt(normal[:, X] ** 2 + normal[:, Y] ** 2 + normal[:, Z] ** 2)
-    sun = environment.sun
-    cosine = -(normal[:, X] * sun[X] + normal[:, Y] * sun[Y] + normal[:, Z] * sun[Z]) / np.maximum(length, 1e-12)
-    direct = np.where(faces[:, LIT] > 0, np.maximum(cosine, 0.0), 0.6)
+    cosine = -(normal * environment.sun).sum(axis=1) / np.maximum(np.sqrt((normal * normal).sum(axis=1)), 1e-12)
+    direct = np.where(faces[:, LIT] > 0, np.maximum(cosine, 0.0), UNLIT)
     return faces[:, GAIN] * (environment.ambient + environment.direct * direct)
 
 
 def compile_for_all():
     """Compile once and keep it on disk where possible, so that the processes started afterwards need not."""
-    textures = Textures(
-        data=np.zeros(1, np.uint8), gray=np.zeros((1, LEVELS, LEVELS), np.int64),
-        alpha=np.full((1, LEVELS, LEVELS), -1), sides=np.zeros((1, 2), np.int64), clouds=0, leaves=0)
-    environment = Environment(np.ones(3), *[1.0] * 7, skyline=np.zeros(2))
+    textures = Textures(np.zeros(1, np.uint8), np.zeros((1, LEVELS, LEVELS), np.int64), np.zeros((1, 2), np.int64),
+                        np.zeros(1, np.bool_))
+    environment = Environment(np.ones(3), *[1.0] * 5)
     render(np.zeros((0, COLUMNS)), textures, np.eye(4), np.eye(3), (1, 1), environment)
 
 
 @fast
-def _pixels(faces, brightness, textures, view, environment, coefficients, nearest, shadow):
+def _pixels(faces, brightness, textures, environment, coefficients, nearest, shadow):
     """Image and label map, from what each sample sees."""
-    height, width = view.size[0] // SUPERSAMPLING, view.size[1] // SUPERSAMPLING
+    height, width = nearest.shape[0] // SUPERSAMPLING, nearest.shape[1] // SUPERSAMPLING
     image = np.empty((height, width), np.float32)
     label_map = np.empty((height, width), np.uint8)
-    hits, counts, labels, depths = np.empty(4, np.int32), np.empty(4), np.empty(4, np.uint8), np.empty(4)
-    data, gray, sides = textures.data, textures.gray, textures.sides
-    clouds, leaves = _whole(textures, textures.clouds), _whole(textures, textures.leaves)
-    rotation, focal, centre = view.rotation, view.focal, view.centre
-    skyline = environment.skyline
+    labels, depths = np.empty(4, np.uint8), np.empty(4)
+    data, start, sides = textures.data, textures.start, textures.sides
     dark, haze, horizon = 1.0 - environment.shadow, environment.haze, environment.horizon
     for i in range(height):
         for j in range(width):
-            # The texture of each face in the pixel is read once, in the middle of its samples.
-            surfaces, total = 0, 0.0
+            index, shaded = nearest[2 * i, 2 * j], 0
+            whole = True  # most pixels show one face, whose texture is read once, in the middle
             for k in range(4):
-                hits[k] = nearest[2 * i + (k >> 1), 2 * j + (k & 1)]
-            for k in range(4):
-                index = hits[k]
-                if index == COUNTED:  # most pixels show one surface
+                y, x = 2 * i + (k >> 1), 2 * j + (k & 1)
+                whole &= nearest[y, x] == index
+                shaded += shadow[y, x] >= 0
+            reads = 1 if whole else 4
+            spread = SHARPNESS * (2 if whole else 1)
+            total = 0.0
+            for k in range(reads):
+                y, x = 2 * i + (k >> 1), 2 * j + (k & 1)
+                index = nearest[y, x]
+                labels[k], depths[k] = SKY, 0.0
+                if index < 0:
+                    total += horizon
                     continue
-                count, row, column, shaded = 0, 0, 0, 0
-                for m in range(k, 4):
-                    if hits[m] == index:
-                        count += 1
-                        row += 2 * i + (m >> 1)
-                        column += 2 * j + (m & 1)
-                        shaded += shadow[2 * i + (m >> 1), 2 * j + (m & 1)]
-                        hits[m] = COUNTED
-                y, x = row / count, column / count
-                if index >= 0:
-                    w = coefficients[index, W] + coefficients[index, W_Y] * y + coefficients[index, W_X] * x
-                    spread = SHARPNESS * math.sqrt(count)
-                    value = _surface_value(faces, coefficients, index, y, x, w, spread, data, gray, sides)
-                    value *= brightness[index] * (1.0 - dark * shaded / count)
-                    clear = math.exp(-haze / w)
-                    value = value * clear + horizon * (1 - clear)
-                    label = int(faces[index, LABEL])
-                else:
-                    value, label = _background((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], rotation,
-                                               environment, skyline, data, clouds, leaves)
-                    w = 0.0
-                total += count * value
-                labels[surfaces], counts[surfaces], depths[surfaces] = label, count, w
-                surfaces += 1
-            image[i, j] = total * 0.25
-            label_map[i, j] = _most(labels, counts, depths, surfaces)
+                row, column = (y + 0.5, x + 0.5) if whole else (float(y), float(x))
+                w = coefficients[index, W] + coefficients[index, W_Y] * row + coefficients[index, W_X] * column
+                u, v, u_step, v_step = _place(coefficients, faces, index, row, column, w)
+                texture = int(faces[index, TEXTURE])
+                value = _filtered(data, start, texture, sides[texture, 0], sides[texture, 1], u, v, u_step * spread,
+                                  v_step * spread)
+                if faces[index, GROUND] > 0:
+                    value *= 1.0 - dark * shaded / 4
+                clear = math.exp(-haze / w)
+                total += value * brightness[index] * clear + horizon * (1 - clear)
+                labels[k], depths[k] = int(faces[index, LABEL]), w
+            image[i, j] = total / reads
+            label_map[i, j] = labels[0] if whole else _most(labels, depths)
     return image, label_map

@@ -9,10 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesis_repro.world import raster, things
-from thesis_repro.world.raster import GROUND_LEVELS, ROAD, SIDEWALK, Environment, Textures
-from thesis_repro.world.textures import PERSONS, noise
+from thesis_repro.world.raster import Environment, Textures
+from thesis_repro.world.textures import PERSONS, TILE
 
-KERB = -GROUND_LEVELS[SIDEWALK]
+KERB = 0.12
+BEYOND = 100.0  # metres of grass around all roads, up to a forest
+SKY_HEIGHT, SKY_HALF = 60.0, 5000.0  # metres; the clouds are a ceiling that fades into the haze
 ZONES = ("row", "gardens", "park", "wall")
 
 
@@ -30,7 +32,7 @@ class Style:
     traffic: float = 0.01  # oncoming cars for each metre
     sunny: bool = True
     sun: tuple = (0.5, 0.8)  # azimuth the light comes from, elevation (radians)
-    sky: tuple = (150.0, 205.0, 0.4)  # zenith, horizon, clouds
+    sky: tuple = (150.0, 205.0)  # gray of the sky between the clouds, and of the haze at the horizon
     haze: float = 0.003
     leaders: tuple = ()  # distances of cars that drive ahead at the camera's pace
     crossing: float | None = None  # s of a crossing with cars that pass ahead of a waiting camera
@@ -83,11 +85,12 @@ def build(rng, bank, track, style, crossing=None):
     """
     plan = _Plan(rng, bank.names, style, track, [road for road in (track, crossing) if road is not None])
     _lay_ground(plan)
+    _surround(plan)
     for side in (-1, 1):
         _build_up(plan, side)
         _furnish(plan, side)
     _traffic(plan, crossing)
-    return Street(np.ascontiguousarray(np.concatenate(plan.parts)), plan.movers, bank.packed, environment(rng, style))
+    return Street(np.ascontiguousarray(np.concatenate(plan.parts)), plan.movers, bank.packed, environment(style))
 
 
 @dataclass
@@ -147,22 +150,33 @@ def _near(x, z, points, distance):
 
 
 def _lay_ground(plan):
-    """Roads, kerbs and sidewalks along the tracks, and grass around them."""
+    """Roads, kerbs and sidewalks along the tracks."""
     half, width = plan.style.half, plan.style.sidewalk
-    plan.extrude([(-half, 0), (half, 0)], 1, plan.style.road, "road", step=2.0, ground=ROAD)
+    plan.extrude([(-half, 0), (half, 0)], 1, plan.style.road, "road", step=2.0, ground=1)
     if width:
         for side in (-1, 1):
             plan.extrude([(half, 0.05), (half, -KERB), (half + width, -KERB)], side, "sidewalk", "sidewalk",
-                         margin=0.2, ground=SIDEWALK)
-            plan.extrude([(half - 0.02, 0.01), (half + width, 0.01)], side, "asphalt", "road", ground=ROAD)
+                         margin=0.2, ground=1)
+            plan.extrude([(half - 0.02, 0.01), (half + width, 0.01)], side, "asphalt", "road", ground=1)
     for crossing in plan.roads[1:]:
         places = np.arange(crossing.s[0], crossing.s[-1], 2.0)
         plan.parts.append(things.extrude(plan.names, crossing, places, 1, [(-half, 0.005), (half, 0.005)], "asphalt",
-                                         "road", ground=ROAD))
-    faces = things.Faces(plan.names)
-    (low_x, low_z), (high_x, high_z) = plan.middle.min(axis=0) - 100, plan.middle.max(axis=0) + 100
-    faces.add((low_x, 0.06, low_z), (high_x - low_x, 0, 0), (0, 0, high_z - low_z), "grass", "terrain",
-              ((high_x - low_x) / 12, (high_z - low_z) / 12), ground=ROAD)
+                                         "road", ground=1))
+
+
+def _surround(plan):
+    """Grass around the roads, a forest around the grass, and the sky."""
+    faces, light = things.Faces(plan.names), environment(plan.style)
+    low, high = plan.middle.min(axis=0) - BEYOND, plan.middle.max(axis=0) + BEYOND
+    (x, z), (width, depth) = low, high - low
+    faces.add((x, 0.06, z), (width, 0, 0), (0, 0, depth), "grass", "terrain",
+              (width / TILE["grass"][0], depth / TILE["grass"][1]), ground=1)
+    for corner, edge in (((x, z), (width, 0)), ((x, z), (0, depth)), (high, (-width, 0)), (high, (0, -depth))):
+        faces.add((corner[0], 0.1, corner[1]), (edge[0], 0, edge[1]), (0, -9, 0), "forest", "vegetation",
+                  (np.abs(edge).max() / TILE["forest"][0], 1), lit=0)
+    faces.add((-SKY_HALF, -SKY_HEIGHT, -SKY_HALF), (2 * SKY_HALF, 0, 0), (0, 0, 2 * SKY_HALF), "sky", "sky",
+              (2 * SKY_HALF / TILE["sky"][0],) * 2, lit=0,
+              gain=plan.style.sky[0] / 128 / (light.ambient + raster.UNLIT * light.direct))
     plan.parts.append(faces.matrix())
 
 
@@ -277,12 +291,10 @@ def _traffic(plan, crossing):
               0.0 if side > 0 else np.pi)
 
 
-def environment(rng, style):
-    """The light of a style, and a skyline of trees: `raster.Environment`."""
+def environment(style):
+    """The light of a style, a `raster.Environment`."""
     azimuth, elevation = style.sun if style.sunny else (style.sun[0], 1.35)
     sun = np.array([-np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth)])
     # Under clouds the light comes from above and shadows are faint pools under things.
     ambient, direct, shadow = (0.36, 0.86, 0.36) if style.sunny else (0.70, 0.30, 0.62)
-    zenith, horizon, clouds = (float(value) for value in style.sky)
-    skyline = np.maximum(0.0, 0.035 + 0.022 * noise(rng, (8, 2048), 256, 5)[0])
-    return Environment(sun, ambient, direct, shadow, zenith, horizon, clouds, style.haze, skyline.astype(np.float64))
+    return Environment(sun, ambient, direct, shadow, float(style.sky[1]), style.haze)

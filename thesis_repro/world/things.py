@@ -114,15 +114,14 @@ def car(names, rng):
     half, length = CAR_HALF, z.max() - z.min()
     height = CAR_HEIGHT * up[0] / CAR_PROFILE[0, 1]
     for side in (1, -1):
-        faces.add((side * half, 0, z.min()), (0, 0, length), (0, -height, 0), "side", "car", gain=gain)
-    materials = (("front", 0.5, 1.0), ("front", 0.0, 0.5), ("paint", 0, 1), ("glass", 0, 1), ("paint", 0, 1),
-                 ("glass", 0, 1), ("rear", 0.0, 0.5), ("rear", 0.5, 1.0))  # from front to rear: texture, its rows
+        faces.add((side * half, 0, z.min()), (0, 0, length), (0, -height, 0), "car side", "car", gain=gain)
+    materials = (("car end", 0.5, 1.0), ("car end", 0.0, 0.5), ("paint", 0, 1), ("glass", 0, 1), ("paint", 0, 1),
+                 ("glass", 0, 1), ("car end", 0.0, 0.5), ("car end", 0.5, 1.0))  # from front to rear: texture, its rows
     for k, (texture, top, bottom) in enumerate(materials):
         low, high = (k, k + 1) if up[k] < up[k + 1] else (k + 1, k)
         right = half if low < high else -half  # of who looks at this part
         faces.add((right, -up[low], z[low]), (-2 * right, 0, 0), (0, up[low] - up[high], z[high] - z[low]), texture,
                   "car", uv=(0, 1, 0, bottom, 0, top - bottom), gain=1.0 if texture == "glass" else gain)
-    faces.add((-half, -0.32, z.min()), (2 * half, 0, 0), (0, 0, length), "metal", "car", lit=0, gain=0.2)  # underside
     return faces.matrix()
 
 
@@ -156,12 +155,11 @@ def lamp(names, rng):
 
 
 def sign(names, rng):
-    """A traffic sign that looks at -z."""
+    """A traffic sign that looks at z and -z."""
     faces, kind = Faces(names), int(rng.integers(0, SIGNS))
-    height, size = rng.uniform(1.9, 2.4), rng.uniform(0.65, 0.9) * (1.4 if kind == 2 else 1)
+    height, size = rng.uniform(1.9, 2.4), rng.uniform(0.65, 0.9) * (1.4 if kind == 1 else 1)
     faces.box((-0.04, 0.04), (-height - size / 2, 0), (0.01, 0.09), "metal", "pole")
     faces.add((-size / 2, -height, 0), (size, 0, 0), (0, -size, 0), f"sign{kind}", "traffic sign", lit=0, gain=1.05)
-    faces.add((size / 2, -height, 0.005), (-size, 0, 0), (0, -size, 0), f"back{kind}", "traffic sign", lit=0)
     return faces.matrix()
 
 
