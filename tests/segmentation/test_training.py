@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+import time
 from copy import copy
 from pathlib import Path
 
@@ -13,7 +14,6 @@ import tensorflow as tf
 
 from thesis_repro import InputError
 from thesis_repro.segmentation import augmentation, training
-from thesis_repro.segmentation.unet import build_unet
 
 pytestmark = pytest.mark.slow
 
@@ -32,11 +32,20 @@ def street(count, seed):
 SETS = (*street(9, 0), *street(4, 1))
 
 
+def network(filters):
+    """A small one with the kinds of layers of the U-Net, which takes ten times as long to compile."""
+    layers = [keras.Input((SIZE, SIZE, 1), name="image"),
+              keras.layers.Conv2D(4 * filters, 3, padding="same", activation="relu", name="features"),
+              keras.layers.BatchNormalization(name="normalized"),
+              keras.layers.Conv2D(35, 1, activation="softmax", name="classes")]
+    return keras.Sequential(layers, name="small")
+
+
 def prepared(sets=SETS, filters=2, rate=0.01, strategy=None):
     """A compiled model and its batches, as notebook 4 prepares them."""
     keras.utils.set_random_seed(0)
     with (strategy or training.strategy()).scope():
-        model = build_unet((SIZE, SIZE, 1), 35, filters)
+        model = network(filters)
         model.compile(keras.optimizers.Adam(rate), training.fused_loss(training.total_loss()),
                       metrics=training.metrics())
         model.optimizer.build(model.trainable_variables)
@@ -44,14 +53,15 @@ def prepared(sets=SETS, filters=2, rate=0.01, strategy=None):
     return model, training.Batches([sets[:2], augmented], 4, seed=0), training.Batches([sets[2:]], 4)
 
 
-def train(folder, epochs=3, patience=5, **options):
-    """The fit of notebook 4."""
+def train(folder, epochs=3, patience=5, pause=0, **options):
+    """The fit of notebook 4; pause: seconds after each batch, so that it can be killed in time."""
     model, batches, validation = prepared(**options)
     stop = keras.callbacks.EarlyStopping(patience=patience)
     best = keras.callbacks.ModelCheckpoint(folder / training.MODEL, save_best_only=True)
     resumable = training.ResumableTraining(folder, model, batches, [stop, best])
+    wait = keras.callbacks.LambdaCallback(on_train_batch_end=lambda batch, logs: time.sleep(pause))
     model.fit(batches.dataset(), validation_data=validation.dataset(), epochs=epochs, shuffle=False, verbose=0,
-              initial_epoch=resumable.first_epoch(epochs), callbacks=[stop, best, resumable])
+              initial_epoch=resumable.first_epoch(epochs), callbacks=[stop, best, resumable, wait])
     return resumable
 
 
@@ -137,7 +147,7 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
 
 def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path, kill_when):
     code = (f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
-            f"t.train(t.Path({str(tmp_path)!r}))")
+            f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)")
     kill_when([sys.executable, "-c", code], (tmp_path / "state.npz").exists)
     assert len(pd.read_csv(tmp_path / "history.csv")) < 3
 

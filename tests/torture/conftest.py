@@ -20,7 +20,7 @@ from thesis_repro.segmentation import training
 import test_training
 try:
     folder = stages.stage(sys.argv[1], **training.made_from(*test_training.prepared()))
-    test_training.train(folder, 3)
+    test_training.train(folder, 3, pause=0.1)
 except Exception as error:
     sys.exit(longrun.report_error(error))
 """
