@@ -6,12 +6,14 @@ and writes it as JSON. Nothing fails for being slow.
 
 import argparse
 import os
+import resource
+import subprocess
 import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from copy import copy
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -21,17 +23,18 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, odometry
-from thesis_repro.cityscapes import N_CLASSES, read_image
-from thesis_repro.files import write_png, write_text
+from thesis_repro import InputError, masks, odometry
+from thesis_repro.files import write_text
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import dilate
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
-from thesis_repro.study.timing import opencv_threads
+from thesis_repro.study import controls, timing
+from thesis_repro.study.sources import Source
 
 REPEATS = 3
-WIDTHS = (1, 5, 10, 15)
-KEYPOINTS = (500, 1000, 2000, 4000)
+WIDTHS = range(1, 17)  # pixels; with all keypoints, 17 runs
+CORES = 2  # of the whole chain
+CAMERA = 10.0  # frames a second of KITTI
+FIRST_USE = "from thesis_repro.odometry import odometry; odometry.warm_up(refined=True)"
 
 
 def seconds(work, clock=time.perf_counter):
@@ -56,30 +59,33 @@ def bare_calls(previous, frame, points, intrinsics):
 
 
 def step_cost(sequence):
-    """Milliseconds of a step that detects anew, and of its bare OpenCV calls: medians over frames of the least of 3."""
-    follower, metres, costs = Odometry(sequence.intrinsics), odometry.scales(sequence), []
+    """Milliseconds of a step, of a refined one and of the thesis's bare OpenCV calls: medians of the least of 3."""
+    thesis, refined = (Odometry(sequence.intrinsics, replace(THESIS, estimator=name)) for name in ("thesis", "refined"))
+    metres, costs = odometry.scales(sequence), []
     clock = time.thread_time  # of a single thread, which does not see what else the machine is doing
     previous = sequence.frame(0)
-    follower.step(previous)
+    for follower in (thesis, refined):
+        follower.step(previous)
     for index, frame in enumerate(list(sequence.frames())[1:], 1):
-        state, steps = follower.state(), []
-        calls = bare_calls(previous, frame, state["points"], sequence.intrinsics)
-        bare = sum(min(seconds(call, clock) for _ in range(REPEATS)) for call in calls)
-        for _ in range(REPEATS):
-            follower.restore(state)
-            steps.append(seconds(lambda: follower.step(frame, metres[index]), clock))  # noqa: B023
-        costs.append((1e3 * min(steps), 1e3 * bare))
+        calls = bare_calls(previous, frame, thesis.points, sequence.intrinsics)
+        states, least = [follower.state() for follower in (thesis, refined)], np.full(3, np.inf)
+        for _ in range(REPEATS):  # in turn, so that what else the machine does falls on all of them
+            row = []
+            for follower, state in zip((thesis, refined), states, strict=True):
+                follower.restore(state)
+                row.append(seconds(lambda: follower.step(frame, metres[index]), clock))  # noqa: B023
+            least = np.minimum(least, [*row, sum(seconds(call, clock) for call in calls)])
+        costs.append(1e3 * least)
         previous = frame
     return np.median(costs, axis=0)
 
 
 def shared_cost(sequence):
     """CPU milliseconds a frame of runs in one pass and of the same runs one by one; whether their poses are equal."""
-    def masks(width):  # boundaries of the frames' own contours, for where there are no label maps
-        smooth = [cv2.GaussianBlur(frame, (0, 0), 4) for frame in sequence.frames()]
-        return [dilate(cv2.Canny(frame, 20, 60), width) for frame in smooth]
-
-    runs = {"": (THESIS, None)} | {f"{width}": (THESIS, masks(width)) for width in WIDTHS}
+    # boundaries of the frames' own contours, for where there are no label maps
+    contours = [cv2.Canny(cv2.GaussianBlur(frame, (0, 0), 4), 20, 60) for frame in sequence.frames()]
+    runs = {"": (THESIS, None)} | {f"{width}": (THESIS, [masks.dilate(edges, width) for edges in contours])
+                                   for width in WIDTHS}
     together, alone = {}, {}
     costs = [seconds(lambda: together.update(odometry.run_many(sequence, runs)), time.process_time),
              seconds(lambda: alone.update({name: odometry.run(sequence, *run) for name, run in runs.items()}),
@@ -88,60 +94,52 @@ def shared_cost(sequence):
     return *(1e3 * cost / len(sequence) for cost in costs), same
 
 
-def keypoint_cost(sequence, count):
-    """CPU milliseconds a frame with at most so many keypoints."""
-    settings = replace(THESIS, max_keypoints=count, redetect_below=count)
-    return 1e3 * seconds(lambda: odometry.run(sequence, settings), time.process_time) / len(sequence)
+def mask_cost(sequence, labels):
+    """CPU milliseconds a mask of all widths and controls of a frame, made together and each by itself."""
+    source, costs = Source(labels), np.zeros(2)
+    kinds = [source.masks(sequence, width) for width in WIDTHS] + [
+        controls.masks(method, source, sequence, controls.LINE_WIDTH) for method in controls.MASKS
+        if method != "true-labels"]
+    for index in range(len(sequence)):
+        for column, forget in enumerate((lambda: None, masks.forget_edges)):
+            masks.forget_edges()
+            for kind in kinds:
+                forget()
+                costs[column] += seconds(lambda: kind[index], time.process_time)  # noqa: B023
+    return 1e3 * costs / len(sequence) / len(kinds)
 
 
-def pass_memory(sequence, frames, runs):
-    """Megabytes that a pass of so many runs over so many frames adds to a process, and what it takes at the start.
+def compile_cost():
+    """CPU seconds until a process may use the refined odometry, with nothing compiled and once more."""
+    with tempfile.TemporaryDirectory() as cache:
+        work = partial(subprocess.run, [sys.executable, "-c", FIRST_USE], check=True,
+                       env={**os.environ, "NUMBA_CACHE_DIR": cache})
+        return [seconds(work, _children) for _ in range(2)]
 
-    The frames of the sequence are gone through to and fro until there are as many.
-    """
+
+def _children():
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def chain_rate(sequence):
+    """Frames a second from the frame's file to the masked pose, one after the other, on CORES cores."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        return pool.submit(_pass, sequence, frames, runs).result()
+        return pool.submit(_chain, sequence).result()
 
 
-def peak_memory():
-    """Bytes: the most that this process has taken so far, without what the one that started it had (Linux)."""
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    return 1024 * next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
-
-
-def _pass(sequence, frames, runs):
-    order = np.resize([*range(len(sequence)), *range(len(sequence) - 2, 0, -1)], frames)
-    longer = copy(sequence)
-    longer.frame_paths, longer._poses = [sequence.frame_paths[index] for index in order], sequence.poses[order]
-    longer.times = 0.1 * np.arange(frames)
-    settings = {f"{seed}": (replace(THESIS, shuffle_seed=seed or None), None) for seed in range(runs)}
-    odometry.run_many(sequence, settings)  # loads and compiles everything
-    start = peak_memory()
-    odometry.run_many(longer, settings)
-    return (peak_memory() - start) / 2**20, start / 2**20
-
-
-def prediction_cost(model, paths):
-    """Milliseconds a frame, from file to file: of `write_label_maps`, and of `model.predict` for each, as in A.7."""
+def _chain(sequence):
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
     from thesis_repro.segmentation import prediction
 
-    def one_by_one(folder):
-        for path in paths:
-            image = read_image(path, *model.input_shape[1:])[None].astype(np.float32)
-            write_png(folder / f"{path.stem}.png", model.predict(image, verbose=0).argmax(-1)[0].astype(np.uint8))
-
-    with tempfile.TemporaryDirectory() as temporary:
-        folder, costs = Path(temporary), []
-        for name, work in (("maps", lambda to: prediction.write_label_maps(model, paths, to)), ("single", one_by_one)):
-            work(folder / f"{name}-warm")  # compiles
-            costs.append(1e3 * seconds(lambda: work(folder / name)) / len(paths))  # noqa: B023
-    return costs
+    table = timing.measure(sequence, prediction.load_shipped())
+    return 1e3 / table.loc[table["method"] != "all keypoints", "milliseconds"].sum()
 
 
-def measure(sequence, frames=200, runs=4, models=None):
+def measure(sequence):
     """A table: what is measured, its unit, the measure, what it is set against, and their ratio."""
     from thesis_repro.segmentation import prediction
-    from thesis_repro.segmentation.unet import build_unet
 
     rows = []
 
@@ -150,21 +148,19 @@ def measure(sequence, frames=200, runs=4, models=None):
         rows.append({"what": what, "unit": unit, "measured": measured, "against": against, "reference": reference,
                      "ratio": measured / reference})
 
-    odometry.run_many(sequence.subset(2), {"": (THESIS, None)})  # compiles and loads what the first use would
-    with opencv_threads(1):
-        add("a step of the odometry", "ms", step_cost(sequence), "its bare OpenCV calls")
-        *pair, same = shared_cost(sequence)
+    odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})  # compiles and loads
+    with timing.opencv_threads(1):
+        step, refined, bare = step_cost(sequence)
+        add("a step of the odometry", "ms", (step, bare), "its bare OpenCV calls")
+        add("a refined step", "ms", (refined, step), "a step")
+        *pair, same = shared_cost(sequence.subset(12))
         add(f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits", "ms a frame", pair,
             "one by one")
-        costs = {count: keypoint_cost(sequence, count) for count in KEYPOINTS}
-    for count, cost in costs.items():
-        add(f"{count} keypoints", "ms a frame", (cost, costs[2000]), "2000 keypoints")
-    add(f"memory that {runs} runs over {frames} frames add", "MB", pass_memory(sequence, frames, runs), "at the start")
-    models = models or {"model in the package": prediction.load_shipped(),
-                        "the thesis's network": build_unet((320, 320, 1), N_CLASSES)}
-    for name, model in models.items():
-        add(f"label maps, {name}", "ms a frame", prediction_cost(model, sequence.frame_paths[:16]),
-            "model.predict one by one")
+        with tempfile.TemporaryDirectory() as labels:
+            prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, labels)
+            add("masks and controls made together", "ms a mask", mask_cost(sequence, Path(labels)), "one by one")
+    add("first use, compiling", "s", compile_cost(), "second use")
+    add(f"from file to masked pose, {CORES} cores", "frames/s", (chain_rate(sequence), CAMERA), "KITTI's camera")
     return pd.DataFrame(rows)
 
 

@@ -263,7 +263,7 @@ def test_too_few_correspondences_keep_the_pose(drive, count, reason):
 
 
 def test_no_essential_matrix_keeps_the_pose(drive, monkeypatch):
-    odometry.odometry.warm_up("thesis")
+    odometry.odometry.warm_up(refined=False)
     real, outcomes = pose.ransac.find_essential_matrix, iter(range(1, 10))
 
     def failing(*arguments):

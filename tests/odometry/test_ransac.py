@@ -153,7 +153,7 @@ def test_same_bits_in_threads():
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["00", "05", "06"])
 def test_same_bits_on_real_frames(kitti_real, name, monkeypatch):
-    odometry.odometry.warm_up("thesis")
+    odometry.odometry.warm_up(refined=False)
     pairs, real = [], ransac.find_essential_matrix
     monkeypatch.setattr(ransac, "find_essential_matrix", lambda *arguments: (
         pairs.append(arguments[:2]), real(*arguments))[1])

@@ -12,7 +12,6 @@ import pytest
 
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.segmentation.unet import build_unet
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -28,12 +27,10 @@ pytestmark = pytest.mark.slow
 def test_bench_sets_each_measure_against_another(small_world, monkeypatch):
     monkeypatch.setattr(bench, "REPEATS", 1)
     monkeypatch.setattr(bench, "WIDTHS", (5,))
-    monkeypatch.setattr(bench, "KEYPOINTS", (500, 2000))
-    sequence = Sequence(small_world / "kitti", "00").subset(5)
-    table = bench.measure(sequence, frames=20, runs=2, models={"tiny": build_unet((32, 32, 1), 35, 2)})
+    monkeypatch.setattr(bench, "chain_rate", lambda sequence: 5.0)  # tests of the timing cover it
+    table = bench.measure(Sequence(small_world / "kitti", "00").subset(5))
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
-    assert (table.drop(index=4)["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
-    assert table["what"][4].startswith("memory") and table["measured"][4] < 100
+    assert (table["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
     assert len(json.loads(table.to_json(orient="records"))) == 6
 
 

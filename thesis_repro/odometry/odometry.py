@@ -82,7 +82,7 @@ class Odometry:
         self.previous: np.ndarray | None = None  # the frame that self.points belong to
         self.points = keypoints.NO_POINTS
         self._gap = 0.0  # metres from there to the last frame seen
-        warm_up(settings.estimator)
+        warm_up(settings.estimator == "refined" or settings.fallback)
 
     def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
         step = self.observe(frame, scale, mask)
@@ -290,13 +290,13 @@ def _mean_shift(step):
 
 
 @lru_cache
-def warm_up(estimator: str) -> None:
+def warm_up(refined: bool) -> None:
     """Load the compiled functions (compile them the first time ever), so that no frame's time holds that."""
     keypoints.detect(np.zeros((8, 8), np.uint8), THESIS)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
     pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
     pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
-    if estimator == "refined":
+    if refined:
         ahead = np.array([0.0, 0.0, 1.0])
         fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)
         ransac_with_prior(points, points[::-1], 1.0, np.eye(3), ahead, 180.0, 180.0)
