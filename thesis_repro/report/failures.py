@@ -80,7 +80,7 @@ def table(steps):
         lambda bin: f"{bin.left} to {bin.right - 1} agreeing" if bin.right < BINS[-1] else f"{bin.left} or more")
     rows = []
     for name, group in [*wide.groupby("sequence"), *wide.groupby(by_number, observed=True)]:
-        medians = {f"{column}, {KINDS[kind][0]}": f"{group[column, kind].median():.3g}"
+        medians = {f"{column}, {KINDS[kind][0]}": float(f"{group[column, kind].median():.3g}")
                    for column in steps.columns[3:-1] for kind in KINDS}
         worse = group["rotation_error", "masks"] - group["rotation_error", "all"]
         rows.append({"steps": name, "number": len(group), **medians,
@@ -110,7 +110,7 @@ def figure(steps, sequences, masks):
             panel = axes[f"{column} {name}"]
             for kind, (words, color) in KINDS.items():
                 rows = steps[(steps["sequence"] == name) & (steps["kind"] == kind)]
-                panel.plot(rows["frame"], rows[column], color=color, label=words, linewidth=1)
+                panel.plot(rows["frame"], rows[column].where(rows[column] > 0), color=color, label=words, linewidth=1)
             for frame in rows.loc[rows["flag"] != "", "frame"]:
                 panel.axvspan(frame - 0.5, frame + 0.5, color=style.ORANGE, alpha=0.3, linewidth=0,
                               label="flag: ambiguous motion")
