@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -122,15 +121,6 @@ def test_agrees_with_the_bare_opencv_calls(drive, masks):
         np.testing.assert_array_equal(result.frames[column].to_numpy(float, na_value=np.nan), counts[column])
     np.testing.assert_allclose(result.poses, poses, rtol=0, atol=1e-12)
     assert metrics.rmse(result.poses, drive.poses) < 0.05
-
-
-def test_gives_the_stored_numbers(drive):
-    # Recorded with OpenCV 4.14.0; another version of OpenCV may move the last digits of a position, never a count.
-    expected = pd.read_csv(Path(__file__).with_name("street.csv"))
-    frames = odometry.run(drive, masks=Stripes(40)).frames
-    for column in ("detected", "tracked", "inliers", "pose_inliers"):
-        np.testing.assert_array_equal(frames[column].to_numpy(float, na_value=np.nan), expected[column])
-    np.testing.assert_allclose(frames[["x", "y", "z"]], expected[["x", "y", "z"]], rtol=0, atol=1e-7)
 
 
 # Keypoints
