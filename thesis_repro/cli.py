@@ -238,9 +238,10 @@ def _look_at(sequence, of_sequence):
 
     warnings = check.oddities(sequence)
     for masks in of_sequence:
-        line, odd = check.of_masks(masks, sequence)
-        longrun.remark(line)
-        warnings += odd
+        with suppress(InputError):  # of a file that cannot be read: what needs it says so
+            line, odd = check.of_masks(masks, sequence)
+            longrun.remark(line)
+            warnings += odd
     for line in warnings:
         longrun.remark(line, warning=True)
     return warnings

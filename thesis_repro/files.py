@@ -54,7 +54,7 @@ def read_ids(path):
 
 
 def glance(path):
-    """What both ends of an image file say without decoding it: (height, width), and whether it has colours.
+    """What both ends of an image file say without decoding it: (height, width).
 
     Raises InputError where `read_gray` would, but for damage in the middle.
     """
@@ -63,7 +63,7 @@ def glance(path):
         file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
         if END_MARKS["PNG" if image.format == "PNG" else "JPEG"] not in file.read():
             read_gray(path)  # some cameras and tools write behind the end
-        return image.size[::-1], image.mode not in ("1", "L", "LA")
+        return image.size[::-1]
 
 
 def _read(path, mode, flag):

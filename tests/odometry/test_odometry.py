@@ -227,6 +227,17 @@ def test_a_sequence_may_begin_black(drive):
     assert not result.frames["updated"][:3].any() and result.frames["updated"][3:].all()
 
 
+def test_motions_that_no_car_makes_are_flagged_with_the_same_bits(drive, monkeypatch):
+    noise = np.random.RandomState(0).normal(0, 2, drive.frame(0).shape)
+    still = Changed(drive, {5: np.clip(drive.frame(4) + noise, 0, 255).astype(np.uint8)})
+    assert flags(odometry.run(still))[5].split("; ")[0] == "still picture"
+    plain = odometry.run(drive)
+    monkeypatch.setattr(odometry.odometry, "MAX_TURN", 0.05)
+    flagged = odometry.run(drive)
+    assert plain.flagged.empty and set(flags(flagged).values()) == {"too large a turn"}
+    np.testing.assert_array_equal(flagged.poses, plain.poses)
+
+
 def test_an_empty_mask_lets_the_tracked_points_go_on(drive):
     masks = [np.full(drive.frame(0).shape, 0 if index == 4 else 255, np.uint8) for index in range(10)]
     result = odometry.run(drive, masks=masks)

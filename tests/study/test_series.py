@@ -9,7 +9,7 @@ import pytest
 from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks
-from thesis_repro.study import compare, runner, series
+from thesis_repro.study import compare, controls, runner, series
 from thesis_repro.study.sources import Source
 
 FRAMES = 6
@@ -56,7 +56,7 @@ def test_masks_ready_made_are_what_label_maps_of_that_width_give(done):
     # all keypoints are run once for both, and each source has controls of its own
     assert (runs["method"] == "baseline").sum() == 4 and set(runs.loc[runs["method"] == "baseline", "source"]) == {""}
     methods = {name: set(runs.loc[runs["source"] == name, "method"]) for name in ("net", "by-hand")}
-    assert methods["net"] - methods["by-hand"] == {"exact-boundaries", "corrected", "true-labels"}
+    assert methods["net"] - methods["by-hand"] == set(controls.OF_LABEL_MAPS)
     assert {"mirrored", "other-frame", "random-lines", "image-edges", "fewer", "spread"} < methods["by-hand"]
 
 
@@ -115,7 +115,7 @@ def test_results_of_another_length_are_not_thrown_away(done, study):
     (["--labels", "LABELS", "--name", "a", "--name", "b"], "--name b: 2 names for 1 folders"),
     (["--labels", "LABELS", "--name", "a/b"], "--name a/b: a name may have letters"),
     (["--masks", "MASKS", "--widths", "5"], "--widths: only masks from label maps"),
-    (["--masks", "MASKS", "--symmetric"], "--without-movable, --ids, --margin: need --labels DIR"),
+    (["--masks", "MASKS", "--symmetric"], "--keep, --ids, --margin: need --labels DIR"),
     (["--labels", "LABELS", "--margin", "-1"], "margin=-1: must be 0 or more pixels"),
     (["--masks", "LABELS"], "320x320 pixels, but the frames have"),
     (["--masks", "TRUE", "--sequences", "00"], "different values; a mask has 0 and 255 (label maps go with --labels)"),

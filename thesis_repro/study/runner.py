@@ -76,8 +76,10 @@ def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) 
     sequences = _open(jobs, study)
     for job in jobs:
         path = study.result(job)
-        if path.is_file() and stages.kept_table(path, len(sequences[job.sequence])) is None:
-            path.unlink()
+        if path.is_file():
+            table = stages.kept_table(path, len(sequences[job.sequence]))
+            if table is None or not np.isfinite(poses_of(table)).all():
+                path.unlink()  # what is missing is made again
     finished = sum(study.result(job).is_file() for job in jobs)
     failures: dict[Job, str] = {}
     with cluster.open_pool(processes, scheduler) as pool:

@@ -80,6 +80,9 @@ class Study:
         with longrun.claimed(folder):
             stages.stage(folder, replace=False, frames=self.frames)
             runs = run(self.first_jobs())
+            if runs["mean_keypoints"].isna().all():
+                raise InputError(f"{self.kitti}: no frame has any structure (all are black, blown out or of one gray); "
+                                 "check how they were written")
             second, made = self.second_jobs(runs), runs.attrs["made"]
             if second:
                 runs = run([*self.first_jobs(), *second])

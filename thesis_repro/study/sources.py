@@ -102,5 +102,5 @@ def check(sources: Iterable[Source], sequences: Collection[Sequence], widths: Co
                 paths = source.masks(sequence, width).paths
             if source.kind == "masks":
                 for path in paths:
-                    check_mask_size(path, glance(path)[0], sequence.size)
+                    check_mask_size(path, glance(path), sequence.size)
             source.check_file(paths[0], sequence.size)
