@@ -111,7 +111,7 @@ def test_label_maps_spread_over_workers_are_those_of_one_and_are_not_made_again(
     made.clear()
     prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences, batch_size=2)
     again = [path.name for path, when in written.items() if path.stat().st_mtime_ns != when]
-    assert made == [1] and removed.is_file() and again == [frames[2].name]  # the other one of its batch
+    assert made == [1] and removed.is_file() and again == []  # the other one of its batch may have been corrected
 
 
 def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_path):

@@ -48,7 +48,8 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
 
     Images may have any size; they are stretched to the model's input as the appendix does. Decoding and writing go
     on while the network works. Files appear whole or not at all, and a killed run goes on where it was: batches whose
-    files are all there are skipped, any other is predicted in full, so that every run gives the same bytes.
+    files are all there are skipped, any other is predicted in full, so that every run gives the same bytes
+    (and what is missing of it is written).
     The folder is a stage (see stages): label maps of another model or of other images in it are deleted.
 
     Returns how many images were predicted.
@@ -108,7 +109,8 @@ def _decode(input_shape, paths):
 def _write(batch):
     pairs, labels = batch
     for (_, target), label_map in zip(pairs, labels, strict=True):
-        files.write_png(target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST))
+        if not files.is_whole(target):  # one that is there may have been corrected by hand
+            files.write_png(target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST))
     return len(pairs)
 
 
