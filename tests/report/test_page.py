@@ -211,7 +211,8 @@ def test_a_study_has_a_page_of_what_it_left(tmp_path):
     study = SimpleNamespace(kitti=Path("kitti"), sources=[], tested=10, estimators=["refined"], repetitions=3)
     html = page.build_study(
         tmp_path, {("figure", "comparison"), ("table", "comparison"), ("text", "findings")}, study=study, embedded=True,
-        kinds={}, estimators={"refined": "refined estimator"}, line_width=10, changed={}, widths=[10], frames={"00": 9})
+        warnings=(), kinds={}, estimators={"refined": "refined estimator"}, line_width=10, changed={}, widths=[10],
+        frames={"00": 9})
     shown = Reader(html)
     assert shown.of("img", "src") == ["comparison.svg"] and "12.0" in shown.text
     assert [attributes["id"] for tag, attributes in shown.elements if tag in ("figure", "section")] == [
