@@ -81,7 +81,7 @@ def test_what_a_run_depends_on_is_found():
 
 
 def test_listing_notices_other_bytes_and_reads_them_once(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("THESIS_REPRO_BUILD", str(tmp_path / "build"))
     monkeypatch.setattr(stages, "SETTLED", -1)
     paths = [tmp_path / "a", tmp_path / "b"]
     for path in paths:

@@ -25,6 +25,7 @@ import pandas as pd
 from thesis_repro import InputError, longrun
 from thesis_repro.files import atomic, progress, write_text
 from thesis_repro.longrun import LIST, LOG, RECORD
+from thesis_repro.settings import PREFIX, ROOT
 
 _PACKAGE = Path(__file__).parent
 
@@ -218,7 +219,7 @@ MOST_DIGESTS = 1_000_000  # that are remembered
 
 
 def contents(paths):
-    """Digests of the bytes of files. They are remembered (in ~/.cache/thesis-repro), so a file is read again only where
+    """Digests of the bytes of files. They are remembered in the build folder, so a file is read again only where
     its path, size, dates or inode are others: gigabytes cost their reading once."""
     paths = [Path(path).absolute() for path in paths]
     keys = [(json.dumps(str(path)), json.dumps(_identity(path))) for path in paths]
@@ -249,7 +250,7 @@ def _remembered():
     """The database of digests; one in memory where none can be kept."""
     table = "CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)"
     try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "thesis-repro")
+        folder = Path(os.environ.get(f"{PREFIX}BUILD") or ROOT / "build")
         folder.mkdir(parents=True, exist_ok=True)
         database = sqlite3.connect(folder / "digests.sqlite", timeout=2)
         database.execute(table)
