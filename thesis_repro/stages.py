@@ -25,7 +25,6 @@ import pandas as pd
 from thesis_repro import InputError, longrun
 from thesis_repro.files import atomic, progress, write_text
 from thesis_repro.longrun import LIST, LOG, RECORD
-from thesis_repro.settings import PREFIX, ROOT
 
 _PACKAGE = Path(__file__).parent
 
@@ -250,7 +249,7 @@ def _remembered():
     """The database of digests; one in memory where none can be kept."""
     table = "CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)"
     try:
-        folder = Path(os.environ.get(f"{PREFIX}BUILD") or ROOT / "build")
+        folder = Path(os.environ.get("THESIS_REPRO_BUILD") or _PACKAGE.parent / "build")
         folder.mkdir(parents=True, exist_ok=True)
         database = sqlite3.connect(folder / "digests.sqlite", timeout=2)
         database.execute(table)
