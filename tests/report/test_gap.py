@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from thesis_repro.report import gap, page, style
+from thesis_repro.report import gap, style
 from thesis_repro.settings import read_settings
 
 OWN, SHIPPED, EXACT = "the model of this run", "the model in the package", "exact label maps"
@@ -42,14 +42,10 @@ def test_the_figure_has_a_panel_a_model_and_a_bar_where_there_is_a_class():
     assert sorted(bar.get_height() for bar in figure.axes[0].patches if bar.get_height() > 0) == [0.7, 0.8, 0.8]
 
 
-def test_the_quality_of_a_runs_label_maps_is_kept_and_shown(tmp_path):
+def test_the_quality_of_a_runs_label_maps_is_kept(tmp_path):
     settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "b"), "THESIS_REPRO_FIGURES": str(tmp_path / "f")})
-    settings.figures.mkdir(parents=True)
     assert gap.label_map_quality(settings.build) == []
-    (settings.figures / "table_4_1.csv").write_text("sequence,frames\n00,12\n")
     style.save_table(Gap.scores.assign(used=Gap.scores["model"] == SHIPPED), settings.build, gap.RECORD, "note")
     rows = gap.label_map_quality(settings.build)
     assert [(row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows] == [
         (VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]
-    html = page.build(settings)
-    assert html.count("mean IoU 0.50 over 2 classes on 20 images") == 2  # below that one table, and at the top

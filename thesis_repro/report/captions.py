@@ -1,8 +1,8 @@
 """What every table, figure and text shows (captions.json), and the numbers that the thesis reports (reported.json).
 
-An artefact is a dict: kind ("figure", "table", "text"), name (of its files), title, caption; on_label_maps where it
-depends on label maps; of_training where it shows a training; thesis, what the thesis reports in words: data, text, and
-a template for this run's numbers, here. Both texts are Jinja templates.
+An artefact is a dict: kind ("figure", "table", "text"), name (of its files), title, caption; needs, the variable
+without which a run on real frames cannot make it; thesis, what the thesis reports in words: data, text, and a template
+for this run's numbers, here. Both texts are Jinja templates.
 """
 
 import json

@@ -20,12 +20,13 @@ from markupsafe import Markup
 
 from thesis_repro import longrun
 from thesis_repro.files import write_text
-from thesis_repro.report import captions, gap, tables, texts
+from thesis_repro.report import captions, tables, texts
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
 EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 ENDINGS = {"figure": (".svg", ".webp"), "table": (".csv", ".md"), "text": (".md",)}
+OPENING = ("findings", "figure-comparison")  # what a page starts with, by id
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # what numbers depend on most
 
 
@@ -69,17 +70,16 @@ def build(settings):
     chapters = {title: [_shown(settings.figures, artefact, makers, settings, numbers) for artefact in artefacts]
                 for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()}
     executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
-    lengths = tables.read(settings.figures / "table_4_1.csv")
     return texts.render(
-        "page.html.j2", title=f"Tables and figures, {settings.run}", settings=settings, chapters=chapters,
+        "page.html.j2", title=f"Keypoint masks, {settings.run}", settings=settings, chapters=chapters,
         shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
-        of=len(captions.THESIS), card=captions.CARD, label_maps=gap.label_map_quality(settings.build),
+        of=len(captions.THESIS), card=captions.CARD,
         missing=[artefact for artefact in artefacts if not artefact["there"] and not artefact["left_out"]],
-        left_out=[artefact for artefact in artefacts if artefact["left_out"]],
+        opening=[artefact for artefact in artefacts if artefact["opens"]],
+        repository=settings.figures.is_relative_to(ROOT) and os.path.relpath(ROOT, settings.figures),
         notebooks={} if settings.figures_in_git else {  # in a clone there is no build folder to link to
             path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures) for path in executed},
         evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE,
-        frames=dict(zip(lengths["sequence"], lengths["frames"])) if "frames" in lengths else {},
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
         made=_made(executed, settings.figures_in_git))
 
@@ -88,18 +88,21 @@ def build_study(folder, names, **facts):
     """The page of a study as HTML, from the files in its folder. names: of what the study left. facts: for the page."""
     shown = [_shown(folder, artefact, {}) for artefact in [*captions.ADDED, captions.OF_STUDIES]
              if (artefact["kind"], artefact["name"]) in names]
-    return texts.render("study.html.j2", title="A study of masks", artefacts=shown, notebooks={}, made=_made(), **facts)
+    return texts.render("study.html.j2", title="A study of masks", artefacts=shown, notebooks={}, made=_made(),
+                        opening=[artefact for artefact in shown if artefact["opens"]], **facts)
 
 
 def _shown(folder, artefact, makers, settings=None, numbers=None):
     """What the template needs to show a table, a figure or a text of a folder, or to say that it is missing."""
     kind, name = artefact["kind"], artefact["name"]
     files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
-    content = None
-    if files and kind == "text":
-        content = texts.html(files[0].read_text(encoding="utf-8"))
+    content, details, rows = None, None, 0
+    if files and kind == "text":  # what stands before its first heading is for everybody
+        content, _, details = files[0].read_text(encoding="utf-8").partition("\n## ")
+        content, details = texts.html(content), texts.html(f"## {details}") if details else None
     elif kind == "table" and files and files[0].suffix == ".csv":
-        content = tables.html(tables.read(files[0]))
+        table = tables.read(files[0])
+        content, rows = tables.html(table), len(table)
     there = bool(files) and (kind == "figure" or content is not None)
     number = None
     if name in captions.THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
@@ -112,10 +115,13 @@ def _shown(folder, artefact, makers, settings=None, numbers=None):
         thesis["here"] = name in numbers and fill(thesis["here"]).render(numbers[name])
         thesis["embedded"] = (settings.kitti_is_embedded if thesis["data"] == "runs" else
                               thesis["data"] == "training" and settings.cityscapes_is_embedded)
-    return {"on_label_maps": False} | artefact | {
-        "id": name if number or kind == "text" else f"{kind}-{name}", "number": number, "there": there,
-        "content": content, "files": [path.name for path in files], "makers": makers.get(name, []), "thesis": thesis,
-        "left_out": bool(settings) and settings.shipped and artefact.get("of_training", False) and not there}
+    needs = artefact.get("needs")
+    given = not needs or not settings or not settings.shipped or (needs == "KITTI_SEMANTIC" and settings.kitti_semantic)
+    identity = name if number or kind == "text" else f"{kind}-{name}"
+    return artefact | {
+        "id": identity, "number": number, "there": there, "content": content, "details": details, "rows": rows,
+        "files": [path.name for path in files], "makers": makers.get(name, []), "thesis": thesis,
+        "opens": there and identity in OPENING, "left_out": needs if not given and not there else None}
 
 
 def _makers():

@@ -28,8 +28,7 @@ def write(study, runs, folder, warnings=()):
         folder, [("text", "findings"), *names], study=study, warnings=warnings,
         embedded=is_embedded(study.kitti), kinds=KINDS, estimators=ESTIMATORS, line_width=controls.LINE_WIDTH,
         changed={source.name: _changed(source) for source in study.sources},
-        widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
-        frames=runs.groupby("sequence")["frames"].first().to_dict()))
+        widths=sorted(runs["dilation_width"].dropna().astype(int).unique())))
     return folder / page.PAGE
 
 
