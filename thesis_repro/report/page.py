@@ -75,7 +75,6 @@ def build(settings):
         shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
         of=len(captions.THESIS), card=captions.CARD,
         missing=[artefact for artefact in artefacts if not artefact["there"] and not artefact["left_out"]],
-        opening=[artefact for artefact in artefacts if artefact["opens"]],
         repository=settings.figures.is_relative_to(ROOT) and os.path.relpath(ROOT, settings.figures),
         notebooks={} if settings.figures_in_git else {  # in a clone there is no build folder to link to
             path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures) for path in executed},
@@ -88,8 +87,7 @@ def build_study(folder, names, **facts):
     """The page of a study as HTML, from the files in its folder. names: of what the study left. facts: for the page."""
     shown = [_shown(folder, artefact, {}) for artefact in [*captions.ADDED, captions.OF_STUDIES]
              if (artefact["kind"], artefact["name"]) in names]
-    return texts.render("study.html.j2", title="A study of masks", artefacts=shown, notebooks={}, made=_made(),
-                        opening=[artefact for artefact in shown if artefact["opens"]], **facts)
+    return texts.render("study.html.j2", title="A study of masks", artefacts=shown, notebooks={}, made=_made(), **facts)
 
 
 def _shown(folder, artefact, makers, settings=None, numbers=None):
