@@ -400,7 +400,7 @@ def test_runs_that_differ_after_the_tracking_share_masks_keypoints_and_essential
     runs = {(order, estimator): (replace(THESIS, shuffle_seed=order, estimator=estimator), stripes)
             for order in (None, 1) for estimator in ("thesis", "refined")}
     for _, estimator in runs:
-        odometry.odometry.warm_up(estimator)  # asks for essential matrices of its own
+        odometry.odometry.warm_up(estimator == "refined")  # asks for essential matrices of its own
     monkeypatch.setattr(pose, "essential_matrix",
                         lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1])
     together = odometry.run_many(few, runs, workers=2)
