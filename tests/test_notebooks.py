@@ -17,6 +17,7 @@ TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
 FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" for n in range(1, 7)),
            *(f"figure_4_{n:02d}" for n in range(1, 18)), "figure_a_01"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
+EXECUTED = re.compile(r"nbconvert .* --output \.(\d\d)_")  # in what make prints
 JUPYTER = ROOT / ".venv" / "bin" / "jupyter-nbconvert"
 
 
@@ -99,7 +100,7 @@ def test_only_what_changed_is_made_again(executed, changed, again):
     # (the check of the data is always made, and touches its file where the data has changed)
     planned = make_figures(executed, "-n", "-W", changed, "-o", executed / "build" / "embedded-smoke" / "checked")
     assert planned.returncode == 0
-    assert re.findall(r"nbconvert .* --output \.(\d\d)_", planned.stdout.replace("\\\n", "")) == again, planned.stdout
+    assert EXECUTED.findall(planned.stdout.replace("\\\n", "")) == again, planned.stdout
 
 
 @pytest.mark.notebooks
@@ -122,6 +123,14 @@ def test_a_notebook_that_fails_costs_the_others_nothing(tmp_path):
 
 
 @pytest.mark.notebooks
+def test_real_frames_alone_ask_for_no_training(tmp_path, tiny_kitti):
+    """What make would do, asked of it without doing it."""
+    planned = make_figures(tmp_path, f"KITTI={tiny_kitti}", "-n")
+    assert planned.returncode == 0, planned.stderr
+    assert EXECUTED.findall(planned.stdout.replace("\\\n", "")) == ["03", "05", "06", "07", "08", "09"]
+
+
+@pytest.mark.torture
 def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
     """On the small world's frames, given as if they were real; one size is not the profile's."""
     done = make_figures(tmp_path, f"KITTI={small_world / 'kitti'}", "WIDTHS=5,10", "REPETITIONS=1")
