@@ -173,7 +173,7 @@ ifeq (,$(THESIS_REPRO_KITTI))
 $(filter $(RUN)/notebooks/05_%,$(EXECUTED)): $(RUN)/drives
 $(RUN)/drives: $(filter $(RUN)/notebooks/01_%,$(EXECUTED)) $(RUN)/checked
 	@nice $(BIN)/python -m thesis_repro.world && \
-	  nice $(BIN)/python -m thesis_repro odometry --kitti $(dir $(RUN))world-$(PROFILE)/kitti --sequence 00 >/dev/null || true
+	  nice $(BIN)/python -m thesis_repro odometry --kitti $(dir $(RUN))world-$(PROFILE)/kitti --sequence 00 --estimator refined >/dev/null || true
 	@touch $@
 endif
 endif
