@@ -59,8 +59,13 @@ def follow(frames: Sequence[np.ndarray], label_maps: Sequence[np.ndarray], dilat
 
 
 def _track(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the keypoints of a frame are in the next one, and which of them were found there."""
-    return keypoints.track(before, after, corners) if len(corners) else (corners, np.zeros(0, bool))
+    """Where the keypoints of a frame are in the next one, and which were found there and from there again: others may
+    have been hidden by something that moves."""
+    if not len(corners):
+        return corners, np.zeros(0, bool)
+    tracked, followed = keypoints.track(before, after, corners)
+    back, returned = keypoints.track(after, before, tracked)
+    return tracked, followed & returned & (np.linalg.norm(back - corners, axis=1) < SAME)
 
 
 def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
