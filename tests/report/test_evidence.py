@@ -23,7 +23,7 @@ def test_a_folder_of_evidence_has_every_method_and_error_and_no_frame(small_worl
     files = evidence.write(*given, frames=6, repetitions=1)
     assert {path.suffix for path in files} == {".csv", ".md", ".svg"}
     assert {path.stem for path in files} == {"README", "audit", "comparison", "comparison_keypoints",
-                                             "comparison_sequences", "failures", "runs", "sequences", "switches",
+                                             "comparison_sequences", "failures", "runs", "switches",
                                              "widths"}
     failures = pd.read_csv(tmp_path / "out" / "failures.csv")
     of_sequences, of_numbers = failures[:2], failures[2:]

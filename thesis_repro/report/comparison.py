@@ -174,16 +174,6 @@ def table_comparison(table):
     return shown.reindex(columns=[*(name for name in shown if name not in last), *last])
 
 
-def table_sequences(table):
-    """Ratios to all keypoints of each sequence and of all by the first error that judges: a row a method."""
-    rows = _tested(_over_all_keypoints(table[table["metric"] == next(iter(compare.JUDGING_METRICS))]))
-    names = _sequences(table)
-    shown = [{"estimator": ESTIMATORS[row["estimator"]], "keypoints": label, "number": round(row["keypoints"]),
-              **row[names].map(texts.number, na_action="ignore"), "all": _short(row)}
-             for label, (_, row) in zip(_labels(rows), rows.iterrows())]
-    return pd.DataFrame(shown)
-
-
 def _short(row):
     return pd.NA if pd.isna(row["ratio"]) else texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
 

@@ -55,7 +55,7 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     table = compare.comparisons(runs)
     longrun.sweep(folder)
     style.save_all(comparison.figures(table, runs) | {"failures": failing}, {
-        "comparison": comparison.table_comparison(table), "sequences": comparison.table_sequences(table),
+        "comparison": comparison.table_comparison(table),
         "failures": failures.table(steps), "widths": comparison.table_widths(runs), "audit": audit.table(measured)},
         folder, note)
     for name, content in {"runs": runs, "switches": switches}.items():
