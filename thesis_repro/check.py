@@ -245,7 +245,7 @@ def of_masks(source, sequence):
         largest = [index for index in np.argsort(-shares, kind="stable") if shares[index] >= 0.005]
         line += f" (width {source.dilation_width}); label maps hold " + ", ".join(
             f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest)
-        lines = _label_oddities(folder, label_maps, np.flatnonzero(shares), sequence, source.settings)
+        lines = _label_oddities(label_maps, np.flatnonzero(shares), sequence, source.settings)
     record = stages.record(folder) or {}
     present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)  # a study may take a part
     if "frames" in record and all(stages.listing(each) != record["frames"] for each in (sequence.frame_paths, frames)):
@@ -262,7 +262,7 @@ def of_masks(source, sequence):
     return line, [f"{folder}: label maps {lines[0]}" if has_labels else f"{folder}: masks {lines[0]}"] if lines else []
 
 
-def _label_oddities(folder, label_maps, ids, sequence, settings):
+def _label_oddities(label_maps, ids, sequence, settings):
     height, width = label_maps[0].shape
     lines = []
     if len(ids) == 1:

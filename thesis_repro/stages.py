@@ -113,15 +113,18 @@ def made_from(folder):
     return content(Path(folder) / RECORD)
 
 
-def kept_table(path, rows=None, text=("sequence", "run", "method", "estimator", "stage", "flag"), **options):
+TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
+
+
+def kept_table(path, rows=None, **options):
     """The table that an earlier run left in a file, or None: where there is none, and where it is empty, cut off, has
-    another number of rows or holds text in another column than those named `text`."""
+    another number of rows or holds text in another column than TEXT_COLUMNS."""
     path = Path(path)
     if not path.is_file():
         return None
     with suppress(ValueError, UnicodeError):  # pandas' errors are ValueErrors
         table = pd.read_csv(path, **options)
-        plain = all(name in text or pd.api.types.is_numeric_dtype(table[name]) for name in table)
+        plain = all(name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table)
         if plain and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
             return table
     longrun.say(f"{path}: is damaged, and made again", warning=True)
@@ -214,7 +217,6 @@ def content(path):
 
 
 SETTLED = 0.1  # seconds: a file that is younger may change again within one tick of the file system's clock
-MOST_DIGESTS = 1_000_000  # that are remembered
 
 
 def contents(paths):
@@ -231,8 +233,6 @@ def contents(paths):
         settled = [(*key, digest) for key, digest in fresh.items()
                    if max(json.loads(key[1])[1:3]) < time.time_ns() - SETTLED * 1e9]
         with suppress(sqlite3.Error), database:
-            if settled and database.execute("SELECT count(*) FROM digests").fetchone()[0] > MOST_DIGESTS:
-                database.execute("DELETE FROM digests")
             database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", settled)
     every = known | fresh
     return [every[key][:12] for key in keys]
