@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import cityscapes, files, stages
+from thesis_repro import InputError, cityscapes, files, stages
 from thesis_repro.check import (
     check_cityscapes,
     check_kitti,
@@ -157,7 +157,7 @@ HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
 def test_odd_masks_are_a_line_with_the_option(tiny_kitti, tmp_path, kind, picture, count, options, seen):
     folder = tmp_path / "masks"
     for index in range(count):
-        files.write_png(folder / f"{index:06d}.png", picture)
+        files.write_png(folder / ("bonnet.png" if count == 1 else f"{index:06d}.png"), picture)
     for path in (tiny_kitti / IMAGES).iterdir() if options.pop("flat", False) else ():  # where the mask keeps
         image = cv2.imread(str(path), 0)
         image[:, 33:] = 100
@@ -179,6 +179,9 @@ def test_masks_of_other_frames_and_other_ways_to_name_them(tiny_kitti, tmp_path)
     assert np.array_equal(MaskFolder(made.paths[0], sequence)[3], read_mask(made.paths[0], sequence.size))
     cv2.imwrite(str(sequence.frame_paths[0]), np.zeros((48, 64), np.uint8))
     assert len(of_masks(made, sequence)[1]) == 1
+    files.write_png(tmp_path / "unfinished" / "000000.png", HALF)  # the mask of one frame, not one for all
+    with pytest.raises(InputError, match="000001.png"):
+        MaskFolder(tmp_path / "unfinished", sequence)
 
 
 def test_train_ids_are_label_ids_in_another_order(tmp_path):

@@ -234,7 +234,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 
 
 class MaskFolder:
-    """Masks of a sequence read from a folder of images named like the frames, or from a single image for all frames:
+    """Masks of a sequence read from a folder of images named like the frames, or of one image of another name for all:
     masks[i] for frame i. invert: no keypoints where the images are not 0.
 
     Raises InputError when the folder or a frame's mask is missing, and for what `read_mask` refuses.
@@ -281,7 +281,8 @@ def _files_of_frames(folder, sequence, what):
         raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence "
                          f"{sequence.name}")
     present = {path.name: path for path in listed(folder)}
-    if what == "mask" and len(present) == 1 and len(sequence) > 1:
+    # (a lone mask that is named like a frame is that frame's, and the others are missing)
+    if what == "mask" and len(present) == 1 and not present.keys() & set(sequence.label_names):
         return list(present.values()) * len(sequence)
     paths = [present.get(name) or present.get(f"{frame.name}.png")  # as some tools append it
              for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)]
