@@ -15,7 +15,6 @@ from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import is_whole, listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence
 
-CANNY_LOW, CANNY_HIGH = 5, 15  # Section 3.6; a 3x3 Sobel operator is OpenCV's default
 BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
 CLASS_EDGE_WINDOW = 5  # pixels a side: a Canny edge within two pixels of a change of class belongs to that change
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked ones too
@@ -31,6 +30,7 @@ class MaskSettings:
     keep: "boundaries"; "static", all but movable things and DYNASLAM_MARGIN around them, whatever the boundaries;
     "inverse", all but the widened boundaries; "static-boundaries", those between two classes that cannot move.
     boundaries: "canny" finds edges in label ids, "exact" every change of class (see `edges`).
+    canny: both thresholds (Section 3.6); a 3x3 Sobel operator is OpenCV's default.
     symmetric: the mask of a mirrored label map is the mirrored mask: no half pixel to one side (see `edges`, `dilate`).
     classes: names of labels; boundaries of these alone, with whatever they touch. Empty: of all classes.
     movable: no keypoints on people and vehicles, whose areas are first widened by so many pixels. None: allowed (but
@@ -48,6 +48,7 @@ class MaskSettings:
     margin: int = 0
     keep: str = "boundaries"
     ids: str = "labels"
+    canny: tuple[float, float] = (5, 15)
 
     def __post_init__(self) -> None:
         for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP), ("ids", IDS)):
@@ -67,7 +68,7 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
     Of the settings, movable and margin do not matter here, and of keep only "static-boundaries" does.
 
-    boundaries "canny" is the thesis: enlarge bilinearly (which invents ids along every boundary), then Canny (5, 15)
+    boundaries "canny" is the thesis: enlarge bilinearly (which invents ids along every boundary), then Canny
     on the ids themselves, so that a boundary shows only where two ids are far enough apart. "exact" is the correction:
     enlarge with nearest neighbour and mark every pixel whose right or lower neighbour has another class.
     symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary. OpenCV's plain nearest
@@ -76,7 +77,7 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
     it lies within two pixels of such a boundary.
     """
     if settings.boundaries == "canny":
-        canny = cv2.Canny(cv2.resize(label_map, size[::-1]), CANNY_LOW, CANNY_HIGH)
+        canny = cv2.Canny(cv2.resize(label_map, size[::-1]), *settings.canny)
         if not settings.classes and settings.keep != "static-boundaries":
             return canny
         of_classes = edges(label_map, size, replace(settings, boundaries="exact", symmetric=True))

@@ -141,15 +141,19 @@ def test_keypoints_are_opencvs_to_the_last_bit(drive, mask):
                                                    blockSize=keypoints.BLOCK_SIZE)
                 np.testing.assert_array_equal(keypoints.detect(image, settings, masks.get(mask), corners),
                                               np.empty((0, 2)) if expected is None else expected[:, 0])
+    expected = cv2.goodFeaturesToTrack(frame, 2000, 0.05, 3, mask=masks.get(mask), blockSize=9)
+    detected = keypoints.SharedKeypoints().detect(frame, replace(THESIS, quality=0.05, block_size=9), masks.get(mask))
+    np.testing.assert_array_equal(detected, np.empty((0, 2)) if expected is None else expected[:, 0])
 
 
 def test_tracks_are_opencvs_to_the_last_bit(drive):
     frame = drive.frame(3)
     points = keypoints.detect(frame, THESIS)
-    for shift in (3, 12, -40):  # at the last one a window leaves the frame
+    for shift, window in ((3, 21), (12, 21), (-40, 21), (12, 11)):  # at -40 a window leaves the frame
         moved = np.roll(frame, shift, axis=1)
-        expected, status, _ = cv2.calcOpticalFlowPyrLK(frame, moved, points, None, **keypoints.TRACKER)
-        tracked, success = keypoints.track(frame, moved, points)
+        tracker = keypoints.TRACKER | {"winSize": (window, window)}
+        expected, status, _ = cv2.calcOpticalFlowPyrLK(frame, moved, points, None, **tracker)
+        tracked, success = keypoints.track(frame, moved, points, window)
         np.testing.assert_array_equal(tracked, expected)
         np.testing.assert_array_equal(success, status.ravel() == 1)
 

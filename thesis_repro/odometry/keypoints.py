@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 
 from thesis_repro.compiled import fast
-from thesis_repro.odometry.settings import OdometrySettings
+from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
-QUALITY = 0.01  # of the strongest corner (inside the mask)
-BLOCK_SIZE = 5
-WINDOW = 21
-TRACKER = {"winSize": (WINDOW, WINDOW), "maxLevel": 3,
+QUALITY = THESIS.quality  # of the strongest corner (inside the mask)
+BLOCK_SIZE = THESIS.block_size
+WINDOW, LEVELS = THESIS.window, THESIS.levels
+TRACKER = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS,
            "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)}
 
 NO_POINTS = np.empty((0, 2), np.float32)
@@ -36,9 +36,9 @@ def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | Non
         points = cv2.KeyPoint_convert(_orb(settings.max_keypoints).detect(frame, inside))
         points = np.reshape(points, (-1, 2)).astype(np.float32, copy=False)
     else:
-        strength, ranked = corners or find_corners(frame)
+        strength, ranked = corners or find_corners(frame, settings.block_size)
         # As OpenCV compares: the limit in double precision, rounded to single.
-        limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * QUALITY)
+        limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * settings.quality)
         points = _spread(strength, ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
                          settings.max_keypoints, float(settings.min_distance))
     if mask is None or settings.mask_mode == "detect":
@@ -52,8 +52,11 @@ def _orb(max_keypoints):
     return cv2.ORB_create(max_keypoints)
 
 
-def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: int = WINDOW,
+          levels: int = LEVELS) -> tuple[np.ndarray, np.ndarray]:
     """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: success.
+
+    window, levels: as in OdometrySettings.
 
     The bits of a plain call of OpenCV, for less: points close to each other follow one another, so that their pixels
     are still in the processor's cache, and the matching error that nobody reads is not computed. Computing it, OpenCV
@@ -61,11 +64,12 @@ def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> tupl
     """
     order = np.argsort(points[:, 1])
     tracked, success = np.empty_like(points), np.empty(len(points), bool)
+    tracker = TRACKER | {"winSize": (window, window), "maxLevel": levels}
     tracked[order], status, _ = cv2.calcOpticalFlowPyrLK(previous, current, points[order], None,
-                                                         flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, **TRACKER)
-    corner = tracked - WINDOW // 2
+                                                         flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, **tracker)
+    corner = tracked - (window - 1) / 2
     success[order] = status.ravel() == 1
-    return tracked, success & ((corner >= -WINDOW) & (corner < current.shape[::-1])).all(axis=1)
+    return tracked, success & ((corner >= -window) & (corner < current.shape[::-1])).all(axis=1)
 
 
 class SharedKeypoints:
@@ -87,15 +91,18 @@ class SharedKeypoints:
             keys = np.unique(np.concatenate([_key(points) for previous, points in with_points if previous is first]))
             self._tracks = first, frame, keys, *track(first, frame, keys.view(np.float32).reshape(-1, 2))
 
-    def track(self, previous: np.ndarray, current: np.ndarray,
-              points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if not self._tracks or previous is not self._tracks[0] or current is not self._tracks[1]:  # resumed, say
-            return track(previous, current, points)
+    def track(self, previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: int = WINDOW,
+              levels: int = LEVELS) -> tuple[np.ndarray, np.ndarray]:
+        is_shared = self._tracks and previous is self._tracks[0] and current is self._tracks[1]  # else resumed, say
+        if not is_shared or (window, levels) != (WINDOW, LEVELS):
+            return track(previous, current, points, window, levels)
         _, _, keys, tracked, success = self._tracks
         where = np.searchsorted(keys, _key(points))
         return tracked[where], success[where]
 
     def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
+        if settings.block_size != BLOCK_SIZE:
+            return detect(frame, settings, mask)
         if self._corners is None or frame is not self._corners[0]:
             self._corners = frame, find_corners(frame)
         return detect(frame, settings, mask, self._corners[1])
@@ -105,7 +112,7 @@ def _key(points):
     return np.ascontiguousarray(points).view(np.int64).ravel()
 
 
-def find_corners(frame: np.ndarray) -> Corners:
+def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
     """The strength of each pixel of a frame, cv2.cornerMinEigenVal to the bit, and where its local maxima are.
 
     These are indices of the flattened image, strongest first, of equals the last first; none lies on the border.
@@ -113,7 +120,7 @@ def find_corners(frame: np.ndarray) -> Corners:
     scale = 1 / (4 * BLOCK_SIZE * 255)  # 4: the sum of a smoothing of (1, 2, 1)
     dx, dy = (cv2.copyMakeBorder(cv2.Sobel(frame, cv2.CV_32F, *order, scale=scale), *[BLOCK_SIZE // 2] * 4,
                                  cv2.BORDER_REFLECT_101) for order in ((1, 0), (0, 1)))
-    strength = _min_eigenvalues(dx, dy)
+    strength = _min_eigenvalues(dx, dy) if block_size == BLOCK_SIZE else cv2.cornerMinEigenVal(frame, block_size)
     is_peak = (strength == cv2.dilate(strength, None)) & (strength > 0)
     is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
     peaks = np.flatnonzero(is_peak)

@@ -106,7 +106,8 @@ class Odometry:
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
             step.points = len(self.points)
-            tracked, was_tracked = self.keypoints.track(self.previous, frame, self.points)
+            tracked, was_tracked = self.keypoints.track(self.previous, frame, self.points,
+                                                         self.settings.window, self.settings.levels)
             step.previous, step.current = self.points[was_tracked], tracked[was_tracked]
             tracked = step.current
         elif self.previous is not None or step.frame > 0:
@@ -193,7 +194,7 @@ class Odometry:
         before, frame = step.frames
         points = keypoints.detect(before, self.settings)
         if len(points):
-            current, was_tracked = keypoints.track(before, frame, points)
+            current, was_tracked = keypoints.track(before, frame, points, self.settings.window, self.settings.levels)
             step.points, step.previous, step.current = len(points), points[was_tracked], current[was_tracked]
             step.flags.append(ALL_KEYPOINTS)
             self.estimate(step)

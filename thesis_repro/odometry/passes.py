@@ -22,7 +22,8 @@ from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 CHECKPOINT = 300  # frames
 # What the keypoints depend on, and what the essential matrix depends on besides. Runs that agree in these share them.
-KEYPOINT_SETTINGS = ("detector", "max_keypoints", "min_distance", "mask_mode", "redetect_below", "fallback")
+KEYPOINT_SETTINGS = ("detector", "max_keypoints", "min_distance", "quality", "block_size", "window", "levels",
+                     "mask_mode", "redetect_below", "fallback")
 ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
 NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "mask_seconds"]
 

@@ -17,6 +17,8 @@ class OdometrySettings:
 
     detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
     max_keypoints: limit of the detector, 0 for none. min_distance: between keypoints, pixels (Shi-Tomasi only).
+    quality: of a keypoint, as a share of the strongest one's. block_size: pixels a side in which gradients are summed
+    (both Shi-Tomasi only). window, levels: of the tracker, pixels a side and how often the frame is halved.
     mask_mode: "detect" gives the mask to the detector, which fills its quota inside; "filter" drops what lies outside.
     redetect_below: new keypoints replace all points on a frame to which fewer than this were tracked.
     essential_method: how the essential matrix is searched for: "ransac", or OpenCV's "usac", "usac-magsac".
@@ -39,6 +41,10 @@ class OdometrySettings:
     min_distance: float = 3
     mask_mode: str = "detect"
     redetect_below: int = 2000
+    quality: float = 0.01
+    block_size: int = 5
+    window: int = 21
+    levels: int = 3
     essential_method: str = "ransac"
     threshold: float = 0.0003
     shuffle_seed: int | None = None
@@ -54,11 +60,13 @@ class OdometrySettings:
             if getattr(self, name) not in known:
                 raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
                                  f"choose one of {', '.join(known)}")
-        for name, most in (("max_keypoints", 2**31 - 1), ("min_distance", 10_000), ("redetect_below", 2**31 - 1),
-                           ("shuffle_seed", 2**32 - 1), ("scale_gate", math.inf), ("shift_gate", math.inf)):
+        for name, least, most in (
+                ("max_keypoints", 0, 2**31 - 1), ("min_distance", 0, 10_000), ("redetect_below", 0, 2**31 - 1),
+                ("quality", 0, 1), ("block_size", 1, 31), ("window", 3, 101), ("levels", 0, 10),
+                ("shuffle_seed", 0, 2**32 - 1), ("scale_gate", 0, math.inf), ("shift_gate", 0, math.inf)):
             value = getattr(self, name)
-            if value is not None and not 0 <= value <= most:
-                wrong = f"is above {most}; give less" if value > most else "is below 0; give 0 or more"
+            if value is not None and not least <= value <= most:
+                wrong = f"is above {most}; give less" if value > most else f"is below {least}; give {least} or more"
                 raise InputError(f"odometry setting {name}: {value} {wrong}")
         if not 0 < self.threshold < math.inf:
             raise InputError(f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003")

@@ -125,7 +125,7 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
         "masked": (THESIS, own),
         "filter": (replace(THESIS, mask_mode="filter"), own),
         "nearest": (THESIS, MadeMasks(lambda index: masks.dilate(
-            cv2.Canny(enlarged(index), masks.CANNY_LOW, masks.CANNY_HIGH), dilation_width))),
+            cv2.Canny(enlarged(index), *MaskSettings().canny), dilation_width))),
         "symmetric": (THESIS, from_labels(MaskSettings(boundaries, symmetric=True))),
         "corrected": (THESIS, from_labels(CORRECTED)),
         "no-vegetation": (THESIS, MadeMasks(lambda index: without_classes(VEGETATION, enlarged(index)))),
