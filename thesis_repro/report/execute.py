@@ -1,11 +1,10 @@
-"""How `make figures` executes a notebook: with progress, one line on failure and outputs without libraries' logs.
+"""How `make figures` executes a notebook: with progress, one line on failure, and what libraries log in a file.
 
 The Makefile calls `jupyter nbconvert --to notebook --execute` and names `Execution` as the preprocessor that does it.
 """
 
 import logging
 import os
-import re
 import signal
 import sys
 import time
@@ -13,16 +12,12 @@ import traceback
 from pathlib import Path
 
 from nbclient.exceptions import CellExecutionError, DeadKernelError
+from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import ExecutePreprocessor
 from traitlets import Unicode
 
 from thesis_repro import longrun
 from thesis_repro.settings import PREFIX
-
-# Lines that segmentation-models, absl and TensorFlow print whatever TF_CPP_MIN_LOG_LEVEL says.
-LOGGED = re.compile(r"^(?:Segmentation Models: using .* framework\.|WARNING: All log messages before absl::"
-                    r"|[IWEF]\d{4} \d\d:\d\d:|To enable the following instructions: ).*\n?", re.MULTILINE)
-COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class Execution(ExecutePreprocessor):
@@ -35,7 +30,7 @@ class Execution(ExecutePreprocessor):
     def preprocess(self, nb, resources=None, km=None):
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
         sys.excepthook = _say_why  # where nbconvert cannot write the result
-        name, path, failure, started = resources["metadata"]["name"], Path(self.log_file), None, time.monotonic()
+        name, path, started = resources["metadata"]["name"], Path(self.log_file), time.monotonic()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
@@ -43,35 +38,25 @@ class Execution(ExecutePreprocessor):
                     open(path, "w", encoding="utf-8") as self._log:
                 longrun.say(name)
                 try:
-                    nb, resources = super().preprocess(nb, resources, km)
+                    executed = super().preprocess(nb, resources, km)
                     longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
+                    return executed
                 except Exception as error:
-                    self._log.write(COLORS.sub("", traceback.format_exc()))
+                    self._log.write(strip_ansi(traceback.format_exc()))
                     failure = f"{name} failed: {_reason(error)}"
                     longrun.note(failure)
         except KeyboardInterrupt:
             logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
             print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
             sys.exit(130)
-        if failure:
-            print(f"{failure}\nthe whole report: {os.path.relpath(path)}; the same command goes on from here",
-                  file=sys.stderr)
-            sys.exit(1)
-        return nb, resources
+        sys.exit(f"{failure}\nthe whole report: {os.path.relpath(path)}; the same command goes on from here")
 
     def setup_kernel(self, **options):
+        # what compiled libraries log goes to the log file instead of into the cells' outputs
+        self.extra_arguments = ["--IPKernelApp.capture_fd_output=False"]
         # bars of progress (`files.progress`) go to this program's own standard error
         environment = os.environ | {f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2"}
         return super().setup_kernel(env=environment, stdout=self._log, stderr=self._log, **options)
-
-    def preprocess_cell(self, cell, resources, index):
-        cell, resources = super().preprocess_cell(cell, resources, index)
-        for output in cell.get("outputs", []):
-            if output.output_type == "stream":
-                output.text = LOGGED.sub("", output.text)
-        if "outputs" in cell:
-            cell.outputs = [output for output in cell.outputs if output.get("text") != ""]
-        return cell, resources
 
 
 def _say_why(kind, error, _trace):
@@ -86,4 +71,3 @@ def _reason(error):
     if isinstance(error, CellExecutionError):
         name, text = error.ename, error.evalue
     return f"{name}: {text}".splitlines()[0] + longrun.remedy(text)
-
