@@ -207,9 +207,7 @@ bench: setup
 .PHONY: evidence
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.report.evidence "$$THESIS_REPRO_KITTI" figures/kitti_excerpts \
-	  $(if $(JOBS),--jobs $(JOBS)) $(if $(filter-out all,$(FRAMES)),--frames $(FRAMES)) \
-	  $(if $(REPETITIONS),--repetitions $(REPETITIONS))
+	@$(BIN)/python -m thesis_repro.report.evidence
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)

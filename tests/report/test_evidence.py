@@ -1,7 +1,5 @@
 """The evidence of a KITTI folder: what is written, and that nothing is run twice."""
 
-import shutil
-
 import pandas as pd
 import pytest
 
@@ -11,12 +9,7 @@ from thesis_repro.study import compare, jobs
 
 
 @pytest.mark.slow
-def test_a_folder_of_evidence_has_every_method_and_error_and_no_frame(small_world, small_labels, tmp_path, monkeypatch):
-    def predict(sequences, labels):
-        if not labels.is_dir():
-            shutil.copytree(small_labels, labels)
-
-    monkeypatch.setattr(evidence, "_predict", predict)  # the network takes long and has tests of its own
+def test_a_folder_of_evidence_has_every_method_and_error_and_no_frame(small_world, tmp_path, monkeypatch):
     monkeypatch.setattr(evidence, "WIDTHS", (5, jobs.CONTROL_WIDTH))
     monkeypatch.setattr(evidence, "OTHER_WIDTHS", (5,))
     given = (small_world / "kitti", tmp_path / "out", tmp_path / "build")

@@ -1,17 +1,12 @@
 """What all of this shows on real frames, for the repository: tables, plots and words, and no frame of the data in them.
 
-`python -m thesis_repro.report.evidence KITTI FOLDER` (make evidence) takes the sequences in a KITTI folder, label maps
-of the model in the package, the thesis's masks and the controls of one width under both estimators, and the audit's
-switches. A stopped run goes on where it was.
+`make evidence KITTI=...` takes the sequences in a KITTI folder, label maps of the model in the package, the thesis's
+masks and the controls of one width under both estimators, and the audit's switches. A stopped run goes on where it was.
 """
 
-import argparse
+import os
 import sys
-from functools import partial
-from pathlib import Path
 
-import cv2
-import joblib
 import pandas as pd
 
 from thesis_repro import kitti, longrun, masks, stages
@@ -19,11 +14,12 @@ from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import audit, captions, comparison, failures, style, texts
-from thesis_repro.settings import cores, number, processes
+from thesis_repro.segmentation import prediction
+from thesis_repro.settings import PREFIX, ROOT, read_settings
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
-BUILD = Path("build/evidence")  # label maps and runs
+FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"  # BUILD: label maps and runs
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
 # Beside the tested width, for the lines of error against number of keypoints: under the refined estimator alone.
 OTHER_WIDTHS, OTHER_REPETITIONS = (5, 15), 3
@@ -31,30 +27,33 @@ LINES = ("masked", "exact-boundaries", "corrected", "mirrored", "random-lines", 
 LOOKED_AT = 12  # frames of each sequence whose boundaries and keypoints are looked at one by one
 
 
-def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
+def write(root, folder, build, frames=None, repetitions=5, processes=1):
     """Run what is missing and write everything into a folder; returns its files.
 
-    root: of KITTI. build: folder for label maps and runs. frames: of each sequence, None for all.
+    root: of KITTI. folder, build: absolute paths; build keeps label maps and runs. frames: of each sequence, None for
+    all.
     """
-    root, build, folder = Path(root).absolute(), Path(build).absolute(), Path(folder)
     stages.stage(build, results="evidence")  # whose parts know what they were made from
+    labels, model = build / "labels", prediction.load_shipped()
     sequences = [kitti.Sequence(root, name).subset(frames) for name in kitti.sequences(root)]
+    for sequence in sequences:
+        prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
     names = [sequence.name for sequence in sequences]
-    _predict(sequences, build / "labels")
     runs = _runs(root, names, build, frames, repetitions, processes)
-    switches = ablations.measure(root, names, build / "labels", build / "audit", frames=frames, repetitions=repetitions,
+    switches = ablations.measure(root, names, labels, build / "audit", frames=frames, repetitions=repetitions,
                                  baseline_repetitions=max(10, repetitions), processes=processes)
     angles = boresight.explained(runner.refined_paths(runs, root, build / "odometry", frames))
     measured = [*audit.of_tables(), *audit.of_ablations(switches), *audit.of_study(runs),
                 *audit.measured(angles, "boresight"),
-                *audit.measured(_boundaries(sequences, build / "labels"), "boundaries"),
-                *audit.measured(_tracks(sequences, build / "labels"), "tracks")]
-    steps, failing = _failures(sequences, build / "labels", processes)
+                *audit.measured(_boundaries(sequences, labels), "boundaries"),
+                *audit.measured(_tracks(sequences, labels), "tracks")]
+    tested = [masks.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH) for sequence in sequences]
+    steps = pd.concat(map(failures.measure, sequences, tested), ignore_index=True)
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
     longrun.sweep(folder)
-    style.save_all(comparison.figures(table, runs) | {"failures": failing}, {
+    style.save_all(comparison.figures(table, runs) | {"failures": failures.figure(steps, sequences, tested)}, {
         "comparison": comparison.table_comparison(table),
         "failures": failures.table(steps), "widths": comparison.table_widths(runs), "audit": audit.table(measured)},
         folder, note)
@@ -64,14 +63,6 @@ def write(root, folder, build, *, frames=None, repetitions=5, processes=1):
     write_text(folder / "README.md", texts.render(
         "evidence.md.j2", findings=texts.findings(runs, table, note), failures=captions.OF_EVIDENCE))
     return sorted(path for path in folder.iterdir() if path.is_file())
-
-
-def _predict(sequences, labels):
-    from thesis_repro.segmentation import prediction  # TensorFlow takes seconds to load
-
-    model = prediction.load_shipped()
-    for sequence in sequences:
-        prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
 
 
 def _runs(root, names, build, frames, repetitions, processes):
@@ -112,31 +103,14 @@ def _tracks(sequences, labels):
     return pd.concat(rows, ignore_index=True)
 
 
-def _failures(sequences, labels, processes):
-    """The steps of `failures.measure` of all sequences, and the figure of them."""
-    own = [masks.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH) for sequence in sequences]
-    steps = pd.concat(joblib.Parallel(processes)(map(joblib.delayed(_steps), sequences, own)), ignore_index=True)
-    return steps, failures.figure(steps, sequences, own)
-
-
-def _steps(sequence, its_masks):
-    cv2.setNumThreads(1)  # the processes already use every core
-    return failures.measure(sequence, its_masks)
-
-
-def main(arguments=None):
-    parser = argparse.ArgumentParser(description="tables, plots and findings on real frames, without any frame")
-    parser.add_argument("kitti", type=Path, help="folder that holds sequences and poses")
-    parser.add_argument("folder", type=Path, help="where to write")
-    parser.add_argument("--frames", type=partial(number, "FRAMES"), help="from the start of each sequence (all)")
-    parser.add_argument("--repetitions", type=partial(number, "REPETITIONS"), default=5, help="of every run (5)")
-    parser.add_argument("--jobs", type=processes, default=cores(), help="processes at once")
+def main():
+    """Write what the settings in the environment ask for; returns the exit status."""
     try:
-        options = parser.parse_args(arguments)
+        settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})  # all frames, unless FRAMES says less
         with longrun.claimed(BUILD), longrun.logged(BUILD, "tables, plots and findings") as run:
-            files = write(options.kitti, options.folder, BUILD, frames=options.frames, repetitions=options.repetitions,
-                          processes=options.jobs)
-            run.end(f"{options.folder}: {len(files)} files, {sum(path.stat().st_size for path in files):,} bytes")
+            files = write(settings.kitti, FOLDER, BUILD, settings.sizes.frames, settings.sizes.repetitions,
+                          settings.jobs)
+            run.end(f"{FOLDER}: {len(files)} files, {sum(path.stat().st_size for path in files):,} bytes")
     except Exception as error:
         return longrun.report_error(error)
     return 0
