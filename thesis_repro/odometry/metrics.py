@@ -228,17 +228,14 @@ def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
     """
     estimated, true = checked(estimated, true)
     along = travelled(true)
-    rows = []
-    for first in range(0, len(true), KITTI_EVERY):
-        for length in KITTI_LENGTHS:
-            last = int(np.searchsorted(along, along[first] + length, side="right"))
-            if last == len(true):
-                continue
-            true_motion = np.linalg.inv(true[first]) @ true[last]
-            motion = np.linalg.inv(estimated[first]) @ estimated[last]
-            error = np.linalg.inv(motion) @ true_motion
-            rows.append((np.linalg.norm(error[:3, 3]) / length, angles(error) / length))
-    note = "" if rows else f"too short: {along[-1]:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m"
-    translation, rotation = np.mean(rows, axis=0) if rows else (np.nan, np.nan)
-    return {"translation_percent": float(translation * 100), "rotation_deg_per_m": float(rotation),
-            "segments": len(rows), "note": note}
+    first, length = (each.ravel() for each in np.meshgrid(np.arange(0, len(true), KITTI_EVERY), KITTI_LENGTHS,
+                                                          indexing="ij"))
+    last = np.searchsorted(along, along[first] + length, side="right")
+    first, last, length = (each[last < len(true)] for each in (first, last, length))
+    if not len(first):
+        return {"translation_percent": np.nan, "rotation_deg_per_m": np.nan, "segments": 0,
+                "note": f"too short: {along[-1]:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m"}
+    motion, true_motion = (np.linalg.inv(poses[first]) @ poses[last] for poses in (estimated, true))
+    error = np.linalg.inv(motion) @ true_motion
+    return {"translation_percent": float(100 * (np.linalg.norm(error[:, :3, 3], axis=1) / length).mean()),
+            "rotation_deg_per_m": float((angles(error) / length).mean()), "segments": len(first), "note": ""}
