@@ -11,13 +11,10 @@ from thesis_repro.study import compare, jobs
 @pytest.mark.slow
 def test_a_folder_of_evidence_has_every_method_and_error_and_no_frame(small_world, tmp_path, monkeypatch):
     monkeypatch.setattr(evidence, "WIDTHS", (5, jobs.CONTROL_WIDTH))
-    monkeypatch.setattr(evidence, "OTHER_WIDTHS", (5,))
     given = (small_world / "kitti", tmp_path / "out", tmp_path / "build")
     files = evidence.write(*given, frames=6, repetitions=1)
     assert {path.suffix for path in files} == {".csv", ".md", ".svg"}
-    assert {path.stem for path in files} == {"README", "audit", "comparison", "comparison_keypoints",
-                                             "comparison_sequences", "failures", "runs", "switches",
-                                             "widths"}
+    assert {path.stem for path in files} == {"README", "audit", "comparison", "failures", "runs", "switches", "widths"}
     failures = pd.read_csv(tmp_path / "out" / "failures.csv")
     of_sequences, of_numbers = failures[:2], failures[2:]
     assert list(of_sequences["steps"]) == ["00", "01"]
@@ -28,7 +25,7 @@ def test_a_folder_of_evidence_has_every_method_and_error_and_no_frame(small_worl
     assert set(runs["sequence"]) == {"00", "01"} and set(runs["frames"]) == {6}
     assert set(compare.METHODS) <= set(runs["method"]) and {*compare.JUDGING_METRICS, "rmse"} <= set(runs)
     corrected = runs[runs["method"] == "corrected"]
-    assert set(corrected["dilation_width"]) == {5, jobs.CONTROL_WIDTH}
+    assert set(corrected["dilation_width"]) == {jobs.CONTROL_WIDTH}
     assert set(corrected["estimator"]) == set(jobs.ESTIMATORS)
     before = {path.name: path.read_bytes() for path in files}
     monkeypatch.setattr(odometry, "run_many", None)  # nothing may run again

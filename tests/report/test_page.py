@@ -63,7 +63,7 @@ def run(tmp_path):
     settings.figures.mkdir()
     for artefact in ARTEFACTS:
         for ending in page.ENDINGS[artefact["kind"]][:1 if artefact["kind"] == "figure" else None]:
-            text = {".svg": SVG, ".csv": CSV, ".md": "What it shows"}[ending]
+            text = {".svg": SVG, ".csv": CSV}.get(ending, "What it shows")
             (settings.figures / f"{artefact['name']}{ending}").write_text(text)
     executed = settings.build / "notebooks" / "08_results.ipynb"
     executed.parent.mkdir(parents=True)
@@ -228,7 +228,8 @@ def test_thesis_numbers_stand_beside_those_of_the_run(run):
 def test_a_study_has_a_page_of_what_it_left(tmp_path):
     for name, text in (("comparison.svg", SVG), ("comparison.csv", CSV), ("findings.md", "**It** <script>shows")):
         (tmp_path / name).write_text(text)
-    study = SimpleNamespace(kitti=Path("kitti"), sources=[], tested=10, estimators=["refined"], repetitions=3)
+    study = SimpleNamespace(kitti=Path("kitti"), sources=[], sequences=["00"], tested=10, estimators=["refined"],
+                            repetitions=3)
     html = page.build_study(
         tmp_path, {("figure", "comparison"), ("table", "comparison"), ("text", "findings")}, study=study, embedded=True,
         kinds={}, estimators={"refined": "refined estimator"}, line_width=10, changed={}, widths=[10],

@@ -129,12 +129,9 @@ def test_every_figure_can_be_drawn_however_close_the_numbers_lie(names, noise, s
             for draw in (chapter4.figure_against_width, chapter4.figure_of_methods, chapter4.figure_of_sequences):
                 draw(runs, metric).draw_without_rendering()
         chapter4.figure_4_07(runs).draw_without_rendering()
-    for figure in (comparison.figure_comparison(table), comparison.figure_keypoints(table),
-                   comparison.figure_sequences(table, runs)):
-        figure.draw_without_rendering()
-        for axes in figure.axes:
-            if axes.axison and axes.get_visible():
-                assert all(bar >= 0 for bar in axes.get_xlim())
+    figure = comparison.figure_comparison(table)
+    figure.draw_without_rendering()
+    assert all(edge > 0 for axes in figure.axes for edge in axes.get_xlim())
 
 
 def test_a_row_of_the_forest_is_a_method_with_its_sequences_and_its_interval():

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from thesis_repro import InputError
+from thesis_repro.report import texts
 from thesis_repro.study import compare
 
 EIGHT = [f"{number:02d}" for number in range(8)]
@@ -128,6 +129,16 @@ def test_the_mean_of_equal_errors_is_among_them():
     assert table.loc["00"].tolist() == [value] * 3
     random = pd.DataFrame({"sequence": "00", "rmse": np.random.default_rng(0).normal(size=50)})
     assert (compare.spread(random, "rmse").diff(axis=1)[["highest"]] > 0).all(axis=None)
+
+
+def test_who_got_lost_is_named_beside_the_mean():
+    runs = runs_of({"masked": lambda name: 6.0 if name == "03" else 0.1 if name == "05" else 1.0})
+    rows = compare.comparisons(runs)
+    assert set(rows.loc[rows["method"] == "masked", "far_off"].map(tuple)) == {("03", "05")}
+    assert texts.ratio_and_far_off(rows[rows["method"] == "masked"].iloc[0]).endswith(
+        ", sequence 03 alone 6.00, sequence 05 alone 0.10")
+    assert compare.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []  # which of two got lost cannot be said
+    assert compare.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
 
 
 def test_shuffling_shows_as_a_factor():

@@ -1,14 +1,19 @@
 """Studies with masks of one's own: what is run, what is kept, and what is refused."""
 
+import re
 import shutil
 import sys
 
 import cv2
+import numpy as np
+import pandas as pd
 import pytest
+from evo.tools import file_interface
 
 from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks
+from thesis_repro.report import study as report
 from thesis_repro.study import compare, controls, runner, series
 from thesis_repro.study.sources import Source
 
@@ -58,6 +63,43 @@ def test_masks_ready_made_are_what_label_maps_of_that_width_give(done):
     methods = {name: set(runs.loc[runs["source"] == name, "method"]) for name in ("net", "by-hand")}
     assert methods["net"] - methods["by-hand"] == set(controls.OF_LABEL_MAPS)
     assert {"mirrored", "other-frame", "random-lines", "image-edges", "fewer", "spread"} < methods["by-hand"]
+
+
+def test_paths_are_read_by_evo_and_those_of_the_runs(done, study):
+    folder, runs = done
+    poses = runner.run_poses(runs[runs["repetition"] == 0], folder / "runs")
+    files = {form: {str(path.relative_to(folder / "paths" / form).with_suffix("")): path
+                    for path in (folder / "paths" / form).rglob("*.txt")} for form in ("kitti", "tum")}
+    names = {f"{name}/{run}" for name, run in poses} | {"00/truth", "01/truth"}
+    assert files["kitti"].keys() == files["tum"].keys() == names
+    times = Sequence(study.kitti, "00").times[:FRAMES]
+    for (name, run), expected in poses.items():
+        of_kitti = file_interface.read_kitti_poses_file(files["kitti"][f"{name}/{run}"])
+        assert np.array_equal(of_kitti.poses_se3, expected)
+        of_tum = file_interface.read_tum_trajectory_file(files["tum"][f"{name}/{run}"])
+        assert np.array_equal(of_tum.timestamps, times) and np.allclose(of_tum.poses_se3, expected, atol=1e-9)
+
+
+def test_what_a_study_leaves_for_a_paper(done, study):
+    folder, runs = done
+    page = report.write(study, runs, folder)
+    for name in ("comparison", "sources", "paths-00", "paths-01"):
+        assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        assert {f"{name}.svg", f"{name}.webp"} & {path.name for path in folder.iterdir()}
+    for name in ("comparison", "widths", "errors"):
+        latex = (folder / f"{name}.tex").read_text()
+        rows = pd.read_csv(folder / f"{name}.csv")
+        body = latex.partition("\\midrule")[2].partition("\\bottomrule")[0]
+        assert body.count("\\\\") == len(rows) and body.count("&") == len(rows) * (len(rows.columns) - 1)
+        assert (folder / f"{name}.md").is_file()
+    links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
+    assert {"sources.webp", "paths-01.pdf", "errors.tex"} <= set(links)
+    assert all((folder / link).is_file() for link in links)
+    sources = report.figure_sources(study)
+    assert len(sources.axes) == 3 * len(study.sources)
+    for path in folder.glob("paths/*/01/net/masked-07-0.txt"):
+        path.unlink()  # of a run that failed
+    assert len(report.figure_paths(study, "01", folder).axes[0].lines) == 3  # all keypoints, by hand, and the truth
 
 
 def test_the_same_again_runs_nothing_and_another_source_runs_only_its_own(done, study, small_labels, masks, tmp_path,

@@ -5,20 +5,17 @@ measures it. Several sources of masks are further rows.
 """
 
 import textwrap
-from itertools import cycle
+from itertools import product
 
 import numpy as np
 import pandas as pd
-from matplotlib.ticker import MaxNLocator
 
 from thesis_repro.report import style, texts
-from thesis_repro.report.style import BASELINE, BLACK, GREEN, MASKED, ORANGE, PINK, SKY
+from thesis_repro.report.style import BASELINE, MASKED
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
 
 SHOWN = (*compare.JUDGING_METRICS, "rmse")
-MARKERS = "oDsh^v<>PX"  # one fewer than colours, so that no two lines look alike
-COLORS = (BASELINE, MASKED, GREEN, "#7fb800", ORANGE, PINK, SKY, BLACK, "#777777", "#8b5a2b", "#5d3a9b")
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
 KEYS = ["source", "method", "dilation_width", "estimator"]
 
@@ -28,10 +25,12 @@ def figure_comparison(table):
     rows = _tested(_over_all_keypoints(table))
     labels = _labels(rows)
     order = list(labels.unique())
-    figure, panels = _panels(rows, height=0.9 + 0.21 * len(order), xlabel="ratio to all keypoints\n(left of 1: lower)",
-                             sharey=True)
-    for panel, of_panel in panels:
-        for index, row in of_panel.iterrows():
+    estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
+    metrics = [name for name in SHOWN if (rows["metric"] == name).any()]
+    figure, axes = style.new_figure(len(estimators), len(metrics), squeeze=False, sharey=True,
+                                    height=0.7 + (0.9 + 0.21 * len(order)) * len(estimators))
+    for panel, (estimator, metric) in zip(axes.flat, product(estimators, metrics), strict=True):
+        for index, row in rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)].iterrows():
             y, color = order.index(labels[index]), MASKED if row["method"] == "masked" else BASELINE
             values = row[_sequences(table)].dropna().astype(float)
             panel.plot(values, [y - 0.22] * len(values), "o", color="#555555", alpha=0.45, markersize=3,
@@ -40,96 +39,21 @@ def figure_comparison(table):
             panel.plot(row["ratio"], y + 0.1, "D", color=color, markersize=5, markeredgecolor="white")
         panel.axvline(1, color="black", linewidth=0.8)
         panel.grid(axis="y", visible=False)
-        panel.set_yticks(range(len(order)), order, fontsize=7)
+        panel.set_yticks(range(len(order)), order)
         panel.set_ylim(len(order) - 0.5, -0.6)
+        panel.tick_params(labelsize=7)
         style.ratio_axis(panel.xaxis, np.concatenate([line.get_xdata() for line in panel.lines]))
-    return figure
-
-
-def figure_keypoints(table):
-    """Ratio to all keypoints against the mean number of keypoints; lines lead through the other widths."""
-    rows, looks = _arms(table)
-    tested = _tested(rows)
-    figure, panels = _panels(rows, height=2.3, xlabel="mean number of keypoints")
-    for panel, of_panel in panels:
-        for name, look in looks.items():
-            line = of_panel[of_panel["arm"] == name].sort_values("keypoints")
-            at_width = line[line.index.isin(tested.index)]
-            panel.plot(line["keypoints"], line["ratio"], color=look["color"], linewidth=0.9, alpha=0.6)
-            panel.vlines(at_width["keypoints"], at_width["low"], at_width["high"], color=look["color"], linewidth=1.6)
-            panel.plot(at_width["keypoints"], at_width["ratio"], linestyle="none", markersize=6,
-                       markeredgecolor="white", markeredgewidth=0.5, label=name, **look)
-        panel.plot(of_panel["reference_keypoints"].iloc[0], 1, "k*", markersize=8, label=compare.METHODS["baseline"])
-        panel.axhline(1, color="black", linewidth=0.8)
-        panel.xaxis.set_major_locator(MaxNLocator(4))
-        intervals = tested.loc[tested.index.intersection(of_panel.index), ["low", "high"]]
-        style.ratio_axis(panel.yaxis, [*of_panel["ratio"], *intervals.to_numpy().ravel(), 1])
-    style.legend_below(figure, figure.axes, 4)
-    return figure
-
-
-def figure_sequences(table, runs):
-    """Ratio to all keypoints against keypoints, one panel a sequence, under the estimator that judges.
-
-    runs: those of the table, for the number of keypoints of each sequence.
-    """
-    metric = next(name for name in SHOWN if (table["metric"] == name).any())
-    estimator = compare.judging_estimator(table)
-    rows, looks = _arms(table[(table["metric"] == metric) & (table["estimator"] == estimator)])
-    keypoints = runs.groupby([*KEYS, "sequence"], dropna=False)["mean_keypoints"].mean().rename("own").reset_index()
-    points = rows.melt([*KEYS, "arm"], _sequences(table), "sequence", "own_ratio").merge(keypoints).dropna(
-        subset="own_ratio").sort_values("own")
-    figure, panels = style.small_panels(sorted(points["sequence"].unique()), "number of keypoints")
-    for panel in panels:
-        own = points[points["sequence"] == panel.get_title()]
-        for name, look in looks.items():
-            line = own[own["arm"] == name]
-            panel.plot(line["own"], line["own_ratio"], linewidth=0.9, markersize=4.5, markeredgewidth=0, label=name,
-                       **look)
-        panel.axhline(1, color="black", linewidth=0.8)
-        style.ratio_axis(panel.yaxis, [*own["own_ratio"], 1])
-    style.legend_below(figure, panels, 4)
-    figure.suptitle(f"{compare.METRICS[metric]}, {ESTIMATORS[estimator]}: ratio to all keypoints", fontsize=9)
-    return figure
-
-
-def _panels(rows, height, xlabel, **options):
-    """(figure, (panel, its rows)), one row of panels an estimator and one column an error; height: inches a row."""
-    estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
-    metrics = [name for name in SHOWN if (rows["metric"] == name).any()]
-    figure, axes = style.new_figure(len(estimators), len(metrics), height=0.7 + height * len(estimators), squeeze=False,
-                                    **options)
     for panel, metric in zip(axes[0], metrics):
         panel.set_title(textwrap.fill(compare.METRICS[metric], 18))
     for panel, estimator in zip(axes[:, 0], estimators):
         panel.set_ylabel(ESTIMATORS[estimator])
     for panel in axes[-1]:
-        panel.set_xlabel(xlabel, fontsize=8)
-    for panel in axes.flat:
-        panel.tick_params(labelsize=7)
-    groups = rows.groupby(["estimator", "metric"])
-    keys = [(estimator, metric) for estimator in estimators for metric in metrics]
-    return figure, [(panel, groups.get_group(key)) for panel, key in zip(axes.flat, keys, strict=True)]
+        panel.set_xlabel("ratio to all keypoints\n(left of 1: lower)", fontsize=8)
+    return figure
 
 
 def _over_all_keypoints(table):
     return table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
-
-
-def _arms(table):
-    """(rows over all keypoints, {arm: colour and marker}); arm, a column of the rows, says which line they belong to.
-
-    A line is a method, or the masks of one source where there are several.
-    """
-    rows = _over_all_keypoints(table)
-    if rows["source"].nunique() > 1:
-        rows = rows[rows["method"] == "masked"]
-        rows, names = rows.assign(arm=rows["source"]), rows["source"].unique()
-    else:
-        rows, names = rows.assign(arm=rows["method"].map(compare.METHODS)), compare.METHODS.values()
-    looks = {name: {"color": color, "marker": marker}
-             for name, color, marker in zip(names, cycle(COLORS), cycle(MARKERS)) if (rows["arm"] == name).any()}
-    return rows, looks
 
 
 def _tested(rows):
@@ -207,9 +131,3 @@ def _widths(runs):
     numbers = chosen[list(CHOICES)].rename(columns=CHOICES).assign(
         **{"same best width in two repetitions (%)": again["same_best"].round()}).dropna(axis=1, how="all")
     return numbers.convert_dtypes().join(shown, how="right").rename_axis("sequence").reset_index()
-
-
-def figures(table, runs):
-    """All three, by name."""
-    return {"comparison": figure_comparison(table), "comparison_keypoints": figure_keypoints(table),
-            "comparison_sequences": figure_sequences(table, runs)}

@@ -21,9 +21,6 @@ from thesis_repro.study.sources import Source
 
 FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"  # BUILD: label maps and runs
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks under the thesis's estimator
-# Beside the tested width, for the lines of error against number of keypoints: under the refined estimator alone.
-OTHER_WIDTHS, OTHER_REPETITIONS = (5, 15), 3
-LINES = ("masked", "exact-boundaries", "corrected", "mirrored", "random-lines", "image-edges")  # that have a width
 LOOKED_AT = 12  # frames of each sequence whose boundaries and keypoints are looked at one by one
 
 
@@ -53,7 +50,8 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
     longrun.sweep(folder)
-    style.save_all(comparison.figures(table, runs) | {"failures": failures.figure(steps, sequences, tested)}, {
+    style.save_all({"comparison": comparison.figure_comparison(table),
+                    "failures": failures.figure(steps, sequences, tested)}, {
         "comparison": comparison.table_comparison(table),
         "failures": failures.table(steps), "widths": comparison.table_widths(runs), "audit": audit.table(measured)},
         folder, note)
@@ -66,22 +64,16 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
 
 
 def _runs(root, names, build, frames, repetitions, processes):
-    """The runs of the comparison, and those of other widths and limits under the refined estimator."""
+    """The runs of the comparison."""
     def run():
         return runner.run(listed, root, build / "labels", build / "odometry", frames=frames, processes=processes)
 
-    fewer = min(repetitions, OTHER_REPETITIONS)
     listed = jobs.first_jobs(root, names, {"thesis": WIDTHS, "refined": []}, tested=jobs.CONTROL_WIDTH,
                              repetitions=repetitions)
-    listed += [jobs.Job(name, method, width, estimator="refined", repetition=repetition) for name in names
-               for method in LINES for width in OTHER_WIDTHS for repetition in range(fewer)]
     runs = run()
     listed += jobs.reduced_jobs(thesis_tables.best_widths(compare.of_method(runs, "masked")), repetitions)
     listed += jobs.keypoint_control_jobs(compare.keypoints_left(runs), root, frames, repetitions,
                                          width=jobs.CONTROL_WIDTH)
-    for width in OTHER_WIDTHS:
-        listed += jobs.keypoint_control_jobs(compare.keypoints_left(runs, width), root, frames, fewer, ["refined"],
-                                             width=width)
     return runner.with_boresight_correction(run(), root, build / "odometry", frames)
 
 

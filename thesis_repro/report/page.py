@@ -25,7 +25,7 @@ from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
 EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
-ENDINGS = {"figure": (".svg", ".webp"), "table": (".csv", ".md"), "text": (".md",)}
+ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
 OPENING = ("findings", "figure-comparison")  # what a page starts with, by id
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # what numbers depend on most
 
@@ -85,8 +85,12 @@ def build(settings):
 
 def build_study(folder, names, **facts):
     """The page of a study as HTML, from the files in its folder. names: of what the study left. facts: for the page."""
-    shown = [_shown(folder, artefact, {}) for artefact in [*captions.ADDED, captions.OF_STUDIES]
-             if (artefact["kind"], artefact["name"]) in names]
+    shown = []
+    for artefact, (kind, name) in itertools.product([*captions.OF_STUDIES, *captions.ADDED], names):
+        base, _, sequence = name.partition("-")  # one artefact stands for the figures of all sequences
+        if (kind, base) == (artefact["kind"], artefact["name"]):
+            title = f"{artefact['title']} {sequence}".strip()
+            shown.append(_shown(folder, artefact | {"name": name, "title": title}, {}))
     return texts.render("study.html.j2", title="A study of masks", artefacts=shown, notebooks={}, made=_made(), **facts)
 
 

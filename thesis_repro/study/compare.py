@@ -33,10 +33,12 @@ from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 JUDGING_METRICS = {"rmse_boresight_corrected": "RMSE, mounting angle removed", "rotation": "rotation error a frame"}
 SECONDARY_METRICS = {"rmse": "RMSE", "mae": "MAE", "se3": "aligned ATE",
                      "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
-                     "rotation_deg_per_m": f"rotation error over {RELATIVE_LENGTH:g} m"}
+                     "rotation_deg_per_m": f"rotation error over {RELATIVE_LENGTH:g} m",
+                     "t_rel": "KITTI's t_rel", "r_rel": "KITTI's r_rel"}
 METRICS = {**JUDGING_METRICS, **SECONDARY_METRICS}
 UNITS = {"rmse_boresight_corrected": "m", "rotation": "degrees", "rmse": "m", "mae": "m", "se3": "m",
-         "translation_percent": "%", "rotation_deg_per_m": "degrees a metre"}
+         "translation_percent": "%", "rotation_deg_per_m": "degrees a metre",
+         "t_rel": "%", "r_rel": "degrees per 100 m"}
 
 METHODS = {  # in the order in which they are shown
     "baseline": "all keypoints",
@@ -61,6 +63,7 @@ MIN_FOR_INTERVAL = 3  # sequences; drawing anew from fewer says nothing
 # With fewer sequences all of them lie on one side of 1 by chance more often than one time in twenty (2 / 2**n).
 MIN_SEQUENCES = 6
 LEVEL = 95  # percent, of all intervals
+FAR_OFF = 3  # times the others: a sequence with such a ratio is named beside the mean
 DRAWS = 10_000
 LOWER, HIGHER, NO_CLEAR_DIFFERENCE = ("lower", "higher", "no clear difference")
 
@@ -106,12 +109,24 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
     return np.exp((logarithms(rows) - logarithms(reference)).dropna())
 
 
+def far_off(ratios: pd.Series) -> list[str]:
+    """The sequences whose ratio is more than FAR_OFF times the geometric mean of the others', or as much below it.
+
+    In one of the two runs they got lost. Fewer than MIN_FOR_INTERVAL sequences have no others to speak of.
+    """
+    if len(ratios) < MIN_FOR_INTERVAL:
+        return []
+    logarithms = np.log(ratios)
+    others = (logarithms.sum() - logarithms) / (len(ratios) - 1)
+    return list(ratios.index[(logarithms - others).abs() > np.log(FAR_OFF)])
+
+
 def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
     """Every method against all keypoints, and masks against every control and every other source.
 
-    Columns: source, method, dilation_width (pixels), keypoints (mean number); reference_source, reference,
-    reference_keypoints; metric, estimator; tested (whether the width is the one put to the test, `tested_width`);
-    ratio, low, high, n, verdict; then the ratio of each sequence, in a column with its name.
+    Columns: source, method, dilation_width (pixels), keypoints (mean number); reference_source, reference; metric,
+    estimator; tested (whether the width is the one put to the test, `tested_width`); ratio, low, high, n,
+    far_off (see `far_off`), verdict; then the ratio of each sequence, in a column with its name.
     """
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
@@ -120,13 +135,13 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
         for (own, own_rows), (other, other_rows) in product(arms, arms):
             if not _is_compared(own, other):
                 continue
-            row = {**own, "reference_source": other["source"], "reference": other["method"],
-                   "reference_keypoints": other["keypoints"], "estimator": estimator}
+            row = {**own, "reference_source": other["source"], "reference": other["method"], "estimator": estimator}
             for metric in metrics:
                 by_sequence = ratios(own_rows, other_rows, metric)
-                rows.append({**row, "metric": metric, **geometric_mean(by_sequence), **by_sequence})
-    columns = ["source", "method", "dilation_width", "keypoints", "reference_source", "reference",
-               "reference_keypoints", "metric", "estimator", "tested", "ratio", "low", "high", "n", "verdict"]
+                rows.append({**row, "metric": metric, "far_off": far_off(by_sequence),
+                             **geometric_mean(by_sequence), **by_sequence})
+    columns = ["source", "method", "dilation_width", "keypoints", "reference_source", "reference", "metric",
+               "estimator", "tested", "ratio", "low", "high", "n", "far_off", "verdict"]
     return pd.DataFrame(rows, columns=[*columns, *sorted(runs["sequence"].unique())])
 
 
@@ -234,9 +249,9 @@ def tested_width(runs: pd.DataFrame) -> int | None:
     return int(widths[0]) if widths else CONTROL_WIDTH
 
 
-def keypoints_left(runs: pd.DataFrame, width: int | None = None) -> pd.Series:
-    """The mean number of keypoints that masks of a width leave, by sequence; by default of `tested_width`."""
-    width = tested_width(runs) if width is None else width
+def keypoints_left(runs: pd.DataFrame) -> pd.Series:
+    """The mean number of keypoints that masks of the `tested_width` leave, by sequence."""
+    width = tested_width(runs)
     rows = runs[runs["method"] == "masked"]
     if width is not None:
         rows = rows[rows["dilation_width"] == width]

@@ -251,10 +251,13 @@ def _row(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
 def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
     """What a table of runs has of a run's table of frames: its length, errors, keypoints and flagged frames.
 
-    true: poses (n, 4, 4). Errors are those of `metrics.errors` and `metrics.step_errors`.
+    true: poses (n, 4, 4). Errors are those of `metrics.errors` and `metrics.step_errors`; t_rel (percent) and r_rel
+    (degrees per 100 m) those of `metrics.kitti_errors`.
     """
     poses = poses_of(frames)
+    kitti = metrics.kitti_errors(poses, true)
     return {"frames": len(frames), **metrics.errors(poses, true), **metrics.step_errors(poses, true),
+            "t_rel": kitti["translation_percent"], "r_rel": 100 * kitti["rotation_deg_per_m"],
             "mean_keypoints": frames["detected"].mean(),
             "flagged": int((~frames["flag"].isin(["", "stationary"])).sum())}
 

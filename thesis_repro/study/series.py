@@ -6,10 +6,12 @@ from pathlib import Path
 import pandas as pd
 
 from thesis_repro import InputError, check, longrun, stages
-from thesis_repro.kitti import Sequence
+from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
 from thesis_repro.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
+
+PATHS = "paths"  # folder of each run's path
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,33 @@ class Study:
                 raise InputError(f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more")
         sources.check(self.sources, sequences, {*self.widths, *([] if self.tested is None else [self.tested])})
 
+    @property
+    def shown_width(self) -> int | None:
+        """The dilation width (pixels) that is shown of masks: the tested one, or else the middle one."""
+        return self.tested or (self.widths[len(self.widths) // 2] if self.widths else None)
+
     def masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
-        """Each sequence with the masks of each source, of the tested width or else of the middle one."""
-        width = self.tested or (self.widths[len(self.widths) // 2] if self.widths else None)
+        """Each sequence with the masks of each source, of the width that is shown."""
         sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
-        return [(sequence, [source.masks(sequence, width) for source in self.sources]) for sequence in sequences]
+        return [(sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
+                for sequence in sequences]
+
+    def shown_jobs(self, name: str) -> list[jobs.Job]:
+        """The runs of a sequence whose paths are drawn: all keypoints, and the masks of each source."""
+        estimator = "refined" if "refined" in self.estimators else "thesis"
+        return [jobs.Job(name, "baseline", estimator=estimator), *(
+            jobs.Job(name, "masked", self.shown_width if source.kind == "labels" else None, estimator=estimator,
+                     source=source.name) for source in self.sources)]
+
+    def write_paths(self, runs: pd.DataFrame, folder: Path) -> None:
+        """Write repetition 0 of every run, and the truth, into folder/PATHS, in KITTI's and in TUM's form."""
+        estimated = runner.run_poses(runs[runs["repetition"] == 0], folder / "runs")
+        for name in self.sequences:
+            sequence = Sequence(self.kitti, name).subset(self.frames)
+            of_sequence = {run: poses for (its_sequence, run), poses in estimated.items() if its_sequence == name}
+            for run, poses in {"truth": sequence.poses, **of_sequence}.items():
+                write_kitti_poses(folder / PATHS / "kitti" / name / f"{run}.txt", poses)
+                write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
     def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
         """`check.path_oddities` of the runs with all keypoints."""
@@ -63,7 +87,7 @@ class Study:
         second: list[jobs.Job] = []
         for source in self.sources if self.tested else ():
             width = None if source.kind == "masks" else self.tested
-            left = compare.keypoints_left(compare.of_source(runs, source.name), width)
+            left = compare.keypoints_left(compare.of_source(runs, source.name))
             second += jobs.keypoint_control_jobs(left, self.kitti, self.frames, self.repetitions, self.estimators,
                                                  source.name, width)
         return second
@@ -88,4 +112,5 @@ class Study:
                 runs = run([*self.first_jobs(), *second])
                 runs.attrs["made"] += made  # what the first call made, the second one kept
                 runs.attrs["kept"] -= made
+            self.write_paths(runs, folder)
         return runs
