@@ -7,8 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from thesis_repro.odometry import THESIS, Odometry, metrics, pose, scales, start_pose
-from thesis_repro.odometry.keypoints import SharedKeypoints
+from thesis_repro.odometry import THESIS, Odometry, metrics, pose, scales
 from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, measured, near
 from thesis_repro.report import style
 
@@ -30,13 +29,8 @@ def measure(sequence, masks):
     and direction_std, how well they determine the direction of motion, degrees. Of the estimate rotation_error,
     degrees, and flag.
     """
-    shared, rows, scale = SharedKeypoints(), [], scales(sequence)
-    odometries = {kind: Odometry(sequence.intrinsics, SETTINGS, start_pose(sequence), shared) for kind in KINDS}
-    for index in range(len(sequence)):
-        frame = sequence.frame(index)
-        shared.expect(frame, [(odometry.previous, odometry.points) for odometry in odometries.values()])
-        steps = {kind: odometry.step(frame, scale[index], masks[index] if kind == "masks" else None)
-                 for kind, odometry in odometries.items()}
+    rows, scale = [], scales(sequence)
+    for index, steps in _steps(sequence, masks, range(len(sequence))):
         reference = steps["all"].motion
         if scale[index] <= SETTINGS.scale_gate or any(step.motion.rotation is None for step in steps.values()):
             continue
@@ -56,6 +50,15 @@ def measure(sequence, masks):
                 "condition": of_agreeing.condition, "direction_std": of_agreeing.heading_std_deg,
                 "rotation_error": metrics.angles(wrong[None])[0], "flag": "; ".join(step.flags)})
     return pd.DataFrame(rows)
+
+
+def _steps(sequence, masks, indices):
+    """The steps of both kinds over some consecutive frames of a sequence, as (frame, {kind: step})."""
+    odometries, scale = {kind: Odometry(sequence.intrinsics, SETTINGS) for kind in KINDS}, scales(sequence)
+    for index in indices:
+        frame = sequence.frame(index)
+        yield index, {kind: odometry.step(frame, scale[index], masks[index] if kind == "masks" else None)
+                      for kind, odometry in odometries.items()}
 
 
 def _agreeing(step, motion, sequence):
@@ -125,12 +128,7 @@ def figure(steps, sequences, masks):
 
 def _draw(panel, sequence, masks, index):
     """The keypoints of the frame before a step, without the frame: kept by the mask or not, near the motion or not."""
-    steps = {}
-    for kind in KINDS:
-        odometry = Odometry(sequence.intrinsics, SETTINGS)
-        for number in (index - 1, index):
-            frame, mask = sequence.frame(number), masks[number] if kind == "masks" else None
-            steps[kind] = odometry.step(frame, scales(sequence)[number], mask)
+    _, (_, steps) = _steps(sequence, masks, (index - 1, index))
     motion, mask = steps["all"].motion, masks[index - 1]
     _, _, agreeing = _agreeing(steps["masks"], motion, sequence)
     columns, rows = np.rint(steps["all"].previous).astype(int).T
