@@ -6,11 +6,11 @@ intervals over what `n` counts: sequences, where nothing else is said.
 """
 
 import json
-from math import comb
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.stats import binomtest
 
 from thesis_repro.cityscapes import LABELS
 from thesis_repro.report.captions import REPORTED
@@ -36,9 +36,9 @@ def measurement(row, quantity, values, unit="", **more):
 
 def ratio(row, quantity, ratios, **more):
     """One measurement of a row: the geometric mean of one ratio a sequence."""
-    result = compare.geometric_mean(ratios)
-    return measurement(row, quantity, [], "ratio", **more) | {
-        "value": result["ratio"], "low": result["low"], "high": result["high"], "n": result["n"]}
+    mean = compare.geometric_mean(ratios)
+    return measurement(row, quantity, [], "ratio", value=mean["ratio"], low=mean["low"], high=mean["high"],
+                       n=mean["n"], **more)
 
 
 def table(measurements, data="this run"):
@@ -75,30 +75,26 @@ def measured(table, kind):
 
     kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (those of `ablations`),
     "shares" (of pixels, a row a frame), "boresight" (`boresight.explained`).
-    With a unit it is the mean over sequences, less that of the reference if there is one. Without, it is a ratio: to
-    the reference, or to another column ("over") of the same rows.
+    With a unit it is the mean over sequences. Without, it is a ratio: to the reference, or to another column ("over")
+    of the same rows.
     """
     measurements = []
-    for spec in (spec for spec in WORDS["measured"] if spec["runs"] == kind):
-        for metric in (metric for metric in spec["metrics"] if metric in table):
-            of_each = "estimator" in table and metric != "mean_keypoints"
-            pairs = [(name, name) for name in compare.ESTIMATORS] if of_each else [("", "")]
-            for own, other in [spec["estimators"]] if "estimators" in spec else pairs:
-                rows = _arm(table, own, spec.get("method"), spec.get("widths"))
-                reference = _arm(table, other, spec.get("reference"), spec.get("reference_widths"))
-                if "over" in spec:
-                    reference = rows.assign(**{metric: rows[spec["over"]]})
-                more = {"metric": spec.get("label", WORDS["metrics"].get(metric, "")), "estimator": own,
-                        "frames": frames_of(table)}
-                if "unit" not in spec:
-                    each = ratio(spec["row"], spec["quantity"], compare.ratios(rows, reference, metric), **more)
-                else:
-                    means = rows.groupby("sequence")[metric].mean()
-                    if "reference" in spec:
-                        means -= reference.groupby("sequence")[metric].mean()
-                    each = measurement(spec["row"], spec["quantity"], means, spec["unit"], **more)
-                measurements += [each] if each["n"] else []
-    return measurements
+    for spec, metric in ((spec, metric) for spec in WORDS["measured"] if spec["runs"] == kind
+                         for metric in spec["metrics"] if metric in table):
+        of_each = "estimator" in table and metric != "mean_keypoints"
+        pairs = [(name, name) for name in compare.ESTIMATORS] if of_each else [("", "")]
+        for estimator, other in spec.get("estimators", pairs):
+            rows = _arm(table, estimator, spec.get("method"), spec.get("widths"))
+            which = {"metric": spec.get("label", WORDS["metrics"].get(metric, "")), "estimator": estimator}
+            if "unit" in spec:
+                means = rows.groupby("sequence")[metric].mean()
+                measurements.append(measurement(spec["row"], spec["quantity"], means, spec["unit"], **which))
+            else:
+                reference = (rows.assign(**{metric: rows[spec["over"]]}) if "over" in spec else
+                             _arm(table, other, spec.get("reference"), spec.get("reference_widths")))
+                ratios = compare.ratios(rows, reference, metric)
+                measurements.append(ratio(spec["row"], spec["quantity"], ratios, **which))
+    return _with_frames(measurements, table)
 
 
 def _arm(table, estimator, method, widths):
@@ -113,12 +109,14 @@ def _arm(table, estimator, method, widths):
     return table if method is None else table[table["method"] == method]
 
 
-def frames_of(table):
-    """How many frames of a sequence a table rests on, on average; NaN where it does not say."""
-    sequences = table.groupby("sequence")
+def _with_frames(measurements, table):
+    """What could be measured, with how many frames of a sequence the table has on average, where it says so."""
+    sequences, frames = table.groupby("sequence"), np.nan
     if "frames" in table:
-        return round(sequences["frames"].first().mean())
-    return round(sequences["frame"].nunique().mean()) if "frame" in table else np.nan
+        frames = round(sequences["frames"].first().mean())
+    elif "frame" in table:
+        frames = round(sequences["frame"].nunique().mean())
+    return [{**each, "frames": frames} for each in measurements if each["n"]]
 
 
 def of_tables():
@@ -126,8 +124,8 @@ def of_tables():
     measurements = []
     for name, key in (("RMSE", "table_4_2_rmse_percent_change"), ("MAE", "table_4_3_mae_percent_change")):
         change = pd.Series(REPORTED[key])
-        improved, count = int((change < 0).sum()), len(change)
-        as_many = sum(comb(count, k) for k in range(improved, count + 1)) / 2**count
+        improved = int((change < 0).sum())
+        as_many = binomtest(improved, len(change), alternative="greater").pvalue
         measurements += [measurement("1", "sum", change.sum(), "%", metric=name),
                          measurement("1", "mean", change, "%", metric=name),
                          measurement("1", "median", change.median(), "%", metric=name),
@@ -152,21 +150,19 @@ def of_tables():
 def of_study(runs):
     """Rows 2, 11, 26, 31 to 33, 35 and 38, from the runs of notebook 08."""
     masked, baseline = (compare.of_method(runs, method) for method in ("masked", "baseline"))
-    best, stability = thesis_tables.of_chosen_width(masked), thesis_tables.stability(masked, baseline).dropna()
+    best, stability = thesis_tables.of_chosen_width(masked), thesis_tables.stability(masked, baseline)
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
-    chosen = {metric: by_width[metric].groupby("sequence").idxmin() for metric in ("rmse", "mae")}
-    errors = {metric: by_width["rmse"].loc[keys].to_numpy() for metric, keys in chosen.items()}
-    widths = chosen["rmse"].map(lambda key: key[1])
-    of_best = compare.ratios(best, baseline, "rmse")
+    by_rmse, by_mae = (by_width[metric].groupby("sequence").idxmin() for metric in ("rmse", "mae"))
+    dearer = by_width["rmse"].loc[by_mae].to_numpy() / by_width["rmse"].loc[by_rmse].to_numpy()
+    widths = thesis_tables.best_widths(masked)["dilation_width"]
     measurements = [
-        ratio("2", "best same", of_best, metric="RMSE"),
-        ratio("31", "mae chooses", errors["mae"] / errors["rmse"], metric="RMSE"),
-        measurement("31", "other width", (chosen["rmse"] != chosen["mae"]).sum(), "sequences"),
-        measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences")]
-    if len(stability):
-        measurements += [ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
-                         measurement("2", "same best", stability["same_best"], "%")]
-    return [*({**each, "frames": frames_of(runs)} for each in measurements), *measured(runs, "study")]
+        ratio("2", "best same", compare.ratios(best, baseline, "rmse"), metric="RMSE"),
+        ratio("31", "mae chooses", dearer, metric="RMSE"),
+        measurement("31", "other width", (by_rmse != by_mae).sum(), "sequences"),
+        measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences"),
+        ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
+        measurement("2", "same best", stability["same_best"], "%")]
+    return _with_frames(measurements, runs) + measured(runs, "study")
 
 
 def of_ablations(runs):
@@ -177,19 +173,8 @@ def of_ablations(runs):
     measurements = [
         *(ratio("14", "spread", factors, metric="RMSE", estimator=estimator)
           for estimator, factors in spread.groupby("estimator")["factor"]),
-        *(measurement("39", f"null {name}", null.loc[name, "expected"], "%", metric="RMSE")
-          | {"low": null.loc[name, "low"], "high": null.loc[name, "high"], "n": ablations.STUDIES}
+        *(measurement("39", f"null {name}", null.loc[name, "expected"], "%", metric="RMSE",
+                      low=null.loc[name, "low"], high=null.loc[name, "high"], n=ablations.STUDIES)
           for name in ("mean", "median")),
         measurement("39", "as low", null.loc["mean", "share_as_low"], "%", metric="RMSE")]
-    return [*({**each, "frames": frames_of(runs)} for each in measurements), *measured(runs, "ablations")]
-
-
-def of_time(seconds, measured):
-    """Rows 16, 47 and 49, from the tables of `timing.time_runs` and `timing.measure`."""
-    savings = thesis_tables.time_savings(seconds)
-    near = savings[savings.index.isin(WIDTHS)]
-    stages = measured.pivot(index="stage", columns="method", values="milliseconds").fillna(0)
-    plain, masked = sorted(stages, key=lambda name: name.startswith("masked"))
-    return [measurement("47", "saved", near if len(near) else savings, "%"),
-            measurement("16", "whole frame", stages[masked].sum() / stages[plain].sum(), "ratio"),
-            *(measurement("49", "stage", value, "ms", metric=stage) for stage, value in stages[masked].items())]
+    return _with_frames(measurements, runs) + measured(runs, "ablations")
