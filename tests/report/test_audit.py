@@ -88,12 +88,3 @@ def test_other_tables_are_measured_by_sequence_and_say_how_many_frames_they_rest
     angles = pd.DataFrame({"sequence": ["00", "01"], "pitch": [0.1, 0.3], "rmse": [2.0, 2.0], "rmse_own": [1.0, 1.0]})
     values = {each["metric"]: each["value"] for each in audit.measured(angles, "boresight")}
     assert values == pytest.approx({"": 0.2, "RMSE": 0.5})
-
-
-def test_times_are_measured_against_their_reference():
-    seconds = pd.DataFrame({"method": ["baseline", "masked", "masked"], "dilation_width": [np.nan, 5, 10],
-                            "seconds": [10.0, 5.0, 9.0]})
-    measured = pd.DataFrame({"method": ["all keypoints", "masked, width 10", "masked, width 10"],
-                             "stage": ["pose", "pose", "segmentation"], "milliseconds": [10.0, 8.0, 32.0]})
-    values = {each["row"]: each["value"] for each in audit.of_time(seconds, measured)[:2]}
-    assert values == {"47": -10, "16": 4}

@@ -79,8 +79,8 @@ def measured(table, kind):
     of the same rows.
     """
     measurements = []
-    for spec, metric in ((spec, metric) for spec in WORDS["measured"] if spec["runs"] == kind
-                         for metric in spec["metrics"] if metric in table):
+    specs = [spec for spec in WORDS["measured"] if spec["runs"] == kind]
+    for spec, metric in [(each, name) for each in specs for name in each["metrics"] if name in table]:
         of_each = "estimator" in table and metric != "mean_keypoints"
         pairs = [(name, name) for name in compare.ESTIMATORS] if of_each else [("", "")]
         for estimator, other in spec.get("estimators", pairs):

@@ -1,4 +1,7 @@
-"""The figures of chapter 2, drawn anew from the project's own network and data: networks, odometry, keypoints."""
+"""The figures of chapter 2, drawn anew from the project's own network and data: networks, odometry, keypoints.
+
+Figures 2.3, 2.6 and 3.4, curves of formulas, are drawn in cells of notebooks 3 and 4.
+"""
 
 import cv2
 import numpy as np
@@ -65,22 +68,6 @@ def figure_2_02(patch, kernel, bias, feature_map, activated, where):
     return figure
 
 
-def figure_2_03():
-    """Figure 2.3: sigmoid against ReLU, with their derivatives."""
-    x = np.linspace(-4, 4, 162)  # without 0, where ReLU has no derivative
-    sigmoid = 1 / (1 + np.exp(-x))
-    figure, axes = style.new_figure(1, 2, height=2.2)
-    for panel, title, values, slope in (
-            (axes[0], "sigmoid, 1 / (1 + exp(-x))", sigmoid, sigmoid * (1 - sigmoid)),
-            (axes[1], "ReLU, max(0, x)", np.maximum(x, 0), np.where(x > 0, 1, 0))):
-        for side in (x < 0, x > 0):
-            panel.plot(x[side], values[side], color=BLUE, label="activation")
-            panel.plot(x[side], slope[side], color=RED, linestyle="--", label="its derivative")
-        panel.set(title=title, xlabel="x (no unit)", ylabel="value (no unit)")
-    style.legend_below(figure, axes, 2)
-    return figure
-
-
 def figure_2_04():
     """Figure 2.4: a 4x4 array under 2x2 max pooling with stride 2."""
     values = np.random.default_rng(0).permutation(np.arange(1, 17)).reshape(4, 4)
@@ -111,32 +98,6 @@ def figure_2_05():
     axes[3].bar_label(axes[3].containers[0], fmt="%.2f", padding=3)
     axes[3].invert_yaxis()
     axes[3].set(title="softmax: exp(score) / sum of all", xlim=(0, 1), xlabel="probability")
-    return figure
-
-
-def figure_2_06():
-    """Figure 2.6: steps of stochastic gradient descent on a loss surface with two valleys."""
-    random, steps, rate, noise = np.random.default_rng(0), 40, 0.1, 1.2
-
-    def loss(x, y):
-        return 0.5 * (x**2 - 1.5) ** 2 + 0.6 * y**2 + 0.35 * x
-
-    path = np.tile([0.35, 1.5], (steps + 1, 1))
-    for step, (x, y) in enumerate(path[:-1]):
-        slope = np.array([2 * x * (x**2 - 1.5) + 0.35, 1.2 * y])
-        path[step + 1] = path[step] - rate * (slope + noise * random.normal(size=2))
-    x, y = np.meshgrid(np.linspace(-1.8, 1.8, 200), np.linspace(-1.2, 1.7, 160))
-    figure, axes = style.new_figure(height=3)
-    levels = axes.contourf(x, y, loss(x, y), 20, cmap="cividis")
-    axes.plot(*path.T, color="white", linewidth=1, marker="o", markersize=3)
-    for point, marker, size, label in ((path[0], "s", 9, "start"), (path[-1], "*", 14, f"after {steps} steps")):
-        axes.plot(*point, marker, color=RED, markersize=size, markeredgecolor="white", label=label)
-    for valley in (-1.28, 1.16):  # along y = 0, where the slope vanishes
-        axes.text(valley, -0.9, f"loss {loss(valley, 0):.2f}", color="white", fontsize=8, ha="center")
-    axes.set(xlabel="first weight (no unit)", ylabel="second weight (no unit)")
-    axes.grid(visible=False)
-    axes.legend(loc="upper left", labelcolor="white")
-    figure.colorbar(levels, label="loss (no unit)")
     return figure
 
 

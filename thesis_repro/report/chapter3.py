@@ -1,4 +1,4 @@
-"""The figures of chapter 3 and A.1: intersection over union, losses, categories, masks, the network's layers."""
+"""The figures of chapter 3 and A.1: intersection over union, categories, masks, the network's layers."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -31,19 +31,6 @@ def figure_3_03(image, label_map, prediction, label):
                            Patch(color=SKY, label="only in the prediction")],
                   title=f"class {label.name}; the three colours together are the union", title_fontsize=8,
                   loc="outside lower center", ncols=3)
-    return figure
-
-
-def figure_3_04():
-    """Figure 3.4: focal loss against the probability of the true class for several gamma, alpha 1 (Equation 3.7)."""
-    p = np.linspace(0.005, 1, 400)
-    figure, axes = style.new_figure(height=2.8)
-    for index, gamma in enumerate((0, 0.5, 1, 2, 5)):
-        name = f"γ = {gamma:g}" + (" (cross-entropy)" if gamma == 0 else "")
-        axes.plot(p, -((1 - p) ** gamma) * np.log(p), label=name, **style.line_style(index))
-    axes.set(xlabel="probability p of the true class (no unit)", ylabel="focal loss, α = 1 (no unit)",
-             xlim=(0, 1), ylim=(0, 5))
-    axes.legend()
     return figure
 
 
