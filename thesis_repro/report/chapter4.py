@@ -1,4 +1,4 @@
-"""Figures 4.6, 4.7 and 4.9 to 4.17, and the time of a whole frame: errors in metres, keypoints and times.
+"""Figures 4.6, 4.7 and 4.9 to 4.17: errors in metres, keypoints and times.
 
 `runs` is the table of `runner.run`. Lines and bars stand at the mean over repetitions; bands and error bars go from the
 lowest to the highest of them. What compares methods by ratios is in comparison.py.
@@ -11,14 +11,11 @@ import numpy as np
 
 from thesis_repro.odometry import THESIS
 from thesis_repro.report import style
-from thesis_repro.report.style import BASELINE, BLUE, GREEN, MASKED, ORANGE, PAGE_WIDTH, PINK, RED, REDUCED, SKY, TRUTH
+from thesis_repro.report.style import BASELINE, MASKED, PAGE_WIDTH, REDUCED, TRUTH
 from thesis_repro.study import compare, thesis_tables
 
 METHODS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
            "reduced": ("plainly reduced", REDUCED, "\\\\")}
-FRAME_MS = 100  # KITTI's cameras take ten frames a second
-STAGES = {"read": (SKY, ""), "segmentation": (RED, ""), "mask": (ORANGE, "//"), "detection": (BLUE, ""),
-          "tracking": (GREEN, "\\\\"), "pose": (PINK, "")}
 BAND = "lowest to highest of the repetitions"
 
 
@@ -149,30 +146,6 @@ def figure_4_17(seconds):
     axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)",
              title="Time of the timed frames against all keypoints (negative: time saved)")
     axes.grid(axis="x", visible=False)
-    return figure
-
-
-def figure_budget(measured):
-    """Milliseconds a frame of every stage, from reading the frame to its pose, against KITTI's ten frames a second.
-
-    measured: method, stage and milliseconds, as `timing.measure` gives them.
-    """
-    table = measured.pivot(index="method", columns="stage", values="milliseconds").fillna(0)
-    table = table.loc[measured["method"].unique(), [stage for stage in STAGES if stage in table]]
-    ends = table.sum(axis=1)
-    figure, axes = style.new_figure(height=1.4 + 0.5 * len(table))
-    left = table.cumsum(axis=1) - table
-    for stage in table:
-        color, hatch = STAGES[stage]
-        axes.barh(table.index, table[stage], 0.6, left=left[stage], label=stage, color=color, hatch=hatch,
-                  edgecolor="white", linewidth=0.5)
-    for place, end in enumerate(ends):
-        axes.text(end, place, f"   {end:.0f} ms", va="center", fontsize=8)
-    axes.axvline(FRAME_MS, color="black", linewidth=1, linestyle="--", label="10 frames a second")
-    axes.set(xlim=(0, max(FRAME_MS, *ends) * 1.12), xlabel="time a frame (ms)",
-             ylim=(len(table) - 0.6, -0.6))
-    axes.grid(axis="y", visible=False)
-    style.legend_below(figure, [axes], 4)
     return figure
 
 
