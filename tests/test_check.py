@@ -8,7 +8,6 @@ from thesis_repro import InputError, cityscapes, files, stages
 from thesis_repro.check import (
     check_cityscapes,
     check_kitti,
-    check_kitti_semantic,
     oddities,
     of_masks,
     path_oddities,
@@ -80,15 +79,15 @@ def test_what_is_missing_is_counted_and_named(tiny_kitti, tiny_cityscapes):
         (tiny_cityscapes / "val" / f"lonely_{index}.png").write_bytes(b"")
     counts = [len(check_cityscapes(tiny_cityscapes, deep)[1]) for deep in (False, True)]
     # four images without label maps and so no pair; of twelve such ones ten are named, and the count of the others
-    assert counts == [4 + 1 + 11, 4 + 1 + 12]
+    assert counts == [4 + 12, 4 + 12]
 
 
 def test_street_scenes_need_no_validation_split(tiny_cityscapes):
     for split in ("val", "valannot"):
         shutil.rmtree(tiny_cityscapes / split)
-    assert check_kitti_semantic(tiny_cityscapes)[1] == [] != check_cityscapes(tiny_cityscapes)[1]
+    assert check_cityscapes(tiny_cityscapes, splits=("train",))[1] == [] != check_cityscapes(tiny_cityscapes)[1]
     (tiny_cityscapes / "trainannot" / "street_0.png").unlink()
-    assert len(check_kitti_semantic(tiny_cityscapes)[1]) == 1
+    assert len(check_cityscapes(tiny_cityscapes, splits=("train",))[1]) == 1
 
 
 def test_sequences_without_truth_are_described_and_missing_poses_named(tiny_kitti):

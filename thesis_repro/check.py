@@ -1,11 +1,11 @@
-"""What is there, missing or wrong in the user's KITTI and Cityscapes folders, and what can be run with it; and what can
-be read, but is hardly what it is taken for.
+"""What is missing, wrong or odd in the user's KITTI and Cityscapes folders, and what can be run with them.
 
-The readers say what is wrong with a file; here all that they say about a folder is collected. What is odd is a line
-with the number that was seen. It is a warning: somebody may mean it.
+What is odd can be read, but is hardly what it is taken for. It is a warning: somebody may mean it.
 """
 
 import sys
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import joblib
@@ -15,7 +15,7 @@ import pandas as pd
 from thesis_repro import InputError, cityscapes, files, kitti, masks, one_line, stages
 from thesis_repro.settings import read_settings
 
-MAX_NAMED = 10  # problems of one kind that a quick look names; a deep one names all
+MAX_NAMED = 20  # problems of a folder that a quick look names; a deep one names all
 
 
 class _Problems(list):
@@ -29,21 +29,12 @@ class _Problems(list):
             self.append(str(error))
             return None
 
-    def of_each(self, function, items, description, deep):
+    def of_each(self, function, items, description):
         """The same for every item, in threads, for reading and decoding release the interpreter."""
-        def problems_of(item):
-            problems = _Problems()
-            problems.of(function, item)
-            return problems
-
-        results = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(
-            joblib.delayed(problems_of)(item) for item in items)
-        self.add(sum(files.progress(results, description, total=len(items), unit="file"), []), deep)
-
-    def add(self, problems, deep):
-        self += problems if deep else problems[:MAX_NAMED]
-        if not deep and len(problems) > MAX_NAMED:
-            self.append(f"and {len(problems) - MAX_NAMED} more like these; check-data --deep names all")
+        calls = (joblib.delayed(self.of)(function, item) for item in items)
+        results = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(calls)
+        for _ in files.progress(results, description, total=len(items), unit="file"):
+            pass
 
 
 def check_kitti(root, deep=False):
@@ -63,8 +54,7 @@ def check_kitti(root, deep=False):
     for commands, names in (("odometry, predict and masks", sound),
                             ("evaluate, boresight, study and plan", [name for name in sound if name in with_truth])):
         facts.append(f"can be run: {commands} with {', '.join(names)}" if names else f"cannot be run: {commands}")
-    facts.append(f"{'cannot' if problems else 'can'} be run: make figures KITTI={root}")
-    return facts, problems
+    return facts, sorted(problems)
 
 
 def _check_sequence(root, name, needs_truth, deep):
@@ -82,7 +72,7 @@ def _check_sequence(root, name, needs_truth, deep):
         rows[times] = problems.of(kitti.read_times, times)
     counts = {path: len(values) for path, values in rows.items() if values is not None}
     missing = kitti.missing_frames(paths, max([count for count in counts.values() if count > len(paths)], default=None))
-    problems.add([f"{path}: is missing" for path in missing], deep)
+    problems += [f"{path}: is missing" for path in missing]
     if not missing:
         problems.of(kitti.check_numbering, paths)
         for path, count in counts.items():
@@ -95,7 +85,7 @@ def _check_sequence(root, name, needs_truth, deep):
         its_size = files.read_gray(path).shape if deep or path in (paths[0], paths[-1]) else files.glance(path)
         kitti.check_size(path, its_size, size)
 
-    problems.of_each(check_frame, paths if size else paths[1:], f"sequence {name}", deep)
+    problems.of_each(check_frame, paths if size else paths[1:], f"sequence {name}")
     complete = kitti.FRAME_COUNTS.get(name, len(paths))
     notes = {f"{len(paths)} of {len(paths) + len(missing)} frames": bool(missing),
              f"{len(paths)} frames{f' of {size[1]}x{size[0]}' if size else ''}": not missing,
@@ -106,58 +96,51 @@ def _check_sequence(root, name, needs_truth, deep):
     return f"sequence {name}: {'; '.join(note for note, holds in notes.items() if holds)}", problems
 
 
-def check_cityscapes(root, deep=False, splits=("train", "val"), used="make figures CITYSCAPES"):
+def check_cityscapes(root, deep=False, splits=("train", "val")):
     """Check the training and validation split; returns (lines that describe, problems).
 
     Names and both ends of every file are looked at, and the first and last pair decoded; deep: all pairs are.
     """
     facts, problems = [], _Problems()
     for split in splits:
-        listing = problems.of(cityscapes.listing, root, split)
-        if listing is None:
-            continue
-        images, labels, where = listing
-        problems.add([f"{(images | labels)[name]}: has no {'label map' if name in images else 'image'}"
-                      for name in sorted(images.keys() ^ labels.keys())], deep)
-        pairs = [cityscapes.Pair(name, images[name], labels[name]) for name in sorted(images.keys() & labels.keys())]
-        if not pairs:
-            problems.append(f"{where}: no PNG images with label maps")
+        pairs = problems.of(cityscapes.listing, root, split)
+        if pairs is None:
             continue
         ids, ends = set(), (pairs[0], pairs[-1])
 
         def check_pair(pair, ids=ids, ends=ends):
+            cityscapes.check_complete(pair)
             if deep or pair in ends:
                 size, label_map = files.read_gray(pair.image).shape, cityscapes.read_label_map(pair.label)
                 label_size = label_map.shape
                 ids.update(np.unique(label_map).tolist())
             else:
                 size, label_size = files.glance(pair.image), files.glance(pair.label)
-            if size != label_size:
-                raise InputError(f"{pair.label}: {label_size[1]}x{label_size[0]} pixels; its image has "
-                                 f"{size[1]}x{size[0]}")
+            kitti.check_size(pair.label, label_size, size, "its image")
 
-        problems.of_each(check_pair, pairs, f"split {split}", deep)
+        problems.of_each(check_pair, pairs, f"split {split}")
         names = ", ".join(f"{label.name} {label.id}" for label in cityscapes.LABELS if label.id in ids)
-        facts.append(f"split {split}: {len(pairs)} images with label maps; "
+        facts.append(f"split {split}: {sum(None not in pair for pair in pairs)} images with label maps; "
                      f"{'labels' if deep else 'labels in the first and last'}: {names}")
-    facts.append(f"{'cannot' if problems else 'can'} be run: {used}={root}")
-    return facts, list(dict.fromkeys(problems))
-
-
-def check_kitti_semantic(root, deep=False):
-    """Check KITTI's street scenes with label maps, which have a training split alone."""
-    return check_cityscapes(root, deep, ("train",), "make figures KITTI_SEMANTIC")
+    return facts, sorted(problems)
 
 
 def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=False):
     """Print what is in the folders, what is wrong and what is odd; returns whether nothing is wrong."""
     wrong = False
-    for root, check in ((kitti_root, check_kitti), (cityscapes_root, check_cityscapes),
-                        (kitti_semantic, check_kitti_semantic)):
-        facts, problems = check(root, deep) if root else ((), ())
-        print("\n".join([*([str(root)] if root else []), *(f"  {fact}" for fact in facts)]), end="\n" * bool(root))
-        for problem in problems:
+    for option, root, check in (("KITTI", kitti_root, check_kitti), ("CITYSCAPES", cityscapes_root, check_cityscapes),
+                                # which has a training split alone
+                                ("KITTI_SEMANTIC", kitti_semantic, partial(check_cityscapes, splits=("train",)))):
+        if not root:
+            continue
+        facts, problems = check(root, deep)
+        facts.append(f"{'cannot' if problems else 'can'} be run: make figures {option}={root}")
+        print("\n  ".join([str(root), *facts]))
+        named = problems if deep else problems[:MAX_NAMED]
+        for problem in named:
             print(f"wrong: {one_line(problem)}", file=sys.stderr)
+        if len(named) < len(problems):
+            print(f"and {len(problems) - len(named)} more; check-data --deep names all", file=sys.stderr)
         wrong = wrong or bool(problems)
     for name in kitti.sequences(kitti_root) + kitti.without_truth(kitti_root) if kitti_root and not wrong else ():
         for line in oddities(kitti.Sequence(kitti_root, name)):
@@ -281,23 +264,20 @@ def _contrast(frame, mask):
 
 def main(path):
     """Check the data of the settings in the environment, unless `path` says that just these bytes were checked."""
-    settings, texts = read_settings(), []
-    roots = (None if settings.kitti_is_embedded else settings.kitti,
-             None if settings.cityscapes_is_embedded else settings.cityscapes, settings.kitti_semantic)
-    try:
-        if roots[0]:
-            texts = [path for name in kitti.sequences(roots[0])
-                     for path in kitti.Sequence(roots[0], name).subset(settings.sizes.frames).files]
-        for root, splits in ((roots[1], ("train", "val")), (roots[2], ("train",))):
-            texts += [path for split in splits if root for by_name in cityscapes.listing(root, split)[:2]
-                      for path in by_name.values()]
-        digest = stages.listing(texts)
-    except InputError:  # the report says more
-        digest = None
-    if digest is None or not path.is_file() or path.read_text(encoding="utf-8") != digest:
-        if not report(*roots):
-            return 1
-        files.write_text(path, digest or "")
+    settings, used, digest = read_settings(), [], None
+    kitti_root = None if settings.kitti_is_embedded else settings.kitti
+    cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes
+    with suppress(InputError):  # the report says more
+        for name in kitti.sequences(kitti_root) if kitti_root else ():
+            used += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
+        for root, split in ((cityscapes_root, "train"), (cityscapes_root, "val"), (settings.kitti_semantic, "train")):
+            used += [file for pair in cityscapes.pairs(root, split) for file in pair[1:]] if root else []
+        digest = stages.listing(used)
+    if digest and path.is_file() and path.read_text(encoding="utf-8") == digest:
+        return 0
+    if not report(kitti_root, cityscapes_root, settings.kitti_semantic):
+        return 1
+    files.write_text(path, digest or "")
     return 0
 
 

@@ -1,6 +1,5 @@
 """Cityscapes: its label table, and image and label map pairs from the official or the thesis's flat layout."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,9 +71,8 @@ LABEL_OF_TRAIN_ID[:len(TRAINED)] = [ID[name] for name in TRAINED]
 LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
 
 
-@dataclass(frozen=True)
-class Pair:
-    """One image and its label map; `name` is what the two file names share."""
+class Pair(NamedTuple):
+    """One image and its label map, of which one may be missing (None); `name` is what their file names share."""
 
     name: str
     image: Path
@@ -93,38 +91,41 @@ def pairs(root, split, limit=None):
     The appendix pairs two unsorted directory listings by position (A.2); here the names decide.
     Raises InputError for a missing folder, an empty split or an image without its label map.
     """
-    images, labels, where = listing(root, split)
-    if not images:
-        raise InputError(f"{where}: no PNG images")
-    lonely = sorted(images.keys() ^ labels.keys())
-    if lonely:
-        name = lonely[0]
-        here, missing = (images[name], "label map") if name in images else (labels[name], "image")
-        raise InputError(f"{here}: has no {missing}")
-    names = sorted(images)
-    if limit is not None and limit < len(names):
-        names = [names[index * len(names) // limit] for index in range(limit)]
-    return [Pair(name, images[name], labels[name]) for name in names]
+    every = listing(root, split)
+    for pair in every:
+        check_complete(pair)
+    if limit is not None and limit < len(every):
+        every = [every[index * len(every) // limit] for index in range(limit)]
+    return every
 
 
 def listing(root, split):
-    """The images and the label maps of a split by name, {name: path} each, and the folder of the images.
+    """The pairs of a split, sorted by name, incomplete ones among them. Raises InputError where there are no images.
 
     Both layouts are read: the official one (leftImg8bit, gtFine) and the appendix's flat one (train, trainannot).
     """
     root = Path(root)
     if (root / "leftImg8bit").is_dir():
-        where = root / "leftImg8bit" / split
+        image_folder, label_folder, within = root / "leftImg8bit" / split, root / "gtFine" / split, "*/*"
         image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
-        images = {f.name.removesuffix(image_end): f for f in listed(where, f"*/*{image_end}")}
-        labels = {f.name.removesuffix(label_end): f for f in listed(root / "gtFine" / split, f"*/*{label_end}")}
     elif (root / split).is_dir():
-        where = root / split
-        images = {f.stem: f for f in listed(where)}
-        labels = {f.stem: f for f in listed(root / f"{split}annot")}
+        image_folder, label_folder, within = root / split, root / f"{split}annot", "*"
+        image_end = label_end = ".png"
     else:
         raise InputError(f"{root}: must be a folder that holds leftImg8bit and gtFine, or {split} and {split}annot")
-    return images, labels, where
+    images = {path.name.removesuffix(image_end): path for path in listed(image_folder, within + image_end)}
+    labels = {path.name.removesuffix(label_end): path for path in listed(label_folder, within + label_end)}
+    if not images:
+        raise InputError(f"{image_folder}: no PNG images")
+    return [Pair(name, images.get(name), labels.get(name)) for name in sorted(images | labels)]
+
+
+def check_complete(pair):
+    """Raise InputError for an image without its label map, or a label map without its image."""
+    if pair.label is None:
+        raise InputError(f"{pair.image}: has no label map")
+    if pair.image is None:
+        raise InputError(f"{pair.label}: has no image")
 
 
 def read_image(path, height, width, channels=1):
@@ -141,16 +142,14 @@ def read_label_map(path, train_ids=False):
 
     Raises InputError for a number that is no such id, and what `read_ids` does.
     """
-    label_map = read_ids(path)
-    if train_ids:
-        label_map = LABEL_OF_TRAIN_ID[label_map]
-        if label_map.max() >= N_CLASSES:
-            raise InputError(f"{path}: holds an id that is no train id (0 to {len(TRAINED) - 1}, 255); leave out --ids "
-                             "train, or --ids labels says the same")
-    elif label_map.max() >= N_CLASSES:
-        raise InputError(f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; take the labelIds.png files, "
-                         "or give --ids train for train ids (0 to 18, 255)")
-    return label_map
+    ids = read_ids(path)
+    label_map = LABEL_OF_TRAIN_ID[ids] if train_ids else ids
+    if label_map.max() < N_CLASSES:
+        return label_map
+    wrong = ids[label_map >= N_CLASSES].max()
+    raise InputError(f"{path}: holds {wrong}, which is no train id (0 to 18, 255); leave out --ids train" if train_ids
+                     else f"{path}: label id {wrong} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
+                          "--ids train for train ids (0 to 18, 255)")
 
 
 def load(image_pairs, size, channels=1, description="reading images"):

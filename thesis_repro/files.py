@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from PIL import Image, ImageOps
 from tqdm import tqdm
+from tqdm.utils import ObjectWrapper
 
 from thesis_repro import InputError, longrun
 
@@ -92,8 +93,7 @@ def _header(path, file):
 
 @contextmanager
 def _opened(path):
-    """The file of an image. Raises an InputError that names it where the system, Pillow or OpenCV raise another error,
-    and for what is no file: a pipe or device may have nothing to read, or no end."""
+    """The file of an image, no pipe or device; whatever the system, Pillow or OpenCV raise is an InputError."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -153,7 +153,11 @@ def atomic(path):
         with tempfile.TemporaryDirectory() as folder:
             temporary = Path(folder, f"written{path.suffix}")
             yield temporary
-            _pour(temporary.read_bytes(), path)
+            if is_stdout(path):
+                sys.stdout.flush()
+                sys.stdout.buffer.write(temporary.read_bytes())
+            else:
+                path.write_bytes(temporary.read_bytes())
         return
     target = path.resolve() if path.is_symlink() else path
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -176,7 +180,7 @@ def atomic(path):
 
 
 def _enter(path, file):
-    """Enter a file that is about to appear in the list of the folder of results that it lies in, if it does."""
+    """Enter a file that is about to appear in the list of the folder of results that it lies in, if any."""
     folder = next((folder for folder in path.absolute().parents if (folder / longrun.RECORD).exists()), None)
     if folder is not None and path.name != longrun.RECORD:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -185,23 +189,14 @@ def _enter(path, file):
 
 
 def is_stream(path):
-    """Whether a path is no file to be replaced: a device or a pipe; "-" and the like, whatever is behind them."""
-    if str(path) == "-" or str(path).startswith(("/dev/std", "/dev/fd/", "/proc/self/fd/")):
-        return True
-    return path.exists() and not path.is_file() and not path.is_dir()
+    """Whether a path is no file to be replaced: a device or a pipe; an open stream, whatever is behind it."""
+    is_open = is_stdout(path) or str(path).startswith(("/dev/std", "/dev/fd/", "/proc/self/fd/"))
+    return is_open or path.exists() and not path.is_file() and not path.is_dir()
 
 
 def is_stdout(path):
+    """Whether a path stands for standard output."""
     return str(path) in ("-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1")
-
-
-def _pour(data, path):
-    if is_stdout(path):
-        sys.stdout.flush()
-        sys.stdout.buffer.write(data)
-        return
-    with open(path, "wb") as file:
-        file.write(data)
 
 
 def check_output(path):
@@ -255,19 +250,13 @@ def progress(iterable=None, description="", total=None, unit="frame", initial=0)
     live = stream.isatty()
     return tqdm(iterable, desc=description, total=total, unit=unit, initial=initial, dynamic_ncols=live,
                 file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live,
-                delay=BAR_DELAY, smoothing=0)  # all of the time so far tells more than the last few
+                delay=BAR_DELAY, ascii=None if live else True,
+                smoothing=0)  # all of the time so far tells more than the last few
 
 
-class _Lines:
+class _Lines(ObjectWrapper):
     """A file for tqdm that holds lines, not carriage returns."""
 
-    def __init__(self, stream):
-        self._stream = stream
-
     def write(self, text):
-        text = text.strip()
-        if text:
-            self._stream.write(text + "\n")
-
-    def flush(self):
-        self._stream.flush()
+        if text.strip():
+            self._wrapped.write(text.strip() + "\n")

@@ -1,9 +1,9 @@
 """KITTI odometry: one sequence's frames, camera, times and true poses, and trajectory files."""
 
 import warnings
+from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice, pairwise
 from pathlib import Path
@@ -14,19 +14,8 @@ import numpy as np
 from thesis_repro import InputError
 from thesis_repro.files import images, numbers_of, read_gray, write_text
 
-
-@dataclass(frozen=True)
-class Camera:
-    """Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no distortion."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
+# Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no distortion.
+Camera = namedtuple("Camera", "width height fx fy cx cy")
 _CAMERA_00 = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 _CAMERA_03 = Camera(1242, 375, 721.5377, 721.5377, 609.5593, 172.854)
 _CAMERA_04 = Camera(1226, 370, 707.0912, 707.0912, 601.8873, 183.1104)
@@ -35,7 +24,6 @@ CAMERAS = {"00": _CAMERA_00, "01": _CAMERA_00, "02": _CAMERA_00, "03": _CAMERA_0
 
 # Frames of the complete sequences (those with ground truth).
 FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201), strict=True))
-
 
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")  # left gray, left colour, then the right ones
 MIN_FRAME_SIDE = 16  # pixels: in smaller frames no keypoint can be tracked
@@ -135,15 +123,14 @@ class Sequence:
     @property
     def assumed_steps(self) -> np.ndarray:
         """Metres from the frame before, (n,), 0 for the first, where no truth says them: those of the speed, or 1."""
-        if self.speed is None:
-            return np.concatenate([[0.0], np.ones(len(self) - 1)])
-        return np.concatenate([[0.0], self.speed * np.diff(self.times)])
+        steps = np.ones(len(self) - 1) if self.speed is None else self.speed * np.diff(self.times)
+        return np.concatenate([[0.0], steps])
 
     @property
     def files(self) -> list[Path]:
         """All that is read of the sequence: frames, calibration, and times and true poses where there are any."""
-        texts = (self.folder / "calib.txt", self.folder / "times.txt", self.poses_path)
-        return [*self.frame_paths, *(path for path in texts if path.is_file())]
+        texts = self.folder / "calib.txt", self.folder / "times.txt", self.poses_path
+        return [*self.frame_paths, *filter(Path.is_file, texts)]
 
     @property
     def label_names(self) -> list[str]:
@@ -159,9 +146,9 @@ class Sequence:
     @cached_property
     def size(self) -> tuple[int, int]:
         """(height, width) of the first frame; every frame must have it. Raises what `check_camera` raises."""
-        height, width = read_gray(self.frame_paths[0]).shape
-        check_camera(self.folder / "calib.txt", self.intrinsics, self.frame_paths[0], (height, width))
-        return height, width
+        size = read_gray(self.frame_paths[0]).shape
+        check_camera(self.folder / "calib.txt", self.intrinsics, self.frame_paths[0], size)
+        return size
 
     def frame(self, index: int) -> np.ndarray:
         """Frame `index` as 8-bit gray, (height, width). Raises InputError when unreadable or of another size."""
@@ -231,30 +218,28 @@ def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
     steps = [after - before for before, after in pairwise(numbers or [])]
     if not numbers or steps and median_low(steps) != 1 or count is None and len(steps) < 2:
         return []
-    first, last = numbers[0], numbers[-1]
+    first, end, there = numbers[0], numbers[-1] + 1, set(numbers)
     if count is not None:
-        first = next((start for start in (0, 1) if start <= first and last < start + count), first)
-        last = max(last, first + count - 1)
+        first = next((start for start in (0, 1) if start <= first and end <= start + count), first)
+        end = max(end, first + count)
+    missing = list(islice((number for number in range(first, end) if number not in there), MAX_MISSING_NAMED))
     stem = paths[0].stem.rstrip("0123456789")
     digits = min(len(path.stem) for path in paths) - len(stem)
-    there = set(numbers)
-    names = (paths[0].with_name(f"{stem}{number:0{digits}d}{paths[0].suffix}") for number in range(first, last + 1)
-             if number not in there)
-    return list(islice(names, MAX_MISSING_NAMED))
+    return [paths[0].with_name(f"{stem}{number:0{digits}d}{paths[0].suffix}") for number in missing]
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
     """Raise InputError unless a file has a line a frame."""
     if count != len(frame_paths):
-        missing = missing_frames(frame_paths, count) if count > len(frame_paths) else []
-        named = f" (the first without one: {missing[0].name})" if missing else ""
-        raise InputError(f"{path}: {count} lines for {len(frame_paths)} frames{named}; one line a frame is needed")
+        missing = missing_frames(frame_paths, max(count, len(frame_paths)))
+        first = f" (the first missing: {missing[0].name})" if missing else ""
+        raise InputError(f"{path}: {count} lines for {len(frame_paths)} frames{first}; one line a frame is needed")
 
 
-def check_size(path: Path, size: tuple[int, ...], first_size: tuple[int, int]) -> None:
-    """Raise InputError for a frame whose (height, width) is not that of the sequence's first one."""
-    if size != first_size:
-        raise InputError(f"{path}: {size[1]}x{size[0]} pixels; the first frame has {first_size[1]}x{first_size[0]}")
+def check_size(path: Path, size: tuple[int, ...], wanted: tuple[int, int], of: str = "the first frame") -> None:
+    """Raise InputError for an image whose (height, width) is not that `of` another one."""
+    if size != wanted:
+        raise InputError(f"{path}: {size[1]}x{size[0]} pixels; {of} has {wanted[1]}x{wanted[0]}")
 
 
 def _read_numbers(path, columns):
@@ -317,12 +302,11 @@ def read_poses(path: str | Path) -> np.ndarray:
     rows = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    rotations = poses[:, :3, :3]
+    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
     with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        mirrored = np.linalg.det(rotations) < 0
-    far = np.abs(poses[:, :3, 3]).max(axis=1) > MAX_POSITION
-    wrong = np.flatnonzero(~(error <= ROTATION_TOLERANCE) | mirrored | far)
+        errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        right = (errors <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
+    wrong = np.flatnonzero(~right | (np.abs(positions).max(axis=1) > MAX_POSITION))
     if len(wrong):
         raise InputError(f"{path}, line {wrong[0] + 1}: must be a right-handed rotation and a position in metres")
     return poses

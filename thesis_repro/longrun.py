@@ -17,6 +17,7 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 from datetime import timedelta
+from logging.handlers import MemoryHandler
 from pathlib import Path
 
 from thesis_repro import InputError, one_line
@@ -35,7 +36,7 @@ WORKER_KILLED = ("a process was killed, most likely because memory ran out; star
                  "JOBS), and it goes on")
 # what libraries write in errors of their own
 NO_MEMORY_TEXTS = ("MemoryError", "nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc",
-                  "ut of memory", "failed to map segment", "can't start new thread")
+                  "ut of memory", "ResourceExhausted", "failed to map segment", "can't start new thread")
 
 _log = logging.getLogger("thesis_repro")
 _log.addHandler(logging.NullHandler())
@@ -51,9 +52,8 @@ def explain(error):
     if isinstance(error, InputError):
         return str(error)
     while error is not None:
-        number, name, text = number_of(error), getattr(error, "filename", None), f"{type(error).__name__} {error}"
-        if number == errno.ENOMEM or text.startswith("ResourceExhausted") or any(words in text
-                                                                                 for words in NO_MEMORY_TEXTS):
+        number, name, text = number_of(error), getattr(error, "filename", None), f"{type(error).__name__}: {error}"
+        if number == errno.ENOMEM or any(words in text for words in NO_MEMORY_TEXTS):
             return NO_MEMORY
         if text.startswith("TerminatedWorkerError"):  # of joblib
             return WORKER_KILLED
@@ -65,10 +65,8 @@ def explain(error):
 
 def number_of(error):
     """The system's number of an error, or None. HDF5 and others give the system's text alone."""
-    if getattr(error, "errno", None) is not None:
-        return error.errno
-    return next((number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error)),
-                None)
+    numbers = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return getattr(error, "errno", None) or next((n for n in numbers if os.strerror(n) in str(error)), None)
 
 
 def need_addresses(gigabytes):
@@ -80,9 +78,9 @@ def need_addresses(gigabytes):
 
 def remedy(text):
     """What to do about an error of which only the text is known, to be put behind it; empty for most errors."""
-    if any(words in text for words in NO_MEMORY_TEXTS):
-        return f"; {NO_MEMORY}"
-    return next((f"; {REMEDIES[number]}" for number in REMEDIES if os.strerror(number) in text), "")
+    remedies = dict.fromkeys(NO_MEMORY_TEXTS, NO_MEMORY)
+    remedies |= {os.strerror(number): remedy for number, remedy in REMEDIES.items()}
+    return next((f"; {remedy}" for words, remedy in remedies.items() if words in text), "")
 
 
 def report_error(error):
@@ -101,10 +99,9 @@ def temporary(path):
 
 def sweep(folder):
     """Delete half-written files of killed runs below a folder of results; no other run may be at work in it."""
-    for where, _, names in os.walk(folder):
-        for name in names:
-            if TEMPORARY.fullmatch(name):
-                Path(where, name).unlink(missing_ok=True)
+    for path in Path(folder).rglob(".*"):
+        if TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 _held = set()  # the folders that this process holds, by device and inode
@@ -144,8 +141,8 @@ def locked(path):
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(f"{path}: another run is at work there; wait, or name another folder") from None
-        except OSError:  # a file system without locks
-            pass
+        except OSError:
+            pass  # a file system without locks
         _held.add(key)
         yield
     finally:
@@ -156,28 +153,19 @@ def locked(path):
 # The log
 
 
-class _LogFile(logging.FileHandler):
+class _LogFile(MemoryHandler):
     """The log of a run. It starts once the folder holds results, so that a run which is refused leaves nothing."""
 
     def __init__(self, folder, ours):
-        super().__init__(folder / LOG, delay=True, encoding="utf-8")
-        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-        self.folder, self.ours, self.waiting = folder, ours, []
-        self.warnings, self.started = 0, time.monotonic()
+        super().__init__(1, target=logging.FileHandler(folder / LOG, delay=True, encoding="utf-8"), flushOnClose=False)
+        self.target.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+        self.target.handleError = lambda record: None  # the results report a full disk; the log need not
+        self.folder, self.ours, self.warnings, self.started = folder, ours, 0, time.monotonic()
 
-    def emit(self, record):
+    def shouldFlush(self, record):
         self.warnings += record.levelno == logging.WARNING
-        self.waiting.append(record)
         self.ours = self.ours or any(self.folder.glob(RECORD)) or any(self.folder.glob(f"*/{RECORD}"))
-        while self.ours and self.waiting:
-            super().emit(self.waiting.pop(0))
-
-    def close(self):
-        with suppress(OSError):
-            super().close()
-
-    def handleError(self, record):
-        pass  # the results report a full disk; the log need not
+        return self.ours
 
     def end(self, text):
         """Print what came of the run, how long it took, how many warnings there were, and where the log is."""
@@ -210,7 +198,8 @@ def logged(folder, what, ours=False):
         logging.captureWarnings(False)
         for logger in loggers:
             logger.removeHandler(handler)
-        handler.close()
+        with suppress(OSError):
+            handler.target.close()
 
 
 def say(text, warning=False):
@@ -241,16 +230,16 @@ def stoppable():
     def stop(number, _):
         raise Stopped(number)
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
-    ours = [number for number, handler in before.items()
-            if handler == signal.SIG_DFL and threading.current_thread() is threading.main_thread()]
-    for number in ours:
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    numbers = [number for number in (signal.SIGTERM, signal.SIGHUP)
+               if in_main_thread and signal.getsignal(number) == signal.SIG_DFL]
+    for number in numbers:
         signal.signal(number, stop)
     try:
         yield
     finally:
-        for number in ours:
-            signal.signal(number, before[number])
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def end_with_parent():

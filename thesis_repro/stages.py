@@ -15,8 +15,9 @@ import stat
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
+from modulefinder import ModuleFinder
 from pathlib import Path
 
 import numpy as np
@@ -39,18 +40,17 @@ def stage(folder, *, replace=True, **inputs):
     """
     folder = Path(folder)
     with longrun.claimed(folder):
-        wanted = json.loads(json.dumps(inputs, default=str))
-        earlier = record(folder)
-        if earlier is None and not all(_own(path) for path in folder.iterdir()):
+        wanted, earlier = json.loads(json.dumps(inputs, default=str)), record(folder)
+        names = [path.name for path in folder.iterdir()]
+        if earlier is None and not all(name in (LOG, LIST) or longrun.TEMPORARY.fullmatch(name) for name in names):
             raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
         if earlier is not None and earlier != wanted:
+            changed = ", ".join(sorted(key for key in wanted | earlier if wanted.get(key) != earlier.get(key)))
             if not replace:
-                other = [key for key in {**wanted, **earlier} if wanted.get(key) != earlier.get(key)]
-                raise InputError(f"{folder}: holds results of other settings ({', '.join(other)}); name another folder")
+                raise InputError(f"{folder}: holds results of other settings ({changed}); name another folder")
             if 2 * len(earlier.keys() & wanted.keys()) <= len(earlier.keys() | wanted.keys()):
                 raise InputError(f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
                                  "choose another folder")
-            changed = ", ".join(sorted(key for key in {**wanted, **earlier} if wanted.get(key) != earlier.get(key)))
             _empty(folder, changed)
         longrun.sweep(folder)
         if earlier != wanted:
@@ -58,19 +58,13 @@ def stage(folder, *, replace=True, **inputs):
     return folder
 
 
-def _own(path):
-    """Whether a file may lie in a folder that is going to be a stage: a log, or a record that was half written."""
-    return path.name in (LOG, LIST) or (path.name.startswith(f".{Path(RECORD).stem}.")
-                                and longrun.TEMPORARY.fullmatch(path.name) is not None)
-
-
 def _empty(folder, changed):
-    """Delete what is on the lists of a folder and of those in it, the records last: what is left when this is killed is
-    known to be ours. Raises InputError, before anything is deleted, for a file that is not ours."""
+    """Delete what is listed as written here, the records last: what is left when this is killed is known to be ours.
+    Raises InputError, before anything is deleted, for a file that is not ours."""
     listed, results, records = {}, [], []
     for path in folder.rglob(LIST):
         listed |= _listed(path.parent)
-    for path in (Path(where, name) for where, _, names in os.walk(folder) for name in names):
+    for path in (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()):
         if path.name in (RECORD, LIST):
             records.append(path)
         elif path.name != LOG and not longrun.TEMPORARY.fullmatch(path.name):
@@ -165,37 +159,23 @@ def code(*places):
 
     Everything of the package that they import counts with them. Comments and docstrings do not.
     """
-    trees = _trees(places)
     digest = hashlib.sha256()
-    for path in sorted(trees):
-        for node in ast.walk(trees[path]):
+    for path in _modules(places):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
                 node.body = node.body[1:]
-        digest.update(f"{path.relative_to(_PACKAGE)}{ast.dump(trees[path])}".encode())
+        digest.update(f"{path.relative_to(_PACKAGE)}{ast.dump(tree)}".encode())
     return digest.hexdigest()[:12]
 
 
-def _trees(places):
-    """The parsed modules of some places and of all that they import, {path: tree}."""
-    paths = [path for place in places
-             for path in (sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"])]
-    trees = {}
-    while paths:
-        path = paths.pop()
-        if path not in trees:
-            trees[path] = ast.parse(path.read_text(encoding="utf-8"))
-            paths += _imported(trees[path])
-    return trees
-
-
-def _imported(tree):
-    """The package's modules that a module imports."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == _PACKAGE.name:
-            place = "/".join(node.module.split(".")[1:])
-            for name in (place, *(f"{place}/{alias.name}".lstrip("/") for alias in node.names)):
-                yield from (path for path in (_PACKAGE / f"{name}.py", _PACKAGE / name / "__init__.py")
-                            if path.is_file())
+def _modules(places):
+    """The files of some places and of all of the package that they import, sorted."""
+    finder = ModuleFinder([str(_PACKAGE.parent)])
+    for place in places:
+        for path in sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"]:
+            finder.import_hook(".".join(path.relative_to(_PACKAGE.parent).with_suffix("").parts))
+    return sorted(Path(module.__file__) for module in finder.modules.values() if module.__file__)
 
 
 def made_with(*packages):
@@ -223,19 +203,22 @@ def contents(paths):
     """Digests of the bytes of files. They are remembered in the build folder, so a file is read again only where
     its path, size, dates or inode are others: gigabytes cost their reading once."""
     paths = [Path(path).absolute() for path in paths]
-    keys = [(json.dumps(str(path)), json.dumps(_identity(path))) for path in paths]
-    with closing(_remembered()) as database:
-        known = _known(database, keys)
-        unknown = {key: path for key, path in zip(keys, paths, strict=True) if key not in known}
-        with ThreadPoolExecutor(4) as pool:
-            digests = pool.map(_sha256, unknown.values())
-            fresh = dict(zip(unknown, progress(digests, "looking at the data once", len(unknown), unit="file")))
-        settled = [(*key, digest) for key, digest in fresh.items()
-                   if max(json.loads(key[1])[1:3]) < time.time_ns() - SETTLED * 1e9]
-        with suppress(sqlite3.Error), database:
-            database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", settled)
-    every = known | fresh
-    return [every[key][:12] for key in keys]
+    identities = {path: _identity(path) for path in paths}
+    keys = {path: (json.dumps(str(path)), json.dumps(identity)) for path, identity in identities.items()}
+    digests = {}
+    with suppress(OSError, sqlite3.Error), _remembered() as database:
+        query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
+        rows = ((path, database.execute(query, key).fetchone()) for path, key in keys.items())
+        digests = {path: row[0] for path, row in rows if row}
+    unknown = [path for path in keys if path not in digests]
+    with ThreadPoolExecutor(4) as pool:
+        read = pool.map(_sha256, unknown)
+        digests |= zip(unknown, progress(read, "looking at the data once", len(unknown), unit="file"))
+    settled = [path for path in unknown if max(identities[path][1:3]) < time.time_ns() - SETTLED * 1e9]
+    with suppress(OSError, sqlite3.Error), _remembered() as database:
+        database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)",
+                             [(*keys[path], digests[path]) for path in settled])
+    return [digests[path][:12] for path in paths]
 
 
 def _identity(path):
@@ -245,27 +228,14 @@ def _identity(path):
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
 
 
+@contextmanager
 def _remembered():
-    """The database of digests; one in memory where none can be kept."""
-    table = "CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)"
-    try:
-        folder = Path(os.environ.get("THESIS_REPRO_BUILD") or _PACKAGE.parent / "build")
-        folder.mkdir(parents=True, exist_ok=True)
-        database = sqlite3.connect(folder / "digests.sqlite", timeout=2)
-        database.execute(table)
-    except (OSError, RuntimeError, sqlite3.Error):
-        database = sqlite3.connect(":memory:")
-        database.execute(table)
-    return database
-
-
-def _known(database, keys):
-    try:
-        query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
-        rows = ((key, database.execute(query, key).fetchone()) for key in keys)
-        return {key: row[0] for key, row in rows if row}
-    except sqlite3.Error:
-        return {}
+    """The database of digests. Where none can be kept, files are read again."""
+    folder = Path(os.environ.get("THESIS_REPRO_BUILD") or _PACKAGE.parent / "build")
+    folder.mkdir(parents=True, exist_ok=True)
+    with closing(sqlite3.connect(folder / "digests.sqlite", timeout=2)) as database, database:
+        database.execute("CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)")
+        yield database
 
 
 def _sha256(path):
