@@ -59,7 +59,7 @@ MOVED = np.roll(LABEL_MAP, 14, axis=1)
 MASK = 255 * (LABEL_MAP == ID["car"]).astype(np.uint8)
 POINTS = np.array([[110.0, 50.0], [120.0, 60.0]])
 DRAWN = {
-    "2.1": chapter2.figure_2_01, "2.4": chapter2.figure_2_04, "2.5": chapter2.figure_2_05,
+    "2.1": chapter2.figure_2_01,
     "2.2": lambda: chapter2.figure_2_02(*convolution()),
     "2.2 of three channels": lambda: chapter2.figure_2_02(*convolution(3)),
     "2.7": lambda: chapter2.figure_2_07(unet(4)),

@@ -1,19 +1,18 @@
 """The figures of chapter 2, drawn anew from the project's own network and data: networks, odometry, keypoints.
 
-Figures 2.3, 2.6 and 3.4, curves of formulas, are drawn in cells of notebooks 3 and 4.
+What follows from a formula alone, Figures 2.3 to 2.6 and 3.4, is drawn in cells of notebooks 3 and 4.
 """
 
 import cv2
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgba_array
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from thesis_repro.odometry import metrics
 from thesis_repro.report import style
-from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, PINK, RED, SKY
+from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 GRAY, LIGHT_GRAY = "#777777", "#bbbbbb"
 
@@ -59,45 +58,12 @@ def figure_2_02(patch, kernel, bias, feature_map, activated, where):
         panel.add_patch(Rectangle((column - side / 2, row - side / 2), side, side, fill=False, edgecolor=RED))
     field = patch[row - reach:row + reach + 1, column - reach:column + reach + 1]
     sums = (field * kernel).sum(axis=(0, 1))
-    _numbers(axes[1, 0], field[..., 0], "its receptive field x (marked)", ".0f")
-    _numbers(axes[1, 1], kernel[..., 0], "times the kernel's weights w", ".4f")
-    _numbers(axes[1, 2], (field * kernel)[..., 0], "is w x", ".2f")
+    show_numbers(axes[1, 0], field[..., 0], "its receptive field x (marked)", ".0f")
+    show_numbers(axes[1, 1], kernel[..., 0], "times the kernel's weights w", ".4f")
+    show_numbers(axes[1, 2], (field * kernel)[..., 0], "is w x", ".2f")
     first = "" if len(sums) == 1 else " (above: the first channel)"
     figure.supxlabel(f"y = b + Σ w x = {bias:.2f} + {' + '.join(f'{term:.2f}' for term in sums)} = "
                      f"{bias + sums.sum():.2f}{first}", fontsize=9)
-    return figure
-
-
-def figure_2_04():
-    """Figure 2.4: a 4x4 array under 2x2 max pooling with stride 2."""
-    values = np.random.default_rng(0).permutation(np.arange(1, 17)).reshape(4, 4)
-    pooled = values.reshape(2, 2, 2, 2).max(axis=(1, 3))
-    figure, axes = style.new_figure(1, 2, height=1.9, width=3.6, width_ratios=[4, 2])
-    colors = to_rgba_array([SKY, ORANGE, GREEN, PINK]).reshape(2, 2, 4)
-    blocks = colors.repeat(2, axis=0).repeat(2, axis=1)
-    blocks[..., 3] = np.where(values == pooled.repeat(2, axis=0).repeat(2, axis=1), 0.75, 0.25)
-    _numbers(axes[0], values, "feature map, 4x4", "d", blocks)
-    _numbers(axes[1], pooled, "2x2 max pooling,\nstride 2", "d", colors)
-    axes[1].set_ylim(2.5, -1.5)  # four rows, as the other panel, so that all cells are of one size
-    axes[0].annotate("", (-0.05, 0.5), (1.03, 0.5), axes[1].transAxes, axes[0].transAxes,
-                     arrowprops={"arrowstyle": "-|>", "color": "black"})
-    return figure
-
-
-def figure_2_05():
-    """Figure 2.5: a feature vector x through a dense layer, W x, and softmax to class scores."""
-    rng = np.random.default_rng(0)
-    weights, features = rng.normal(size=(3, 5)).round(1), rng.normal(size=(5, 1)).round(1)
-    sums = weights @ features
-    scores = (np.exp(sums) / np.exp(sums).sum()).ravel()
-    figure, axes = style.new_figure(1, 4, height=2.1, width_ratios=[5, 1.5, 2, 4])
-    _numbers(axes[0], weights, "dense layer: weights W,\none row a class", ".1f")
-    _numbers(axes[1], features, "features x", ".1f")
-    _numbers(axes[2], sums, "scores W x", ".2f")
-    axes[3].barh(["class 1", "class 2", "class 3"], scores, color=GREEN)
-    axes[3].bar_label(axes[3].containers[0], fmt="%.2f", padding=3)
-    axes[3].invert_yaxis()
-    axes[3].set(title="softmax: exp(score) / sum of all", xlim=(0, 1), xlabel="probability")
     return figure
 
 
@@ -224,7 +190,7 @@ def _arrow(axes, start, end, color="black", **options):
     axes.annotate("", end, start, zorder=0, arrowprops=looks)
 
 
-def _numbers(axes, values, title, form, colors=None):
+def show_numbers(axes, values, title, form, colors=None):
     """An array as a table of numbers, on `colors` (h, w, 4) or on a scale whose middle is zero."""
     limit = np.abs(values).max()
     style.show_image(axes, values if colors is None else colors, title, cmap="PuOr", vmin=-2 * limit, vmax=2 * limit)
