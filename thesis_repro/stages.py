@@ -107,6 +107,19 @@ def made_from(folder):
     return content(Path(folder) / RECORD)
 
 
+def check_worker(folder, made_from, **here):
+    """Raise InputError where this worker does not see the record of a stage that the others see, or has other inputs.
+
+    made_from: the record that the others see. here: inputs as this worker has them, such as versions of packages.
+    """
+    if record(folder) != made_from:
+        raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
+                         "folders under the same paths")
+    if made_from | here != made_from:
+        raise InputError("this worker has another model, or another version of thesis_repro or its packages; give all "
+                         "of them the same, and start them again")
+
+
 TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
 
 

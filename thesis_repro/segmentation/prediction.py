@@ -180,14 +180,9 @@ def ensemble(models):
 def _write_part(model_files, folder, record, batches):
     """Write some batches of a sequence, here or on another machine; returns why that failed, None where it did not."""
     try:
-        if stages.record(folder) != record:
-            raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
-                             "folders under the same paths")
+        stages.check_worker(folder, record)
         model = load(model_files)
-        here = {"model": training.weights_digest(model), **_arithmetic()}
-        if record | here != record:
-            raise InputError(f"{', '.join(model_files)}: this worker has another model, or another version of "
-                             "thesis_repro; give all of them the same, and start them again")
+        stages.check_worker(folder, record, model=training.weights_digest(model), **_arithmetic())
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # whatever it is, the other parts go on and the reason is reported
         return longrun.explain(error) or f"{type(error).__name__}: {error}"

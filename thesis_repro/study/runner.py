@@ -5,7 +5,8 @@ Each finished run is one CSV file, one row a frame. A stopped or failed study go
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -82,11 +83,11 @@ def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) 
                 path.unlink()  # what is missing is made again
     finished = sum(study.result(job).is_file() for job in jobs)
     failures: dict[Job, str] = {}
+    lengths = {name: len(sequence) for name, sequence in sequences.items()}
     with cluster.open_pool(processes, scheduler) as pool:
-        lengths = {name: len(sequence) for name, sequence in sequences.items()}
         passes = _passes(jobs, lengths, study, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
-        calls = [(of_pass, study, stages.made_from(study.folder / of_pass[0].sequence), threads)
+        calls = [(of_pass, study, stages.record(study.folder / of_pass[0].sequence), threads)
                  for of_pass in passes]
         work = [len(of_pass) * lengths[of_pass[0].sequence] for of_pass in passes]  # a frame of each run
         with progress(None, "odometry", total=sum(work), unit="frame") as bar:
@@ -158,7 +159,10 @@ def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: 
         of_name = {job.name: job for job in jobs if job.sequence == name}
         waiting = {key: job for key, job in of_name.items() if not study.result(job).is_file()}
         for state in sorted((study.folder / name).glob(STATES)):
-            keys = _jobs_in(state)
+            checkpoint = None
+            with suppress(InputError):  # it is damaged
+                checkpoint = stages.resume(state, arrays=False)
+            keys = checkpoint[0]["job"]["runs"] if checkpoint else []
             if not of_name.keys() >= set(keys):
                 continue  # somebody may ask for these again
             if waiting.keys().isdisjoint(keys):
@@ -170,15 +174,6 @@ def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: 
     return sorted(passes + in_passes(rest, frames, workers), key=lambda jobs: -len(jobs) * frames[jobs[0].sequence])
 
 
-def _jobs_in(state: Path) -> list[str]:
-    """The names of the jobs in a checkpoint, none where it is damaged."""
-    try:
-        checkpoint = stages.resume(state, arrays=False)
-    except InputError:
-        return []
-    return list(checkpoint[0]["job"]["runs"]) if checkpoint else []
-
-
 def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
              ) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
     """The masks of each job over a sequence, {job: masks}, and {job: reason} of those whose masks cannot be made.
@@ -187,27 +182,29 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Sour
     the same object: so `run_many` knows that they share the work.
     """
     check = cache(lambda source, path: sources[source].check_file(path, sequence.size))
-    by_kind: dict[tuple, controls.ControlMasks | None] = {}
-    reasons: dict[tuple, str] = {}
-    kinds = {job: (job.source, job.method, job.dilation_width) for job in jobs}
-    for kind, job in {kind: job for job, kind in kinds.items()}.items():
+
+    @cache
+    def read(job: Job) -> controls.ControlMasks | str | None:
         try:
-            by_kind[kind] = its_masks = job.masks(sequence, sources)
+            its_masks = job.masks(sequence, sources)
             for path in its_masks.paths if its_masks is not None else ():
                 check(job.source, path)
         except InputError as error:
-            reasons[kind] = str(error)
-    return ({job: by_kind[kind] for job, kind in kinds.items() if kind not in reasons},
-            {job: reasons[kind] for job, kind in kinds.items() if kind in reasons})
+            return str(error)
+        return its_masks
+
+    masks = {job: read(Job("", job.method, job.dilation_width, source=job.source)) for job in jobs}
+    reasons = {job: reason for job, reason in masks.items() if isinstance(reason, str)}
+    return {job: its_masks for job, its_masks in masks.items() if not isinstance(its_masks, str)}, reasons
 
 
-def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict[Job, str]:
+def _run_pass(jobs: list[Job], study: _Study, record: dict, threads: int) -> dict[Job, str]:
     """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason} of those that failed."""
     cv2.setNumThreads(1)  # the processes already use every core
     name, state = jobs[0].sequence, study.state(jobs)
     failures: dict[Job, str] = {}
     try:
-        _check_machine(study.folder / name, record)
+        stages.check_worker(study.folder / name, record, **_versions())
         sequence = study.sequence(name)
         # all of them where there is a checkpoint to go on from, for it is one of all of them
         waiting = jobs if state.is_file() else [job for job in jobs if not study.result(job).is_file()]
@@ -230,22 +227,9 @@ def _run_pass(jobs: list[Job], study: _Study, record: str, threads: int) -> dict
     return failures
 
 
-def _check_machine(folder: Path, digest: str) -> None:
-    made_from = stages.record(folder)
-    if made_from is None or stages.made_from(folder) != digest:
-        raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
-                         "folders under the same paths")
-    if any(made_from[key] != value for key, value in _versions().items()):
-        raise InputError("this worker has another version of thesis_repro or of OpenCV; install the same on all")
-
-
 def _row(job: Job, sequence: Sequence, result: Path) -> dict[str, Any]:
     frames = pd.read_csv(result, keep_default_na=False, na_values={"detected": "", "tracked": ""})
-    return {
-        "sequence": job.sequence, "run": job.name, "source": job.source, "method": job.method,
-        "dilation_width": job.dilation_width, "max_keypoints": job.max_keypoints, "min_distance": job.min_distance,
-        "estimator": job.estimator, "repetition": job.repetition, **measures(frames, sequence.poses),
-    }
+    return {"sequence": job.sequence, "run": job.name, **asdict(job), **measures(frames, sequence.poses)}
 
 
 def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
@@ -294,5 +278,6 @@ def paths(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]
 
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
+    """Estimated poses (n, 4, 4) of each row of a table of runs, keyed by sequence and run."""
     return {(name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
             for name, run in zip(runs["sequence"], runs["run"], strict=True)}
