@@ -45,10 +45,10 @@ def halved(name, method, _):
     return (0.5 if method == "masked" else 1.0) * (1 + int(name) / 10)
 
 
-@pytest.mark.parametrize("metric, key, total, median, improved", [
-    ("rmse", "table_4_2_rmse_percent_change", -13.2, -5.27, 6),
-    ("mae", "table_4_3_mae_percent_change", -25.65, 1.76, 4)])
-def test_the_thesis_tables_come_out_of_the_thesis_numbers(metric, key, total, median, improved):
+@pytest.mark.parametrize("metric, key, total, mean, median, improved", [
+    ("rmse", "table_4_2_rmse_percent_change", -13.2, -1.2, -5.27, 6),
+    ("mae", "table_4_3_mae_percent_change", -25.65, -2.33, 1.76, 4)])
+def test_the_thesis_tables_come_out_of_the_thesis_numbers(metric, key, total, mean, median, improved):
     reported = REPORTED[key]
     runs = runs_of(list(reported), lambda name, method, width: 2.0 if method == "baseline" else 2 * (
         1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0))
@@ -57,7 +57,7 @@ def test_the_thesis_tables_come_out_of_the_thesis_numbers(metric, key, total, me
                            "change (%), thesis"]
     for column in ("change (%)", "change (%), thesis"):
         assert table.loc["sum (the thesis's aggregate)", column] == pytest.approx(total, abs=0.06)
-        assert table.loc["median", column] == pytest.approx(median, abs=0.05)
+        assert table.loc[["mean", "median"], column].tolist() == pytest.approx([mean, median], abs=0.05)
         assert table.loc["sequences improved", column] == improved
     widths = tables.table_4_1(runs, "thesis")
     assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[:2] == [10, 11]

@@ -4,7 +4,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro import InputError
 from thesis_repro.report import texts
 from thesis_repro.study import compare
 
@@ -58,13 +57,10 @@ def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
 @pytest.mark.parametrize("factor, verdict", [(0.5, "lower"), (2.0, "higher"), (1.0, "no clear difference"),
                                              (lambda name: 2.0 ** (int(name) % 2 * 2 - 1), "no clear difference")])
 def test_the_verdict_follows_the_interval(factor, verdict):
-    result = ratio_of(*arms(runs_of({"masked": factor}), "masked", "baseline"))
-    assert result["verdict"] == verdict
-
-
-@pytest.mark.parametrize("count, verdict", [(5, "no clear difference"), (6, "lower")])
-def test_a_verdict_needs_six_sequences(count, verdict):
-    assert compare.geometric_mean([0.5 + 0.01 * index for index in range(count)])["verdict"] == verdict
+    masked, baseline = arms(runs_of({"masked": factor}), "masked", "baseline")
+    assert ratio_of(masked[masked["sequence"] < "06"], baseline)["verdict"] == verdict
+    of_five = ratio_of(masked[masked["sequence"] < "05"], baseline)  # which are too few for one
+    assert of_five["n"] == 5 and of_five["verdict"] == "no clear difference"
 
 
 def test_the_interval_covers_the_true_mean_about_as_often_as_it_says():
@@ -119,8 +115,7 @@ def test_the_tested_width_is_that_of_the_controls():
     assert compare.tested_width(runs_of({})) == 10
     assert compare.tested_width(runs_of({"masked": 0.5}, width=np.nan)) is None  # masks that came ready made
     assert (compare.keypoints_left(narrow) == 900).all()
-    with pytest.raises(InputError, match="controls of the widths 5, 7"):
-        compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)]))
+    assert compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 
 
 def test_the_mean_of_equal_errors_is_among_them():

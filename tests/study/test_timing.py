@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro import InputError, cityscapes, masks, odometry, stages
+from thesis_repro import InputError, cityscapes, masks, odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.segmentation import prediction, training
+from thesis_repro.segmentation import prediction
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.study import timing
 
@@ -52,19 +52,6 @@ def test_its_masks_and_steps_are_those_of_a_run(sequence, model, tmp_path, monke
     for of_method, expected in ((steps[:10:2], odometry.run(short)), (steps[1:10:2], odometry.run(short, masks=made))):
         assert np.array_equal([each.pose for each in of_method], expected.poses)
         assert [each.detected for each in of_method] == expected.frames["detected"].tolist()
-
-
-def test_it_is_measured_once_for_a_model(sequence, model, tmp_path, monkeypatch):
-    training_file = tmp_path / "model.keras"
-    model.save(training_file)
-    first = timing.frame_times(tmp_path / "timing", sequence, training_file)
-    monkeypatch.setattr(training, "load_model", lambda path: pytest.fail("measured again"))
-    assert first.equals(timing.frame_times(tmp_path / "timing", sequence, training_file))
-    with pytest.raises(pytest.fail.Exception, match="measured again"):
-        timing.frame_times(tmp_path / "timing", sequence, training_file, width=5)
-    monkeypatch.setattr(stages, "content", lambda path: "another model")
-    with pytest.raises(pytest.fail.Exception, match="measured again"):
-        timing.frame_times(tmp_path / "timing", sequence, training_file)
 
 
 def test_too_few_frames_are_refused(sequence, model):

@@ -23,7 +23,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from thesis_repro import InputError
 from thesis_repro.odometry.metrics import RELATIVE_LENGTH
 from thesis_repro.study.controls import MASKS
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
@@ -232,21 +231,14 @@ def sources(runs: pd.DataFrame) -> list[str]:
 def tested_width(runs: pd.DataFrame) -> int | None:
     """The dilation width (pixels) at which masks are put to the test: that of the controls, or the only one there is.
 
-    CONTROL_WIDTH where neither says it; None for masks that came ready made. Raises InputError where the mask controls
-    of several widths leave it open.
+    CONTROL_WIDTH where neither says it; None for masks that came ready made.
     """
     masked = runs.loc[runs["method"] == "masked", "dilation_width"]
     if len(masked) and masked.isna().all():
         return None
-    widths = sorted(runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique())
-    if CONTROL_WIDTH in widths:
-        return CONTROL_WIDTH
-    if len(widths) > 1:
-        raise InputError(f"controls of the widths {', '.join(f'{width:g}' for width in widths)}; masks are put "
-                         "to the test at one width, so list the controls of one")
-    if not widths and masked.nunique() == 1:
-        widths = list(masked.unique())
-    return int(widths[0]) if widths else CONTROL_WIDTH
+    of_controls = runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique()
+    widths = of_controls if len(of_controls) else masked.unique()
+    return int(widths[0]) if len(widths) == 1 else CONTROL_WIDTH
 
 
 def keypoints_left(runs: pd.DataFrame) -> pd.Series:

@@ -31,13 +31,17 @@ class Study:
     repetitions: int = 1
     frames: int | None = None
 
+    def opened(self) -> list[Sequence]:
+        """The sequences, cut to their frames."""
+        return [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
+
     def check(self) -> None:
         """Raise InputError for the first thing that a run would need and that is not there."""
         if self.frames is not None and self.frames < 3:
             raise InputError(f"--frames {self.frames}: must be 3 or more")
         if not 1 <= self.repetitions <= MOST_REPETITIONS:
             raise InputError(f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}")
-        sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
+        sequences = self.opened()
         for sequence in sequences:
             if len(sequence) < 3:
                 raise InputError(f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more")
@@ -50,9 +54,8 @@ class Study:
 
     def masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
         """Each sequence with the masks of each source, of the width that is shown."""
-        sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
         return [(sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
-                for sequence in sequences]
+                for sequence in self.opened()]
 
     def shown_jobs(self, name: str) -> list[jobs.Job]:
         """The runs of a sequence whose paths are drawn: all keypoints, and the masks of each source."""
@@ -64,8 +67,8 @@ class Study:
     def write_paths(self, runs: pd.DataFrame, folder: Path) -> None:
         """Write repetition 0 of every run, and the truth, into folder/PATHS, in KITTI's and in TUM's form."""
         estimated = runner.run_poses(runs[runs["repetition"] == 0], folder / "runs")
-        for name in self.sequences:
-            sequence = Sequence(self.kitti, name).subset(self.frames)
+        for sequence in self.opened():
+            name = sequence.name
             of_sequence = {run: poses for (its_sequence, run), poses in estimated.items() if its_sequence == name}
             for run, poses in {"truth": sequence.poses, **of_sequence}.items():
                 write_kitti_poses(folder / PATHS / "kitti" / name / f"{run}.txt", poses)

@@ -36,11 +36,6 @@ def changes(rows: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> pd.Serie
     return percent_change(*(runs.groupby("sequence")[metric].mean() for runs in (rows, baseline)))
 
 
-def width_changes(masked: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Equation 4.1 for masks of every width: one row a sequence, one column a dilation width."""
-    return pd.DataFrame({width: changes(rows, baseline, metric) for width, rows in masked.groupby("dilation_width")})
-
-
 def chosen_widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     """The dilation width of each sequence, chosen in three ways, always by RMSE. One row a sequence.
 
@@ -50,7 +45,7 @@ def chosen_widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     The choices share data, so an interval of what left_out gives is too narrow: where masks do nothing, it excludes 1
     in one of three studies of eleven sequences and fifteen widths.
     """
-    table = width_changes(masked, baseline, "rmse")
+    table = pd.DataFrame({width: changes(rows, baseline, "rmse") for width, rows in masked.groupby("dilation_width")})
     return pd.DataFrame({"best": best_widths(masked)["dilation_width"].reindex(table.index),
                          "left_out": [_lowest(table.drop(index=name)) for name in table.index],
                          "fixed": _lowest(table)}, index=table.index).astype("Int64")

@@ -74,26 +74,10 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
                 if index > 1:
                     # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
                     seconds[job] += masking + sum(step.seconds.values())
-    columns = ["sequence", "run", "method", "dilation_width", "seconds"]
-    table = pd.DataFrame([(job.sequence, job.name, job.method, job.dilation_width, value)
-                          for job, value in seconds.items()], columns=columns)
+    table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "method": job.method,
+                           "dilation_width": job.dilation_width, "seconds": value} for job, value in seconds.items()])
     write_text(path, table.to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
-
-
-def frame_times(folder: Path, sequence: Sequence, model_file: Path, width: int = CONTROL_WIDTH,
-                boundaries: str = "canny") -> pd.DataFrame:
-    """`measure` with the model in a file. The folder keeps the table until frames, masks, model or code change."""
-    short = sequence.subset(FRAMES + WARM_UP)
-    path = stages.stage(folder, code=stages.code("study/timing"), model=stages.content(model_file),
-                        opencv=cv2.__version__, sequence=stages.listing(short.files), width=width,
-                        boundaries=boundaries) / "budget.csv"
-    if stages.kept_table(path) is None:
-        from thesis_repro.segmentation import training  # here and below: TensorFlow takes seconds to load
-
-        table = measure(short, training.load_model(model_file), width, boundaries)
-        write_text(path, table.to_csv(index=False))
-    return pd.read_csv(path)
 
 
 def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH, boundaries: str = "canny") -> pd.DataFrame:
