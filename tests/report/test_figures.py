@@ -1,7 +1,6 @@
 """Figures of chapters 2 and 3, and of frames in chapter 4: they show what the data says, and all can be read."""
 
 import numpy as np
-import pandas as pd
 import pytest
 from drawn import problems
 from matplotlib.text import Text
@@ -46,12 +45,6 @@ def unet(base_filters):
     return build_unet((32, 32, 1), 35, base_filters=base_filters)
 
 
-def history():
-    loss = np.array([0.9, 0.2, -0.1, -0.3, -0.2])
-    columns = {"loss": loss, "f1-score": 1 - loss, "iou_score": 1 - loss}
-    return pd.DataFrame({"epoch": range(1, 6)} | columns | {f"val_{name}": values for name, values in columns.items()})
-
-
 FRAME, LATER = textured(), textured(5)
 LABEL_MAP = np.full(FRAME.shape, ID["road"], np.uint8)
 LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = ID["car"], ID["sky"], ID["license plate"]
@@ -69,13 +62,10 @@ DRAWN = {
     "2.11": lambda: chapter2.figure_2_11(FRAME, LATER, (POINTS, POINTS), POINTS[:0], POINTS, ("frame 0", "frame 5")),
     "2.12": lambda: chapter2.figure_2_12(FRAME, POINTS, LABEL_MAP, POINTS, ("frame 0", "its label map")),
     "3.3": lambda: chapter3.figure_3_03(FRAME, LABEL_MAP, np.roll(LABEL_MAP, 9), LABELS[ID["car"]]),
-    "3.5": lambda: chapter3.figure_3_05(10 ** np.minimum(np.arange(35), 7), 4),
-    "3.5 of one class": lambda: chapter3.figure_3_05(np.eye(35, dtype=int)[ID["car"]], 1),
     "3.6": lambda: chapter3.figure_3_06(FRAME, LABEL_MAP, MASK, MASK, 10),
     "masks": lambda: chapter3.figure_masks(FRAME, dict.fromkeys("abc", MASK), dict.fromkeys("abc", POINTS), MASK),
     "A.1": lambda: chapter3.figure_a_01([{"layer": "conv2d", "output_shape": "(None, 320, 320, 64)", "params": 640,
                                           "connected_to": "input"}] * 20, 12800, 12000),
-    "4.1": lambda: chapter4_frames.figure_4_01(history()),
     "4.2": lambda: chapter4_frames.figure_4_02(FRAME[:, :120], LABEL_MAP[:, :120], LABEL_MAP[:, 100:220], "this model"),
     "4.3": lambda: chapter4_frames.figure_4_03(FRAME, LABEL_MAP[::2, ::3], "sequence 00, frame 0", LABEL_MAP),
     "4.4": lambda: chapter4_frames.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
@@ -118,12 +108,6 @@ def test_relative_motions_are_measured_between_the_poses():
     shown = texts(chapter2.figure_2_08(turning(), "title"))
     assert any("{1,0}" in text and "2.0 m, 0.0°" in text for text in shown)
     assert any("{3,2}" in text and "1.4 m, 30.0°" in text for text in shown)
-
-
-def test_best_epoch_and_zero_are_marked_on_the_loss():
-    panel = chapter4_frames.figure_4_01(history()).axes[2]
-    assert [4, -0.3] in [list(line.get_xydata()[0]) for line in panel.lines if len(line.get_xydata()) == 1]
-    assert [0, 0] in [list(line.get_ydata()) for line in panel.lines]
 
 
 def test_a_pure_shift_is_found_again():

@@ -1,6 +1,6 @@
 """The figures of chapter 2, drawn anew from the project's own network and data: networks, odometry, keypoints.
 
-What follows from a formula alone, Figures 2.3 to 2.6 and 3.4, is drawn in cells of notebooks 3 and 4.
+Plots of a formula or of one table, Figures 2.3 to 2.6, 3.4, 3.5 and 4.1, are drawn in cells of notebooks 1, 3 and 4.
 """
 
 import cv2

@@ -1,10 +1,9 @@
-"""The figures of chapter 3 and A.1: intersection over union, categories, masks, the network's layers."""
+"""The figures of chapter 3 and A.1: intersection over union, masks, the network's layers."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
-from thesis_repro.cityscapes import LABELS
 from thesis_repro.report import style
 from thesis_repro.report.style import BLUE, EDGE_COLOR, KEYPOINT, ORANGE, SKY
 
@@ -31,24 +30,6 @@ def figure_3_03(image, label_map, prediction, label):
                            Patch(color=SKY, label="only in the prediction")],
                   title=f"class {label.name}; the three colours together are the union", title_fontsize=8,
                   loc="outside lower center", ncols=3)
-    return figure
-
-
-def figure_3_05(counts, n_images):
-    """Figure 3.5: pixels of each category in the training data at hand; counts: (35,) by label id."""
-    present = sorted((label for label in LABELS[:len(counts)] if counts[label.id]), key=lambda label: -counts[label.id])
-    pixels = [counts[label.id] for label in present]
-    figure, axes = style.new_figure(height=3.4)
-    axes.bar([label.name for label in present], pixels, color=[np.array(label.color) / 255 for label in present],
-             edgecolor="#555555", linewidth=0.5)
-    style.ratio_axis(axes.yaxis, [min(pixels) / 2, max(pixels)])
-    axes.yaxis.set_major_formatter("{x:,.0f}")
-    axes.set(ylabel="pixels", xlabel="category", title=f"{n_images} training label maps")
-    axes.tick_params(axis="x", labelrotation=45, labelsize=8)
-    for name in axes.get_xticklabels():
-        name.set(ha="right", rotation_mode="anchor")
-    axes.margins(x=0.01)
-    axes.grid(axis="x", visible=False)
     return figure
 
 

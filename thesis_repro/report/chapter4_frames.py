@@ -1,4 +1,4 @@
-"""Figures 4.1 to 4.5 and 4.8: the training, its predictions, and the keypoints that masks leave on frames."""
+"""Figures 4.2 to 4.5 and 4.8: predictions, and the keypoints that masks leave on frames."""
 
 import numpy as np
 from matplotlib.lines import Line2D
@@ -6,25 +6,7 @@ from matplotlib.patches import Patch
 
 from thesis_repro.cityscapes import colorize
 from thesis_repro.report import style
-from thesis_repro.report.style import BLUE, EDGE_COLOR, KEYPOINT, ORANGE, PAGE_WIDTH, PINK
-
-
-def figure_4_01(history):
-    """Figure 4.1: F1 score, IoU score and loss of training and validation, one point an epoch, the best one marked."""
-    figure, axes = style.new_figure(1, 3, height=2.6)
-    best = history.loc[history["val_loss"].idxmin()]
-    for panel, (column, title) in zip(axes, (("f1-score", "(a) F1 score"), ("iou_score", "(b) IoU score"),
-                                             ("loss", "(c) loss")), strict=True):
-        panel.plot(history["epoch"], history[column], color=BLUE, label="training")
-        panel.plot(history["epoch"], history[f"val_{column}"], color=ORANGE, linestyle="--", label="validation")
-        panel.plot(best["epoch"], best[f"val_{column}"], "o", color=ORANGE, markeredgecolor="black", markersize=6,
-                   label=f"lowest validation loss (epoch {best['epoch']:.0f})")
-        panel.set(title=title, xlabel="epoch", ylabel=f"{title[4:]} (no unit)")
-        panel.xaxis.get_major_locator().set_params(integer=True)
-    if history[["loss", "val_loss"]].min(axis=None) < 0:
-        axes[2].axhline(0, color="black", linewidth=0.8)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return figure
+from thesis_repro.report.style import EDGE_COLOR, KEYPOINT, PAGE_WIDTH, PINK
 
 
 def figure_4_02(image, label_map, prediction, whose):

@@ -28,7 +28,7 @@ def draw_frame(frame, step, settings=THESIS, mask=None):
     image = cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR)
     if mask is not None:
         contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
-        cv2.drawContours(image, contours, -1, OUTLINE, 1)
+        cv2.drawContours(image, contours, -1, OUTLINE)
         everywhere = keypoints.detect(frame, settings)
         columns, rows = np.rint(everywhere).astype(int).T
         _dots(image, everywhere[mask[rows, columns] == 0], DISCARDED)
@@ -56,14 +56,13 @@ def pictures(sequence, settings=THESIS, masks=None):
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.2, 0.6, 0.75), xlabel="x (m)", ylabel="z (m)")
     axes.set_aspect("equal", adjustable="datalim")
-    # The true path starts at frame 1 for the errors; here both start where the odometry does.
-    true = sequence.poses.copy() if sequence.has_truth else None
-    if true is not None:
-        true[:, :3, 3] += odometry.pose[:3, 3] - true[0, :3, 3]
-        axes.plot(true[:, 0, 3], true[:, 2, 3], color=TRUTH, label="ground truth")
+    true, metres, poses = None, scales(sequence), []
+    if sequence.has_truth:  # for the errors, the true path starts at frame 1; here both start where the odometry does
+        true = sequence.poses[:, :3, 3] + odometry.pose[:3, 3] - sequence.poses[0, :3, 3]
+        axes.plot(true[:, 0], true[:, 2], color=TRUTH, label="ground truth")
     (path,) = axes.plot([], [], color=BASELINE, label="estimate")
     figure.legend(loc="lower right")
-    words, metres, poses = figure.text(0.7, 0.95, "", va="top"), scales(sequence), []
+    words = figure.text(0.7, 0.95, "", va="top")
     for index in progress(range(len(sequence)), "video"):
         frame, mask = sequence.frame(index), None if masks is None else masks[index]
         step = odometry.step(frame, metres[index], mask)
@@ -81,7 +80,7 @@ def _description(step, true, masked):
     """What happened in a step, in lines that name the colours of the frame."""
     row, lines = step.row(), [f"frame {step.frame}"]
     if true is not None:
-        lines.append(f"{np.linalg.norm(step.pose[:3, 3] - true[step.frame, :3, 3]):.2f} m from the truth")
+        lines.append(f"{np.linalg.norm(step.pose[:3, 3] - true[step.frame]):.2f} m from the truth")
     if step.detected is not None:
         lines.append(f"{step.detected} keypoints (blue)")
     if masked:
