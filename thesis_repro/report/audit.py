@@ -1,8 +1,7 @@
 """The audit: where the thesis contradicts itself, its code or its libraries, and what each of these does, in numbers.
 
-audit.json has the rows, and lists what is measured of which table. The functions here turn tables into measurements,
-one dictionary each; `table` joins them to the rows. Ratios are those of `study.compare`; intervals are bootstrap
-intervals over what `n` counts: sequences, where nothing else is said.
+audit.json has the rows, and lists what is measured of which table; `table` joins measurements to the rows. Ratios are
+those of `study.compare`; intervals are bootstrap intervals over what `n` counts: sequences, unless said otherwise.
 """
 
 import json
@@ -62,12 +61,6 @@ def table(measurements, data="this run"):
 def rounded(value):
     """A number to four significant digits, or more where it would become 1."""
     return float(f"{value:.{8 if abs(value - 1) < 5e-4 else 4}g}")
-
-
-def missing(audit):
-    """Rows of a table that could be measured and have no measurement."""
-    of_words = {row["row"] for row in WORDS["rows"] if row["switch"].startswith(("none, a description", "not "))}
-    return [row for row in audit.loc[audit["quantity"] == "", "row"] if row not in of_words]
 
 
 def measured(table, kind):

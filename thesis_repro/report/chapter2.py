@@ -1,6 +1,6 @@
 """The figures of chapter 2, drawn anew from the project's own network and data: networks, odometry, keypoints.
 
-Plots of a formula or of one table, Figures 2.3 to 2.6, 3.4, 3.5 and 4.1, are drawn in cells of notebooks 1, 3 and 4.
+Plots of a formula or of one table, Figures 2.3 to 2.6, 3.4, 3.5, 4.1 and 4.17, are drawn in cells of the notebooks.
 """
 
 import cv2

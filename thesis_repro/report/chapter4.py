@@ -1,4 +1,4 @@
-"""Figures 4.6, 4.7 and 4.9 to 4.17: errors in metres, keypoints and times.
+"""Figures 4.6, 4.7 and 4.9 to 4.16: errors in metres, and keypoints.
 
 `runs` is the table of `runner.run`. Lines and bars stand at the mean over repetitions; bands and error bars go from the
 lowest to the highest of them. What compares methods by ratios is in comparison.py.
@@ -128,24 +128,6 @@ def figure_of_sequences(runs, metric):
         panel.grid(axis="x", visible=False)
     figure.supylabel(f"{metric.upper()} (m)", fontsize=8)
     style.legend_below(figure, panels, 3)
-    return figure
-
-
-def figure_4_17(seconds):
-    """Percent time savings of each dilation width (Equation 4.2), from the table of `time_runs`; dots: sequences."""
-    savings = thesis_tables.time_savings(seconds)
-    figure, axes = style.new_figure(height=3.0)
-    axes.bar(savings.index.astype(int), savings, color=MASKED, label="all sequences together")
-    for _, rows in seconds.groupby("sequence"):
-        own = thesis_tables.time_savings(rows)
-        axes.plot(own.index.astype(int), own, "o", color="#333333", alpha=0.5, markersize=3, markeredgewidth=0,
-                  label="one sequence")
-    style.legend_below(figure, [axes], 2)
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.set_xticks(savings.index.astype(int))
-    axes.set(xlabel="dilation width (pixels)", ylabel="change of time (%)",
-             title="Time of the timed frames against all keypoints (negative: time saved)")
-    axes.grid(axis="x", visible=False)
     return figure
 
 
