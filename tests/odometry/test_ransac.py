@@ -128,7 +128,7 @@ def test_a_look_in_single_precision_rules_out_no_better_solution():
             _, solutions, _ = rounding.solve(columns[:, random.choice(np.arange(90, 300), 5, replace=False)].T.copy())
             for e in solutions:
                 moved = e + random.choice([-1, 1], 9) * 1e-6 / 3
-                inliers = int(ransac._inlier_mask(moved, columns, limit).sum())
+                inliers = int(ransac._inlier_masks(moved[None], columns, limit).sum())
                 assert inliers == 0 or ransac._may_beat(e, 1e-6, rough, float(limit), inliers - 1)
                 ruled_out.append(not ransac._may_beat(e, 1e-6, rough, float(limit), inliers + 20))
     assert np.mean(ruled_out) > 0.7

@@ -98,7 +98,7 @@ class SharedKeypoints:
             return track(previous, current, points, window, levels)
         _, _, keys, tracked, success = self._tracks
         where = np.searchsorted(keys, _key(points))
-        return tracked[where], success[where]
+        return tracked.take(where, axis=0), success[where]
 
     def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
         if settings.block_size != BLOCK_SIZE:

@@ -108,7 +108,7 @@ class Odometry:
             step.points = len(self.points)
             tracked, was_tracked = self.keypoints.track(self.previous, frame, self.points,
                                                          self.settings.window, self.settings.levels)
-            step.previous, step.current = self.points[was_tracked], tracked[was_tracked]
+            step.previous, step.current = (side.compress(was_tracked, axis=0) for side in (self.points, tracked))
             tracked = step.current
         elif self.previous is not None or step.frame > 0:
             step.points = 0

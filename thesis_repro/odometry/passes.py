@@ -25,6 +25,9 @@ CHECKPOINT = 300  # frames
 KEYPOINT_SETTINGS = ("detector", "max_keypoints", "min_distance", "quality", "block_size", "window", "levels",
                      "mask_mode", "redetect_below", "fallback")
 ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
+SHARED_TIMES = ("detect_seconds", "track_seconds")  # belong to no run of a pass
+DTYPES = {"frame": int, "updated": bool,
+          **dict.fromkeys(("points", "detected", "tracked", "inliers", "pose_inliers"), "Int64")}
 NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "mask_seconds"]
 
 
@@ -99,10 +102,7 @@ def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Mask
     file, sequence and settings goes on from there. Whoever names the file deletes it once the results are stored,
     and gives other masks another file.
     """
-    results = _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
-    for result in results.values():
-        result.frames[["detect_seconds", "track_seconds"]] = np.nan
-    return results
+    return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
 
 
 @dataclass
@@ -182,7 +182,7 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
                 waiting = []
                 _store(checkpoint, job, index + 1, members, leaders)
         _finish(waiting)
-    return {name: _result(member) for name, member in members.items()}
+    return {name: _result(member, SHARED_TIMES if shared else ()) for name, member in members.items()}
 
 
 def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
@@ -248,12 +248,13 @@ def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], lea
     return done
 
 
-def _result(member: _Run) -> Result:
-    frames = pd.DataFrame(member.numbers, columns=NUMBER_COLUMNS)
-    flags = [member.flags.get(index, "") for index in range(len(frames))]
-    frames.insert(FRAME_COLUMNS.index("flag"), "flag", flags)
-    counts = ["points", "detected", "tracked", "inliers", "pose_inliers"]
-    frames = frames.astype({"frame": int, "updated": bool, **dict.fromkeys(counts, "Int64")})
+def _result(member: _Run, blank: Iterable[str]) -> Result:
+    columns = dict(zip(NUMBER_COLUMNS, member.numbers.T, strict=True))
+    columns |= dict.fromkeys(blank, np.full(len(member.numbers), np.nan))
+    columns["flag"] = [member.flags.get(index, "") for index in range(len(member.numbers))]
+    for name, dtype in DTYPES.items():
+        columns[name] = pd.array(columns[name], dtype)
+    frames = pd.DataFrame(columns, columns=[*FRAME_COLUMNS, "mask_seconds"])
     return Result(poses_of(frames), frames, member.odometry.settings)
 
 

@@ -78,10 +78,11 @@ def recover_pose(matrix: np.ndarray, current: np.ndarray,
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     motions = [(rotation, sign * translation) for sign in (1.0, -1.0) for rotation in (first, second)]
-    votes, doubtful = np.zeros(4, np.int64), []
-    for index, rotation in enumerate((first, second)):
-        votes[index], votes[index + 2], points = _count_in_front(current, previous, rotation, translation.ravel())
-        doubtful.append(points)
+    votes, doubtful = np.zeros(4, np.int64), [np.empty(0, np.int64)] * 2
+    # A car's rotation is the smaller one. Once its votes are known, the other's are counted only while it may win.
+    for index in (0, 1) if np.trace(first) >= np.trace(second) else (1, 0):
+        votes[index], votes[index + 2], doubtful[index] = _count_in_front(
+            current, previous, motions[index][0], translation.ravel(), votes.max())
     most_sure = votes.max()
     for index, motion in enumerate(motions):
         points = doubtful[index % 2]
@@ -103,13 +104,18 @@ def _triangulate_and_count(current, previous, rotation, translation):
 
 
 @fast
-def _count_in_front(current, previous, rotation, t):
-    """Votes for (rotation, t), for (rotation, -t), and the indices of points too close to a limit to be sure."""
+def _count_in_front(current, previous, rotation, t, least):
+    """Votes for (rotation, t), for (rotation, -t), and the indices of points too close to a limit to be sure.
+
+    Stops as soon as neither can have `least` votes any more.
+    """
     forward, backward, doubts = 0, 0, 0
     doubtful = np.empty(len(current), np.int64)
     a = np.zeros((4, 4))
     b = np.empty((4, 4))
     for index in range(len(current)):
+        if max(forward, backward) + doubts + len(current) - index < least:
+            break
         # Rows x * P[2] - P[0], y * P[2] - P[1] of both cameras; the point is their singular vector of least value.
         u, v = previous[index, 0], previous[index, 1]
         a[0, 0] = -1.0

@@ -38,10 +38,9 @@ def find_essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: 
     or None; mask is (N, 1) uint8 as OpenCV returns it, or None.
     """
     count = len(current)
-    current, previous = np.ascontiguousarray(current, float), np.ascontiguousarray(previous, float)
-    if count < MIN_FOR_SHORTCUT or not (np.isfinite(current).all() and np.isfinite(previous).all()):
+    columns = np.stack([*current.T, *previous.T])
+    if count < MIN_FOR_SHORTCUT or not np.isfinite(columns).all():
         return _opencv(current, previous, threshold, probability)
-    columns = np.ascontiguousarray(np.hstack([current, previous]).T)
     limit = np.float32(threshold * threshold)
     rough = _single_precision(columns)
 
@@ -81,13 +80,12 @@ def _opencv_solution(columns, sample, threshold, probability, limit):
     """OpenCV's first best solution for five correspondences: its inliers among all, the matrix, the mask."""
     five = np.ascontiguousarray(columns[:, sample].T)
     stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
-    best = 0, None, None
-    for start in range(0, 0 if stack is None else len(stack), 3):
-        mask = _inlier_mask(stack[start:start + 3].ravel(), columns, limit)
-        inliers = int(mask.sum())
-        if inliers > best[0]:
-            best = inliers, stack[start:start + 3].copy(), mask.reshape(-1, 1)
-    return best
+    if stack is None:
+        return 0, None, None
+    masks = _inlier_masks(stack.reshape(-1, 9), columns, limit)
+    inliers = masks.sum(axis=1)
+    best = int(inliers.argmax())  # the first of equals, as in OpenCV
+    return int(inliers[best]), stack[3 * best:3 * best + 3].copy(), masks[best].reshape(-1, 1)
 
 
 def _samples_needed(probability, outliers):
@@ -107,16 +105,17 @@ def _single_precision(columns):
 
 
 @fast
-def _inlier_mask(e, columns, limit):
-    """N times 0 or 1: whether the squared Sampson distance, rounded to float32, is within the limit."""
-    mask = np.empty(columns.shape[1], np.uint8)
-    matrix = epipolar.entries(e)
-    for k in range(len(mask)):
-        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, columns[0, k], columns[1, k], columns[2, k],
-                                                           columns[3, k])
-        distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
-        mask[k] = np.float32(distance) <= limit
-    return mask
+def _inlier_masks(matrices, columns, limit):
+    """(K, N) of 0 or 1 for K matrices: whether the squared Sampson distance, rounded to float32, is in the limit."""
+    masks = np.empty((len(matrices), columns.shape[1]), np.uint8)
+    for index in range(len(matrices)):
+        matrix = epipolar.entries(matrices[index])
+        for k in range(columns.shape[1]):
+            algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, columns[0, k], columns[1, k], columns[2, k],
+                                                               columns[3, k])
+            distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+            masks[index, k] = np.float32(distance) <= limit
+    return masks
 
 
 @inner

@@ -5,9 +5,11 @@ is its signed Sampson distance: to first order, how far it is from meeting (u, v
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numba import types
 
 from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
@@ -20,6 +22,10 @@ RESTART_SCALES = (4, 1)  # thresholds: scales of the second start
 SAME_MOTION_COSINE = np.cos(np.radians(15.0))  # of the angle between two directions of motion
 LOWER_COST = 0.99  # of the first start's cost: below it, the difference is more than rounding
 POINTS_PER_BLOCK = 64
+# LAPACK's gesv as np.linalg.solve calls it in compiled code, where the rest of that function takes seconds to compile.
+_solve: Any = types.ExternalFunction("numba_xgesv", types.intc(
+    types.char, types.intp, types.intp, types.CPointer(types.float64), types.intp, types.CPointer(types.int32),
+    types.CPointer(types.float64), types.intp))
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,7 @@ def measured(rotation: np.ndarray, heading: np.ndarray, current: np.ndarray, pre
              inliers: np.ndarray, threshold: float) -> RefinedMotion:
     """A motion as it is, with the sign of its translation and how far the points near it determine it."""
     support = near(rotation, heading, current, previous, SUPPORT_THRESHOLDS * threshold)
-    current, previous = current[support], previous[support]
+    current, previous = current.compress(support, axis=0), previous.compress(support, axis=0)
     forward, backward = cheirality_votes(rotation, heading, current, previous, threshold)
     rotation_std, heading_std, condition = _deviations(rotation, heading, current, previous, threshold / 2)
     return RefinedMotion(rotation, heading if forward >= backward else -heading, inliers, max(forward, backward),
@@ -96,7 +102,7 @@ def _rounds(motion, current, previous, chosen, threshold):
     for _ in range(REFINE_ROUNDS):
         if chosen.sum() < MIN_CORRESPONDENCES:
             break
-        motion = _minimise(*motion, current[chosen], previous[chosen], threshold / 2)
+        motion = _minimise(*motion, current.compress(chosen, axis=0), previous.compress(chosen, axis=0), threshold / 2)
         chosen = near(*motion, current, previous, SUPPORT_THRESHOLDS * threshold)
     return motion
 
@@ -133,13 +139,14 @@ def near(r, t, current, previous, limit):
 @fast
 def _minimise(r, t, current, previous, scale):
     """Levenberg and Marquardt's iteration: steps of (H + damping diag H) change = -gradient, while the cost falls."""
-    damping = 1e-4
+    damping, pivots = 1e-4, np.empty(5, np.int32)
     cost, hessian, gradient = _normal_equations(r, t, current, previous, scale)
     for _ in range(MAX_ITERATIONS):
         damped = hessian.copy()
         for k in range(5):
             damped[k, k] += damping * hessian[k, k] + 1e-12
-        change = np.linalg.solve(damped, -gradient)
+        change = -gradient
+        _solve(ord("d"), 5, 1, damped.ctypes, 5, pivots.ctypes, change.ctypes, 5)
         r_new, t_new = _moved(r, t, change)
         cost_new, hessian_new, gradient_new = _normal_equations(r_new, t_new, current, previous, scale)
         if cost_new < cost:
