@@ -1,10 +1,12 @@
 """Notebooks as they are in git, and as they run: on the smallest profile, executed once for all that looks at them."""
 
+import ast
 import json
 import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -93,7 +95,7 @@ def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path):
 
 @pytest.mark.notebooks
 @pytest.mark.parametrize("changed, again", [
-    ("notebooks/06_keypoint_masks.ipynb", ["06", "07", "08", "09"]), ("notebooks/07_visual_odometry.ipynb", ["07"]),
+    ("notebooks/06_keypoint_masks.ipynb", ["06", "07", "08", "09"]), ("notebooks/07_visual_odometry.ipynb", ["07", "08", "09"]),
     ("thesis_repro/masks.py", [name[:2] for name in NOTEBOOKS]), ("thesis_repro/report/page.py", [])])
 def test_only_what_changed_is_made_again(executed, changed, again):
     """What make would do, asked of it without doing it."""
@@ -150,6 +152,23 @@ def test_bad_data_stops_before_the_notebooks(tmp_path, tiny_kitti):
     assert not list((tmp_path / "build").rglob("*.ipynb"))
     assert "PROFILE=huge" in make_figures(tmp_path, "PROFILE=huge").stderr
     assert "PROFIL: unknown setting" in make_figures(tmp_path, "PROFIL=smoke").stderr
+
+
+def assigned(code):
+    """{name: value} of all assignments, as text; those of tuples one by one."""
+    values = {}
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
+            values |= dict(zip(map(ast.unparse, node.targets[0].elts), map(ast.unparse, node.value.elts), strict=True))
+        elif isinstance(node, ast.Assign):
+            values[node.targets[0].id] = ast.unparse(node.value)
+    return values
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_the_last_cell_puts_all_knobs_back(name):
+    (knobs,), last = [code for code in cells(name, "code") if code.startswith("# Knobs")], cells(name, "code")[-1]
+    assert assigned(last) == assigned(knobs) | {"PUT_BACK": "False"}
 
 
 def test_the_order_of_the_notebooks_has_what_each_of_them_asks_for():

@@ -51,6 +51,8 @@ class MaskSettings:
     canny: tuple[float, float] = (5, 15)
 
     def __post_init__(self) -> None:
+        for name in ("classes", "canny"):  # JSON has lists
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP), ("ids", IDS)):
             if getattr(self, name) not in known:
                 raise InputError(f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(known)}")

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from thesis_repro import InputError
@@ -60,6 +60,10 @@ PROFILES = {
     "smoke": Profile(image_size=64, base_filters=4, batch_size=4, learning_rate=0.001, threads=1, epochs=2,
                      patience=5, training_images=16, frames=12, timed_frames=5, widths=(1, 5, 10, 15), repetitions=2,
                      world_sequences=2, world_frames=12, world_training_images=12, world_validation_images=4),
+    # For a course: a minute a notebook on two cores, and one drive that bends.
+    "lab": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, threads=1, epochs=6, patience=5,
+                   training_images=60, frames=40, timed_frames=5, widths=(1, 5, 10, 15), repetitions=2,
+                   world_sequences=1, world_frames=40, world_training_images=60, world_validation_images=12),
     # The thesis's loss wants many steps: small batches and a higher rate come further in the same minutes.
     "demo": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, threads=1, epochs=16,
                     patience=5, training_images=200, frames=200, timed_frames=5, widths=ALL_WIDTHS, repetitions=2,
@@ -107,18 +111,12 @@ class Settings:
         labels = ("label maps: by the model in the package, no training" if self.shipped else
                   "training: embedded world (rendered)" if self.cityscapes_is_embedded else
                   "training: the user's Cityscapes folder")
-        sizes = "".join(f", {name.replace('_', ' ')} {_short(value)}"
+        sizes = "".join(f", {name.replace('_', ' ')} {_as_text(value)}"
                         for name, value in _changed(self.profile, self.sizes).items())
         return f"odometry: {odometry}; {labels}; profile {self.profile}{sizes}"
 
     def __str__(self):
-        rows = {"run": self.run, "odometry data": self.kitti, "training data": self.cityscapes,
-                **({"KITTI semantic": self.kitti_semantic} if self.kitti_semantic else {}),
-                "label maps by": "the model in the package" if self.shipped else "the network of this run",
-                "results": self.build, "figures": self.figures, "processes": self.jobs, "seed": self.seed,
-                **{key.replace("_", " "): value for key, value in asdict(self.sizes).items()
-                   if not key.startswith("world_") or self.kitti_is_embedded or self.cityscapes_is_embedded}}
-        return "\n".join(f"{key:24}{_short(value)}" for key, value in rows.items())
+        return f"run {self.run}; results: {_from_root(self.build)}"
 
 
 def read_settings(environment=None):
@@ -137,23 +135,23 @@ def read_settings(environment=None):
     build = Path(given.get("BUILD", ROOT / "build")).absolute()
     figures = Path(given.get("FIGURES", ROOT / "figures")).absolute()
     world = build / f"world-{profile}"
-    kitti, cityscapes, kitti_semantic = (_data_folder(name, given.get(name))
-                                         for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC"))
-    data = "_".join(_short_name(name, path) for name, path in (("kitti", kitti), ("cityscapes", cityscapes)) if path)
+    folders = {name: _data_folder(name, given[name])
+               for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC") if name in given}
     changed = {name.lower(): _widths(text) if name == "WIDTHS" else number(name, text)
                for name, text in given.items() if name in SIZES and (name, text) != ("FRAMES", "all")}
     sizes = replace(PROFILES[profile], **changed | ({"frames": None} if given.get("FRAMES") == "all" else {}))
-    judged = f"_{_short_name('semantic', kitti_semantic)}" if kitti_semantic else ""
-    run = "-".join([f"{data or 'embedded'}{judged}", profile, *(f"{name.replace('_', '-')}-{_in_a_name(value)}"
-                                                                for name, value in _changed(profile, sizes).items())])
+    data = [_short_name(name.lower().removeprefix("kitti_"), path) for name, path in folders.items()]
+    whose = ["embedded"] if folders.keys() <= {"KITTI_SEMANTIC"} else []
+    run = "-".join(["_".join(whose + data), profile, *(f"{name.replace('_', '-')}-{_in_a_name(value)}"
+                                                       for name, value in _changed(profile, sizes).items())])
     return Settings(
-        profile=profile, sizes=sizes, kitti=kitti or world / "kitti",
-        cityscapes=cityscapes or world / "cityscapes", kitti_is_embedded=kitti is None,
-        cityscapes_is_embedded=cityscapes is None, run=run, build=build / run,
+        profile=profile, sizes=sizes, kitti=folders.get("KITTI", world / "kitti"),
+        cityscapes=folders.get("CITYSCAPES", world / "cityscapes"), kitti_is_embedded="KITTI" not in folders,
+        cityscapes_is_embedded="CITYSCAPES" not in folders, run=run, build=build / run,
         # the default run's figures are what visitors see; those of all others go into folders beside them
         figures=figures if run == "embedded-demo" else figures / run,
-        world=world, jobs=processes(given.get("JOBS", str(cores()))),
-        scheduler=scheduler_address(given.get("DASK_SCHEDULER")), kitti_semantic=kitti_semantic)
+        world=world, jobs=processes(given.get("JOBS", str(cores()))), kitti_semantic=folders.get("KITTI_SEMANTIC"),
+        scheduler=scheduler_address(given.get("DASK_SCHEDULER")))
 
 
 def number(name, text):
@@ -187,8 +185,12 @@ def _changed(profile, sizes):
     return {name: value for name, value in own.items() if value != getattr(PROFILES[profile], name)}
 
 
+def _as_text(value, between=", "):
+    return between.join(map(str, value)) if isinstance(value, tuple) else "all" if value is None else str(value)
+
+
 def _in_a_name(value):
-    text = "_".join(map(str, value)) if isinstance(value, tuple) else "all" if value is None else str(value)
+    text = _as_text(value, "_")
     return text if len(text) <= 40 else hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
@@ -206,8 +208,6 @@ def cores():
 
 
 def _data_folder(name, value):
-    if value is None:
-        return None
     path = Path(value).expanduser().absolute()
     if not path.is_dir():
         raise InputError(f"{name}={value}: no such folder")
@@ -220,14 +220,8 @@ def _short_name(name, path):
     return f"{name}-{letters}-{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:6]}"
 
 
-def _short(value):
-    if value is None:
-        return "all"
-    if isinstance(value, Path):
-        return value.relative_to(ROOT) if value.is_relative_to(ROOT) else value
-    if isinstance(value, tuple):
-        return ", ".join(map(str, value))
-    return value
+def _from_root(path):
+    return path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
 
 
 if __name__ == "__main__":
@@ -236,8 +230,6 @@ if __name__ == "__main__":
         _settings = read_settings()
     except InputError as error:
         sys.exit(f"error: {error}")
-    if sys.argv[1:] == ["figures"]:
-        print(f"tables and figures: open {_short(_settings.figures / 'index.html')} in a browser; "
-              f"executed notebooks: {_short(_settings.build / 'notebooks')}")
-    else:
-        print(_short(_settings.build))
+    built, page = _from_root(_settings.build), _from_root(_settings.figures / "index.html")
+    print(built if sys.argv[1:] != ["figures"] else
+          f"tables and figures: open {page} in a browser; executed notebooks: {built / 'notebooks'}")
