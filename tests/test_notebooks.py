@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import nbformat
@@ -95,7 +94,8 @@ def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path):
 
 @pytest.mark.notebooks
 @pytest.mark.parametrize("changed, again", [
-    ("notebooks/06_keypoint_masks.ipynb", ["06", "07", "08", "09"]), ("notebooks/07_visual_odometry.ipynb", ["07", "08", "09"]),
+    ("notebooks/06_keypoint_masks.ipynb", ["06", "07", "08", "09"]),
+    ("notebooks/07_visual_odometry.ipynb", ["07", "08", "09"]),
     ("thesis_repro/masks.py", [name[:2] for name in NOTEBOOKS]), ("thesis_repro/report/page.py", [])])
 def test_only_what_changed_is_made_again(executed, changed, again):
     """What make would do, asked of it without doing it."""

@@ -1,0 +1,90 @@
+"""What a cell changes reaches the last table of notebook 8: the cells that an edit goes through, in one process."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from thesis_repro.settings import read_settings
+
+ROOT = Path(__file__).resolve().parent.parent
+CELLS = {"01": "02 03 09 11 13 15 25", "02": "02 03 04 06 08 17", "03": "02 03 15 17 19 27",
+         "04": "02 03 05 06 08 12 16", "05": "02 03 05 12 17", "06": "02 03 04 26", "07": "02 03 04",
+         "08": "01 02 03 32"}
+ALWAYS = {"04": {"LIVE_CURVES = True": "LIVE_CURVES = False"}, "08": {"NAMES = None": 'NAMES = ["00"]'}}
+THESIS, YOURS = ("thesis's, all keypoints", "thesis's, masked"), ("yours, all keypoints", "yours, masked")
+
+
+def code(number, edits):
+    """The cells of a notebook that an edit goes through, edited: {number: {old text: new text}}."""
+    (path,) = (ROOT / "notebooks").glob(f"{number}_*.ipynb")
+    sources = ["".join(cell["source"]) for cell in json.loads(path.read_text())["cells"]
+               if cell["id"].removeprefix(f"{number}-") in CELLS[number].split()]
+    assert len(sources) == len(CELLS[number].split())
+    text = "\n".join(sources)
+    for old, new in (ALWAYS.get(number, {}) | edits.get(number, {})).items():
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    return text
+
+
+def environment(world, build):
+    return {f"THESIS_REPRO_{name}": str(value) for name, value in {
+        "PROFILE": "smoke", "KITTI": world / "kitti", "CITYSCAPES": world / "cityscapes", "BUILD": build}.items()}
+
+
+def run(world, build, *texts):
+    return subprocess.run([sys.executable, "-c", "\n".join(texts)], capture_output=True, text=True, env=os.environ
+                          | environment(world, build) | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"})
+
+
+def tables(world, build, numbers, edits):
+    """The last table of notebook 8 after each edit, {settings: {keypoints, RMSE}}."""
+    texts = [code("04", {}).split("# Knobs")[0]]  # TensorFlow's threads can be set at the beginning alone
+    for edit in edits:
+        texts += [code(number, edit) for number in [*numbers, "06", "07", "08"]]
+        texts.append("print('TABLE', table.to_json(orient='index'))")
+    done = run(world, build, *texts)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return [json.loads(line[6:]) for line in done.stdout.splitlines() if line.startswith("TABLE ")]
+
+
+def test_knobs_of_masks_and_odometry_move_their_rows(small_world, small_labels, tmp_path):
+    shutil.copytree(small_labels, read_settings(environment(small_world, tmp_path)).build / "labels")
+    none, *edited = tables(small_world, tmp_path, [], [
+        {}, {"06": {"CANNY = (5, 15)": "CANNY = (1, 3)"}}, {"06": {'"canny", ()': '"canny", ("road",)'}},
+        {"06": {"DILATION_WIDTH = 10": "DILATION_WIDTH = 5"}}, {"07": {"= 2000, 0.01": "= 500, 0.01"}},
+        {"07": {"LEVELS = 21, 3": "LEVELS = 11, 3"}}])
+    assert none == {}
+    assert all([table[row] for row in THESIS] == [edited[0][row] for row in THESIS] for table in edited)
+    keypoints = [[table[row]["keypoints"] for row in YOURS] for table in edited]
+    everywhere, masked = (edited[0][row]["keypoints"] for row in THESIS)
+    canny, classes, width, few, window = keypoints
+    assert [of_all for of_all, _ in keypoints] == [everywhere] * 3 + [500, everywhere]
+    assert classes[1] < masked < canny[1] and width[1] < masked and few[1] <= 500 and window[1] == masked
+    assert all(table[YOURS[1]]["RMSE (m)"] != table[THESIS[1]]["RMSE (m)"] for table in edited)
+
+
+@pytest.mark.torture
+def test_network_and_loss_move_the_masked_row(small_world, tmp_path):
+    assert run(small_world, tmp_path, code("01", {}), code("02", {})).returncode == 0
+    width = {"06": {"DILATION_WIDTH = 10": "DILATION_WIDTH = 5"}}  # so that there is a table
+    rows = tables(small_world, tmp_path, ["03", "04", "05"], [
+        width, width | {"03": {"DEPTH = 4": "DEPTH = 3"}},
+        width | {"04": {"= dice_loss_plus_1focal_loss": "= keras.losses.CategoricalCrossentropy()"}}])
+    everywhere, masked = ([json.dumps(table[row]) for table in rows] for row in THESIS)
+    assert len(set(everywhere)) == 1 and len(set(masked)) == 3
+
+
+@pytest.mark.torture
+def test_sizes_that_do_not_fit_name_their_knobs(small_world, tmp_path):
+    half = {"03": {"SIZE = settings.sizes.image_size": "SIZE = 32"}}
+    done = run(small_world, tmp_path, *(code(number, half) for number in ("01", "02", "03", "04")))
+    assert done.returncode != 0 and "SIZE in notebooks 1 and 3" in done.stderr.splitlines()[-1]
+    odd = {"03": {"SIZE = settings.sizes.image_size": "SIZE = 40"}}
+    done = run(small_world, tmp_path, code("03", odd))
+    assert done.returncode != 0 and "SIZE=40" in done.stderr.splitlines()[-1]
