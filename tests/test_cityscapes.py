@@ -35,13 +35,8 @@ def test_colour_is_read_where_it_is_asked_for(tiny_cityscapes):
     assert images.shape == (4, 16, 16, 3) and images[0, 5, 5].tolist() == [200, 100, 10]
     gray, same_labels = cityscapes.load(pairs, 16)
     assert gray.shape == (4, 16, 16, 1) and np.array_equal(labels, same_labels)
+    assert set(np.unique(cityscapes.load(pairs, 48)[1])) == {7, 11, 23}  # resizing invents no label
     assert np.array_equal(images[1, ..., :1], gray[1])  # a gray file has three equal channels
-
-
-def test_resizing_invents_no_label(tiny_cityscapes):
-    images, labels = cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 48)
-    assert images.shape == (4, 48, 48, 1) and images.dtype == labels.dtype == np.uint8
-    assert set(np.unique(labels)) == {7, 11, 23}
 
 
 def test_faults_are_named(tiny_cityscapes):
@@ -55,6 +50,16 @@ def test_faults_are_named(tiny_cityscapes):
                                (tiny_cityscapes, "train", "train/street_2.png"), (tiny_cityscapes, "val", "val")):
         with pytest.raises(InputError, match=named):
             cityscapes.pairs(root, split)
+
+
+def test_train_ids_are_label_ids_in_another_order(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[*range(19), 255]], np.uint8))
+    names = [cityscapes.LABELS[label].name for label in cityscapes.read_label_map(tmp_path / "a.png", True)[0]]
+    assert names == [*cityscapes.TRAINED, "unlabeled"]
+    for train_ids, value in ((True, 19), (False, 255)):
+        cv2.imwrite(str(tmp_path / "a.png"), np.array([[value]], np.uint8))
+        with pytest.raises(InputError, match="a.png: .*--ids"):
+            cityscapes.read_label_map(tmp_path / "a.png", train_ids)
 
 
 @pytest.mark.real

@@ -14,6 +14,9 @@ def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
     before = stages.made_from(folder)
     stages.stage(tmp_path / "a", data="other", size=3)
     assert not (folder / "result").exists() and stages.made_from(folder) != before
+    with pytest.raises(InputError, match="a: .*size"):
+        stages.stage(folder, replace=False, data="other", size=4)
+    assert stages.record(folder) == {"data": "other", "size": 3}
 
 
 def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
@@ -26,13 +29,6 @@ def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
     (tmp_path / stages.RECORD).write_text("[1, 2")  # a damaged record
     with pytest.raises(InputError, match="made-from.json: "):
         stages.stage(tmp_path, data="one")
-
-
-def test_results_of_other_settings_are_refused_where_they_must_not_be_deleted(tmp_path):
-    files.write_text(stages.stage(tmp_path / "a", size=3) / "result", "kept")
-    with pytest.raises(InputError, match="a: .*size"):
-        stages.stage(tmp_path / "a", replace=False, size=4)
-    assert (tmp_path / "a" / "result").exists()
 
 
 def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):

@@ -7,27 +7,26 @@ import subprocess
 import sys
 import zipfile
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
 from thesis_repro import longrun
 
 ROOT = Path(__file__).resolve().parents[2]
-TIMEOUT = 300  # seconds; a command that takes longer hangs
+TIMEOUT = 900  # seconds; a command that takes longer hangs
 # what tests/conftest.py sets for the tests' own process and a user does not have
 NOT_THE_USERS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
 
 
-@dataclass
-class Result:
+class Result(NamedTuple):
     """How a command ended. left: files and folders below its working folder that are new, changed or gone."""
 
     returncode: int
     stdout: str
     stderr: str
-    left: list
+    left: list = ()
 
 
 def thesis(*words):
@@ -51,22 +50,20 @@ def start(command, where, before=None, **changes):
                             start_new_session=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def finish(process, timeout=TIMEOUT):
+def finish(process):
     """Wait for what `start` started; a command that hangs is killed with all its processes."""
     try:
-        stdout, stderr = process.communicate(timeout=timeout)
+        stdout, stderr = process.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
         kill(process)
         raise
-    return Result(process.returncode, stdout, stderr, [])
+    return Result(process.returncode, stdout, stderr)
 
 
-def run(command, where, timeout=TIMEOUT, **options):
+def run(command, where, **options):
     """Start a command and wait for it; see `start`."""
     before = snapshot(where)
-    result = finish(start(command, where, **options), timeout)
-    result.left = changes(before, snapshot(where))
-    return result
+    return finish(start(command, where, **options))._replace(left=changes(before, snapshot(where)))
 
 
 def succeed(command, where, **options):
