@@ -9,7 +9,6 @@ import struct
 import sys
 import tempfile
 from contextlib import contextmanager, suppress
-from io import BytesIO
 from pathlib import Path
 
 import cv2
@@ -45,8 +44,7 @@ def read_ids(path):
     Raises what `read_gray` raises, and InputError where reading as gray would change them: a palette, less than 8
     bits, colours (but for three equal channels), another format.
     """
-    with _opened(path) as file:
-        image = _header(path, file)
+    with _opened(path) as (_, image):
         stored = str(image.tile)  # with Pillow's name of the mode in the file: "L;4" is gray of 4 bits
     channels = np.atleast_3d(read_gray(path) if image.mode == "L" else read_color(path))
     if image.format != "PNG" or image.mode in ("1", "P") or "L;" in stored or (channels != channels[..., :1]).any():
@@ -59,8 +57,7 @@ def glance(path):
 
     Raises InputError where `read_gray` would, but for damage in the middle.
     """
-    with _opened(path) as file:
-        image = _header(path, file)
+    with _opened(path) as (file, image):
         file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
         if END_MARKS["PNG" if image.format == "PNG" else "JPEG"] not in file.read():
             read_gray(path)  # some cameras and tools write behind the end
@@ -68,37 +65,33 @@ def glance(path):
 
 
 def _read(path, mode, flag):
-    with _opened(path) as file:
-        data = file.read()
-        image = _header(path, BytesIO(data))
+    with _opened(path) as (file, image):
         if image.format != "PNG":
             image.draft(mode, image.size)  # gray without converting colours first, as OpenCV does
             return np.array(ImageOps.exif_transpose(image).convert(mode))
         image.verify()  # the checksums, of which OpenCV and Pillow's own decoder take no notice
+        file.seek(0)
+        data = file.read()
         if END_MARKS["PNG"] not in data:
             raise OSError
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)  # faster than Pillow's decoder
         if pixels is None:
-            Image.open(BytesIO(data)).load()  # raises where the file is corrupt; OpenCV does not say why it fails
+            Image.open(file).load()  # raises where the file is corrupt; OpenCV does not say why it fails
             raise MemoryError
         return pixels
 
 
-def _header(path, file):
-    image = Image.open(file, formats=("PNG", "JPEG"))
-    if ";16" in str(image.tile):
-        raise InputError(f"{path}: has 16 bits a channel; convert it to 8 bits a channel")
-    return image
-
-
 @contextmanager
 def _opened(path):
-    """The file of an image, no pipe or device; whatever the system, Pillow or OpenCV raise is an InputError."""
+    """An image's file, which is no pipe or device, and its header. Whatever goes wrong is an InputError."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise InputError(f"{path}: is no file; an image must be one")
-            yield file
+            image = Image.open(file, formats=tuple(END_MARKS))
+            if ";16" in str(image.tile):
+                raise InputError(f"{path}: has 16 bits a channel; convert it to 8 bits a channel")
+            yield file, image
     except InputError:
         raise
     except Image.DecompressionBombError:
