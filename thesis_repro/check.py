@@ -15,8 +15,6 @@ import pandas as pd
 from thesis_repro import InputError, cityscapes, files, kitti, masks, one_line, stages
 from thesis_repro.settings import read_settings
 
-MAX_NAMED = 20  # problems of a folder that a quick look names; a deep one names all
-
 
 class _Problems(list):
     """Lines that say what is wrong."""
@@ -47,10 +45,10 @@ def check_kitti(root, deep=False):
     without_truth = kitti.without_truth(root)
     with_truth = problems.of(kitti.sequences, root) or []
     for name in sorted(with_truth + without_truth):
-        fact, its_problems = _check_sequence(root, name, name in with_truth, deep)
+        fact, of_sequence = _check_sequence(root, name, name in with_truth, deep)
         facts.append(fact)
-        problems += its_problems
-        sound += [] if its_problems else [name]
+        problems += of_sequence
+        sound += [] if of_sequence else [name]
     for commands, names in (("odometry, predict and masks", sound),
                             ("evaluate, boresight, study and plan", [name for name in sound if name in with_truth])):
         facts.append(f"can be run: {commands} with {', '.join(names)}" if names else f"cannot be run: {commands}")
@@ -128,19 +126,16 @@ def check_cityscapes(root, deep=False, splits=("train", "val")):
 def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=False):
     """Print what is in the folders, what is wrong and what is odd; returns whether nothing is wrong."""
     wrong = False
+    check_semantic = partial(check_cityscapes, splits=("train",))  # KITTI's street scenes have no other
     for option, root, check in (("KITTI", kitti_root, check_kitti), ("CITYSCAPES", cityscapes_root, check_cityscapes),
-                                # which has a training split alone
-                                ("KITTI_SEMANTIC", kitti_semantic, partial(check_cityscapes, splits=("train",)))):
+                                ("KITTI_SEMANTIC", kitti_semantic, check_semantic)):
         if not root:
             continue
         facts, problems = check(root, deep)
         facts.append(f"{'cannot' if problems else 'can'} be run: make figures {option}={root}")
         print("\n  ".join([str(root), *facts]))
-        named = problems if deep else problems[:MAX_NAMED]
-        for problem in named:
+        for problem in problems:
             print(f"wrong: {one_line(problem)}", file=sys.stderr)
-        if len(named) < len(problems):
-            print(f"and {len(problems) - len(named)} more; check-data --deep names all", file=sys.stderr)
         wrong = wrong or bool(problems)
     for name in kitti.sequences(kitti_root) + kitti.without_truth(kitti_root) if kitti_root and not wrong else ():
         for line in oddities(kitti.Sequence(kitti_root, name)):
