@@ -3,7 +3,6 @@
 What is shown is a `segmentation.domain_gap.Gap`.
 """
 
-import numpy as np
 import pandas as pd
 
 from thesis_repro.report.style import BLUE, GREEN, ORANGE, new_figure
@@ -28,17 +27,14 @@ def table(gap):
 
     Flicker needs no true label maps. It is measured on the odometry's frames, and stands in a model's first column.
     """
-    columns, flicker = {}, gap.flicker.to_dict()
-    for row in gap.scores.to_dict("records"):
-        classes = gap.classes[(gap.classes["model"] == row["model"]) & (gap.classes["domain"] == row["domain"])]
-        columns[f"{row['model']}: {row['domain']}"] = {
-            **{name: round(factor * row[key], digits) for key, (name, factor, digits) in MEASURES.items()},
-            **dict(zip("IoU: " + classes["class"], classes["iou"].round(3))),
-            FLICKER: round(100 * flicker.pop(row["model"], np.nan), 2)}
-    columns |= {name: {FLICKER: round(100 * share, 2)} for name, share in flicker.items()}  # exact label maps
-    names = [name for name, _, _ in MEASURES.values()]
-    order = [*names, *("IoU: " + gap.classes.sort_values("id")["class"].drop_duplicates()), FLICKER]
-    return pd.DataFrame(columns).reindex(order).rename_axis("measure").reset_index()
+    scores, classes = (rows.assign(column=rows["model"] + ": " + rows["domain"]) for rows in (gap.scores, gap.classes))
+    measures = pd.DataFrame({name: (factor * scores[key]).round(digits)
+                             for key, (name, factor, digits) in MEASURES.items()}).set_axis(scores["column"]).T
+    ious = classes.pivot(index=["id", "class"], columns="column", values="iou").droplevel("id").round(3)
+    first_columns = dict(zip(scores["model"][::-1], scores["column"][::-1]))
+    flicker = (100 * gap.flicker).round(2).rename(first_columns).to_frame(FLICKER).T
+    table = pd.concat([measures, ious.rename("IoU: {}".format), flicker])
+    return table.rename_axis(index="measure", columns=None).reset_index()
 
 
 def figure(gap):
@@ -60,10 +56,9 @@ def figure(gap):
 
 
 def label_map_quality(build):
-    """How good the label maps of a run are, from its build folder: a list of dicts, one a domain, for the templates.
+    """How good the label maps of a run are, from RECORD in its build folder: a list of dicts, one a domain.
 
-    The table (RECORD) is `domain_gap.Gap.scores` with a column `used`, true for the model that the odometry uses.
-    `seen` says whether some images were in the model's training.
+    `used`: by the model that the odometry uses. `seen`: some of the images were in the model's training.
     The domain that masks are made on comes first where it has true label maps. Empty where nothing was measured.
     """
     path = build / f"{RECORD}.csv"
