@@ -3,7 +3,6 @@
 import pandas as pd
 
 from thesis_repro.report import gap, style
-from thesis_repro.settings import read_settings
 
 OWN, SHIPPED, EXACT = "the model of this run", "the model in the package", "exact label maps"
 VALIDATION, STREETS = "validation images", "KITTI's street scenes"
@@ -12,13 +11,11 @@ VALIDATION, STREETS = "validation images", "KITTI's street scenes"
 class Gap:
     """Two models on two domains; the second domain of the first model has no sky."""
 
-    scores = pd.DataFrame([
-        {"model": model, "domain": domain, "images": images, "classes": 2 - (sky != sky), "mean_iou": mean_iou,
-         "accuracy": 0.7, "sky_recall": sky, "dark": 0.1,
-         "dark_wrong": 0.4, "lit_wrong": 0.2}
-        for model, domain, images, mean_iou, sky in (
-            (OWN, VALIDATION, 20, 0.6, 0.9), (OWN, STREETS, 7, 0.3, float("nan")),
-            (SHIPPED, VALIDATION, 20, 0.5, 0.8), (SHIPPED, STREETS, 7, 0.4, 0.7))])
+    scores = pd.DataFrame(
+        [(OWN, VALIDATION, 20, 2, 0.6, 0.9), (OWN, STREETS, 7, 1, 0.3, float("nan")),
+         (SHIPPED, VALIDATION, 20, 2, 0.5, 0.8), (SHIPPED, STREETS, 7, 2, 0.4, 0.7)],
+        columns=["model", "domain", "images", "classes", "mean_iou", "sky_recall"],
+    ).assign(accuracy=0.7, dark=0.1, dark_wrong=0.4, lit_wrong=0.2)
     classes = pd.DataFrame([
         {"model": row.model, "domain": row.domain, "class": name, "id": number, "share": 0.5, "iou": iou}
         for row in scores.itertuples() for name, number, iou in (("road", 7, 0.8), ("sky", 23, 0.7))[:row.classes]])
@@ -43,9 +40,8 @@ def test_the_figure_has_a_panel_a_model_and_a_bar_where_there_is_a_class():
 
 
 def test_the_quality_of_a_runs_label_maps_is_kept(tmp_path):
-    settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "b"), "THESIS_REPRO_FIGURES": str(tmp_path / "f")})
-    assert gap.label_map_quality(settings.build) == []
-    style.save_table(Gap.scores.assign(used=Gap.scores["model"] == SHIPPED), settings.build, gap.RECORD, "note")
-    rows = gap.label_map_quality(settings.build)
+    assert gap.label_map_quality(tmp_path) == []
+    style.save_table(Gap.scores.assign(used=Gap.scores["model"] == SHIPPED), tmp_path, gap.RECORD, "note")
+    rows = gap.label_map_quality(tmp_path)
     assert [(row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows] == [
         (VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]

@@ -38,17 +38,13 @@ def test_a_frame_shows_what_the_mask_keeps_and_discards():
 
 
 def test_the_video_has_every_frame_and_grows(tmp_path):
-    drive = TimedStreet()
-    video.write_video(tmp_path / "drive.mp4", drive, masks=Stripes(60))
-    capture = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
-    frames = []
-    while (read := capture.read())[0]:
-        frames.append(read[1])
-    with av.open(str(tmp_path / "drive.mp4")) as file:  # what every browser plays
-        context = file.streams.video[0].codec_context
-        assert (context.name, context.pix_fmt) == ("h264", "yuv420p")
-    assert len(frames) == 4 and capture.get(cv2.CAP_PROP_FPS) == pytest.approx(10, rel=0.01)
-    assert frames[0].shape == (280, 480, 3)
+    video.write_video(tmp_path / "drive.mp4", TimedStreet(), masks=Stripes(60))
+    with av.open(str(tmp_path / "drive.mp4")) as file:
+        stream = file.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")  # browsers play it
+        assert stream.average_rate == pytest.approx(10, rel=0.01)
+        frames = [frame.to_ndarray(format="gray") for frame in file.decode(stream)]
+    assert [frame.shape for frame in frames] == [(280, 480)] * 4
     assert np.abs(frames[0].astype(int) - frames[3]).mean() > 5
     assert [file.name for file in tmp_path.iterdir()] == ["drive.mp4"]
 
