@@ -14,6 +14,7 @@ import sqlite3
 import stat
 import time
 import zipfile
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
@@ -59,11 +60,14 @@ def stage(folder, *, replace=True, **inputs):
 
 
 def _empty(folder, changed):
-    """Delete what is listed as written here, the records last: what is left when this is killed is known to be ours.
-    Raises InputError, before anything is deleted, for a file that is not ours."""
-    listed, results, records = {}, [], []
+    """Delete what is listed (see `files.atomic`), the records last: what is left when this is killed is ours. Raises
+    InputError, before anything is deleted, for a file that is not ours."""
+    listed, results, records = defaultdict(set), [], []
     for path in folder.rglob(LIST):
-        listed |= _listed(path.parent)
+        for line in path.read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError):  # a line that was cut off
+                digest, name = line.split(" ", 1)
+                listed[path.parent / json.loads(name)].add(digest)
     for path in (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()):
         if path.name in (RECORD, LIST):
             records.append(path)
@@ -79,16 +83,6 @@ def _empty(folder, changed):
         with suppress(OSError):  # not empty
             path.parent.rmdir()
     folder.mkdir(exist_ok=True)
-
-
-def _listed(folder):
-    """What was written into a folder of results, {path: its digests}; see `files.atomic`."""
-    digests, path = {}, folder / LIST
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
-        with suppress(ValueError):  # a line that was cut off
-            digest, name = line.split(" ", 1)
-            digests.setdefault(folder / json.loads(name), set()).add(digest)
-    return digests
 
 
 def record(folder):
