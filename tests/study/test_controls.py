@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, masks, odometry
+from thesis_repro import masks, odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
 from thesis_repro.study import compare, controls, runner, thesis_tables
@@ -37,36 +37,34 @@ def test_every_control_gives_masks_that_the_odometry_takes_and_always_the_same(s
         assert np.array_equal(mask, made["masked"][3]) == (method in ("masked", "fallback")), method
 
 
-def test_masks_of_another_frame_come_from_half_a_sequence_away_and_mirrored_ones_are_mirrored(made):
+def test_masks_come_from_the_frame_and_settings_that_their_name_says(sequence, small_world, small_labels, made):
     for index, other in ((0, 6), (5, 11), (6, 0), (11, 5)):
         assert np.array_equal(made["other-frame"][index], made["masked"][other])
         assert np.array_equal(made["mirrored"][index], cv2.flip(made["masked"][index], 1))
+    predicted = cv2.imread(str(small_labels / "00" / "000005.png"), cv2.IMREAD_GRAYSCALE)
+    true = cv2.imread(str(small_world / "kitti/sequences/00/labels_0/000005.png"), cv2.IMREAD_GRAYSCALE)
+    for method, label_map, settings in (
+            ("true-labels", true, masks.MaskSettings()), ("exact-boundaries", predicted, masks.MaskSettings("exact")),
+            ("corrected", predicted, masks.MaskSettings("exact", symmetric=True, movable=2, margin=10))):
+        assert np.array_equal(made[method][5], masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)), method
 
 
-def test_random_lines_and_image_edges_cover_what_the_mask_covers(made):
+def test_random_lines_and_image_edges_cover_what_the_mask_covers(sequence, made):
     for index in range(12):
         wanted = masks.coverage(made["masked"][index])
         assert 0.05 < wanted < 0.95
         assert masks.coverage(made["random-lines"][index]) == pytest.approx(wanted, abs=0.01)
         assert masks.coverage(made["image-edges"][index]) == pytest.approx(wanted, abs=0.01)
     assert not np.array_equal(made["random-lines"][0], made["random-lines"][1])
-
-
-def test_random_lines_are_segments_dilated_like_the_boundaries(made):
-    # a square of ones leaves no pixel alone: opening with it changes nothing but at the border
+    # segments are dilated like boundaries: opening with the square of ones changes nothing but at the border
     mask = made["random-lines"][2]
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((WIDTH - 1, WIDTH - 1), np.uint8))
     assert np.array_equal(opened[WIDTH:-WIDTH, WIDTH:-WIDTH], mask[WIDTH:-WIDTH, WIDTH:-WIDTH])
-
-
-def test_image_edges_lie_along_the_strongest_edges_of_the_frame(sequence, made):
     dx, dy = cv2.spatialGradient(sequence.frame(3))
     strength = np.abs(dx.astype(int)) + np.abs(dy)
     strongest = strength >= np.quantile(strength, 0.995)
-    for method, least in (("image-edges", 0.9), ("random-lines", 0)):
-        share = (made[method][3][strongest] > 0).mean()
-        assert share > least
-    assert share < 0.6  # of random lines
+    assert (made["image-edges"][3][strongest] > 0).mean() > 0.9
+    assert (made["random-lines"][3][strongest] > 0).mean() < 0.6
 
 
 @pytest.mark.parametrize("value", [0, 255])
@@ -77,21 +75,6 @@ def test_masks_that_are_empty_or_full_have_controls_of_their_kind(sequence, made
         assert set(covered.values()) == {0.0}
     else:
         assert covered["random-lines"] > 0.99 and covered["image-edges"] > 0.5
-
-
-def test_true_labels_are_those_of_the_world(sequence, small_world, made):
-    label_map = cv2.imread(str(small_world / "kitti/sequences/00/labels_0/000005.png"), cv2.IMREAD_GRAYSCALE)
-    assert label_map.shape == sequence.size
-    assert np.array_equal(made["true-labels"][5], masks.keypoint_mask(label_map, sequence.size, WIDTH))
-    exact = masks.keypoint_mask(label_map, sequence.size, WIDTH, masks.MaskSettings("exact"))
-    near = masks.keypoint_mask(cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST), sequence.size, WIDTH,
-                               masks.MaskSettings("exact"))
-    assert np.array_equal(made["exact-boundaries"][5], near) and not np.array_equal(near, exact)
-
-
-def test_a_sequence_without_label_maps_has_no_controls(sequence, tmp_path):
-    with pytest.raises(InputError, match="no such folder; it must hold one label map"):
-        controls.masks("mirrored", Source(tmp_path / "none"), sequence, WIDTH)
 
 
 def test_keypoints_spread_out_are_as_many_as_asked_for(sequence):
@@ -120,13 +103,3 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(small_wor
     assert left["00"] == number["masked-05-0"] < number["masked-10-0"]
     assert number[number.index.str.startswith("fewer")].iloc[0] == pytest.approx(left["00"], abs=1)
     assert number[number.index.str.startswith("spread")].iloc[0] == pytest.approx(left["00"], rel=0.05)
-
-
-def test_corrected_masks_have_all_corrections_and_nothing_where_things_move(sequence, small_labels, made):
-    corrected = made["corrected"][5]
-    label_map = cv2.imread(str(small_labels / "00" / "000005.png"), cv2.IMREAD_GRAYSCALE)
-    settings = masks.MaskSettings("exact", symmetric=True, movable=2, margin=10)
-    assert np.array_equal(corrected, masks.keypoint_mask(label_map, sequence.size, WIDTH, settings))
-    assert not corrected[:10].any() and not corrected[:, -10:].any() and corrected.any()
-    moving = np.isin(cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT), masks.MOVABLE)
-    assert moving.any() and not corrected[moving].any()

@@ -33,17 +33,11 @@ def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finish
     expected = metrics.errors(alone.poses, sequence.poses) | metrics.step_errors(alone.poses, sequence.poses)
     assert {name: row[name] for name in expected} == pytest.approx(expected, nan_ok=True, rel=0)
     assert row["se3"] <= row["rmse"]
+    best = thesis_tables.best_widths(compare.of_method(summary, "masked")).loc["01"]
+    of_name = summary[summary["sequence"] == "01"].groupby("method")[["rmse", "max_keypoints"]].min()
+    assert best["rmse"] == of_name.loc["masked", "rmse"]
+    assert of_name.loc["reduced", "max_keypoints"] == round(best["mean_keypoints"])
     assert np.array_equal(runner.paths(summary, folder)["01", "masked-15-0"], alone.poses[:, :3, 3])
-
-
-def test_reduced_runs_have_the_keypoints_of_the_best_width(finished):
-    _, _, summary = finished
-    best = thesis_tables.best_widths(compare.of_method(summary, "masked"))
-    for name in ("00", "01"):
-        of_name = summary[(summary["sequence"] == name) & (summary["method"] == "masked")]
-        assert best.loc[name, "rmse"] == of_name["rmse"].min()
-        reduced = summary[(summary["sequence"] == name) & (summary["method"] == "reduced")]
-        assert reduced["max_keypoints"].item() == round(best.loc[name, "mean_keypoints"])
 
 
 def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, small_labels, finished, monkeypatch):
@@ -54,15 +48,6 @@ def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, small
     again = runner.run(jobs, small_world / "kitti", small_labels, folder)
     assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost}
     pd.testing.assert_frame_equal(again, summary)
-
-
-def test_a_failing_run_is_reported_and_stops_no_other(small_world, small_labels, tmp_path, capsys):
-    jobs = [Job("00", "baseline"), Job("00", "masked", dilation_width=0)]
-    summary = runner.run(jobs, small_world / "kitti", small_labels, tmp_path)
-    assert list(summary["run"]) == ["baseline-0"]
-    assert "sequence 00, masked-00-0: failed: dilation width 0" in capsys.readouterr().out
-    with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
-        runner.run(jobs[1:], small_world / "kitti", small_labels, tmp_path)
 
 
 @pytest.mark.parametrize("error", [OSError("pulled the plug"), KeyboardInterrupt()])
@@ -100,16 +85,19 @@ def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small
         pd.testing.assert_frame_equal(whole[exact], resumed[exact], check_exact=True)
 
 
-def test_a_broken_label_map_costs_only_the_runs_that_need_it(small_world, small_labels, tmp_path, capsys):
+def test_what_fails_is_reported_and_stops_no_other_run(small_world, small_labels, tmp_path, capsys):
     shutil.copytree(small_labels, tmp_path / "labels")
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
     jobs = [*first_jobs(small_world / "kitti", ["00"], {"thesis": WIDTHS}), Job("00", "true-labels", 10),
-            Job("00", "mirrored", 10)]
+            Job("00", "mirrored", 10), Job("00", "masked", dilation_width=0)]
     summary = runner.run(jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5)
     assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
-    assert ("sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: "
-            f"{broken}: ") in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: {broken}: " in printed
+    assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
+    with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
+        runner.run(jobs[-1:], small_world / "kitti", small_labels, tmp_path / "none")
 
 
 def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_path):

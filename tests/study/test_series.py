@@ -158,14 +158,9 @@ def test_results_of_another_length_are_not_thrown_away(done, study):
     (["--labels", "LABELS", "--name", "a/b"], "--name a/b: a name may have letters"),
     (["--masks", "MASKS", "--widths", "5"], "--widths: only masks from label maps"),
     (["--masks", "MASKS", "--symmetric"], "--keep, --ids, --margin: need --labels DIR"),
-    (["--labels", "LABELS", "--margin", "-1"], "margin=-1: must be 0 or more pixels"),
     (["--masks", "LABELS"], "320x320 pixels, but the frames have"),
-    (["--masks", "TRUE", "--sequences", "00"], "different values; a mask has 0 and 255 (label maps go with --labels)"),
-    (["--labels", "LABELS", "--sequences", "77"], "77: no such folder"),
     (["--labels", "LABELS/00"], "holds the label maps of one sequence, but 2 are asked for"),
     (["--labels", "LESS", "--sequences", "00"], "(2 of 12 frames of sequence 00 have none)"),
-    (["--labels", "LESS", "--sequences", "01"], "LESS/01: no such folder"),
-    (["--labels", "LABELS", "--widths", "0"], "dilation width 0: must be 1 or more"),
     (["--labels", "LABELS", "--repetitions", "0"], "--repetitions 0: must be 1 or more"),
     (["--labels", "LABELS", "--frames", "2"], "--frames 2: must be 3 or more"),
 ])
@@ -175,8 +170,7 @@ def test_bad_input_is_one_clear_line_before_anything_runs(small_world, small_lab
     shutil.copytree(small_labels / "00", less)
     for index in (3, 4):
         (less / f"{index:06d}.png").unlink()
-    places = {"LABELS": small_labels, "MASKS": masks, "LESS": less.parent,
-              "TRUE": small_world / "kitti/sequences/00/labels_0"}
+    places = {"LABELS": small_labels, "MASKS": masks, "LESS": less.parent}
     given = [str(places[word.split("/")[0]] / word.partition("/")[2]) if word.split("/")[0] in places else word
              for word in given]
     assert main(["study", "--kitti", str(small_world / "kitti"), *given, "--output", str(tmp_path / "out")]) == 1
