@@ -1,5 +1,6 @@
 """Chapter 4's figures and tables, the comparison and the findings: their numbers are those of the runs."""
 
+import made_up
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from thesis_repro.report import chapter4, comparison, tables, texts
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import compare, thesis_tables
-from thesis_repro.study.jobs import ESTIMATORS, Job
+from thesis_repro.study.jobs import ESTIMATORS
 
 ELEVEN = [f"{number:02d}" for number in range(11)]
 CONTROLS = compare.SEGMENTATION_FREE_CONTROLS
@@ -17,27 +18,9 @@ def best_of(runs):
     return thesis_tables.of_chosen_width(compare.of_method(runs, "masked"))
 
 
-def runs_of(names, errors, repetitions=3, noise=0.0, widths=(5, 10, 15), sources=("",), seed=0):
-    """Runs with made-up errors: errors(sequence, method, width) -> RMSE in metres; the others follow from it.
-
-    noise: relative spread of the repetitions.
-    """
-    random, rows = np.random.default_rng(seed), []
-    methods = [("baseline", None, ""), ("reduced", None, "")]
-    for source in sources:
-        methods += [("masked", width, source) for width in widths] + [(name, 10, source) for name in CONTROLS]
-    for name in names:
-        for method, width, source in methods:
-            for estimator in ESTIMATORS:
-                for repetition in range(repetitions):
-                    error = errors(name, method, width) * np.exp(noise * random.normal())
-                    job = Job(name, method, width, estimator=estimator, repetition=repetition, source=source)
-                    rows.append({
-                        "sequence": name, "run": job.name, "source": source, "method": method, "dilation_width": width,
-                        "estimator": estimator, "repetition": repetition, "frames": 100, "rmse": error,
-                        "mae": error / 2, "rmse_boresight_corrected": error / 3, "rotation": error / 100,
-                        "mean_keypoints": 1900 if method == "baseline" else 500 + (width or 10), "flagged": 0})
-    return pd.DataFrame(rows).astype({"dilation_width": float})
+def runs_of(names, errors, widths=(5, 10, 15), **options):
+    methods = {"baseline": [None], "reduced": [None], "masked": widths} | {name: [10] for name in CONTROLS}
+    return made_up.runs(names, errors, methods, **options)
 
 
 def halved(name, method, _):

@@ -1,5 +1,6 @@
 """Comparisons: known ratios, symmetry, intervals and verdicts on made-up runs."""
 
+import made_up
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,19 +11,14 @@ from thesis_repro.study import compare
 EIGHT = [f"{number:02d}" for number in range(8)]
 
 
-def runs_of(factors, sequences=EIGHT, repetitions=2, noise=0.0, estimators=("thesis", "refined"), width=10):
-    """Runs whose errors are made up: {method: factor on the error of all keypoints, or a function of the sequence}."""
-    random, rows = np.random.default_rng(0), []
-    for name in sequences:
-        for method, factor in {"baseline": 1.0, **factors}.items():
-            for estimator in estimators:
-                for repetition in range(repetitions):
-                    error = (factor(name) if callable(factor) else factor) * np.exp(noise * random.normal())
-                    rows.append({"sequence": name, "source": "" if method == "baseline" else "net", "method": method,
-                                 "dilation_width": np.nan if method == "baseline" else width, "estimator": estimator,
-                                 "repetition": repetition, "mean_keypoints": 900.0, "frames": 30,
-                                 **dict.fromkeys(compare.METRICS, (1 + int(name)) * error)})
-    return pd.DataFrame(rows)
+def runs_of(factors, sequences=EIGHT, width=10, **options):
+    """factors: {method: factor on the error of all keypoints, or a function of the sequence}."""
+    def error(name, method, _):
+        factor = factors.get(method, 1.0)
+        return (1 + int(name)) * (factor(name) if callable(factor) else factor)
+
+    widths = {"baseline": [None]} | {method: [width] for method in factors}
+    return made_up.runs(sequences, error, widths, sources=["net"], **{"repetitions": 2} | options)
 
 
 def arms(runs, *methods):
@@ -113,8 +109,8 @@ def test_the_tested_width_is_that_of_the_controls():
     assert compare.tested_width(narrow) == 5
     assert compare.tested_width(runs_of({"masked": 0.5}, width=7)) == 7  # the only one that there is
     assert compare.tested_width(runs_of({})) == 10
-    assert compare.tested_width(runs_of({"masked": 0.5}, width=np.nan)) is None  # masks that came ready made
-    assert (compare.keypoints_left(narrow) == 900).all()
+    assert compare.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None  # masks that came ready made
+    assert (compare.keypoints_left(narrow) == 505).all()
     assert compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 
 

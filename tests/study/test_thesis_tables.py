@@ -1,5 +1,6 @@
 """Equation 4.1, the choice of width and the thesis's own tables."""
 
+import made_up
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,18 +11,9 @@ ELEVEN = [f"{number:02d}" for number in range(11)]
 
 
 def parts_of(error, sequences=ELEVEN, widths=range(1, 16), repetitions=5, noise=0.0):
-    """(masked, baseline) runs with made-up errors: error(sequence, width) in metres, width None for all keypoints.
-
-    MAE is half of it."""
-    random, rows = np.random.default_rng(0), []
-    for name in sequences:
-        for width in (None, *widths):
-            for repetition in range(repetitions):
-                value = error(name, width) * np.exp(noise * random.normal())
-                rows.append({"sequence": name, "method": "masked" if width else "baseline", "source": "",
-                             "dilation_width": width, "estimator": "thesis", "repetition": repetition, "frames": 100,
-                             "rmse": value, "mae": value / 2, "mean_keypoints": 500.0 + (width or 1500)})
-    runs = pd.DataFrame(rows).astype({"dilation_width": float})
+    """(masked, baseline) runs with made-up errors: error(sequence, width) in metres, width None for all keypoints."""
+    runs = made_up.runs(sequences, lambda name, _, width: error(name, width), {"baseline": [None], "masked": widths},
+                        estimators=["thesis"], repetitions=repetitions, noise=noise)
     return runs[runs["method"] == "masked"], runs[runs["method"] == "baseline"]
 
 
