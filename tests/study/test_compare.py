@@ -109,7 +109,7 @@ def test_the_tested_width_is_that_of_the_controls():
     assert compare.tested_width(narrow) == 5
     assert compare.tested_width(runs_of({"masked": 0.5}, width=7)) == 7  # the only one that there is
     assert compare.tested_width(runs_of({})) == 10
-    assert compare.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None  # masks that came ready made
+    assert compare.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None  # made ready
     assert (compare.keypoints_left(narrow) == 505).all()
     assert compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 

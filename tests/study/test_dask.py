@@ -7,7 +7,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pandas as pd
 import pytest
 
 from thesis_repro import InputError, longrun
+from thesis_repro.kitti import Sequence
 from thesis_repro.study import cluster, runner
 from thesis_repro.study.jobs import first_jobs
 
@@ -144,12 +144,12 @@ def test_a_scheduler_that_cannot_be_used_is_one_line(scheduler, monkeypatch):
 def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, small_labels, tmp_path, monkeypatch):
     jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
-    record = runner.stages.made_from(tmp_path / "00")
-    study = runner._Study(kitti, runner.by_name(small_labels), tmp_path, frames=None)
-    elsewhere = runner._run_pass(jobs, replace(study, folder=tmp_path / "elsewhere"), record, 1)
+    record = runner.stages.record(tmp_path / "00")
+    given = Sequence(kitti, "00"), runner.by_name(small_labels)
+    elsewhere = runner._run_pass(jobs, *given, tmp_path / "elsewhere", record, 1)
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
-    older = runner._run_pass(jobs, study, record, 1)
+    older = runner._run_pass(jobs, *given, tmp_path, record, 1)
     assert elsewhere[jobs[0]] != older[jobs[0]] and not (tmp_path / "00" / "baseline-0.csv").exists()
 
 

@@ -207,15 +207,14 @@ def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
 # Parts of a table of runs
 
 
-def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None, width: int | None = None) -> pd.DataFrame:
-    """The rows of one method under one estimator, of one dilation width where it is given.
+def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None) -> pd.DataFrame:
+    """The rows of one method under one estimator.
 
     estimator: by default the one of the thesis's tables, which is the thesis's own where it was run.
     """
     if estimator is None:
         estimator = next((name for name in ESTIMATORS if (runs["estimator"] == name).any()), "thesis")
-    rows = runs[(runs["method"] == method) & (runs["estimator"] == estimator)]
-    return rows if width is None else rows[rows["dilation_width"] == width]
+    return runs[(runs["method"] == method) & (runs["estimator"] == estimator)]
 
 
 def of_source(runs: pd.DataFrame, source: str) -> pd.DataFrame:

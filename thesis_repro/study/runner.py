@@ -6,7 +6,7 @@ Each finished run is one CSV file, one row a frame. A stopped or failed study go
 import hashlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,29 +25,18 @@ from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
 
-STATES = f"pass-{'[0-9a-f]' * 12}.npz"  # the names that `_Study.state` gives
+STATES = f"pass-{'[0-9a-f]' * 12}.npz"  # the names that `_state` gives
 
 
-@dataclass(frozen=True)
-class _Study:
-    """What all jobs of one call have in common, and where each of them keeps its files."""
+def _result(folder: Path, job: Job) -> Path:
+    """One row a frame, written when the job is done."""
+    return folder / job.sequence / f"{job.name}.csv"
 
-    kitti: Path
-    sources: dict[str, Source]
-    folder: Path
-    frames: int | None
 
-    def sequence(self, name: str) -> Sequence:
-        return Sequence(self.kitti, name).subset(self.frames)
-
-    def result(self, job: Job) -> Path:
-        """One row a frame, written when the job is done."""
-        return self.folder / job.sequence / f"{job.name}.csv"
-
-    def state(self, jobs: list[Job]) -> Path:
-        """The checkpoint of jobs that go over their sequence together."""
-        digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
-        return self.folder / jobs[0].sequence / f"pass-{digest}.npz"
+def _state(folder: Path, jobs: list[Job]) -> Path:
+    """The checkpoint of jobs that go over their sequence together."""
+    digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
+    return folder / jobs[0].sequence / f"pass-{digest}.npz"
 
 
 def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *,
@@ -67,29 +56,38 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
     Raises InputError where another run is at work in the folder, where all jobs fail, or where the machine lacks
     something, such as space or memory; what is finished is kept.
     """
-    study = _Study(kitti, by_name(labels), folder, frames)
-    jobs = list(dict.fromkeys(jobs))
+    jobs, sources = list(dict.fromkeys(jobs)), by_name(labels)
+    sequences = {name: Sequence(kitti, name).subset(frames) for name in sorted({job.sequence for job in jobs})}
+    files = {job: _result(folder, job) for job in jobs}
     with longrun.claimed(folder):
-        return _run(jobs, study, processes, scheduler)
-
-
-def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) -> pd.DataFrame:
-    sequences = _open(jobs, study)
-    for job in jobs:
-        path = study.result(job)
-        if path.is_file():
+        for sequence in sequences.values():
+            _stage(folder, sequence, sources)
+        for job, path in files.items():
             table = stages.kept_table(path, len(sequences[job.sequence]))
             if table is None or not np.isfinite(poses_of(table)).all():
-                path.unlink()  # what is missing is made again
-    finished = sum(study.result(job).is_file() for job in jobs)
+                path.unlink(missing_ok=True)  # what is missing is made again
+        finished = sum(path.is_file() for path in files.values())
+        failures = _run_passes(jobs, sequences, sources, folder, processes, scheduler)
+    done = {job: path for job, path in files.items() if path.is_file()}
+    if not done:
+        raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
+    runs = pd.DataFrame([_row(job, sequences[job.sequence], path) for job, path in done.items()])
+    runs.attrs = {"made": len(done) - finished, "kept": finished, "failed": len(jobs) - len(done)}
+    return runs
+
+
+def _run_passes(jobs: list[Job], sequences: dict[str, Sequence], sources: dict[str, Source], folder: Path,
+                processes: int, scheduler: str | None) -> dict[Job, str]:
+    """Run what has no result, and print what fails; returns the reasons."""
     failures: dict[Job, str] = {}
     lengths = {name: len(sequence) for name, sequence in sequences.items()}
     with cluster.open_pool(processes, scheduler) as pool:
-        passes = _passes(jobs, lengths, study, pool.size)
+        passes = _passes(jobs, lengths, folder, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
-        calls = [(of_pass, study, stages.record(study.folder / of_pass[0].sequence), threads)
-                 for of_pass in passes]
-        work = [len(of_pass) * lengths[of_pass[0].sequence] for of_pass in passes]  # a frame of each run
+        names = [of_pass[0].sequence for of_pass in passes]
+        calls = [(of_pass, sequences[name], sources, folder, stages.record(folder / name), threads)
+                 for of_pass, name in zip(passes, names)]
+        work = [len(of_pass) * lengths[name] for of_pass, name in zip(passes, names)]  # a frame of each run
         with progress(None, "odometry", total=sum(work), unit="frame") as bar:
             for index, failed in pool.run(_run_pass, calls):
                 failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
@@ -97,18 +95,13 @@ def _run(jobs: list[Job], study: _Study, processes: int, scheduler: str | None) 
     by_reason: dict[tuple[str, str], list[str]] = {}
     for job, reason in failures.items():
         by_reason.setdefault((job.sequence, reason), []).append(job.name)
-    for (name, reason), names in by_reason.items():
-        more = f" and {len(names) - 3} more" * (len(names) > 3)
-        longrun.say(f"sequence {name}, {', '.join(names[:3])}{more}: failed: {reason}", warning=True)
+    for (name, reason), of_reason in by_reason.items():
+        more = f" and {len(of_reason) - 3} more" * (len(of_reason) > 3)
+        longrun.say(f"sequence {name}, {', '.join(of_reason[:3])}{more}: failed: {reason}", warning=True)
     for reason in failures.values():
         if isinstance(reason, _Lacking):  # no answer can be trusted that is left out for want of space
             raise InputError(reason)
-    done = [job for job in jobs if study.result(job).is_file()]
-    if not done:
-        raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
-    runs = pd.DataFrame([_row(job, sequences[job.sequence], study.result(job)) for job in done])
-    runs.attrs = {"made": len(done) - finished, "kept": finished, "failed": len(jobs) - len(done)}
-    return runs
+    return failures
 
 
 class _Lacking(str):
@@ -120,27 +113,24 @@ def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
     return {source.name: source for source in ([Source(labels)] if isinstance(labels, Path) else labels)}
 
 
-def _open(jobs: list[Job], study: _Study) -> dict[str, Sequence]:
-    """The jobs' sequences by name; what the folder holds of other data, code or settings is deleted.
+def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None:
+    """Delete what the folder holds of a sequence that was made from other data, code or settings.
 
     Each source has a folder of its own in that of the sequence, so a change of one source leaves the others' runs.
     """
-    sequences = {name: study.sequence(name) for name in sorted({job.sequence for job in jobs})}
-    for name, sequence in sequences.items():
-        if not sequence.has_truth:
-            raise InputError(f"{sequence.poses_path}: no such file; without true poses sequence {name} has no "
-                             "errors to compare; leave it out (the odometry command runs it)")
-        true_labels, folder = controls.true_labels(study.kitti, name), study.folder / name
-        records = {source.name: source.record(name) for source in study.sources.values()}
-        stages.stage(folder, **_versions(), sequence=stages.listing(sequence.files),
-                     true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None,
-                     **records.pop("", {}))
-        for source, record in records.items():
-            if stages.record(folder / source) != record:  # so a state may have masks of other files
-                for state in folder.glob(STATES):
-                    state.unlink()
-            stages.stage(folder / source, **record)
-    return sequences
+    if not sequence.has_truth:
+        raise InputError(f"{sequence.poses_path}: no such file; without true poses sequence {sequence.name} has no "
+                         "errors to compare; leave it out (the odometry command runs it)")
+    true_labels, folder = controls.true_labels(sequence.root, sequence.name), folder / sequence.name
+    records = {source.name: source.record(sequence.name) for source in sources.values()}
+    stages.stage(folder, **_versions(), sequence=stages.listing(sequence.files),
+                 true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None,
+                 **records.pop("", {}))
+    for source, record in records.items():
+        if stages.record(folder / source) != record:  # so a state may have masks of other files
+            for state in folder.glob(STATES):
+                state.unlink()
+        stages.stage(folder / source, **record)
 
 
 def _versions() -> dict[str, Any]:
@@ -148,7 +138,7 @@ def _versions() -> dict[str, Any]:
             **stages.made_with("opencv-python-headless", "numpy", "numba")}
 
 
-def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: int) -> list[list[Job]]:
+def _passes(jobs: list[Job], frames: Mapping[str, int], folder: Path, workers: int) -> list[list[Job]]:
     """What is to be run, as lists of jobs, each for one pass over its sequence, the longest first.
 
     A pass that was stopped goes on as it was. The rest is cut anew. frames: of each sequence.
@@ -157,8 +147,8 @@ def _passes(jobs: list[Job], frames: Mapping[str, int], study: _Study, workers: 
     rest: list[Job] = []
     for name in frames:
         of_name = {job.name: job for job in jobs if job.sequence == name}
-        waiting = {key: job for key, job in of_name.items() if not study.result(job).is_file()}
-        for state in sorted((study.folder / name).glob(STATES)):
+        waiting = {key: job for key, job in of_name.items() if not _result(folder, job).is_file()}
+        for state in sorted((folder / name).glob(STATES)):
             checkpoint = None
             with suppress(InputError):  # it is damaged
                 checkpoint = stages.resume(state, arrays=False)
@@ -198,24 +188,24 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Sour
     return {job: its_masks for job, its_masks in masks.items() if not isinstance(its_masks, str)}, reasons
 
 
-def _run_pass(jobs: list[Job], study: _Study, record: dict, threads: int) -> dict[Job, str]:
+def _run_pass(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], folder: Path, record: dict, threads: int
+              ) -> dict[Job, str]:
     """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason} of those that failed."""
     cv2.setNumThreads(1)  # the processes already use every core
-    name, state = jobs[0].sequence, study.state(jobs)
+    state = _state(folder, jobs)
     failures: dict[Job, str] = {}
     try:
-        stages.check_worker(study.folder / name, record, **_versions())
-        sequence = study.sequence(name)
+        stages.check_worker(folder / sequence.name, record, **_versions())
         # all of them where there is a checkpoint to go on from, for it is one of all of them
-        waiting = jobs if state.is_file() else [job for job in jobs if not study.result(job).is_file()]
-        masks, failures = masks_of(waiting, sequence, study.sources)
+        waiting = jobs if state.is_file() else [job for job in jobs if not _result(folder, job).is_file()]
+        masks, failures = masks_of(waiting, sequence, sources)
         if not masks:  # or Dask does again what it lost the answer of
             return failures
         results = odometry.run_many(sequence, {job.name: (job.settings, its_masks) for job, its_masks in masks.items()},
                                     checkpoint=state, workers=threads)
         for job in masks:
-            if not study.result(job).is_file():
-                write_text(study.result(job), results.pop(job.name).frames.to_csv(index=False))
+            if not _result(folder, job).is_file():
+                write_text(_result(folder, job), results.pop(job.name).frames.to_csv(index=False))
         state.unlink(missing_ok=True)
     except Exception as error:  # whatever it is, the others go on and the reason is reported
         reason = longrun.explain(error)
@@ -223,7 +213,7 @@ def _run_pass(jobs: list[Job], study: _Study, record: dict, threads: int) -> dic
             reason = f"{type(error).__name__}: {error}"
         elif not isinstance(error, InputError):
             reason = _Lacking(reason)
-        failures = dict.fromkeys((job for job in jobs if not study.result(job).is_file()), reason) | failures
+        failures = dict.fromkeys((job for job in jobs if not _result(folder, job).is_file()), reason) | failures
     return failures
 
 
