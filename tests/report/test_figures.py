@@ -52,7 +52,6 @@ MOVED = np.roll(LABEL_MAP, 14, axis=1)
 MASK = 255 * (LABEL_MAP == ID["car"]).astype(np.uint8)
 POINTS = np.array([[110.0, 50.0], [120.0, 60.0]])
 DRAWN = {
-    "2.1": chapter2.figure_2_01,
     "2.2": lambda: chapter2.figure_2_02(*convolution()),
     "2.2 of three channels": lambda: chapter2.figure_2_02(*convolution(3)),
     "2.7": lambda: chapter2.figure_2_07(unet(4)),
@@ -135,11 +134,11 @@ def test_keypoints_jump_with_the_boundary_and_stay_without():
 
 def test_the_same_figure_gives_the_same_files_with_its_note(tmp_path):
     for folder in (tmp_path / "first", tmp_path / "second"):
-        style.save_figure(chapter2.figure_2_01(), folder, "plot", "a note")
+        style.save_figure(chapter2.figure_2_08(turning(), "title"), folder, "plot", "a note")
         style.save_figure(chapter2.figure_2_09(MASK, MASK, "title"), folder, "picture", "a note")
         assert sorted(path.name for path in folder.iterdir()) == ["picture.webp", "plot.svg"]
     for name in ("plot.svg", "picture.webp"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
         assert b"a note" in (tmp_path / "first" / name).read_bytes()
-    style.save_figure(chapter2.figure_2_01(), tmp_path / "first", "picture", "a note")  # has become a plot
+    style.save_figure(chapter2.figure_2_08(turning(), "title"), tmp_path / "first", "picture", "a note")  # now a plot
     assert sorted(path.name for path in (tmp_path / "first").iterdir()) == ["picture.svg", "plot.svg"]

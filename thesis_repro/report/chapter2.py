@@ -1,6 +1,7 @@
 """The figures of chapter 2, drawn anew from the project's own network and data: networks, odometry, keypoints.
 
-Plots of a formula or of one table, Figures 2.3 to 2.6, 3.4, 3.5, 4.1 and 4.17, are drawn in cells of the notebooks.
+Diagrams and plots of a formula or of one table are drawn in cells of the notebooks: 2.1, 2.3 to 2.6, 3.4, 3.5, 4.1 and
+4.17.
 """
 
 import cv2
@@ -15,30 +16,6 @@ from thesis_repro.report import style
 from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 GRAY, LIGHT_GRAY = "#777777", "#bbbbbb"
-
-
-def figure_2_01():
-    """Figure 2.1: a basic convolutional network as a diagram."""
-    figure, axes = style.new_figure(height=2.3)
-    axes.set(xlim=(0, 18.6), ylim=(0, 5.6))
-    axes.set_axis_off()
-    middle = 3.1
-    inputs, outputs = (middle + 0.62 * (np.arange(count) - (count - 1) / 2) for count in (6, 4))
-    for name, left, side, maps, color in (
-            ("input\nimage", 0.2, 3.2, 1, "#aaaaaa"), ("convolution\none map per kernel", 3.5, 2.8, 5, BLUE),
-            ("activation\nReLU", 6.9, 2.8, 5, SKY), ("pooling\n2x2, largest", 10.3, 1.4, 5, ORANGE)):
-        for offset in np.arange(maps) * 0.15:
-            axes.add_patch(Rectangle((left + offset, middle - side / 2 - offset + 0.3), 0.65 * side, side,
-                                     facecolor=color, edgecolor="white", linewidth=0.8))
-        right = left + 0.65 * side + 0.15 * (maps - 1)
-        axes.text((left + right) / 2, 0.45, name, ha="center", va="center", fontsize=8)
-        _arrow(axes, (right + 0.1, middle), (right + 0.8, middle))
-    axes.plot([[13.6], [16.3]], [np.repeat(inputs, 4), np.tile(outputs, 6)], color=LIGHT_GRAY, linewidth=0.5, zorder=0)
-    for x, heights, color, name in ((13.6, inputs, GREEN, "dense\nall, weighted"),
-                                    (16.3, outputs, RED, "softmax\nclass scores")):
-        axes.scatter(np.full(len(heights), x), heights, s=110, color=color)
-        axes.text(x, 0.45, name, ha="center", va="center", fontsize=8)
-    return figure
 
 
 def figure_2_02(patch, kernel, bias, feature_map, activated, where):

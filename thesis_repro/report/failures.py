@@ -39,8 +39,6 @@ def measure(sequence, masks):
             current, previous, agreeing = _agreeing(step, reference, sequence)
             of_agreeing = measured(reference.rotation, reference.translation, current[agreeing], previous[agreeing],
                                    agreeing, SETTINGS.threshold)
-            wrong = np.eye(4)
-            wrong[:3, :3] = true[:3, :3].T @ step.motion.rotation
             cells = (step.previous // [sequence.size[1] / CELLS, sequence.size[0] / CELLS]).astype(int)
             rows.append({
                 "sequence": sequence.name, "frame": index, "kind": kind, "tracked": len(current),
@@ -48,7 +46,7 @@ def measure(sequence, masks):
                 "spread_u": step.previous[:, 0].std(), "spread_v": step.previous[:, 1].std(),
                 "depth_spread": _depth_spread(current[agreeing], previous[agreeing], reference),
                 "condition": of_agreeing.condition, "direction_std": of_agreeing.heading_std_deg,
-                "rotation_error": metrics.angles(wrong[None])[0], "flag": "; ".join(step.flags)})
+                "rotation_error": metrics.angles(true[:3, :3].T @ step.motion.rotation), "flag": "; ".join(step.flags)})
     return pd.DataFrame(rows)
 
 
