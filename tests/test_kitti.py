@@ -6,7 +6,7 @@ import pytest
 from evo.tools import file_interface
 
 from thesis_repro import InputError, odometry
-from thesis_repro.kitti import Sequence, name_of, sequences, true_poses, without_truth, write_tum
+from thesis_repro.kitti import Sequence, name_of, sequences, true_path, without_truth, write_tum
 
 
 def test_reads_a_sequence(tiny_kitti):
@@ -121,6 +121,6 @@ def test_a_folder_of_ones_own_needs_no_layout(tiny_kitti, tmp_path):
     assert sequence.name == "mine" and len(sequence) == 4 and not sequence.has_truth and not sequence.has_times
     shutil.copy(tiny_kitti / "poses/00.txt", folder / "poses.txt")
     assert np.array_equal(Sequence(None, folder).poses, Sequence(tiny_kitti, "00").poses)
-    assert np.array_equal(true_poses(None, folder), true_poses(tiny_kitti, "0"))
+    assert np.array_equal(true_path(None, folder)[0], true_path(tiny_kitti, "0")[0])
     official = Sequence(None, tiny_kitti / "sequences/00")
     assert official.has_truth and official.name == "00"

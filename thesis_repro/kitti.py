@@ -39,7 +39,7 @@ def sequences(root: str | Path) -> list[str]:
 
     Of 00 to 10 only the frames need be there: if they have no poses, a file is missing, which `Sequence` says.
     """
-    names = [name for name in _with_frames(root) if _has_truth(root, name)]
+    names = [name for name in with_frames(root) if _has_truth(root, name)]
     if not names:
         raise InputError(f"{Path(root) / 'sequences'}: no sequence holds frames (image_0 or image_2) and true poses")
     return names
@@ -47,10 +47,11 @@ def sequences(root: str | Path) -> list[str]:
 
 def without_truth(root: str | Path) -> list[str]:
     """Names of the other sequences with frames, sorted, such as 11 to 21, whose poses the benchmark keeps to itself."""
-    return [name for name in _with_frames(root) if not _has_truth(root, name)]
+    return [name for name in with_frames(root) if not _has_truth(root, name)]
 
 
-def _with_frames(root):
+def with_frames(root: str | Path) -> list[str]:
+    """Names of all sequences with frames, sorted. Raises InputError for a folder of another layout."""
     root = Path(root)
     if not (root / "sequences").is_dir():
         raise InputError(f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt")
@@ -190,9 +191,14 @@ def name_of(root: str | Path, name: str) -> str:
     return _places(root, name)[1].name
 
 
-def true_poses(root: str | Path | None, name: str | Path) -> np.ndarray:
-    """The true poses of a sequence, (n, 4, 4), whose frames need not be there; root and name as Sequence takes them."""
-    return read_poses(_places(root, name)[2])
+def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """The true poses of a sequence, (n, 4, 4), and their times, (n,), seconds; the frames need not be there.
+
+    root and name as Sequence takes them; without times.txt KITTI's ten frames a second.
+    """
+    _, folder, path = _places(root, name)
+    poses, times = read_poses(path), folder / "times.txt"
+    return poses, read_times(times) if times.is_file() else FRAME_TIME * np.arange(len(poses))
 
 
 def check_numbering(paths: list[Path]) -> None:
@@ -323,6 +329,27 @@ def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
 
     quaternions = Rotation.from_matrix(np.asarray(poses)[:, :3, :3]).as_quat(canonical=True)
     _write_rows(path, np.column_stack([times, np.asarray(poses)[:, :3, 3], quaternions]))
+
+
+def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The poses of a file in TUM's form that are nearest to times (n,), seconds, as evo finds them.
+
+    Returns the numbers of the times that have one, (m,), and their poses, (m, 4, 4); InputError for fewer than two.
+    """
+    from evo import EvoException  # loads in 0.4 s, as above
+    from evo.core.sync import matching_time_indices
+    from evo.tools import file_interface
+
+    try:
+        trajectory = file_interface.read_tum_trajectory_file(path)
+    except EvoException as error:
+        raise InputError(f"{path}: {error}") from None
+    numbers, nearest = matching_time_indices(times, trajectory.timestamps)
+    poses = np.array(trajectory.poses_se3)[nearest]
+    if len(poses) < 2 or not np.isfinite(poses).all():
+        raise InputError(f"{path}: {len(poses)} poses at the times of frames, {times[0]:g} to {times[-1]:g} s; two or "
+                         "more finite ones are needed")
+    return np.array(numbers), poses
 
 
 def _write_rows(path, rows):

@@ -137,9 +137,10 @@ def read_settings(environment=None):
     world = build / f"world-{profile}"
     folders = {name: _data_folder(name, given[name])
                for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC") if name in given}
-    changed = {name.lower(): _widths(text) if name == "WIDTHS" else number(name, text)
-               for name, text in given.items() if name in SIZES and (name, text) != ("FRAMES", "all")}
-    sizes = replace(PROFILES[profile], **changed | ({"frames": None} if given.get("FRAMES") == "all" else {}))
+    own_forms = {"WIDTHS": widths, "FRAMES": frames}
+    sizes = replace(PROFILES[profile], **{
+        name.lower(): own_forms[name](text) if name in own_forms else number(name, text)
+        for name, text in given.items() if name in SIZES})
     data = [_short_name(name.lower().removeprefix("kitti_"), path) for name, path in folders.items()]
     whose = ["embedded"] if folders.keys() <= {"KITTI_SEMANTIC"} else []
     run = "-".join(["_".join(whose + data), profile, *(f"{name.replace('_', '-')}-{_in_a_name(value)}"
@@ -169,14 +170,20 @@ def processes(text):
     return number("JOBS", text)
 
 
-def _widths(text):
+def frames(text):
+    """How many frames of each sequence a text says: a whole number, or None for "all"."""
+    return None if text == "all" else number("FRAMES", text)
+
+
+def widths(text):
+    """The dilation widths, pixels, that a text such as "5,10", "1-15" or "1-3,10" says: a sorted tuple."""
     matches = [re.fullmatch("([0-9]{1,4})(?:-([0-9]{1,4}))?", word) for word in text.replace(",", " ").split()]
     ranges = [range(int(match[1]), int(match[2] or match[1]) + 1) for match in matches if match]
-    widths = sorted({width for widths in ranges for width in widths})
+    chosen = sorted({width for of_range in ranges for width in of_range})
     least, most, _ = LIMITS["WIDTHS"]
-    if not all(matches) or not all(ranges) or not widths or widths[0] < least or widths[-1] > most:
+    if not all(matches) or not all(ranges) or not chosen or chosen[0] < least or chosen[-1] > most:
         raise InputError(f"WIDTHS={text[:60]}: must be whole numbers from {least} to {most}, such as 5,10 or 1-15")
-    return tuple(widths)
+    return tuple(chosen)
 
 
 def _changed(profile, sizes):

@@ -162,7 +162,6 @@ def test_results_of_another_length_are_not_thrown_away(done, study):
     (["--labels", "LABELS/00"], "holds the label maps of one sequence, but 2 are asked for"),
     (["--labels", "LESS", "--sequences", "00"], "(2 of 12 frames of sequence 00 have none)"),
     (["--labels", "LABELS", "--repetitions", "0"], "--repetitions 0: must be 1 or more"),
-    (["--labels", "LABELS", "--frames", "2"], "--frames 2: must be 3 or more"),
 ])
 def test_bad_input_is_one_clear_line_before_anything_runs(small_world, small_labels, masks, tmp_path, capsys, given,
                                                           names):

@@ -117,7 +117,7 @@ odometry --kitti kitti --sequence 77 -> sequences/77
 odometry --kitti kitti --sequence ../00 -> '../00'
 {MASKS[:-3]}labels -> --output labels
 {MASKS[:-3]}mine -> mine
-{STUDY} --widths 5000 -> 5000
+{STUDY} --widths 900 -> 900
 {STUDY} --dask nonsense -> nonsense
 {STUDY_ALL} -> --labels
 check-data -> --kitti

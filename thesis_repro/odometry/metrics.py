@@ -4,9 +4,11 @@ from typing import Any
 
 import evo
 import numpy as np
-from evo.core import metrics as evo_metrics
+from evo.core.metrics import PoseRelation
 from evo.core.trajectory import PosePath3D
 from evo.core.units import Unit
+from evo.main_ape import ape
+from evo.main_rpe import rpe as evo_rpe
 from scipy.spatial.transform import Rotation
 
 from thesis_repro import InputError
@@ -64,6 +66,7 @@ def checked(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.nda
 # The field's measures
 
 ALIGNMENTS = ("none", "se3", "sim3", "scale")
+STATISTICS = ("rmse", "mean", "median", "max")
 
 
 def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dict[str, Any]:
@@ -75,12 +78,10 @@ def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dic
     try:
         estimated, scale = align(estimated, true, alignment)
     except evo.EvoException:
-        return {**dict.fromkeys(("rmse", "mean", "median", "max", "scale"), np.nan),
+        return {**dict.fromkeys((*STATISTICS, "scale"), np.nan),
                 "note": f"no {alignment} alignment: the path is straight or does not move"}
-    reference, estimate = _evo_paths(estimated, true)
-    error = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
-    error.process_data((reference, estimate))
-    return {**_statistics(error), "scale": float(scale), "note": ""}
+    result = ape(*_evo_paths(estimated, true), PoseRelation.translation_part)
+    return {**{name: float(result.stats[name]) for name in STATISTICS}, "scale": float(scale), "note": ""}
 
 
 def align(estimated: np.ndarray, true: np.ndarray, alignment: str) -> tuple[np.ndarray, float]:
@@ -102,13 +103,10 @@ def align(estimated: np.ndarray, true: np.ndarray, alignment: str) -> tuple[np.n
 def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """Relative pose error from frame to frame: {translation_rmse, ..._mean, _median, _max} in metres, and
     {rotation_rmse, ...} in degrees."""
-    result = {}
-    for name, relation in (("translation", evo_metrics.PoseRelation.translation_part),
-                           ("rotation", evo_metrics.PoseRelation.rotation_angle_deg)):
-        error = evo_metrics.RPE(relation, delta=1, delta_unit=Unit.frames, all_pairs=True)
-        error.process_data(_evo_paths(estimated, true))
-        result.update({f"{name}_{key}": value for key, value in _statistics(error).items()})
-    return result
+    relations = {"translation": PoseRelation.translation_part, "rotation": PoseRelation.rotation_angle_deg}
+    results = {name: evo_rpe(*_evo_paths(estimated, true), relation, delta=1, delta_unit=Unit.frames, all_pairs=True)
+               for name, relation in relations.items()}
+    return {f"{name}_{key}": float(results[name].stats[key]) for name in relations for key in STATISTICS}
 
 
 def _evo_paths(estimated, true):
@@ -116,16 +114,11 @@ def _evo_paths(estimated, true):
     return tuple(PosePath3D(poses_se3=list(np.array(poses, np.float64))) for poses in (true, estimated))
 
 
-def _statistics(error):
-    values = error.get_all_statistics()
-    return {key: float(values[key]) for key in ("rmse", "mean", "median", "max")}
-
-
 RELATIVE_LENGTH = 20.0  # metres: several of them in every path at hand
 
 
 def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = RELATIVE_LENGTH) -> dict[str, Any]:
-    """Mean errors over stretches of one length: {translation_percent, rotation_deg_per_m, segments, note}.
+    """Mean errors over stretches of one length: {translation_percent, rotation_deg_per_100m, segments, note}.
 
     Neither a constant rotation between both frames nor the path's start can change them. A stretch goes from each frame
     to the first one `length` metres of true path away. The camera's motion M over it is compared with the true one
@@ -138,7 +131,7 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
     last = np.searchsorted(along, along + length)
     first = np.flatnonzero(last < len(true))
     if not len(first):
-        return {"translation_percent": np.nan, "rotation_deg_per_m": np.nan, "segments": 0,
+        return {"translation_percent": np.nan, "rotation_deg_per_100m": np.nan, "segments": 0,
                 "note": f"too short: {along[-1]:.1f} m, stretches of {length:g} m are compared"}
     motion, given = (np.linalg.inv(poses[first]) @ poses[last[first]] for poses in (estimated, true))
     vectors, goals = (np.concatenate([steps[:, :3, 3], length * _rotation_vectors(steps[:, :3, :3])])
@@ -151,18 +144,17 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
     differences = given[:, :3, :3].swapaxes(1, 2) @ turn @ motion[:, :3, :3] @ turn.T
     angle = np.linalg.norm(_rotation_vectors(differences), axis=1)
     return {"translation_percent": float(offsets.mean() / length * 100),
-            "rotation_deg_per_m": float(np.degrees(angle.mean()) / length), "segments": len(first), "note": ""}
+            "rotation_deg_per_100m": float(np.degrees(angle.mean()) / length * 100), "segments": len(first), "note": ""}
 
 
 def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> dict[str, float]:
     """The errors of a table of runs: rmse and mae (metres; alignment as in `rmse`), se3, the RMSE in metres after the
-    rotation and shift that fit best, and translation_percent and rotation_deg_per_m of `relative_errors`. NaN where a
-    path is too short or too straight for one.
+    rotation and shift that fit best, and the two of `relative_errors`. NaN where a path is too short or too straight.
     """
     relative = relative_errors(estimated, true)
     return {"rmse": rmse(estimated, true, alignment), "mae": mae(estimated, true, alignment),
             "se3": ate(estimated, true, "se3")["rmse"],
-            **{name: relative[name] for name in ("translation_percent", "rotation_deg_per_m")}}
+            **{name: relative[name] for name in ("translation_percent", "rotation_deg_per_100m")}}
 
 
 MIN_DIRECTED_STEP = 0.25  # metres; in a shorter step the direction of motion is lost in noise
@@ -220,7 +212,7 @@ KITTI_EVERY = 10  # frames between the starts of segments
 
 
 def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """The KITTI odometry benchmark's errors: {translation_percent, rotation_deg_per_m, segments, note}.
+    """The KITTI odometry benchmark's errors: {translation_percent, rotation_deg_per_100m, segments, note}.
 
     Means over segments: from every tenth frame, for each of KITTI_LENGTHS, up to the first frame more than that many
     metres of true path away. NaN, with a note, where the path is too short for a single one; a zero would look like a
@@ -233,9 +225,9 @@ def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
     last = np.searchsorted(along, along[first] + length, side="right")
     first, last, length = (each[last < len(true)] for each in (first, last, length))
     if not len(first):
-        return {"translation_percent": np.nan, "rotation_deg_per_m": np.nan, "segments": 0,
+        return {"translation_percent": np.nan, "rotation_deg_per_100m": np.nan, "segments": 0,
                 "note": f"too short: {along[-1]:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m"}
     motion, true_motion = (np.linalg.inv(poses[first]) @ poses[last] for poses in (estimated, true))
     error = np.linalg.inv(motion) @ true_motion
     return {"translation_percent": float(100 * (np.linalg.norm(error[:, :3, 3], axis=1) / length).mean()),
-            "rotation_deg_per_m": float((angles(error) / length).mean()), "segments": len(first), "note": ""}
+            "rotation_deg_per_100m": float(100 * (angles(error) / length).mean()), "segments": len(first), "note": ""}

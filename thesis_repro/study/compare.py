@@ -32,12 +32,12 @@ from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 JUDGING_METRICS = {"rmse_boresight_corrected": "RMSE, mounting angle removed", "rotation": "rotation error a frame"}
 SECONDARY_METRICS = {"rmse": "RMSE", "mae": "MAE", "se3": "aligned ATE",
                      "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
-                     "rotation_deg_per_m": f"rotation error over {RELATIVE_LENGTH:g} m",
+                     "rotation_deg_per_100m": f"rotation error over {RELATIVE_LENGTH:g} m",
                      "t_rel": "KITTI's t_rel", "r_rel": "KITTI's r_rel"}
 METRICS = {**JUDGING_METRICS, **SECONDARY_METRICS}
-UNITS = {"rmse_boresight_corrected": "m", "rotation": "degrees", "rmse": "m", "mae": "m", "se3": "m",
-         "translation_percent": "%", "rotation_deg_per_m": "degrees a metre",
-         "t_rel": "%", "r_rel": "degrees per 100 m"}
+UNITS = {"rmse_boresight_corrected": "m", "rotation": "deg", "rmse": "m", "mae": "m", "se3": "m",
+         "translation_percent": "%", "rotation_deg_per_100m": "deg/100 m",
+         "t_rel": "%", "r_rel": "deg/100 m"}
 
 METHODS = {  # in the order in which they are shown
     "baseline": "all keypoints",

@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 
 from thesis_repro import InputError, cityscapes, kitti, odometry
-from thesis_repro.settings import Profile
-from thesis_repro.study import ablations, jobs, runner
+from thesis_repro.settings import Profile, cores
+from thesis_repro.study import ablations, compare, jobs, runner
 from thesis_repro.study.series import Study
 from thesis_repro.study.sources import Source
 
 SHORT, LONG = 3, 9  # frames that are timed: the difference leaves out what a run costs once
 LABEL_MAP_BYTES, ROW_BYTES = 6_000, 450  # of a label map, and of a frame of a run
+NOTEBOOK_SECONDS = 16  # that a notebook takes however few frames there are: imports, figures, small examples
+RUNS_IN_07 = 7  # what notebook 7 costs a frame of its one sequence, in runs with all keypoints
 
 
 def of_study(study: Study) -> dict[str, Any]:
@@ -36,8 +38,8 @@ def of_study(study: Study) -> dict[str, Any]:
                  total * runs * ROW_BYTES)
 
 
-def of_thesis(root: Path, sizes: Profile, complete: bool = False, training_images: int = 0) -> dict[str, Any]:
-    """What the notebooks would take on a KITTI folder, or on the complete benchmark, see `_plan`.
+def of_thesis(root: Path, sizes: Profile, training_images: int = 0) -> dict[str, Any]:
+    """What the notebooks would take on a KITTI folder, see `_plan`.
 
     training_images: of the folder, before they are split and doubled; 0 where the model in the package is used.
     Raises InputError where the folder has no sequence that is long enough.
@@ -47,13 +49,10 @@ def of_thesis(root: Path, sizes: Profile, complete: bool = False, training_image
     with quietly():
         from thesis_repro.segmentation import prediction  # here and below: TensorFlow takes seconds to load
 
-    lengths = {name: len(kitti.Sequence(root, name)) for name in kitti.sequences(root)}
-    name = _to_time(lengths)
-    frames = {name: min(count, sizes.frames or count)
-              for name, count in (kitti.FRAME_COUNTS if complete else lengths).items()}
-    total = sum(frames.values())
+    frames = {name: len(kitti.Sequence(root, name).subset(sizes.frames)) for name in kitti.sequences(root)}
+    name, total, steps = _to_time(frames), sum(frames.values()), []
     timed_frames = sum(min(count, sizes.timed_frames) for count in frames.values())
-    model, sequence, steps = prediction.load_shipped(), kitti.Sequence(root, name), []
+    model, sequence = prediction.load_shipped(), kitti.Sequence(root, name)
     chosen = jobs.first_jobs(root, [name], {"thesis": sizes.widths, "refined": []}, tested=jobs.CONTROL_WIDTH,
                              repetitions=sizes.repetitions)
     # of a sequence; with the plainly reduced ones, "fewer" and "spread"
@@ -65,7 +64,6 @@ def of_thesis(root: Path, sizes: Profile, complete: bool = False, training_image
     with TemporaryDirectory() as folder:
         labels = Path(folder)
         predict(LONG, labels)
-        ablated = len(ablations.runs_of(sequence.subset(LONG), labels / name))
         label_map = _seconds_a_frame(predict)
         of_chosen = _seconds_a_frame(lambda count, folder: runner.run(chosen, root, [Source(labels)], folder,
                                                                       frames=count))
@@ -75,19 +73,25 @@ def of_thesis(root: Path, sizes: Profile, complete: bool = False, training_image
     if training_images:
         label_map, training = _network_seconds(sizes)
         images = 2 * min(training_images, sizes.training_images or training_images)  # once more, augmented
-        steps.append(("04: training", sizes.epochs, "epochs", images * sizes.epochs * (0.8 * training + 0.2 * label_map)
-                      ))
+        seconds = images * sizes.epochs * (0.8 * training + 0.2 * label_map)
+        steps.append(("04: training", sizes.epochs, "epochs", seconds))
+    notebooks, in_07 = 9 if training_images else 6, frames[min(frames)]
     steps += [("05: label maps", total, "frames", total * label_map),
+              ("07: one sequence", in_07, "frames", in_07 * RUNS_IN_07 * alone),
               ("08: odometry", runs * len(frames), "runs", total * runs * of_chosen / len(chosen)),
               ("08: timing of every width", timed_frames, "frames", timed_frames * (len(sizes.widths) + 1) * alone),
-              ("09: ablations", ablated * len(frames), "runs", total * of_ablated)]
-    return _plan(steps, frames, name, total * (LABEL_MAP_BYTES + runs * ROW_BYTES))
+              ("09: ablations", total, "frames", total * of_ablated)]
+    return _plan(steps, frames, name, total * (LABEL_MAP_BYTES + runs * ROW_BYTES), notebooks * NOTEBOOK_SECONDS)
 
 
-def _plan(steps: list[tuple[str, int, str, float]], frames: dict[str, int], timed: str, disk: float) -> dict[str, Any]:
-    """steps: name, number, of what, and the seconds of one core. frames: by sequence. timed: which. disk: bytes."""
-    return {"steps": steps, "seconds": sum(step[-1] for step in steps), "sequences": len(frames),
-            "frames": sum(frames.values()), "timed": timed, "timed_frames": LONG, "disk": disk}
+def _plan(steps: list[tuple[str, int, str, float]], frames: dict[str, int], timed: str, disk: float, once: float = 0
+          ) -> dict[str, Any]:
+    """steps: name, number, of what, and the seconds of one core. frames: by sequence. timed: which. disk: bytes. once:
+    seconds that more cores do not shorten."""
+    seconds = sum(step[-1] for step in steps)
+    return {"steps": steps, "once": once, "seconds": once + seconds, "cores": cores(),
+            "on_all_cores": once + seconds / cores(), "sequences": len(frames), "frames": sum(frames.values()),
+            "timed": timed, "timed_frames": LONG, "disk": disk, "fewest": compare.MIN_SEQUENCES}
 
 
 def _to_time(lengths: dict[str, int]) -> str:

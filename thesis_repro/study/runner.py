@@ -231,7 +231,7 @@ def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
     poses = poses_of(frames)
     kitti = metrics.kitti_errors(poses, true)
     return {"frames": len(frames), **metrics.errors(poses, true), **metrics.step_errors(poses, true),
-            "t_rel": kitti["translation_percent"], "r_rel": 100 * kitti["rotation_deg_per_m"],
+            "t_rel": kitti["translation_percent"], "r_rel": kitti["rotation_deg_per_100m"],
             "mean_keypoints": frames["detected"].mean(),
             "flagged": int((~frames["flag"].isin(["", "stationary"])).sum())}
 
