@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
@@ -60,20 +61,18 @@ def bare_calls(previous, frame, points, intrinsics):
 
 def step_cost(sequence):
     """Milliseconds of a step, of a refined one and of the thesis's bare OpenCV calls: medians of the least of 3."""
-    thesis, refined = (Odometry(sequence.intrinsics, replace(THESIS, estimator=name)) for name in ("thesis", "refined"))
+    followers = [Odometry(sequence.intrinsics, replace(THESIS, estimator=name)) for name in ("thesis", "refined")]
     metres, costs = odometry.scales(sequence), []
     clock = time.thread_time  # of a single thread, which does not see what else the machine is doing
     previous = sequence.frame(0)
-    for follower in (thesis, refined):
+    for follower in followers:
         follower.step(previous)
     for index, frame in enumerate(list(sequence.frames())[1:], 1):
-        calls = bare_calls(previous, frame, thesis.points, sequence.intrinsics)
-        states, least = [follower.state() for follower in (thesis, refined)], np.full(3, np.inf)
+        calls = bare_calls(previous, frame, followers[0].points, sequence.intrinsics)
+        before, least = followers, np.full(3, np.inf)
         for _ in range(REPEATS):  # in turn, so that what else the machine does falls on all of them
-            row = []
-            for follower, state in zip((thesis, refined), states, strict=True):
-                follower.restore(state)
-                row.append(seconds(lambda: follower.step(frame, metres[index]), clock))  # noqa: B023
+            followers = [copy(follower) for follower in before]
+            row = [seconds(partial(follower.step, frame, metres[index]), clock) for follower in followers]
             least = np.minimum(least, [*row, sum(seconds(call, clock) for call in calls)])
         costs.append(1e3 * least)
         previous = frame

@@ -81,7 +81,7 @@ class Odometry:
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame that self.points belong to
         self.points = keypoints.NO_POINTS
-        self._gap = 0.0  # metres from there to the last frame seen
+        self.gap = 0.0  # metres from there to the last frame seen
         warm_up(settings.estimator == "refined" or settings.fallback)
 
     def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
@@ -95,14 +95,14 @@ class Odometry:
         self._check(frame, scale, mask)
         self.count += 1
         if self.previous is not None:
-            step.scale += self._gap
+            step.scale += self.gap
         if frame[::8, ::8].std() < MIN_CONTRAST:
             step.flags.append("flat frame")
-            self._gap = step.scale
+            self.gap = step.scale
             return step
         if self.settings.fallback and mask is not None and self.previous is not None:
             step.frames = self.previous, frame
-        started, self._gap = time.perf_counter(), 0.0
+        started, self.gap = time.perf_counter(), 0.0
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
             step.points = len(self.points)
@@ -210,15 +210,6 @@ class Odometry:
         if flag:
             step.flags.append(flag)
         step.seconds["pose"] += time.perf_counter() - started
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to go on from here, and nothing that belongs to the settings."""
-        return {"pose": self.pose, "prior": self.prior, "count": self.count, "previous": self.previous,
-                "points": self.points, "gap": self._gap}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.pose, self.prior, self.count = state["pose"], state["prior"], state["count"]
-        self.previous, self.points, self._gap = state["previous"], state["points"], state["gap"]
 
     def _moved(self, motion, scale):
         moved, rotation = np.eye(4), self.pose[:3, :3]

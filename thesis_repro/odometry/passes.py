@@ -214,16 +214,16 @@ def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
 
 
 def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: list[_Run]) -> None:
-    last = leaders[0].odometry.state()  # which frame was the last to be tracked to, all runs agree
+    last = leaders[0].odometry  # which frame was the last to be tracked to, all runs agree
     arrays = {"numbers": np.array([member.numbers[:done] for member in members.values()]),
               "poses": np.array([member.odometry.pose for member in members.values()]),
               **{f"prior {part}": np.array([getattr(member.odometry.prior, part) for member in members.values()])
                  for part in MotionPrior._fields},
               **{f"points {index}": leader.odometry.points for index, leader in enumerate(leaders)}}
-    if last["previous"] is not None:
-        arrays["previous"] = last["previous"]
+    if last.previous is not None:
+        arrays["previous"] = last.previous
     flags = {name: member.flags for name, member in members.items()}
-    stages.store(checkpoint, {"job": job, "done": done, "gap": last["gap"], "flags": flags}, arrays)
+    stages.store(checkpoint, {"job": job, "done": done, "gap": last.gap, "flags": flags}, arrays)
 
 
 def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
@@ -243,8 +243,9 @@ def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], lea
         member.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
         member.odometry.pose, member.odometry.prior = pose, MotionPrior(*prior)
     for index, leader in enumerate(leaders):
-        leader.odometry.restore({**leader.odometry.state(), "count": done, "previous": arrays.get("previous"),
-                                 "points": arrays[f"points {index}"], "gap": state["gap"]})
+        follower = leader.odometry
+        follower.count, follower.gap = done, state["gap"]
+        follower.previous, follower.points = arrays.get("previous"), arrays[f"points {index}"]
     return done
 
 

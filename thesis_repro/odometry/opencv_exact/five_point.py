@@ -280,21 +280,11 @@ def _root_between(polynomial, slopes, degree, left, right, rising, start, precis
 
 
 @inner
-def essential(b, basis, z, matrix):
-    """Step 6: write the essential matrix (9, unit norm) that belongs to a root z: (x, y, 1) is normal to B(z)."""
-    rows = np.empty((3, 3))
-    for i in range(3):
-        rows[i, 0], rows[i, 1], rows[i, 2] = row_values(b[i], z)
-    x, y, w, largest = 0.0, 0.0, 1.0, -1.0
-    for i in range(3):  # the rows span a plane; the best conditioned pair gives its normal
-        p, q = rows[i], rows[(i + 1) % 3]
-        c0, c1, c2 = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
-        size = c0 * c0 + c1 * c1 + c2 * c2
-        if size > largest:
-            x, y, w, largest = c0, c1, c2, size
+def essential(normal, basis, z, matrix):
+    """Step 6: write the essential matrix (9, unit norm) that belongs to a root z and to the normal (3) of B(z)."""
     total = 0.0
     for j in range(9):
-        matrix[j] = x * basis[0, j] + y * basis[1, j] + w * (z * basis[2, j] + basis[3, j])
+        matrix[j] = normal[0] * basis[0, j] + normal[1] * basis[1, j] + normal[2] * (z * basis[2, j] + basis[3, j])
         total += matrix[j] * matrix[j]
     total = np.sqrt(total)
     for j in range(9):

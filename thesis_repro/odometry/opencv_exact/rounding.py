@@ -36,7 +36,7 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     Returns whether these are surely all that OpenCV computes, the matrices (K, 9) of unit norm, and K margins within
     which (Frobenius norm, up to sign) OpenCV's rounding leaves its own.
     """
-    solutions, margins, b = np.empty((10, 9)), np.empty(10), np.zeros((3, 13))
+    solutions, margins, b, b_sizes = np.empty((10, 9)), np.empty(10), np.zeros((3, 13)), np.empty((3, 13))
     unsure = False, solutions[:0], margins[:0]
     independence, basis = null_space(five)  # step 1
     if not independence > MIN_INDEPENDENCE:
@@ -44,6 +44,9 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     equations = constraints(basis)  # step 2
     if not eliminate(equations, b):  # step 3
         return unsure
+    for i in range(3):
+        for j in range(13):
+            b_sizes[i, j] = abs(b[i, j])
     errors = _elimination_errors(equations)
     polynomial = determinant(b)  # step 4
     solved, roots, extrema = real_roots(polynomial)  # step 5
@@ -51,12 +54,14 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
         return unsure
     work = np.empty((4, 3, 3))
     for k in range(len(extrema)):  # one as small as rounding may be a double root or none at all
-        error = _determinant_error(b, errors, extrema[k], work)
+        error = _determinant_error(b, b_sizes, errors, extrema[k], work)
         if not abs(value(polynomial, 10, extrema[k])) > SAFETY_FACTOR * ROUNDING * error:
             return unsure
     for k in range(len(roots)):
-        essential(b, basis, roots[k], solutions[k])  # step 6
-        change = 1 / independence + _solution_error(b, errors, roots[k], polynomial, work)
+        error = _determinant_error(b, b_sizes, errors, roots[k], work)
+        best = _best_row(work[3])
+        essential(work[3, best], basis, roots[k], solutions[k])  # step 6
+        change = 1 / independence + _solution_error(b, best, roots[k], error, polynomial, work)
         margins[k] = MIN_MARGIN + SAFETY_FACTOR * ROUNDING * change
         if not margins[k] < MAX_MARGIN:
             return unsure
@@ -67,10 +72,8 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
 def _elimination_errors(a):
     """By how many units of rounding the six rows (6) from which B(z) is made may be wrong, OpenCV's among them.
 
-    a: what elimination leaves of the equations (10, 20): the triangle U (6, 6) of the last six unknowns, beside it the
-    result. Equations that are wrong by a unit make the result wrong by |U^-1| times its size. Besides, OpenCV inverts
-    the matrix and multiplies, where elimination would do, which adds |U^-1| |U| |U^-1|: with ill-conditioned equations
-    far more. Of their products with what is of the size of 1 only sums of rows are needed.
+    a: what elimination leaves (10, 20): the triangle U of the last six unknowns, and the result. Equations wrong by a
+    unit make it wrong by |U^-1| times its size; that OpenCV inverts and multiplies adds |U^-1| |U| |U^-1|.
     """
     largest = 1.0
     for k in range(4, 10):
@@ -95,18 +98,17 @@ def _elimination_errors(a):
 
 
 @inner
-def _determinant_error(b, errors, z, work):
+def _determinant_error(b, b_sizes, errors, z, work):
     """By how many units of rounding det B(z) may be wrong, after Wilkinson: the sizes of all terms, whatever cancels.
 
-    errors: see _elimination_errors. Written to work (4, 3, 3): B(z), the sizes of its terms, by how many units it may
-    be wrong, its cofactors.
+    Written to work (4, 3, 3): B(z), the sizes of its terms, by how many units it may be wrong, its cofactors.
     """
     values, sizes, wrong, cofactors = work[0], work[1], work[2], work[3]
     size = abs(z)
     powers = 1 + size + size * size
     for i in range(3):
         values[i, 0], values[i, 1], values[i, 2] = row_values(b[i], z)
-        sizes[i, 0], sizes[i, 1], sizes[i, 2] = _row_sizes(b[i], size)
+        sizes[i, 0], sizes[i, 1], sizes[i, 2] = row_values(b_sizes[i], size)
         error = errors[2 * i] + size * errors[2 * i + 1]
         wrong[i, 0], wrong[i, 1] = error * powers + sizes[i, 0], error * powers + sizes[i, 1]
         wrong[i, 2] = error * (1 + size * powers) + sizes[i, 2]
@@ -122,24 +124,30 @@ def _determinant_error(b, errors, z, work):
 
 
 @inner
-def _solution_error(b, errors, z, polynomial, work):
+def _best_row(cofactors):
+    """The row whose normal is the best conditioned: the rows of B(z) span a plane, and any two of them give it."""
+    best, largest = 0, -1.0
+    for i in range(3):
+        size = cofactors[i, 0] * cofactors[i, 0] + cofactors[i, 1] * cofactors[i, 1] + cofactors[i, 2] * cofactors[i, 2]
+        if size > largest:
+            best, largest = i, size
+    return best
+
+
+@inner
+def _solution_error(b, best, z, error, polynomial, work):
     """By how many units of rounding the essential matrix (unit norm) of a root z may be wrong, to the first order.
 
     As coordinates in the orthonormal basis it is (x, y, w z, w), (x, y, w) normal to B(z). It changes as z does, by the
     error of det B(z) over its slope, and as the plane of B(z)'s rows does, by their errors over its second singular
     value, which is about the norm of the cofactors over that of B(z).
     """
-    error = _determinant_error(b, errors, z, work)
     values, wrong, cofactors = work[0], work[2], work[3]
-    best, largest, cofactor_norm, norm = 0, -1.0, 0.0, 0.0
+    cofactor_norm, norm = 0.0, 0.0
     for i in range(3):
-        square = 0.0
         for j in range(3):
-            square += cofactors[i, j] * cofactors[i, j]
+            cofactor_norm += cofactors[i, j] * cofactors[i, j]
             norm += values[i, j] * values[i, j]
-        cofactor_norm += square
-        if square > largest:
-            best, largest = i, square
     p, q = values[(best + 1) % 3], values[(best + 2) % 3]
     x, y, w = cofactors[best, 0], cofactors[best, 1], cofactors[best, 2]
     p0, p1, p2 = _row_slopes(b[(best + 1) % 3], z)
@@ -160,14 +168,6 @@ def _solution_error(b, errors, z, polynomial, work):
         slope = slope * z + height
         height = height * z + polynomial[k]
     return (error / abs(slope) * np.sqrt(speed) + np.sqrt(tilt)) / np.sqrt(square)
-
-
-@inner
-def _row_sizes(c, size):
-    """The sizes of all terms of one row of B(z), where z has that size."""
-    return (((abs(c[0]) * size + abs(c[1])) * size + abs(c[2])) * size + abs(c[3]),
-            ((abs(c[4]) * size + abs(c[5])) * size + abs(c[6])) * size + abs(c[7]),
-            (((abs(c[8]) * size + abs(c[9])) * size + abs(c[10])) * size + abs(c[11])) * size + abs(c[12]))
 
 
 @inner

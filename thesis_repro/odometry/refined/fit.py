@@ -108,12 +108,8 @@ def _rounds(motion, current, previous, chosen, threshold):
 
 
 def _deviations(rotation, translation, current, previous, scale):
-    """Standard deviations, degrees, of the rotation and of the translation's direction, each where it is largest; and
-    the condition number.
-
-    From the inverse of the Gauss-Newton matrix, for residuals whose own is `scale`. Points that leave the motion open,
-    all on one line in space, say, make them large.
-    """
+    """Largest standard deviations, degrees, of the rotation and of the heading, and the condition number: from the
+    inverse of the Gauss-Newton matrix, for residuals whose own is `scale`."""
     hessian = _normal_equations(rotation, translation, current, previous, scale)[1]
     values, vectors = np.linalg.eigh(hessian)
     if len(current) < MIN_CORRESPONDENCES or not values[0] > 1e-12 * values[-1]:
