@@ -38,13 +38,15 @@ def environment(world, build):
 
 
 def run(world, build, *texts):
-    return subprocess.run([sys.executable, "-c", "\n".join(texts)], capture_output=True, text=True, env=os.environ
-                          | environment(world, build) | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"})
+    threads = code("04", {}).split("# Knobs")[0]  # TensorFlow's can be set at the beginning alone
+    settings = environment(world, build) | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    return subprocess.run([sys.executable, "-c", "\n".join([threads, *texts])], env=os.environ | settings,
+                          capture_output=True, text=True)
 
 
 def tables(world, build, numbers, edits):
     """The last table of notebook 8 after each edit, {settings: {keypoints, RMSE}}."""
-    texts = [code("04", {}).split("# Knobs")[0]]  # TensorFlow's threads can be set at the beginning alone
+    texts = []
     for edit in edits:
         texts += [code(number, edit) for number in [*numbers, "06", "07", "08"]]
         texts.append("print('TABLE', table.to_json(orient='index'))")
