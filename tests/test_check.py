@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, files, stages
+from thesis_repro import InputError, check, files, stages
 from thesis_repro.check import check_cityscapes, check_kitti, oddities, of_masks, path_oddities
 from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
@@ -83,6 +83,15 @@ def test_sequences_without_truth_are_described_and_missing_poses_named(tiny_kitt
     (tiny_kitti / "poses/00.txt").unlink()
     _, problems = check_kitti(tiny_kitti)
     assert len(problems) == 1 and "poses/00.txt" in problems[0]
+
+
+def test_data_that_did_not_change_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
+    for frame, reports in ((None, True), (None, False), (0, True), (9, True)):
+        if frame is not None:
+            shutil.copy(tiny_kitti / IMAGES / "000001.png", tiny_kitti / IMAGES / f"{frame:06d}.png")
+        assert check.main(tmp_path / "checked") == (frame == 9)  # a gap
+        assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
 
 # What can be read, and is hardly what it is taken for: one line, with the number that was seen
