@@ -58,9 +58,12 @@ def figure_sources(study):
 
     The frame alone stands in place of the label map where there is none.
     """
-    sequence, of_sources = study.masks()[0]
-    index = len(sequence) // 2
-    frame, label_maps = sequence.frame(index), []
+    for sequence, own in study.masks():
+        index = len(sequence) // 2
+        with suppress(InputError):  # a frame that cannot be read costs the runs of its sequence alone
+            frame, of_sources = sequence.frame(index), own
+            break
+    label_maps = []
     figure, axes = style.frame_panels(frame, len(of_sources), 3, 1.5 * style.PAGE_WIDTH)
     for (first, second, third), source, masks in zip(np.reshape(axes, (-1, 3)), study.sources, of_sources):
         style.show_image(first, frame, f"{source.name}: frame {index}")
