@@ -6,7 +6,7 @@ import pytest
 from evo.tools import file_interface
 
 from thesis_repro import InputError, odometry
-from thesis_repro.kitti import Sequence, name_of, sequences, true_path, without_truth, write_tum
+from thesis_repro.kitti import Sequence, name_of, sequences, true_path, with_frames, write_tum
 
 
 def test_reads_a_sequence(tiny_kitti):
@@ -50,7 +50,7 @@ def test_reads_real_sequences(kitti_real):
 def test_sequences_without_published_poses_are_left_out(tiny_kitti):
     for name in ("03", "11"):
         (tiny_kitti / "sequences" / name / "image_0").mkdir(parents=True)
-    assert sequences(tiny_kitti) == ["00", "03"] and without_truth(tiny_kitti) == ["11"]
+    assert sequences(tiny_kitti) == ["00", "03"] and with_frames(tiny_kitti) == ["00", "03", "11"]
 
 
 def test_colour_jpeg_frames_are_read_as_gray_with_their_own_camera(tiny_kitti):

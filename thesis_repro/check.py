@@ -42,9 +42,9 @@ def check_kitti(root, deep=False):
     decoded; deep: all frames are, on all cores.
     """
     facts, problems, sound = [], _Problems(), []
-    without_truth = kitti.without_truth(root)
+    every = kitti.with_frames(root)
     with_truth = problems.of(kitti.sequences, root) or []
-    for name in sorted(with_truth + without_truth):
+    for name in every:
         fact, of_sequence = _check_sequence(root, name, name in with_truth, deep)
         facts.append(fact)
         problems += of_sequence
@@ -137,7 +137,7 @@ def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=Fals
         for problem in problems:
             print(f"wrong: {one_line(problem)}", file=sys.stderr)
         wrong = wrong or bool(problems)
-    for name in kitti.sequences(kitti_root) + kitti.without_truth(kitti_root) if kitti_root and not wrong else ():
+    for name in kitti.with_frames(kitti_root) if kitti_root and not wrong else ():
         for line in oddities(kitti.Sequence(kitti_root, name)):
             print(f"warning: {one_line(line)}", file=sys.stderr)
     return not wrong

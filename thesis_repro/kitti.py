@@ -39,28 +39,21 @@ def sequences(root: str | Path) -> list[str]:
 
     Of 00 to 10 only the frames need be there: if they have no poses, a file is missing, which `Sequence` says.
     """
-    names = [name for name in with_frames(root) if _has_truth(root, name)]
+    names = [name for name in with_frames(root)
+             if name in FRAME_COUNTS or (Path(root) / "poses" / f"{name}.txt").is_file()]
     if not names:
         raise InputError(f"{Path(root) / 'sequences'}: no sequence holds frames (image_0 or image_2) and true poses")
     return names
 
 
-def without_truth(root: str | Path) -> list[str]:
-    """Names of the other sequences with frames, sorted, such as 11 to 21, whose poses the benchmark keeps to itself."""
-    return [name for name in with_frames(root) if not _has_truth(root, name)]
-
-
 def with_frames(root: str | Path) -> list[str]:
-    """Names of all sequences with frames, sorted. Raises InputError for a folder of another layout."""
+    """Names of all sequences with frames, sorted; the benchmark keeps the poses of 11 to 21 to itself. Raises
+    InputError for a folder of another layout."""
     root = Path(root)
     if not (root / "sequences").is_dir():
         raise InputError(f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt")
     return sorted(folder.name for folder in (root / "sequences").iterdir()
                   if folder.is_dir() and (images_of(folder).name in IMAGE_FOLDERS or images(folder)))
-
-
-def _has_truth(root, name):
-    return name in FRAME_COUNTS or (Path(root) / "poses" / f"{name}.txt").is_file()
 
 
 def images_of(folder: str | Path, camera: str | None = None) -> Path:
