@@ -18,7 +18,6 @@ from thesis_repro.settings import frames, processes, widths
 # the files that options name
 WRITTEN = {"output": "poses in KITTI's form", "tum": "poses in TUM's form", "plot": "the paths", "video": "the video"}
 ENDINGS = {"plot": (".png", ".svg", ".pdf", ".jpg"), "video": (".mp4",)}
-EXAMPLES = Path(__file__).parent / "report" / "templates" / "examples.txt"
 
 
 # The commands. Each imports what it needs itself, so that --help and errors of the command line come at once.
@@ -134,14 +133,13 @@ def odometry(options):
 def boresight(options):
     """estimate the constant rotation between camera and ground truth (degrees; for odometry --boresight)"""
     from thesis_repro import kitti, odometry
-    from thesis_repro.kitti import Sequence
     from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import terminal
 
     paths = {}
     names = options.sequences or kitti.sequences(options.kitti)
     for name in dict.fromkeys(kitti.name_of(options.kitti, name) for name in names):
-        sequence = Sequence(options.kitti, name).subset(options.frames)
+        sequence = kitti.Sequence(options.kitti, name).subset(options.frames)
         _look_at(sequence, [])
         result = odometry.run(sequence, replace(odometry.THESIS, estimator="refined"), description=f"sequence {name}")
         paths[name] = result.poses, sequence.poses
@@ -364,25 +362,23 @@ SHARED = {
 SEQUENCE, REQUIRED = ("--kitti", "--sequence", "--camera", "--frames"), {"required": True}
 WIDTHS = dict(type=widths, nargs="+", action="extend", metavar="W")
 MASKS = {
-    "--boundaries": dict(choices=("canny", "exact"), default="canny", help="the thesis's, or every change of class"),
+    "--boundaries": dict(metavar="canny|exact", default="canny", help="the thesis's, or every change of class"),
     "--symmetric": dict(action="store_true", help="masks in the middle of the boundaries, not half a pixel aside"),
     "--classes": dict(nargs="+", action="extend", default=[], metavar="NAME", help="boundaries of these classes alone"),
     "--without-movable": dict(type=int, nargs="?", const=0, metavar="PIXELS",
                               help="nothing on people and vehicles, nor so many pixels around them (0)"),
-    "--keep": dict(choices=("boundaries", "static", "inverse", "static-boundaries"), default="boundaries",
-                   help="where keypoints may lie: on boundaries, on all but movable things (static), on all but "
-                        "boundaries (inverse), on boundaries of what cannot move"),
-    "--ids": dict(choices=("labels", "train"), default="labels", help="of label maps: Cityscapes', or its train ids"),
+    "--keep": dict(metavar="boundaries|static|inverse|static-boundaries", default="boundaries", help="where keypoints "
+                   "may lie: on boundaries, on what cannot move, on all but boundaries, on boundaries of the static"),
+    "--ids": dict(metavar="labels|train", default="labels", help="of label maps: Cityscapes', or its train ids"),
     "--margin": dict(type=int, default=0, metavar="PIXELS", help="nothing along the frame's rim (0)"),
 }
 
 
 def build_parser():
-    parser = _Parser(prog="thesis-repro", description="Keypoint masks from semantic segmentation for monocular "
-                                                           "visual odometry: a thesis, reproduced.")
+    parser = _Parser(prog="thesis-repro", description="Keypoint masks from semantic segmentation for visual odometry")
     parser.add_argument("--version", action="version", version=f"thesis-repro {version('thesis-repro')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    examples = EXAMPLES.read_text(encoding="utf-8").splitlines()
+    examples = (Path(__file__).parent / "report/templates/examples.txt").read_text(encoding="utf-8").splitlines()
 
     def command(function, *shared, **changed):
         """The parser of a command with options of SHARED; changed: what is other in one of them."""

@@ -81,11 +81,11 @@ def evaluate(paths, true, alignment="none", sequence=""):
 
 def means(rows):
     """Rows of `evaluate` with the means over the sequences of a trajectory that has several, without missing values."""
-    table = pd.DataFrame(rows)
-    for name, of_path in table.groupby("trajectory", sort=False):
+    for name, of_path in pd.DataFrame(rows).groupby("trajectory", sort=False):
         if len(of_path) > 1:
-            values = of_path.select_dtypes("number").mean().to_dict()
-            yield values | {"trajectory": name, "sequence": f"mean of {len(of_path)}", "note": ""}
+            errors = of_path.drop(columns=["poses", "frames", "segments"], errors="ignore").mean(numeric_only=True)
+            yield {"trajectory": name, "sequence": f"mean of {len(of_path)}", "poses": int(of_path["poses"].sum()),
+                   **errors.to_dict(), "note": ""}
 
 
 def aligned(paths, true, alignment):
