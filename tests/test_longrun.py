@@ -1,38 +1,28 @@
 """What long runs rest on: folders that one process holds, logs, and one line for what the machine lacks."""
 
 import errno
+import fcntl
 import logging
-import signal
-import subprocess
-import sys
+import os
 import warnings
 
 import pytest
 
 from thesis_repro import InputError, files, longrun, stages
 
-HOLD = "import sys, time; from thesis_repro import longrun\n" \
-       "with longrun.claimed(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(100)"
 
-
-@pytest.fixture
-def holder(tmp_path):
-    """Another process that holds the folder `out`."""
-    process = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path / "out"], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "held\n"
-    yield process
-    process.kill()
-    process.communicate()
-
-
-def test_a_folder_is_held_by_one_process_until_it_ends_in_whatever_way(tmp_path, holder):
-    for attempt in (lambda: longrun.claimed(tmp_path / "out").__enter__(), lambda: stages.stage(tmp_path / "out")):
+def test_a_folder_is_held_by_one_process(tmp_path):
+    folder = tmp_path / "out"
+    with longrun.claimed(folder), longrun.claimed(folder):  # by one process as often as it likes
+        stages.stage(folder, size=3)
+        other = os.open(folder, os.O_RDONLY)  # as another process has it
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    for attempt in (lambda: longrun.claimed(folder).__enter__(), lambda: stages.stage(folder)):
         with pytest.raises(InputError, match="out: "):
             attempt()
-    holder.send_signal(signal.SIGKILL)
-    holder.wait()
-    with longrun.claimed(tmp_path / "out"), longrun.claimed(tmp_path / "out"):  # by one process as often as it likes
-        stages.stage(tmp_path / "out", size=3)
+    os.close(other)
     assert not longrun._held
 
 

@@ -152,14 +152,14 @@ def read_label_map(path, train_ids=False):
                           "--ids train for train ids (0 to 18, 255)")
 
 
-def load(image_pairs, size, channels=1, description="reading images"):
+def load(image_pairs, size, channels=1):
     """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size), both uint8 (A.2).
 
     Label maps are resized with nearest neighbour, so that no id is invented.
     """
     images = np.empty((len(image_pairs), size, size, channels), np.uint8)
     labels = np.empty((len(image_pairs), size, size), np.uint8)
-    for index, pair in enumerate(progress(image_pairs, description, unit="image")):
+    for index, pair in enumerate(progress(image_pairs, "reading images", unit="image")):
         images[index] = read_image(pair.image, size, size, channels)
         labels[index] = cv2.resize(read_label_map(pair.label), (size, size), interpolation=cv2.INTER_NEAREST)
     return images, labels
