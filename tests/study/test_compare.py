@@ -114,14 +114,6 @@ def test_the_tested_width_is_that_of_the_controls():
     assert compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 
 
-def test_the_mean_of_equal_errors_is_among_them():
-    value = 1.1  # three of them sum to 3.3000000000000003
-    table = compare.spread(pd.DataFrame({"sequence": "00", "rmse": [value] * 3}), "rmse")
-    assert table.loc["00"].tolist() == [value] * 3
-    random = pd.DataFrame({"sequence": "00", "rmse": np.random.default_rng(0).normal(size=50)})
-    assert (compare.spread(random, "rmse").diff(axis=1)[["highest"]] > 0).all(axis=None)
-
-
 def test_who_got_lost_is_named_beside_the_mean():
     runs = runs_of({"masked": lambda name: 6.0 if name == "03" else 0.1 if name == "05" else 1.0})
     rows = compare.comparisons(runs)

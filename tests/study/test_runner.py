@@ -40,6 +40,16 @@ def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finish
     assert np.array_equal(runner.paths(summary, folder)["01", "masked-15-0"], alone.poses[:, :3, 3])
 
 
+@pytest.mark.parametrize("frames, t_rel", [(151, 2.02), (99, np.nan)])
+def test_kittis_errors_are_those_of_paths_of_100_metres_and_more(frames, t_rel):
+    true = np.tile(np.eye(4), (frames, 1, 1))
+    true[:, 2, 3] = np.arange(frames)
+    table = pd.DataFrame({"detected": [9.0] * frames, "flag": ""})
+    measured = runner.measures(odometry.Result(true, table).with_poses(true * [1, 1, 1, 1.02]).frames, true)
+    assert measured["t_rel"] == pytest.approx(t_rel, nan_ok=True)
+    assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
+
+
 def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, small_labels, finished, monkeypatch):
     folder, jobs, summary = finished
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}

@@ -246,8 +246,8 @@ def with_boresight_correction(runs: pd.DataFrame, kitti: Path, folder: Path, fra
     estimator.
     """
     references = refined_paths(runs, kitti, folder, frames)
+    of_run = run_poses(runs[runs["sequence"].isin(references)], folder)
     angles = {name: boresight.angles_of_day(name, references) for name in references}
-    of_run = run_poses(runs[runs["sequence"].isin(angles)], folder)
     corrected = {key: metrics.rmse(boresight.corrected(poses, angles[key[0]]), references[key[0]][1])
                  for key, poses in of_run.items()}
     return runs.assign(rmse_boresight_corrected=[corrected.get(key, np.nan)
