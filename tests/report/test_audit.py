@@ -12,16 +12,11 @@ WORDS = ("where", "does", "right", "switch")
 
 def ablation_runs(factors, sequences=8):
     """A table like that of `ablations.measure`: {method: factor on the errors of all keypoints}."""
-    random, rows = np.random.default_rng(0), []
-    for number in range(sequences):
-        for method, factor in factors.items():
-            for estimator in ablations.ESTIMATORS:
-                for repetition in range(3):
-                    error = factor * np.exp(0.02 * random.normal())
-                    rows.append({"sequence": f"{number:02d}", "method": method, "estimator": estimator, "sim3": error,
-                                 "repetition": repetition, "frames": 10, "mean_keypoints": 900.0, "failed": 1.0,
-                                 "across": 0.1, "down": 0.2, **dict.fromkeys(compare.METRICS, error)})
-    return pd.DataFrame(rows)
+    runs = pd.MultiIndex.from_product([[f"{number:02d}" for number in range(sequences)], factors, ablations.ESTIMATORS,
+                                       range(3)], names=["sequence", "method", "estimator", "repetition"]).to_frame()
+    error = runs["method"].map(factors) * np.exp(0.02 * np.random.default_rng(0).normal(size=len(runs)))
+    return runs.assign(frames=10, mean_keypoints=900.0, failed=1.0, across=0.1, down=0.2, sim3=error,
+                       **dict.fromkeys(compare.METRICS, error)).reset_index(drop=True)
 
 
 def test_every_row_has_its_words_and_everything_measured_its_row():

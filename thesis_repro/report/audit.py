@@ -64,12 +64,11 @@ def rounded(value):
 
 
 def measured(table, kind):
-    """The measurements that audit.json lists for one kind of table, each with the number of frames of a sequence.
+    """The measurements that audit.json lists for one kind of table: means over sequences where it gives a unit, else
+    ratios to the reference, or to another column ("over") of the same rows.
 
     kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (those of `ablations`),
     "shares" (of pixels, a row a frame), "boresight" (`boresight.explained`).
-    With a unit it is the mean over sequences. Without, it is a ratio: to the reference, or to another column ("over")
-    of the same rows.
     """
     measurements = []
     specs = [spec for spec in WORDS["measured"] if spec["runs"] == kind]

@@ -139,10 +139,9 @@ def figure_2_09(first, second, title):
         matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors, other_descriptors)
     best = sorted(matches, key=lambda match: match.distance)[:60]
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
-    below = (0, first.shape[0] + gap.shape[0])
-    figure, (axes,) = style.frame_panels(np.vstack([first, gap, second]))
-    style.show_image(axes, np.vstack([first, gap, second]),
-                     f"{title}: the {len(best)} best of {len(matches)} ORB matches")
+    both, below = np.vstack([first, gap, second]), (0, first.shape[0] + gap.shape[0])
+    figure, (axes,) = style.frame_panels(both)
+    style.show_image(axes, both, f"{title}: the {len(best)} best of {len(matches)} ORB matches")
     lines = LineCollection([(points[match.queryIdx].pt, np.add(others[match.trainIdx].pt, below)) for match in best],
                            array=[match.distance for match in best], cmap="plasma", linewidth=0.8)
     lines.set_clim(0, max((match.distance for match in best), default=1))

@@ -4,8 +4,6 @@
 lowest to the highest of them. What compares methods by ratios is in comparison.py.
 """
 
-import itertools
-
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -31,7 +29,7 @@ def figure_paths(truths, rows, paths, method):
     figure, axes = style.new_figure(2 * count, columns, height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
                                     squeeze=False, height_ratios=[2, 1] * count)
     pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))  # the path, and its error below
-    for panel in itertools.chain(*pairs[len(groups):]):
+    for panel in np.ravel(pairs[len(groups):]):
         panel.remove()
     errors = compare.spread(rows, "rmse")
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):

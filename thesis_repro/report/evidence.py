@@ -25,10 +25,9 @@ LOOKED_AT = 12  # frames of each sequence whose boundaries and keypoints are loo
 
 
 def write(root, folder, build, frames=None, repetitions=5, processes=1):
-    """Run what is missing and write everything into a folder; returns its files.
+    """Run what is missing and write everything into a folder.
 
-    root: of KITTI. folder, build: absolute paths; build keeps label maps and runs. frames: of each sequence, None for
-    all.
+    root: of KITTI. folder, build: absolute paths; build keeps label maps and runs. frames: of each sequence (all).
     """
     stages.stage(build, results="evidence")  # whose parts know what they were made from
     labels, model = build / "labels", prediction.load_shipped()
@@ -60,7 +59,6 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
         write_text(folder / f"{name}.csv", content.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
     write_text(folder / "README.md", texts.render(
         "evidence.md.j2", findings=texts.findings(runs, table, note), failures=captions.OF_EVIDENCE))
-    return sorted(path for path in folder.iterdir() if path.is_file())
 
 
 def _runs(root, names, build, frames, repetitions, processes):
@@ -100,9 +98,8 @@ def main():
     try:
         settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})  # all frames, unless FRAMES says less
         with longrun.claimed(BUILD), longrun.logged(BUILD, "tables, plots and findings") as run:
-            files = write(settings.kitti, FOLDER, BUILD, settings.sizes.frames, settings.sizes.repetitions,
-                          settings.jobs)
-            run.end(f"{FOLDER}: {len(files)} files, {sum(path.stat().st_size for path in files):,} bytes")
+            write(settings.kitti, FOLDER, BUILD, settings.sizes.frames, settings.sizes.repetitions, settings.jobs)
+            run.end(f"tables, plots and findings: {FOLDER}")
     except Exception as error:
         return longrun.report_error(error)
     return 0
