@@ -1,5 +1,7 @@
 """The page of a run, on a figures folder written by hand."""
 
+import html
+import json
 import os
 import platform
 import re
@@ -86,10 +88,11 @@ def test_the_answer_stands_before_the_chapters_and_all_41_are_in_the_order_of_th
     ids = [attributes["id"] for tag, attributes in shown.elements
            if tag in ("figure", "section", "h2") and "chapter" not in attributes["id"]]
     own = [f"{one['kind']}-{one['name']}" for one in captions.ADDED[1:]]
-    own.remove(page.OPENING[1])
-    assert ids == [*page.OPENING, *captions.THESIS, *own, "notebooks"] and len(captions.THESIS) == 41
+    own.remove(page.OPENING[2])
+    in_order = [name for name in captions.THESIS if name not in page.OPENING]
+    assert ids == [*page.OPENING, *in_order, *own, "notebooks"] and len(captions.THESIS) == 41
     images = [f"{one['name']}.svg" for one in ARTEFACTS if one["kind"] == "figure"]
-    assert sorted(shown.of("img", "src")) == sorted(["figure_4_05.svg", *images]) and all(shown.of("img", "alt"))
+    assert sorted(shown.of("img", "src")) == sorted(images) and all(shown.of("img", "alt"))
     assert shown.text.index("What it shows") < shown.text.index("Chapter 2")
     assert "41 of 41" in shown.text and shown.text.count("What it shows") == 1
 
@@ -103,30 +106,64 @@ def test_chapter_2_long_tables_and_details_of_the_findings_are_closed(run):
     assert [text in shown.folded_text for text in ("Masks do not", "By odometry", "77")] == [False, True, True]
 
 
-@pytest.mark.skipif(not BROWSER, reason="no chromium on this machine")
-def test_nothing_is_wider_than_a_narrow_screen(run):
-    page.update(run.settings)
-    narrow = run.settings.figures / "narrow.html"  # a browser's own window is never as narrow
-    narrow.write_text("""<iframe src="index.html" style="width: 400px; border: 0"></iframe><p></p>
-        <script>onload = () => {
-        const page = document.querySelector("iframe").contentDocument.documentElement;
-        document.querySelector("p").textContent = page.clientWidth + " shows " + page.scrollWidth;}</script>""")
+PROBE = """<iframe src="index.html" style="width: 400px; border: 0"></iframe>
+<iframe src="index.html" style="width: 1400px; border: 0"></iframe><pre></pre><script>onload = () => {
+const faults = [];
+for (const frame of document.querySelectorAll("iframe")) {
+    const page = frame.contentDocument, width = page.documentElement.clientWidth;
+    page.querySelectorAll("details").forEach(details => { details.open = true; });
+    if (page.documentElement.scrollWidth > width) faults.push(`wider than ${width}`);
+    for (const image of page.images)
+        if (!image.naturalWidth) faults.push(`no image ${image.getAttribute("src")} at ${width}`);
+    for (const link of page.querySelectorAll('a[href^="#"]'))
+        if (!page.getElementById(link.hash.slice(1))) faults.push(`dead link ${link.hash} at ${width}`);
+    const blocks = [...page.querySelectorAll("h1, h2, h3, h4, p, figcaption, dl, ul, summary, img, .scroll")];
+    const boxes = blocks.map(block => { // where its text is, which may be more than its box
+        const range = page.createRange();
+        range.selectNodeContents(block);
+        return (block.matches("img, .scroll") ? block : range).getBoundingClientRect(); });
+    blocks.forEach((block, i) => blocks.slice(0, i).forEach((other, j) => {
+        const [a, b] = [boxes[i], boxes[j]], apart = block.closest("nav") || other.closest("nav");
+        if (!apart && !other.contains(block) && Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1
+            && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 1)
+            faults.push(`${block.textContent.slice(0, 40)} on ${other.textContent.slice(0, 40)} at ${width}`); }));
+}
+document.querySelector("pre").textContent = JSON.stringify(faults); }</script>"""
+
+
+def faults_in_a_browser(folder, scratch):
+    """What is too wide, broken, dead or overlapping on a folder's page, 400 and 1400 pixels wide, everything open."""
+    (folder / "probe.html").write_text(PROBE)  # a browser's own window is never as narrow
     dumped = subprocess.run([BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--dump-dom",
-                             "--allow-file-access-from-files", f"--user-data-dir={run.settings.build / 'chromium'}",
-                             narrow.as_uri()], capture_output=True, text=True, timeout=120, check=True)
-    assert "<p>400 shows 400</p>" in dumped.stdout
+                             "--allow-file-access-from-files", "--window-size=1600,900", f"--user-data-dir={scratch}",
+                             (folder / "probe.html").as_uri()], capture_output=True, text=True, timeout=120, check=True)
+    return json.loads(html.unescape(re.search("<pre>(.*?)</pre>", dumped.stdout, re.DOTALL)[1]))
+
+
+@pytest.mark.skipif(not BROWSER, reason="no Chromium on this machine")
+def test_a_browser_shows_the_page_of_the_repository_whole(tmp_path):
+    figures = tmp_path / "figures"
+    shutil.copytree(ROOT / "figures", figures)
+    (figures / page.PAGE).write_text(page.build(replace(read_settings({}), figures=figures, build=tmp_path)))
+    assert faults_in_a_browser(figures, tmp_path / "scratch") == []
+    folded = '<p style="height: 0">Folded <img src="none.svg"></p><p>over <a href="#nowhere">it</a></p>'
+    (figures / page.PAGE).write_text(f'<details>{folded}</details><div style="width: 900px">wide</div>')
+    faults = faults_in_a_browser(figures, tmp_path / "scratch")
+    assert {fault.split(" at ")[0] for fault in faults} >= {"wider than 400", "no image none.svg", "dead link #nowhere"}
+    assert any(fault.startswith("over it on Folded") for fault in faults)
 
 
 def test_what_is_missing_is_no_link_and_what_was_not_given_is_no_error(run, tmp_path):
-    for name in ("figure_4_06.svg", "table_3_2.csv", "findings.md", "domain_gap.svg"):
+    for name in ("figure_4_06.svg", "table_3_2.csv", "figure_3_05.svg", "findings.md", "domain_gap.svg"):
         (run.settings.figures / name).unlink()
     shown = read(run)
+    assert (run.settings.figures / "table_3_2.csv").read_bytes() == (ROOT / "figures" / "table_3_2.csv").read_bytes()
     assert "39 of 41" in shown.text and "figure_4_06.svg" not in shown.of("img", "src")
-    assert shown.of("a", "href").count("#table_3_2") == 2 and "Notebook 08_results makes it" in shown.text
+    assert shown.of("a", "href").count("#figure_3_05") == 2 and "Notebook 08_results makes it" in shown.text
     on_real_frames = replace(run.settings, kitti_is_embedded=False)
     text = page.build(on_real_frames)
     missing = re.search(r'<p class="missing">Missing:(.*?)</p>', text, re.DOTALL)[1]
-    assert "#figure_4_06" in missing and "table_3_2" not in missing and "domain_gap" not in missing
+    assert "#figure_4_06" in missing and "figure_3_05" not in missing and "domain_gap" not in missing
     assert text.count("CITYSCAPES=/path") == text.count("KITTI_SEMANTIC=/path") == 1
     assert "KITTI_SEMANTIC=/path" not in page.build(replace(on_real_frames, kitti_semantic=tmp_path))
 
