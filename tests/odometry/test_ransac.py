@@ -118,22 +118,6 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
 
 
-def test_a_look_in_single_precision_rules_out_no_better_solution():
-    random, ruled_out = np.random.default_rng(5), []
-    for threshold in (1e-6, 1e-4, 3e-4, 1e-2):
-        current, previous = scene(random, 300)
-        columns, limit = np.ascontiguousarray(np.hstack([current, previous]).T), np.float32(threshold**2)
-        rough = ransac._single_precision(columns)
-        for _ in range(50):
-            _, solutions, _ = rounding.solve(columns[:, random.choice(np.arange(90, 300), 5, replace=False)].T.copy())
-            for e in solutions:
-                moved = e + random.choice([-1, 1], 9) * 1e-6 / 3
-                inliers = int(ransac._inlier_masks(moved[None], columns, limit).sum())
-                assert inliers == 0 or ransac._may_beat(e, 1e-6, rough, float(limit), inliers - 1)
-                ruled_out.append(not ransac._may_beat(e, 1e-6, rough, float(limit), inliers + 20))
-    assert np.mean(ruled_out) > 0.7
-
-
 def test_real_roots_of_a_known_polynomial():
     roots = np.array([-3.0, -1.0, 0.5, 2.0])
     polynomial = np.poly(np.concatenate([roots, [1j, -1j, 2 + 1j, 2 - 1j, -1 + 3j, -1 - 3j]])).real
