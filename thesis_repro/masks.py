@@ -68,7 +68,6 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
     """Boundaries between classes at the frame's size.
 
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
-    Of the settings, movable and margin do not matter here, and of keep only "static-boundaries" does.
 
     boundaries "canny" is the thesis: enlarge bilinearly (which invents ids along every boundary), then Canny
     on the ids themselves, so that a boundary shows only where two ids are far enough apart. "exact" is the correction:

@@ -81,7 +81,7 @@ class SharedKeypoints:
 
     def __init__(self) -> None:
         self._tracks: tuple[np.ndarray, ...] = ()  # both frames, the sorted keys of all points, what `track` returns
-        self._corners: tuple[np.ndarray, Corners] | None = None  # the frame and what `find_corners` gives for it
+        self._corners: tuple[np.ndarray, int, Corners] | None = None  # what `find_corners` was given and gave
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
         """Track to `frame` the points of all runs that come from the same previous frame (nearly always all)."""
@@ -101,11 +101,10 @@ class SharedKeypoints:
         return tracked.take(where, axis=0), success[where]
 
     def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
-        if settings.block_size != BLOCK_SIZE:
-            return detect(frame, settings, mask)
-        if self._corners is None or frame is not self._corners[0]:
-            self._corners = frame, find_corners(frame)
-        return detect(frame, settings, mask, self._corners[1])
+        size = settings.block_size
+        if self._corners is None or frame is not self._corners[0] or size != self._corners[1]:
+            self._corners = frame, size, find_corners(frame, size)
+        return detect(frame, settings, mask, self._corners[2])
 
 
 def _key(points):
@@ -130,14 +129,11 @@ def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
 
 @fast
 def _min_eigenvalues(dx, dy):
-    """The smaller eigenvalue of the sums of dx dx, dx dy, dy dy over a square of BLOCK_SIZE; the border is cut off.
-
-    Sums are in double precision and in OpenCV's order: along the row first, then down, adding a row and taking one off.
-    """
+    """The smaller eigenvalue of the sums of dx dx, dx dy, dy dy over a square of BLOCK_SIZE; the border is cut off."""
     height, width = dx.shape[0] - BLOCK_SIZE + 1, dx.shape[1] - BLOCK_SIZE + 1
     smaller = np.empty((height, width), np.float32)
     products, half = np.empty((3, dx.shape[1]), np.float32), np.float32(0.5)
-    rows, sums = np.zeros((BLOCK_SIZE, 3, width)), np.zeros((3, width))
+    rows, sums = np.zeros((BLOCK_SIZE, 3, width)), np.zeros((3, width))  # in OpenCV's order and double precision
     for y in range(dx.shape[0]):
         for x in range(dx.shape[1]):
             products[0, x] = dx[y, x] * dx[y, x]
@@ -158,11 +154,8 @@ def _min_eigenvalues(dx, dy):
 
 @fast
 def _spread(strength, ranked, limit, mask, max_keypoints, min_distance):
-    """The strongest corners above `limit` inside the mask (if any) that keep `min_distance` from stronger ones.
-
-    Distances are looked at within the neighbouring cells of a grid of about min_distance, as in OpenCV; for a
-    fractional min_distance that is not quite the same as looking at all of them.
-    """
+    """The strongest corners above `limit` inside the mask (if any) that keep `min_distance` from stronger ones, which
+    are looked for in the neighbouring cells of a grid, as in OpenCV (so a fractional distance is not kept quite)."""
     height, width = strength.shape
     cell = max(int(np.rint(min_distance)), 1)
     grid_rows, grid_columns = height // cell + 1, width // cell + 1

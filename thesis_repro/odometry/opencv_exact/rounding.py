@@ -138,9 +138,8 @@ def _best_row(cofactors):
 def _solution_error(b, best, z, error, polynomial, work):
     """By how many units of rounding the essential matrix (unit norm) of a root z may be wrong, to the first order.
 
-    As coordinates in the orthonormal basis it is (x, y, w z, w), (x, y, w) normal to B(z). It changes as z does, by the
-    error of det B(z) over its slope, and as the plane of B(z)'s rows does, by their errors over its second singular
-    value, which is about the norm of the cofactors over that of B(z).
+    In the basis it is (x, y, w z, w), (x, y, w) normal to B(z). It changes as z does, by the error of det B(z) over its
+    slope, and as B(z) does, by the errors over its second singular value: the cofactors' norm over that of B(z).
     """
     values, wrong, cofactors = work[0], work[2], work[3]
     cofactor_norm, norm = 0.0, 0.0

@@ -255,8 +255,7 @@ def _normal_equations(r, t, current, previous, scale):
     """
     matrices = _essential_and_derivatives(r, t)
     essential = epipolar.entries(matrices[0])
-    hessian, gradient = np.zeros((5, 5)), np.zeros(5)
-    cost = 0.0
+    cost, hessian, gradient = 0.0, np.zeros((5, 5)), np.zeros(5)
     # In blocks, each quantity of all points at once, which the processor does several at a time; the sums go point by
     # point, so the bits are those of one loop over all points.
     size = POINTS_PER_BLOCK
