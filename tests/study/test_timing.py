@@ -40,15 +40,14 @@ def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
     assert slow["masked, width 5", "mask"] > 500 > slow.drop(("masked, width 5", "mask")).max()
 
 
-@pytest.mark.parametrize("width, boundaries", [(10, "canny"), (5, "exact")])
-def test_its_masks_and_steps_are_those_of_a_run(sequence, model, tmp_path, monkeypatch, width, boundaries):
+def test_its_masks_and_steps_are_those_of_a_run(sequence, model, tmp_path, monkeypatch):
     steps = []
     step = odometry.Odometry.step
     monkeypatch.setattr(odometry.Odometry, "step", lambda *given: steps.append(step(*given)) or steps[-1])
-    timing.measure(sequence, model, width, boundaries)
+    timing.measure(sequence, model, 5)
     short = sequence.subset(5)
     prediction.write_label_maps(model, short.frame_paths, tmp_path)
-    made = masks.LabelMasks(tmp_path, short, width, masks.MaskSettings(boundaries))
+    made = masks.LabelMasks(tmp_path, short, 5)
     for of_method, expected in ((steps[:10:2], odometry.run(short)), (steps[1:10:2], odometry.run(short, masks=made))):
         assert np.array_equal([each.pose for each in of_method], expected.poses)
         assert [each.detected for each in of_method] == expected.frames["detected"].tolist()

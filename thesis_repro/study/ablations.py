@@ -103,8 +103,7 @@ def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | N
 
 
 def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
-            baseline_repetitions: int = BASELINE_REPETITIONS, dilation_width: int = CONTROL_WIDTH,
-            boundaries: str = "canny") -> Runs:
+            baseline_repetitions: int = BASELINE_REPETITIONS, dilation_width: int = CONTROL_WIDTH) -> Runs:
     """The runs over one sequence: {(method, estimator, repetition): (settings, masks)}. labels: of its frames.
 
     "baseline" (all keypoints) and "masked" are run under each of ESTIMATORS, the others under the thesis's and the
@@ -117,7 +116,7 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
         label_map = read_label_map(labels / sequence.frame_paths[index].name)
         return cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
 
-    own = from_labels(MaskSettings(boundaries))
+    own = from_labels()
     sample = range(0, len(sequence), max(1, len(sequence) // 8))
     number = round(np.mean([len(keypoints.detect(sequence.frame(index), THESIS, own[index])) for index in sample]))
     methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
@@ -126,7 +125,7 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
         "filter": (replace(THESIS, mask_mode="filter"), own),
         "nearest": (THESIS, MadeMasks(lambda index: masks.dilate(
             cv2.Canny(enlarged(index), *MaskSettings().canny), dilation_width))),
-        "symmetric": (THESIS, from_labels(MaskSettings(boundaries, symmetric=True))),
+        "symmetric": (THESIS, from_labels(MaskSettings(symmetric=True))),
         "corrected": (THESIS, from_labels(CORRECTED)),
         "no-vegetation": (THESIS, MadeMasks(lambda index: without_classes(VEGETATION, enlarged(index)))),
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),

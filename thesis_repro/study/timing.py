@@ -18,7 +18,6 @@ import pandas as pd
 from thesis_repro import InputError, longrun, masks, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import MaskSettings
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import by_name, masks_of
 from thesis_repro.study.sources import Source
@@ -80,13 +79,13 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
     return pd.read_csv(path, dtype={"sequence": str})
 
 
-def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH, boundaries: str = "canny") -> pd.DataFrame:
+def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
     """Milliseconds a frame of each stage, with all keypoints and with masks: method, stage, milliseconds (medians).
 
     Stages: read (the frame's file), segmentation (stretch to the model's input, network, class of every pixel), mask
     (label map to 320x320, edges, dilation), detection, tracking, pose (essential matrix, then rotation and
-    translation). model: a Keras model of `segmentation`. width (pixels), boundaries: of the masks, see `masks.edges`.
-    The methods take turns. Raises InputError for a sequence with too few frames.
+    translation). model: a Keras model of `segmentation`. width: of the masks, pixels. The methods take turns.
+    Raises InputError for a sequence with too few frames.
     """
     sequence = sequence.subset(FRAMES + WARM_UP)
     if len(sequence) < WARM_UP + 2:
@@ -98,7 +97,7 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH, boundari
         for index in progress(range(len(sequence)), "timing"):
             frame, read = _timed(sequence.frame, index)
             label_map, network = _timed(_segment, model, frame)
-            mask, masking = _timed(_mask, label_map, frame.shape, width, boundaries)
+            mask, masking = _timed(_mask, label_map, frame.shape, width)
             for name, run in runs.items():
                 seconds = run.step(frame, metres[index], mask if name == masked else None).seconds
                 before = {"read": read, **({"segmentation": network, "mask": masking} if name == masked else {})}
@@ -135,9 +134,9 @@ def _segment(model: Any, frame: np.ndarray) -> np.ndarray:
     return prediction.predict(model, image[None])[0]
 
 
-def _mask(label_map: np.ndarray, size: tuple[int, int], width: int, boundaries: str) -> np.ndarray:
+def _mask(label_map: np.ndarray, size: tuple[int, int], width: int) -> np.ndarray:
     from thesis_repro.segmentation import prediction
 
     # the same as from a written label map, whose size is the thesis's whatever the model's is
     label_map = cv2.resize(label_map, (prediction.SIZE,) * 2, interpolation=cv2.INTER_NEAREST)
-    return masks.keypoint_mask(label_map, size, width, MaskSettings(boundaries))
+    return masks.keypoint_mask(label_map, size, width)
