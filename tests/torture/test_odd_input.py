@@ -84,7 +84,7 @@ def test_a_user_who_may_write_to_no_cache(tmp_path, tiny_kitti):
     package, home = tmp_path / "package" / "thesis_repro", tmp_path / "home"
     shutil.copytree(trials.ROOT / "thesis_repro", package, ignore=shutil.ignore_patterns("__pycache__"))
     home.mkdir()
-    folders = [home, package, *(path for path in package.rglob("*") if path.is_dir())]
+    folders = [home, package.parent, package, *(path for path in package.rglob("*") if path.is_dir())]
     for folder in folders:
         folder.chmod(0o555)
     no_caches = dict.fromkeys(("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "NUMBA_CACHE_DIR", "KERAS_HOME"))
