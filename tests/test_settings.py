@@ -28,13 +28,9 @@ def test_runs_of_other_data_and_profiles_never_meet(tmp_path):
 
 
 def test_street_scenes_to_judge_by_are_a_run_of_their_own(tmp_path):
-    scenes = tmp_path / "scenes"
-    scenes.mkdir()
-    settings = read_settings({"THESIS_REPRO_KITTI_SEMANTIC": str(scenes)})
-    assert settings.kitti_semantic == scenes and "scenes" in str(settings)
-    assert settings.run != "embedded-demo" and settings.figures.name == settings.run  # not what visitors see
-    assert settings.kitti_is_embedded and settings.world == read_settings({}).world
-    assert read_settings({}).kitti_semantic is None
+    settings, default = read_settings({"THESIS_REPRO_KITTI_SEMANTIC": str(tmp_path)}), read_settings({})
+    assert settings.kitti_semantic == tmp_path and default.kitti_semantic is None
+    assert settings.run != default.run and settings.world == default.world and settings.run in str(settings)
 
 
 def test_sizes_one_by_one_are_part_of_the_name():
