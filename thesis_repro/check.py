@@ -226,9 +226,10 @@ def of_masks(source, sequence):
         lines = _label_oddities(label_maps, np.flatnonzero(shares), sequence, source.settings)
     record = stages.record(folder) or {}
     present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)  # a study may take a part
-    if "frames" in record and all(stages.listing(each) != record["frames"] for each in (sequence.frame_paths, frames)):
+    known = [stages.listing(each) for each in (sequence.frame_paths, frames, frames[:present])]
+    if record.get("frames", known[0]) not in known:
         lines.append("were made from other frames than these")
-    elif present not in (1, len(sequence), len(frames)):
+    elif "frames" not in record and present not in (1, len(sequence), len(frames)):
         lines.append(f"are {present} files for {len(frames)} frames")
     option = "" if has_labels else "; --invert takes masks the other way round"
     if coverage.min() < MIN_COVERAGE or coverage.mean() > MAX_COVERAGE:

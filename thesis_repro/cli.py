@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from thesis_repro import InputError, longrun, one_line
-from thesis_repro.settings import frames, processes, widths
+from thesis_repro.settings import PROFILES, SEED, frames, processes, widths
 
 # the files that options name
 WRITTEN = {"output": "poses in KITTI's form", "tum": "poses in TUM's form", "plot": "the paths", "video": "the video"}
@@ -26,7 +26,6 @@ ENDINGS = {"plot": (".png", ".svg", ".pdf", ".jpg"), "video": (".mp4",)}
 def synthesize(options):
     """write the embedded world: a rendered street world in KITTI's and Cityscapes' layouts"""
     from thesis_repro import world
-    from thesis_repro.settings import PROFILES, SEED
 
     with longrun.logged(options.out, options.command_line) as run:
         new, total = world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
@@ -394,7 +393,7 @@ def build_parser():
 
     add = command(synthesize).add_argument
     add("out", type=Path, metavar="OUT", help="folder to write, new or left unfinished before")
-    add("--profile", choices=("smoke", "demo", "thesis"), default="demo", help="size of the world (demo)")
+    add("--profile", choices=tuple(PROFILES), default="demo", help="size of the world (demo)")
 
     add = command(check_data, "--kitti", "--cityscapes").add_argument
     add("--kitti-semantic", type=Path, metavar="ROOT", help="folder that holds train and trainannot")
