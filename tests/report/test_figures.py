@@ -63,8 +63,6 @@ DRAWN = {
     "3.3": lambda: frames.figure_3_03(FRAME, LABEL_MAP, np.roll(LABEL_MAP, 9), LABELS[ID["car"]]),
     "3.6": lambda: frames.figure_3_06(FRAME, LABEL_MAP, MASK, MASK, 10),
     "masks": lambda: frames.figure_masks(FRAME, dict.fromkeys("abc", MASK), dict.fromkeys("abc", POINTS), MASK),
-    "A.1": lambda: chapter2.figure_a_01([{"layer": "conv2d", "output_shape": "(None, 320, 320, 64)", "params": 640,
-                                          "connected_to": "input"}] * 20, 12800, 12000),
     "4.2": lambda: frames.figure_4_02(FRAME[:, :120], LABEL_MAP[:, :120], LABEL_MAP[:, 100:220], "this model"),
     "4.3": lambda: frames.figure_4_03(FRAME, LABEL_MAP[::2, ::3], "sequence 00, frame 0", LABEL_MAP),
     "4.4": lambda: frames.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),

@@ -1,7 +1,7 @@
-"""The figures of chapter 2 and A.1, drawn from the project's own network and data: networks, odometry, keypoints.
+"""The figures of chapter 2, drawn from the project's own network and data: networks, odometry, keypoints.
 
-Diagrams and plots of a formula or of one table are drawn in cells of the notebooks: 2.1, 2.3 to 2.6, 3.4, 3.5, 4.1 and
-4.17.
+Diagrams and plots of a formula or of one table are drawn in cells of the notebooks: 2.1, 2.3 to 2.6, 3.4, 3.5, 4.1,
+4.17 and A.1.
 """
 
 import cv2
@@ -79,23 +79,6 @@ def figure_2_07(model):
     handles = [Patch(color=color, label=text) for text, color in UNET_PARTS.values()]
     handles.append(Line2D([], [], color=GRAY, marker=">", markersize=5, label="skip connection"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
-    return figure
-
-
-def figure_a_01(rows, total, trainable):
-    """Figure A.1: the model summary from the rows of `unet.summary_rows`."""
-    lines = [("Layer (type)", "Output shape", "Parameters", "Connected to"),
-             *((row["layer"], row["output_shape"], f"{row['params']:,}", row["connected_to"]) for row in rows),
-             ("", "", "", ""), ("Parameters, total", "", f"{total:,}", ""), ("trainable", "", f"{trainable:,}", ""),
-             ("not trainable", "", f"{total - trainable:,}", "")]
-    figure, axes = style.new_figure(height=0.155 * len(lines))
-    axes.set(xlim=(0, 1), ylim=(len(lines), 0))
-    axes.set_axis_off()
-    for number, line in enumerate(lines):
-        for cell, x, side in zip(line, (0.0, 0.36, 0.62, 0.66), ("left", "left", "right", "left"), strict=True):
-            axes.text(x, number + 0.5, cell, ha=side, va="center", fontsize=6.5, family="monospace",
-                      weight="bold" if number == 0 else "normal")
-    axes.axhline(1, color="black", linewidth=0.8)
     return figure
 
 

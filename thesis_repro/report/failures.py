@@ -94,8 +94,8 @@ def table(steps):
 def figure(steps, sequences, masks):
     """The worst step as a drawing, and below it what masks leave the worst two sequences, frame by frame.
 
-    sequences, masks: lists, as long as each other; the steps are theirs. Worst are those sequences whose mean rotation
-    error masks raise the most, and the first one's step whose error they raise the most.
+    sequences, masks: lists; the steps are theirs. Worst is where masks raise the rotation error the most: the
+    sequences by its mean, and the step among those of the first.
     """
     error = steps.pivot(index=["sequence", "frame"], columns="kind", values="rotation_error")
     means = error.groupby("sequence").mean()
