@@ -50,7 +50,9 @@ def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):
 def test_code_ignores_comments_and_docstrings_and_follows_imports(tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "_PACKAGE", tmp_path / "package")
     plain = {"__init__": "", "room____init__": "", "house": "def f():\n    return 1\n", "garden": "x = 1\n",
-             "room__table": "from package.room import chair\n", "room__chair": "from package import house\n"}
+             "room__table": "import beside\nfrom package.room import chair\n",
+             "room__chair": "from package import house\n"}
+    (tmp_path / "beside.py").touch()  # as other packages are where this one is installed
 
     def version(place="room", **changed):
         for name, text in {**plain, **changed}.items():

@@ -65,8 +65,8 @@ def explain(error):
 
 def number_of(error):
     """The system's number of an error, or None. HDF5 and others give the system's text alone."""
-    numbers = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    return getattr(error, "errno", None) or next((n for n in numbers if os.strerror(n) in str(error)), None)
+    named = (number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error))
+    return getattr(error, "errno", None) or next(named, None)
 
 
 def need_addresses(gigabytes):

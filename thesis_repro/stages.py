@@ -176,13 +176,22 @@ def code(*places):
     return digest.hexdigest()[:12]
 
 
+class _PackageFinder(ModuleFinder):
+    """Finds what is imported of this package, and nothing of those that are installed beside it."""
+
+    def find_module(self, name, path, parent=None):
+        if path is None and name != _PACKAGE.name:
+            raise ImportError(name)
+        return super().find_module(name, path, parent)
+
+
 def _modules(places):
     """The files of some places and of all of the package that they import, sorted."""
-    finder = ModuleFinder([str(_PACKAGE.parent)])
+    finder = _PackageFinder([str(_PACKAGE.parent)])
     for place in places:
         for path in sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"]:
             finder.import_hook(".".join(path.relative_to(_PACKAGE.parent).with_suffix("").parts))
-    return sorted(Path(module.__file__) for module in finder.modules.values() if module.__file__)
+    return sorted({Path(module.__file__) for module in finder.modules.values() if module.__file__})
 
 
 def made_with(*packages):
