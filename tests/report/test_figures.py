@@ -1,4 +1,4 @@
-"""Figures of chapters 2 and 3, and of frames in chapter 4: they show what the data says, and all can be read."""
+"""Figures of chapter 2 and of frames: they show what the data says, and all can be read."""
 
 import numpy as np
 import pytest
@@ -39,12 +39,6 @@ def convolution(channels=1):
     return patch, kernel, 1.25, response, np.maximum(response, 0), (6, 4)
 
 
-def unet(base_filters):
-    from thesis_repro.segmentation.unet import build_unet
-
-    return build_unet((32, 32, 1), 35, base_filters=base_filters)
-
-
 FRAME, LATER = textured(), textured(5)
 LABEL_MAP = np.full(FRAME.shape, ID["road"], np.uint8)
 LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = ID["car"], ID["sky"], ID["license plate"]
@@ -54,7 +48,6 @@ POINTS = np.array([[110.0, 50.0], [120.0, 60.0]])
 DRAWN = {
     "2.2": lambda: chapter2.figure_2_02(*convolution()),
     "2.2 of three channels": lambda: chapter2.figure_2_02(*convolution(3)),
-    "2.7": lambda: chapter2.figure_2_07(unet(4)),
     "2.8": lambda: chapter2.figure_2_08(turning(), "sequence 00"),
     "2.9": lambda: chapter2.figure_2_09(FRAME, LATER, "sequence 00"),
     "2.9 without corners": lambda: chapter2.figure_2_09(MASK, np.zeros_like(MASK), "sequence 00"),
@@ -74,7 +67,7 @@ DRAWN = {
 }
 
 
-@pytest.mark.parametrize("name", [*sorted(set(DRAWN) - {"2.7"}), pytest.param("2.7", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", DRAWN)
 def test_nothing_in_a_figure_is_raw_missing_or_covered(name):
     assert [problem for problem in problems(DRAWN[name]()) if "raw TeX: $all$" not in problem] == []
 
@@ -96,7 +89,10 @@ def test_iou_figure_states_the_areas_and_their_ratio():
 
 @pytest.mark.slow
 def test_unet_figure_is_read_from_the_model():
-    figure = chapter2.figure_2_07(unet(2))
+    from thesis_repro.segmentation.unet import build_unet
+
+    figure = chapter2.figure_2_07(build_unet((32, 32, 1), 35, base_filters=2))
+    assert problems(figure) == []
     assert {"32x32", "2x2", "35"} <= set(texts(figure)) and "64" not in texts(figure)
     assert sum(getattr(text, "arrow_patch", None) is not None for text in figure.axes[0].texts) == 4  # skip connections
 

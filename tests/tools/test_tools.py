@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import keras
 import numpy as np
@@ -34,19 +35,14 @@ def test_bench_sets_each_measure_against_another(small_world, monkeypatch):
     assert len(json.loads(table.to_json(orient="records"))) == 6
 
 
-class Line:
-    """A sequence of six frames along a line, 0.3 m apart."""
-
-    poses = np.tile(np.eye(4), (6, 1, 1))
-    poses[:, 2, 3] = 0.3 * np.arange(6)
-
-
 def test_a_wrong_turn_counts_once_and_as_flagged_where_it_is():
-    turned = Line.poses.copy()
+    line = np.tile(np.eye(4), (6, 1, 1))
+    line[:, 2, 3] = 0.3 * np.arange(6)
+    turned = line.copy()
     turned[2:, :3, :3] = [[0.999, 0, 0.0447], [0, 1, 0], [-0.0447, 0, 0.999]]  # 2.6 degrees, once
     for flag, unflagged in (("", 1), ("ambiguous motion", 0)):
         frames = pd.DataFrame({"flag": ["", "", flag, "", "motion not determined", ""]})
-        counts = reliability.count_steps(odometry.Result(turned, frames), Line, np.arange(6) > 0)
+        counts = reliability.count_steps(odometry.Result(turned, frames), SimpleNamespace(poses=line), np.arange(6) > 0)
         assert (counts["steps"], counts["wrong"], counts["unflagged"]) == (5, 1, unflagged)
         assert counts["largest"] == pytest.approx(2.56, abs=0.01) and counts["not_determined"] == 1
 
