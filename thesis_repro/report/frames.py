@@ -90,7 +90,8 @@ def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation
     return _pictures(frame, {
         f"(a) {title}": frame, everywhere: frame, "(c) prediction": style.label_colors(prediction, frame),
         f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask, on_mask: frame},
-        {everywhere: all_keypoints, on_mask: kept_keypoints}, label_maps=[prediction], width=0.78 * PAGE_WIDTH)
+        {everywhere: all_keypoints, on_mask: kept_keypoints}, columns=3, label_maps=[prediction],
+        width=1.4 * PAGE_WIDTH)
 
 
 def figure_4_08(views, title):
