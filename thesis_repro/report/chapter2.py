@@ -1,7 +1,6 @@
 """The figures of chapter 2, drawn from the project's own network and data: networks, odometry, keypoints.
 
-Diagrams and plots of a formula or of one table are drawn in cells of the notebooks: 2.1, 2.3 to 2.6, 3.4, 3.5, 4.1,
-4.17 and A.1.
+Diagrams, and plots of a formula or of one table (2.1, 2.3 to 2.6, 3.4, 3.5, 4.1, 4.17, A.1), are cells of notebooks.
 """
 
 import cv2

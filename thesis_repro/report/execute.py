@@ -24,8 +24,7 @@ class Execution(ExecutePreprocessor):
     """Executes all cells of a notebook; ends the program with status 1 where one fails, 130 where it is interrupted."""
 
     kernel_name = Unicode("python3").tag(config=True)  # not what the last editor of the notebook called it
-    log_file = Unicode("execution.log", help="what the kernel says outside of cells, and a failure's whole report"
-                       ).tag(config=True)
+    log_file = Unicode("execution.log").tag(config=True)  # what is said outside of cells, and a failure's whole report
 
     def preprocess(self, nb, resources=None, km=None):
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program

@@ -139,7 +139,6 @@ def _draw(panel, sequence, masks, index):
         panel.plot(*np.vstack([outline[:, 0], outline[:1, 0]]).T, color="black", linewidth=0.4)
     epipole = sequence.intrinsics @ motion.translation
     panel.plot(*(epipole[:2] / epipole[2]), "+", color="black", markersize=11, label="epipole: where the car goes")
-    height, width = sequence.size
-    panel.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xticks=[], yticks=[],
+    panel.set(xlim=(0, sequence.size[1]), ylim=(sequence.size[0], 0), aspect="equal", xticks=[], yticks=[],
               title=f"sequence {sequence.name}, frames {index - 1} to {index}: {agreeing.sum()} of {len(agreeing)} "
                     f"keypoints in the mask agree with the motion")
