@@ -28,7 +28,6 @@ pytestmark = pytest.mark.slow
 def test_bench_sets_each_measure_against_another(small_world, monkeypatch):
     monkeypatch.setattr(bench, "REPEATS", 1)
     monkeypatch.setattr(bench, "WIDTHS", (5,))
-    monkeypatch.setattr(bench, "chain_rate", lambda sequence: 5.0)  # tests of the timing cover it
     table = bench.measure(Sequence(small_world / "kitti", "00").subset(5))
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
     assert (table["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
