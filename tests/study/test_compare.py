@@ -122,6 +122,7 @@ def test_who_got_lost_is_named_beside_the_mean():
         ", sequence 03 alone 6.00, sequence 05 alone 0.10")
     assert compare.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []  # which of two got lost cannot be said
     assert compare.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
+    assert compare.far_off(pd.Series({"00": 1.0, "01": 0.6, "02": 1.4, "03": 90.0})) == ["03"]  # no other for its sake
 
 
 def test_shuffling_shows_as_a_factor():

@@ -109,15 +109,14 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
 
 
 def far_off(ratios: pd.Series) -> list[str]:
-    """The sequences whose ratio is more than FAR_OFF times the geometric mean of the others', or as much below it.
+    """The sequences whose ratio is more than FAR_OFF times the median of all, or less than the FAR_OFF-th part of it.
 
-    In one of the two runs they got lost. Fewer than MIN_FOR_INTERVAL sequences have no others to speak of.
+    In one of the two runs they got lost. Fewer than MIN_FOR_INTERVAL sequences do not tell which of them.
     """
     if len(ratios) < MIN_FOR_INTERVAL:
         return []
     logarithms = np.log(ratios)
-    others = (logarithms.sum() - logarithms) / (len(ratios) - 1)
-    return list(ratios.index[(logarithms - others).abs() > np.log(FAR_OFF)])
+    return list(ratios.index[(logarithms - logarithms.median()).abs() > np.log(FAR_OFF)])
 
 
 def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
