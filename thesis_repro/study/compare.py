@@ -62,7 +62,7 @@ MIN_FOR_INTERVAL = 3  # sequences; drawing anew from fewer says nothing
 # With fewer sequences all of them lie on one side of 1 by chance more often than one time in twenty (2 / 2**n).
 MIN_SEQUENCES = 6
 LEVEL = 95  # percent, of all intervals
-FAR_OFF = 3  # times the others: a sequence with such a ratio is named beside the mean
+FAR_OFF = 3  # times the median: a sequence with such a ratio is named beside the mean
 DRAWS = 10_000
 LOWER, HIGHER, NO_CLEAR_DIFFERENCE = ("lower", "higher", "no clear difference")
 
