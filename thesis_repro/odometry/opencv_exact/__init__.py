@@ -1,1 +1,1 @@
-"""OpenCV's essential-matrix estimator repeated to the bit, in less than half of its time."""
+"""OpenCV's RANSAC for the essential matrix: the same bits in less than half the time."""

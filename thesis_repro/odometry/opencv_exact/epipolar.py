@@ -1,11 +1,11 @@
-"""Terms of the Sampson distance, which the search for an essential matrix and its refinement both minimise."""
+"""Terms of the Sampson distance, for the RANSAC search and for the refined estimator."""
 
 from thesis_repro.compiled import inner
 
 
 @inner
 def entries(e):
-    """The nine entries of an array (9): as single numbers they stay in registers."""
+    """Entries of an array (9) as a tuple: single numbers stay in registers."""
     return e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
 
 
@@ -13,10 +13,10 @@ def entries(e):
 def sampson_terms(e, x, y, u, v):
     """Terms of one correspondence's Sampson distance: (algebraic, l0, l1, m0, m1).
 
-    e: the nine entries of an essential matrix E. (x, y) lies in the current frame, (u, v) in the previous one.
-    algebraic is the epipolar constraint (u, v, 1) E (x, y, 1)^T, which is 0 where they agree. The others are the first
-    two coordinates of the epipolar lines: l = E (x, y, 1)^T in the previous frame, m = E^T (u, v, 1)^T in the current
-    one. The squared Sampson distance is algebraic^2 / (l0^2 + l1^2 + m0^2 + m1^2).
+    e: nine entries of an essential matrix E. (x, y): point in the current frame. (u, v): point in the previous frame.
+    algebraic is (u, v, 1) E (x, y, 1)^T, which is 0 for an exact match (epipolar constraint). l0, l1 and m0, m1 are the
+    first two coordinates of the epipolar lines l = E (x, y, 1)^T (previous frame) and m = E^T (u, v, 1)^T (current
+    frame). The squared Sampson distance is algebraic^2 / (l0^2 + l1^2 + m0^2 + m1^2).
     """
     l0 = e[0] * x + e[1] * y + e[2]
     l1 = e[3] * x + e[4] * y + e[5]

@@ -1,1 +1,1 @@
-"""The refined estimator, which is this project's own: a fit to all points near the motion, and a motion prior."""
+"""The refined estimator (not in the thesis): the motion is fitted to all points near it and checked with a prior."""

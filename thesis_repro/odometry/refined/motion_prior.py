@@ -1,9 +1,9 @@
-"""Whether a step's motion is consistent with the step before: what makes the refined estimator reliable.
+"""Consistency of a step's motion with the step before, which makes the refined estimator reliable.
 
-A camera on a car moves nearly the same way from frame to frame. KITTI has 22,437 true pairs of steps of more than
-0.25 m. In 7 of them the rotations differ by more than MAX_ROTATION_CHANGE (after the first is stretched to the second's
-length), and in 4 the directions of motion differ by more than MAX_HEADING_CHANGE. A motion estimated from few points,
-from points far away or from points along one line can differ by far more: a turn looks like a shift to the side, and
+A camera on a car moves nearly the same way from frame to frame. KITTI's ground truth has 22,437 pairs of steps longer
+than 0.25 m. In 7 pairs the rotations differ by more than MAX_ROTATION_CHANGE (with the first rotation scaled to the
+second step's length). In 4 pairs the directions of motion differ by more than MAX_HEADING_CHANGE. A motion estimated
+from few points, far points or points along one line can differ by far more: a turn looks like a shift to the side, and
 both explain the correspondences.
 """
 
@@ -18,19 +18,18 @@ from thesis_repro.odometry.refined.guided import ransac_with_prior
 
 MAX_ROTATION_CHANGE, MAX_HEADING_CHANGE = 1.5, 20.0  # degrees
 MAX_FIRST_ROTATION = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
-PRIOR_FIT_THRESHOLDS = 4  # how near the expected motion the correspondences of the second fit lie
-SAME_SUPPORT = 0.97  # a fit with this share of the estimated motion's support is as good
-MIN_SUPPORT = 0.6  # a motion with less than this share of the estimated motion's support is wrong
-MAX_ROTATION_STD, MAX_HEADING_STD = 0.5, 5.0  # degrees: with more, a motion is not determined by its points
+PRIOR_FIT_THRESHOLDS = 4  # points within so many thresholds of the expected motion start the second fit
+SAME_SUPPORT = 0.97  # a second fit with this share of the estimated motion's support is as good
+MIN_SUPPORT = 0.6  # an alternative with less than this share of the estimated motion's support is wrong
+MAX_ROTATION_STD, MAX_HEADING_STD = 0.5, 5.0  # degrees; with more, the points do not determine the motion
 
 AMBIGUOUS, NOT_DETERMINED = "ambiguous motion", "motion not determined"  # flags
 
 
 class MotionPrior(NamedTuple):
-    """The last consistent step: `rotation` (3x3), unit `translation` and `scale` (metres). The next one is expected to
-    be like it.
+    """Last consistent step: `rotation` (3x3), unit `translation` and `scale` (metres). The next step should be similar.
 
-    Before the first step, `scale` is 0 and a camera is expected to look where it goes.
+    Before the first step, `scale` is 0 and the camera is expected to move straight ahead.
     """
 
     rotation: np.ndarray = np.eye(3)
@@ -38,7 +37,7 @@ class MotionPrior(NamedTuple):
     scale: float = 0.0
 
     def expected_rotation(self, scale: float) -> np.ndarray:
-        """The rotation to expect of a step of `scale` metres, 3x3: the same curve."""
+        """Expected rotation (3x3) of a step of `scale` metres on the same curve."""
         if not self.scale:
             return self.rotation
         return cv2.Rodrigues(cv2.Rodrigues(self.rotation)[0] * (scale / self.scale))[0]
@@ -46,17 +45,18 @@ class MotionPrior(NamedTuple):
 
 def check_consistency(motion: RefinedMotion, current: np.ndarray, previous: np.ndarray, scale: float, threshold: float,
                       prior: MotionPrior) -> tuple[RefinedMotion, MotionPrior, str]:
-    """The motion to use, the prior of the next step, and a flag: "" where the refined `motion` is consistent.
+    """Return the motion to use, the prior of the next step, and a flag ("" if the refined `motion` is consistent).
 
     current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers. scale: metres.
 
-    A consistent motion (`is_consistent`) is fitted once more from the expected motion. All shuffles of the
-    correspondences start alike there, so little of RANSAC's chance is left.
+    A consistent motion (`is_consistent`) is fitted once more, starting from the expected motion. This start does not
+    depend on RANSAC's random samples, so shuffled correspondences give nearly the same motion.
 
-    Otherwise the best consistent motion is searched for. In a scene that stands still the true motion has nearly as
-    many correspondences near it as any other. So this motion is used if it has at least MIN_SUPPORT times as many; if
-    not, the camera did move another way, and the estimated motion is used. Either way the step is AMBIGUOUS. Where
-    neither is determined, the step is NOT_DETERMINED and repeats the motion of the prior.
+    If the motion is not consistent, the best consistent motion is searched for. In a static scene, the true motion has
+    nearly as much support as any other. So the consistent motion is used if its support is at least MIN_SUPPORT times
+    that of the estimated motion. If not, the camera really moved differently, and the estimated motion is used. The
+    flag is AMBIGUOUS in both cases. If the points determine no motion, the step repeats the expected motion, and the
+    flag is NOT_DETERMINED.
     """
     rotation, translation = prior.expected_rotation(scale), prior.translation
     flag = ""
@@ -81,7 +81,7 @@ def check_consistency(motion: RefinedMotion, current: np.ndarray, previous: np.n
 
 
 def is_consistent(motion: RefinedMotion, scale: float, prior: MotionPrior) -> bool:
-    """Whether a step's points determine its motion, and it is within the limits of the prior's; scale: metres."""
+    """Whether a step of `scale` metres is determined by its points and within the limits of the expected motion."""
     assert motion.rotation is not None and motion.translation is not None
     turned = _degrees((np.trace(prior.expected_rotation(scale).T @ motion.rotation) - 1) / 2)
     return bool(_determined(motion) and turned <= _max_rotation(prior)
