@@ -1,16 +1,15 @@
-"""The five-point algorithm: the steps from five correspondences to the essential matrices through them.
+"""The five-point algorithm: essential matrices from five correspondences.
 
-After Nister (2004), An efficient solution to the five-point relative pose problem, PAMI 26(6), in his steps:
+The steps follow Nister (2004), An efficient solution to the five-point relative pose problem, PAMI 26(6):
 
-1. the epipolar constraints of five correspondences leave E = x X + y Y + z Z + W (`null_space`);
-2. the trace constraint and the determinant constraint make E essential: ten cubics in x, y, z (`constraints`);
-3. elimination leaves three equations B(z) (x, y, 1)^T = 0 (`eliminate`);
-4. det B(z) = 0, a polynomial of degree ten (`determinant`);
-5. its roots (`real_roots`): a complex root is no motion, so only the real ones are computed;
-6. x, y and with them E for each root (`essential`).
+1. `null_space`: five epipolar constraints leave E = x X + y Y + z Z + W with unknown x, y, z;
+2. `constraints`: the trace constraint and the determinant constraint on E are ten cubic equations in x, y, z;
+3. `eliminate`: Gauss-Jordan elimination leaves three equations B(z) (x, y, 1)^T = 0;
+4. `determinant`: det B(z) is a polynomial of degree ten in z;
+5. `real_roots`: the real roots of det B(z) = 0 (a complex root gives no motion);
+6. `essential`: x, y and E for one root.
 
-`rounding.solve` takes these steps one after the other. Nister's last step, rotation and translation from E and the
-vote, is pose.recover_pose.
+`rounding.solve` runs these steps. Nister's last step, rotation and translation from E, is pose.recover_pose.
 """
 
 import math
@@ -20,11 +19,11 @@ import numpy as np
 from thesis_repro.compiled import fast, inner
 
 SAMPLE_SIZE = 5
-MIN_INDEPENDENCE = 1e-8  # of the five epipolar constraints
+MIN_INDEPENDENCE = 1e-8  # of five epipolar constraints: with less, no solution is trusted
 
 
 def _signs() -> np.ndarray:
-    """The vectors from which OpenCV's singular value decomposition completes a basis: 4 x 9 random signs."""
+    """Random signs (4, 9) from which OpenCV's singular value decomposition completes a basis."""
     state, signs = 0x12345678, np.empty((4, 9))
     for place in np.ndindex(signs.shape):
         state = (state & 0xFFFFFFFF) * 4164903690 + (state >> 32)
@@ -33,10 +32,10 @@ def _signs() -> np.ndarray:
 
 
 def _products() -> tuple[np.ndarray, np.ndarray]:
-    """Where monomials of x, y, z, 1 go when multiplied: (4, 4) to quadratic ones, (10, 4) to cubic ones.
+    """Tables of monomial products: linear times linear (4, 4) and quadratic times linear (10, 4).
 
-    The cubic ones are in Nister's order, by which elimination leaves a system of three equations in x, y, 1: those of
-    degree two and more in x and y first, then x, y and 1, each with its powers of z.
+    Entry [p, q] is the index of the product of monomials p and q. The cubic monomials are in Nister's order: first
+    those of degree two or more in x and y, then x, y and 1 times powers of z. So elimination leaves x, y and 1.
     """
     linear = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]
     quadratic = [(2, 0, 0), (1, 1, 0), (1, 0, 1), (1, 0, 0), (0, 2, 0), (0, 1, 1), (0, 1, 0), (0, 0, 2), (0, 0, 1),
@@ -57,11 +56,10 @@ TO_QUADRATIC, TO_CUBIC = _products()
 
 @inner
 def null_space(five):
-    """Step 1: how independent the epipolar constraints of five correspondences, (u, v, 1) E (x, y, 1)^T = 0, are, from
-    0 to 1, and the basis X, Y, Z, W (4, 9) that OpenCV takes of the matrices that meet them, each row by row.
+    """Step 1: independence of five epipolar constraints (0 to 1) and the basis X, Y, Z, W (4, 9; matrices row by row).
 
-    Where Nister has a QR factorisation this is Gram and Schmidt's, done twice because of rounding. Another basis would
-    have the same solutions, but rounding would change them by other amounts.
+    A constraint is (u, v, 1) E (x, y, 1)^T = 0. Nister uses a QR factorisation. This is Gram-Schmidt, run twice against
+    rounding. It gives OpenCV's basis: in another basis, rounding would change the solutions by other amounts.
     """
     rows, independence = np.empty((9, 9)), 1.0
     for k in range(9):
@@ -111,7 +109,7 @@ def constraints(basis):
         for j in range(i):
             for p in range(10):
                 squares[3 * j + i, p] = squares[3 * i + j, p]
-        first, second = 3 + (i + 1) % 3, 6 + (i + 2) % 3  # for the minors of E's first row, of the determinant
+        first, second = 3 + (i + 1) % 3, 6 + (i + 2) % 3  # entries in the minors of E's first row
         for p in range(4):
             for q in range(4):
                 minors[i, TO_QUADRATIC[p, q]] += (basis[p, first] * basis[q, second]
@@ -134,12 +132,11 @@ def constraints(basis):
 
 @inner
 def eliminate(a, b):
-    """Step 3: whether it could be done, and written to b (3, 13, given as zeros): Nister's B(z), three rows of three
-    polynomials in z, to which (x, y, 1) is normal.
+    """Step 3: write B(z) to b (3, 13; given as zeros), and return False if the equations a (10, 20) are singular.
 
-    Gauss and Jordan's elimination with partial pivoting of the ten equations a (10, 20), which it overwrites. A row
-    of B is one row less z times the next, in which nothing but x, y and 1 is left; a polynomial has its highest power
-    first, of degree 3, 3 and 4.
+    Gauss-Jordan elimination with partial pivoting, in place. A row of B(z) is one eliminated row minus z times the
+    next one, so that only x, y and 1 are left. It holds their factors: polynomials in z of degree 3, 3 and 4, each
+    with its highest power first.
     """
     for k in range(10):
         pivot = k
@@ -155,7 +152,7 @@ def eliminate(a, b):
             factor = a[i, k] / a[k, k]
             for j in range(k + 1, 20):
                 a[i, j] -= factor * a[k, j]
-    for k in range(9, 3, -1):  # the first four unknowns are not needed
+    for k in range(9, 3, -1):  # B(z) needs the last six unknowns only
         for i in range(k + 1, 10):
             for j in range(10, 20):
                 a[k, j] -= a[k, i] * a[i, j]
@@ -172,14 +169,14 @@ def eliminate(a, b):
 
 @inner
 def row_values(c, z):
-    """One row c (13) of B(z) at z: its three polynomials."""
+    """Values at z of the three polynomials in one row c (13) of B(z)."""
     return (((c[0] * z + c[1]) * z + c[2]) * z + c[3], ((c[4] * z + c[5]) * z + c[6]) * z + c[7],
             (((c[8] * z + c[9]) * z + c[10]) * z + c[11]) * z + c[12])
 
 
 @inner
 def determinant(b):
-    """Step 4: coefficients (11, highest power first) of det B(z), expanded along its last column."""
+    """Step 4: coefficients (11, highest power first) of det B(z), by expansion along the last column."""
     polynomial = np.zeros(11)
     minor = np.empty(7)
     for i in range(3):
@@ -197,20 +194,20 @@ def determinant(b):
 
 @fast
 def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Step 5: whether a polynomial of degree ten (11, highest power first) could be solved, its real roots, and the
-    places of its extrema. An extremum that is nearly 0 may be a double root or none at all.
+    """Step 5: solve a polynomial of degree ten (11, highest power first): (solved, real roots, places of the extrema).
 
-    Between two roots of the derivative lies at most one root, so the derivatives are solved one after the other. Those
-    of low degree are solved less precisely: their roots only bound the intervals of the next.
+    At most one root lies between two neighbouring extrema. The extrema are the roots of the derivative, so all
+    derivatives are solved, the lowest degree first and less precisely. The caller must look at the extrema: where the
+    polynomial is nearly 0 there, it has a double root or none.
     """
     edges, roots, bends = np.empty(12), np.empty(11), np.empty(12)
-    bound = 0.0
+    bound, unsolved = 0.0, (False, roots[:0], edges[:0])
     for k in range(1, 11):
         if not abs(polynomial[k]) < 1e15 * abs(polynomial[0]):
-            return False, roots[:0], edges[:0]
+            return unsolved
         bound = max(bound, 2 * (abs(polynomial[k]) / abs(polynomial[0])) ** (1.0 / k))
     if abs(polynomial[0]) < 1e-12:  # OpenCV drops a leading coefficient of 2e-16
-        return False, roots[:0], edges[:0]
+        return unsolved
     derivatives = np.empty((11, 11))
     for k in range(11):
         derivatives[10, k] = polynomial[k]
@@ -229,10 +226,10 @@ def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
             right = value(derivative, degree, edges[k + 1])
             if (left < 0) != (right < 0):
                 start = 0.5 * (edges[k] + edges[k + 1])
-                if 0 < k < intervals - 1:  # between two extrema, where a cubic that shares them is 0
+                if 0 < k < intervals - 1:  # root of the cubic with the same two extrema
                     part = 0.5 - math.sin(math.asin((left + right) / (left - right)) / 3)
                     start = edges[k] + part * (edges[k + 1] - edges[k])
-                elif k > 0:  # beyond one, where a parabola would be
+                elif k > 0:  # beyond the last extremum: root of the parabola with the same bend there
                     start = edges[k] + math.sqrt(abs(2 * left / bends[k]))
                 elif intervals > 1:
                     start = edges[1] - math.sqrt(abs(2 * right / bends[1]))
@@ -247,7 +244,7 @@ def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
 
 @inner
 def value(polynomial, degree, z):
-    """A polynomial at z. Even and odd powers are summed separately: a processor works on both at the same time."""
+    """Value of a polynomial at z. Even and odd powers are summed apart, so the processor runs both sums at once."""
     square = z * z
     first, second = polynomial[0], polynomial[1] if degree else 0.0
     for k in range(2, degree, 2):
@@ -260,7 +257,7 @@ def value(polynomial, degree, z):
 
 @inner
 def _root_between(polynomial, slopes, degree, left, right, rising, start, precision):
-    """Newton's iteration, with bisection where it would leave the interval or is slow."""
+    """Root in an interval by Newton's method, with bisection where a step leaves the interval or converges slowly."""
     z = start if left < start < right else 0.5 * (left + right)
     before = right - left
     for _ in range(100):
@@ -281,7 +278,7 @@ def _root_between(polynomial, slopes, degree, left, right, rising, start, precis
 
 @inner
 def essential(normal, basis, z, matrix):
-    """Step 6: write the essential matrix (9, unit norm) that belongs to a root z and to the normal (3) of B(z)."""
+    """Step 6: write the essential matrix (9, unit norm) of a root z, at which `normal` (3) solves B(z) normal = 0."""
     total = 0.0
     for j in range(9):
         matrix[j] = normal[0] * basis[0, j] + normal[1] * basis[1, j] + normal[2] * (z * basis[2, j] + basis[3, j])

@@ -1,17 +1,17 @@
-"""cv2.findEssentialMat with RANSAC to the last bit, several times faster.
+"""cv2.findEssentialMat with RANSAC: the same bits, several times faster.
 
-Nearly all of OpenCV's time goes into the five-point solver, most of it into finding all ten complex roots of a
-polynomial by an iteration that runs to its last round although the roots settled long before. Of all these solutions
-RANSAC keeps one. So the search goes like this:
+OpenCV spends nearly all of its time in the five-point solver. It finds all ten complex roots of a polynomial by an
+iteration that goes on long after the roots have converged. But RANSAC keeps only one of all solutions. So this search
+solves few samples with OpenCV:
 
-1. Samples of five correspondences are drawn with OpenCV's generator of random numbers.
-2. `rounding.solve` solves a sample quickly. Its solutions are not OpenCV's to the last bit, but it gives a margin for
-   the difference, and with it bounds of the number of inliers. A look in single precision rules out most solutions.
-3. OpenCV itself solves the samples for which the bounds leave open whether they are better than the best so far, and
+1. Draw samples of five correspondences with OpenCV's random number generator.
+2. Solve each sample quickly with `rounding.solve`. The last digits differ from OpenCV's, but the difference is within
+   a margin. The margin gives bounds of OpenCV's number of inliers. A test in single precision rules out most solutions.
+3. Let OpenCV solve a sample if the bounds do not decide whether it beats the best one so far. Let OpenCV also solve
    the winner.
-4. If the winner's inliers are not as many as the bounds say, OpenCV does everything.
+4. If the winner's number of inliers is outside its bounds, let OpenCV do the whole search.
 
-The margin is an estimate with room to spare, not a proof; the tests compare with OpenCV.
+The margin is a generous estimate, not a proof. The tests compare the results with OpenCV's.
 """
 
 import math
@@ -25,30 +25,33 @@ from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
 from thesis_repro.odometry.opencv_exact.rounding import solve
 
 MAX_SAMPLES = 1000
-MIN_FOR_SHORTCUT = 8  # correspondences; with fewer there are so few samples that OpenCV solves them all
-OPENCV_SEED = 2**64 - 1  # of its RANSAC
-SCORING_BLOCK = 128  # correspondences scored between two looks at whether the best can still be beaten
+MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole search
+OPENCV_SEED = 2**64 - 1  # of its RANSAC's random number generator
+SCORING_BLOCK = 128  # correspondences scored between two checks whether the best can still be beaten
 
 
 def find_essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float,
                           probability: float) -> tuple[np.ndarray | None, np.ndarray | None]:
     """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability, threshold): (E, mask).
 
-    Correspondences are (N, 2) float64 in normalised coordinates. E is 3x3, or OpenCV's stack of solutions for N = 5,
-    or None; mask is (N, 1) uint8 as OpenCV returns it, or None.
+    current, previous: correspondences (N, 2), float64, normalised coordinates. E: 3x3, or OpenCV's stack of solutions
+    for N = 5, or None. mask: (N, 1) uint8, or None.
     """
     count = len(current)
     columns = np.stack([*current.T, *previous.T])
     if count < MIN_FOR_SHORTCUT or not np.isfinite(columns).all():
         return _opencv(current, previous, threshold, probability)
     limit = np.float32(threshold * threshold)
-    rough = _single_precision(columns)
+    # Correspondences in single precision; the last row says how much an error of the matrix may matter to each.
+    x, y, u, v = np.abs(columns)
+    with np.errstate(over="ignore"):
+        rough = np.vstack([columns, (1 + x + y) * (1 + u + v)]).astype(np.float32)
 
     def solve_exactly(sample):
         return _opencv_solution(columns, sample, threshold, probability, limit)
 
-    # The best so far has between `low` and `high` inliers; which of them matters only when another comes near it, or
-    # when it decides whether the search ends. `solution` is OpenCV's for the sample `winner`, once it was asked.
+    # The best sample so far, `winner`, has between `low` and `high` inliers. The exact number matters only when another
+    # sample comes close, or when it decides whether the search ends. Then OpenCV's `solution` is computed.
     state, drawn, low, high, winner, solution = OPENCV_SEED, 0, SAMPLE_SIZE - 1, SAMPLE_SIZE - 1, None, None
     while True:
         enough = MAX_SAMPLES if winner is None else _samples_needed(probability, (count - high) / count)
@@ -77,19 +80,19 @@ def _opencv(current, previous, threshold, probability):
 
 
 def _opencv_solution(columns, sample, threshold, probability, limit):
-    """OpenCV's first best solution for five correspondences: its inliers among all, the matrix, the mask."""
+    """OpenCV's best solution for a sample of five: number of inliers among all correspondences, matrix, mask."""
     five = np.ascontiguousarray(columns[:, sample].T)
     stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
     if stack is None:
         return 0, None, None
     masks = _inlier_masks(stack.reshape(-1, 9), columns, limit)
     inliers = masks.sum(axis=1)
-    best = int(inliers.argmax())  # the first of equals, as in OpenCV
+    best = int(inliers.argmax())  # the first one if several are equal, as in OpenCV
     return int(inliers[best]), stack[3 * best:3 * best + 3].copy(), masks[best].reshape(-1, 1)
 
 
 def _samples_needed(probability, outliers):
-    """Samples of five for one without outliers to be among them with that probability."""
+    """Number of samples among which one is free of outliers with the given probability (`outliers`: their share)."""
     missed = 1.0 - math.pow(1.0 - outliers, SAMPLE_SIZE)
     if missed < np.finfo(float).tiny:
         return 0
@@ -97,16 +100,9 @@ def _samples_needed(probability, outliers):
     return MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
 
 
-def _single_precision(columns):
-    """Correspondences in single precision, and how much an error of a matrix's entries may matter to each: (5, N)."""
-    x, y, u, v = np.abs(columns)
-    with np.errstate(over="ignore"):
-        return np.vstack([columns, (1 + x + y) * (1 + u + v)]).astype(np.float32)
-
-
 @fast
 def _inlier_masks(matrices, columns, limit):
-    """(K, N) of 0 or 1 for K matrices: whether the squared Sampson distance, rounded to float32, is in the limit."""
+    """Inlier masks (K, N) of K matrices: 1 where the squared Sampson distance, as float32, is within the limit."""
     masks = np.empty((len(matrices), columns.shape[1]), np.uint8)
     for index in range(len(matrices)):
         matrix = epipolar.entries(matrices[index])
@@ -118,9 +114,9 @@ def _inlier_masks(matrices, columns, limit):
     return masks
 
 
-@inner
+@fast
 def draw(state, columns, sample, five):
-    """Write five correspondences, drawn as OpenCV does: indices and rows; returns the generator's state."""
+    """Draw a sample as OpenCV does: write its five indices and rows, and return the generator's new state."""
     count, taken = columns.shape[1], 0
     while taken < SAMPLE_SIZE:
         state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
@@ -138,10 +134,10 @@ def draw(state, columns, sample, five):
 
 @fast
 def _next_better(columns, rough, limit, state, drawn, samples, best):
-    """Draw samples until one may have more than `best` inliers, or until there are `samples` of them.
+    """Draw samples until one may have more than `best` inliers, or until `samples` of them are drawn.
 
-    Returns the generator's state, the number of samples drawn, the five indices, and the bounds between which the
-    number of inliers of the sample's best solution lies, 0 and 0 where there is none that may be better.
+    Returns the generator's state, the number of samples drawn, the sample's five indices, and bounds of the number of
+    inliers of its best solution (0, 0 if no sample may be better).
     """
     count = columns.shape[1]
     sample = np.empty(SAMPLE_SIZE, np.int64)
@@ -163,13 +159,13 @@ def _next_better(columns, rough, limit, state, drawn, samples, best):
     return state, drawn, sample, 0, 0
 
 
-@fast
+@inner
 def _may_beat(e, margin, rough, limit, best):
-    """False if no matrix within the margin of e has more than `best` inliers: a look in single precision."""
+    """False if surely no matrix within the margin of e has more than `best` inliers: a test in single precision."""
     count, allowed = rough.shape[1], rough.shape[1] - best
     root = np.sqrt(limit)
-    # What the margin (see _bounds_of_block) and nine roundings of 2^-24 may change: `algebraic`, and `root` times the
-    # root of the sum of squares. The rounding of what is made of those two is in `wide`.
+    # `doubt` bounds how far the margin (see _bounds_of_block) and nine roundings of 2^-24 may change `algebraic` and
+    # `root` times the root of the sum of squares. `wide` allows for the rounding of their squares.
     doubt = np.float32(4.001 * margin + 1e-6 * (1 + root))
     wide = np.float32(1.00001 * limit)
     matrix = epipolar.entries(e.astype(np.float32))
@@ -185,7 +181,7 @@ def _may_beat(e, margin, rough, limit, best):
 
 @inner
 def _surely_out(matrix, doubt, limit, x, y, u, v, reach):
-    outliers = np.int32(0)  # as wide as the numbers, so that several are counted at once
+    outliers = np.int32(0)  # of the same width as the distances, so that the loop is vectorised
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
         least = max(abs(algebraic) - doubt * reach[k], np.float32(0))
@@ -195,7 +191,7 @@ def _surely_out(matrix, doubt, limit, x, y, u, v, reach):
 
 @inner
 def _bounds(e, margin, columns, limit, best):
-    """Inliers that any matrix within the margin of e has at least and at most; 0 and 0 where not above `best`."""
+    """Least and most inliers that any matrix within the margin of e has; (0, 0) if never more than `best`."""
     count = columns.shape[1]
     low, high = 0, 0
     for start in range(0, count, SCORING_BLOCK):
@@ -217,7 +213,7 @@ def _bounds_of_block(e, margin, x, y, u, v, limit):
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
         excess = algebraic * algebraic - limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
-        # Both |algebraic| and the root of the other term change by less than `change`.
+        # |algebraic| and the root of the other term each change by less than `change` within the margin.
         change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))
         size = abs(algebraic) + root * (abs(l0) + abs(l1) + abs(m0) + abs(m1)) + change
         doubt = 2 * change * size + 1e-6 * size * size

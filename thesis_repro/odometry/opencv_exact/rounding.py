@@ -1,8 +1,8 @@
-"""Essential matrices through five correspondences, and how far OpenCV's own may lie from them by rounding alone.
+"""Essential matrices through five correspondences, with a margin for the rounding errors of OpenCV's solutions.
 
-OpenCV takes the same steps in another order of operations, so its solutions differ in their last digits. `ransac` needs
-a bound of that difference. It is an estimate to the first order from the conditioning of each step, in units of
-rounding (ROUNDING, for a number of the size of 1), with room to spare.
+OpenCV takes the same steps with the operations in another order, so its solutions differ in the last digits. `ransac`
+needs a bound of this difference: the margin. It is a first-order error estimate from the conditioning of each step, in
+units of ROUNDING, times SAFETY_FACTOR.
 """
 
 import numpy as np
@@ -20,21 +20,20 @@ from thesis_repro.odometry.opencv_exact.five_point import (
     value,
 )
 
-ROUNDING = 2.0**-52
-# OpenCV's solution may lie this many times the estimate away: of 200,000 solutions, of real and of degenerate scenes,
-# none needed more than 1.4 times.
+ROUNDING = 2.0**-52  # of a number of size 1
+# Among 200,000 solutions of real and degenerate scenes, no difference was larger than 1.4 times the estimate.
 SAFETY_FACTOR = 3.0
-# How much of the errors of B(z) arrives in det B(z). They largely move its rows alike, which cancels. Measured.
+# Share of the errors of B(z) that reaches det B(z), as measured. Errors that the rows have in common cancel.
 DETERMINANT_SHARE = 0.1
-MIN_MARGIN, MAX_MARGIN = 1e-9, 1e-3  # of a unit-norm essential matrix
+MIN_MARGIN, MAX_MARGIN = 1e-9, 1e-3  # for an essential matrix of unit norm
 
 
 @fast
 def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the previous one).
+    """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the previous frame).
 
-    Returns whether these are surely all that OpenCV computes, the matrices (K, 9) of unit norm, and K margins within
-    which (Frobenius norm, up to sign) OpenCV's rounding leaves its own.
+    Returns (sure, matrices (K, 9) of unit norm, K margins). `sure`: OpenCV finds the same K matrices, each within its
+    margin (Frobenius norm, up to sign). If not sure, K = 0.
     """
     solutions, margins, b, b_sizes = np.empty((10, 9)), np.empty(10), np.zeros((3, 13)), np.empty((3, 13))
     unsure = False, solutions[:0], margins[:0]
@@ -52,10 +51,10 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     solved, roots, extrema = real_roots(polynomial)  # step 5
     if not solved:
         return unsure
-    work = np.empty((4, 3, 3))
-    for k in range(len(extrema)):  # one as small as rounding may be a double root or none at all
+    work, degree = np.empty((4, 3, 3)), len(polynomial) - 1
+    for k in range(len(extrema)):  # a value as small as rounding: a double root or none
         error = _determinant_error(b, b_sizes, errors, extrema[k], work)
-        if not abs(value(polynomial, 10, extrema[k])) > SAFETY_FACTOR * ROUNDING * error:
+        if not abs(value(polynomial, degree, extrema[k])) > SAFETY_FACTOR * ROUNDING * error:
             return unsure
     for k in range(len(roots)):
         error = _determinant_error(b, b_sizes, errors, roots[k], work)
@@ -70,10 +69,10 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
 
 @inner
 def _elimination_errors(a):
-    """By how many units of rounding the six rows (6) from which B(z) is made may be wrong, OpenCV's among them.
+    """Rounding errors (6, in units of ROUNDING) of the six rows that B(z) is made from, OpenCV's way included.
 
-    a: what elimination leaves (10, 20): the triangle U of the last six unknowns, and the result. Equations wrong by a
-    unit make it wrong by |U^-1| times its size; that OpenCV inverts and multiplies adds |U^-1| |U| |U^-1|.
+    a (10, 20): result of the elimination, with the triangle U of the last six unknowns. An error of one unit in the
+    equations becomes |U^-1| times the size of the result. OpenCV inverts and multiplies, which adds |U^-1| |U| |U^-1|.
     """
     largest = 1.0
     for k in range(4, 10):
@@ -99,9 +98,9 @@ def _elimination_errors(a):
 
 @inner
 def _determinant_error(b, b_sizes, errors, z, work):
-    """By how many units of rounding det B(z) may be wrong, after Wilkinson: the sizes of all terms, whatever cancels.
+    """Rounding error of det B(z), in units of ROUNDING (Wilkinson's bound: the sum of the sizes of all terms).
 
-    Written to work (4, 3, 3): B(z), the sizes of its terms, by how many units it may be wrong, its cofactors.
+    Also writes to work (4, 3, 3): B(z), the sizes of its terms, its errors in units of ROUNDING, its cofactors.
     """
     values, sizes, wrong, cofactors = work[0], work[1], work[2], work[3]
     size = abs(z)
@@ -125,7 +124,7 @@ def _determinant_error(b, b_sizes, errors, z, work):
 
 @inner
 def _best_row(cofactors):
-    """The row whose normal is the best conditioned: the rows of B(z) span a plane, and any two of them give it."""
+    """Index of the largest row of cofactors: the best conditioned normal of the plane that the rows of B(z) span."""
     best, largest = 0, -1.0
     for i in range(3):
         size = cofactors[i, 0] * cofactors[i, 0] + cofactors[i, 1] * cofactors[i, 1] + cofactors[i, 2] * cofactors[i, 2]
@@ -136,10 +135,11 @@ def _best_row(cofactors):
 
 @inner
 def _solution_error(b, best, z, error, polynomial, work):
-    """By how many units of rounding the essential matrix (unit norm) of a root z may be wrong, to the first order.
+    """First-order rounding error of the essential matrix (unit norm) of a root z, in units of ROUNDING.
 
-    In the basis it is (x, y, w z, w), (x, y, w) normal to B(z). It changes as z does, by the error of det B(z) over its
-    slope, and as B(z) does, by the errors over its second singular value: the cofactors' norm over that of B(z).
+    In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal to B(z). An error of z changes it; that error
+    is the error of det B(z) over the slope of det B(z). An error of B(z) changes it by the error over B(z)'s second
+    singular value, which is the norm of the cofactors over the norm of B(z).
     """
     values, wrong, cofactors = work[0], work[2], work[3]
     cofactor_norm, norm = 0.0, 0.0
@@ -156,7 +156,7 @@ def _solution_error(b, best, z, error, polynomial, work):
     dw = p0 * q[1] - p1 * q[0] + p[0] * q1 - p[1] * q0
     dwz = dw * z + w
     square = x * x + y * y + w * w * (1 + z * z)
-    along = (x * dx + y * dy + w * dw + w * z * dwz) / square  # what a unit norm undoes
+    along = (x * dx + y * dy + w * dw + w * z * dwz) / square  # the part that normalisation removes
     speed = (dx - along * x)**2 + (dy - along * y)**2 + (dw - along * w)**2 + (dwz - along * w * z)**2
     tilt = 0.0
     for i in range(3):
@@ -171,5 +171,6 @@ def _solution_error(b, best, z, error, polynomial, work):
 
 @inner
 def _row_slopes(c, z):
+    """Derivatives at z of the three polynomials in one row c (13) of B(z)."""
     return ((3 * c[0] * z + 2 * c[1]) * z + c[2], (3 * c[4] * z + 2 * c[5]) * z + c[6],
             ((4 * c[8] * z + 3 * c[9]) * z + 2 * c[10]) * z + c[11])

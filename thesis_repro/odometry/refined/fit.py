@@ -1,7 +1,7 @@
-"""A motion fitted to all correspondences that agree with it, where RANSAC's goes through five of them.
+"""A motion fitted to all correspondences that agree with it. (RANSAC's motion is computed from five of them.)
 
 The essential matrix is E = [t]x R (Equation 2.5, without its factor). The residual of a correspondence (x, y), (u, v)
-is its signed Sampson distance: to first order, how far it is from meeting (u, v, 1) E (x, y, 1)^T = 0.
+is its signed Sampson distance: its distance, to first order, from a pair with (u, v, 1) E (x, y, 1)^T = 0.
 """
 
 from dataclasses import dataclass
@@ -17,12 +17,13 @@ from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
 
 MAX_ITERATIONS = 10
 REFINE_ROUNDS = 3
-SUPPORT_THRESHOLDS = 2  # thresholds within which a correspondence supports a motion
-RESTART_SCALES = (4, 1)  # thresholds: scales of the second start
-SAME_MOTION_COSINE = np.cos(np.radians(15.0))  # of the angle between two directions of motion
-LOWER_COST = 0.99  # of the first start's cost: below it, the difference is more than rounding
+SUPPORT_THRESHOLDS = 2  # a correspondence within so many thresholds supports a motion
+RESTART_SCALES = (4, 1)  # scales of the second start, in thresholds
+SAME_MOTION_COSINE = np.cos(np.radians(15.0))  # of the largest angle between the headings of one motion
+LOWER_COST = 0.99  # of the first start's cost: a smaller difference may be rounding
 POINTS_PER_BLOCK = 64
-# LAPACK's gesv as np.linalg.solve calls it in compiled code, where the rest of that function takes seconds to compile.
+# LAPACK's gesv, which np.linalg.solve calls in compiled code; np.linalg.solve itself takes seconds to compile.
+DOUBLE = ord("d")  # here, because `ord` would be compiled too
 _solve: Any = types.ExternalFunction("numba_xgesv", types.intc(
     types.char, types.intp, types.intp, types.CPointer(types.float64), types.intp, types.CPointer(types.int32),
     types.CPointer(types.float64), types.intp))
@@ -30,19 +31,18 @@ _solve: Any = types.ExternalFunction("numba_xgesv", types.intc(
 
 @dataclass(frozen=True)
 class RefinedMotion(Motion):
-    """A fitted motion, and how far its points determine it."""
+    """A fitted motion with its uncertainty."""
 
-    support: int = 0  # correspondences near the motion
+    support: int = 0  # number of correspondences near the motion
     rotation_std_deg: float = 0.0  # standard deviation of the rotation in its least certain direction, degrees
-    heading_std_deg: float = 0.0  # the same of the translation's direction
-    condition: float = 1.0  # number of the normal equations
+    heading_std_deg: float = 0.0  # standard deviation of the translation's direction in its least certain one, degrees
+    condition: float = 1.0  # condition number of the normal equations
 
 
 def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An essential matrix's smaller rotation (3x3), and the translation (3, unit length) up to its sign.
+    """Smaller rotation (3x3) and translation (3, unit length, either sign) of an essential matrix.
 
-    The other rotation is the twisted pair's: turned by 180 degrees about the translation, as no car is from frame to
-    frame.
+    The other rotation differs by 180 degrees about the translation (twisted pair). No car turns so far between frames.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     return (first if np.trace(first) >= np.trace(second) else second), translation.ravel()
@@ -50,17 +50,14 @@ def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def fit(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
         inliers: np.ndarray, threshold: float) -> RefinedMotion:
-    """The motion that `refine` makes of a start whose translation (unit) has any sign.
-
-    The points near it vote on the sign: see `cheirality_votes`.
-    """
+    """Motion refined from a start (see `refine`) whose unit translation may have either sign (see `measured`)."""
     return measured(*refine(rotation, translation, current, previous, inliers, threshold), current, previous, inliers,
                     threshold)
 
 
 def measured(rotation: np.ndarray, heading: np.ndarray, current: np.ndarray, previous: np.ndarray,
              inliers: np.ndarray, threshold: float) -> RefinedMotion:
-    """A motion as it is, with the sign of its translation and how far the points near it determine it."""
+    """The same motion with its uncertainty; the points near it vote on the sign of its heading (`cheirality_votes`)."""
     support = near(rotation, heading, current, previous, SUPPORT_THRESHOLDS * threshold)
     current, previous = current.compress(support, axis=0), previous.compress(support, axis=0)
     forward, backward = cheirality_votes(rotation, heading, current, previous, threshold)
@@ -72,16 +69,16 @@ def measured(rotation: np.ndarray, heading: np.ndarray, current: np.ndarray, pre
 
 def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
            inliers: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """The motion (rotation 3x3, unit translation) fitted to all its inliers among correspondences (N, 2).
+    """Motion (rotation 3x3, unit translation) fitted to all its inliers among normalised correspondences (N, 2).
 
-    Levenberg-Marquardt over the rotation and the two angles of the translation's direction, on Sampson distances with
-    Cauchy weights at half the estimator's threshold. It starts from `inliers` (N booleans), and fits twice again to
-    what lies within SUPPORT_THRESHOLDS. So the result does not depend on which inliers RANSAC happened to choose.
+    Levenberg-Marquardt over the rotation and the two angles of the translation's direction. It minimises Sampson
+    distances with Cauchy weights at half the threshold. The first fit uses `inliers` (N booleans). Two more fits use
+    the points within SUPPORT_THRESHOLDS, so the result hardly depends on which inliers RANSAC happened to choose.
 
-    So narrow a scale has many minima. Therefore a second start goes from the motion found, on all correspondences at
-    wider scales first, and the better of both is the result. A motion farther away than SAME_MOTION_COSINE is another
-    one, between which the fit does not choose. An essential matrix does not know the sign of the translation, so the
-    sign that was given is kept.
+    The cost at this narrow scale has many minima. So a second start fits the first result to all correspondences at
+    wider scales first, and the motion with the lower cost is returned. A second result with another heading (see
+    SAME_MOTION_COSINE) is another motion and is not used. The sign of the given translation is kept, because the cost
+    does not depend on it.
     """
     first = _rounds((np.ascontiguousarray(rotation), np.ascontiguousarray(translation)), current, previous, inliers,
                     threshold)
@@ -97,19 +94,22 @@ def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, p
     return rotation, heading if heading @ translation >= 0 else -heading
 
 
-def _rounds(motion, current, previous, chosen, threshold):
-    """A motion (rotation, translation) fitted to the chosen correspondences, and again to those near the result."""
+def _rounds(motion, current, previous, support, threshold):
+    """A motion (rotation, translation) fitted to its support (N booleans), and again to the points near the result."""
     for _ in range(REFINE_ROUNDS):
-        if chosen.sum() < MIN_CORRESPONDENCES:
+        if support.sum() < MIN_CORRESPONDENCES:
             break
-        motion = _minimise(*motion, current.compress(chosen, axis=0), previous.compress(chosen, axis=0), threshold / 2)
-        chosen = near(*motion, current, previous, SUPPORT_THRESHOLDS * threshold)
+        points = (side.compress(support, axis=0) for side in (current, previous))
+        motion = _minimise(*motion, *points, threshold / 2)
+        support = near(*motion, current, previous, SUPPORT_THRESHOLDS * threshold)
     return motion
 
 
 def _deviations(rotation, translation, current, previous, scale):
-    """Largest standard deviations, degrees, of the rotation and of the heading, and the condition number: from the
-    inverse of the Gauss-Newton matrix, for residuals whose own is `scale`."""
+    """Largest standard deviations (degrees) of rotation and heading, and the condition number of the normal equations.
+
+    The covariance is the inverse of the Gauss-Newton matrix times scale^2, the variance of the residuals.
+    """
     hessian = _normal_equations(rotation, translation, current, previous, scale)[1]
     values, vectors = np.linalg.eigh(hessian)
     if len(current) < MIN_CORRESPONDENCES or not values[0] > 1e-12 * values[-1]:
@@ -122,7 +122,7 @@ def _deviations(rotation, translation, current, previous, scale):
 @fast
 def near(r, t, current, previous, limit):
     """N booleans: the correspondences whose Sampson distance from the motion is below the limit."""
-    essential = epipolar.entries(np.dot(_skew(t), r).ravel())
+    essential = epipolar.entries(_product(_skew(t), r).ravel())
     mask = np.empty(len(current), np.bool_)
     for index in range(len(current)):
         x, y = current[index, 0], current[index, 1]
@@ -134,7 +134,7 @@ def near(r, t, current, previous, limit):
 
 @fast
 def _minimise(r, t, current, previous, scale):
-    """Levenberg and Marquardt's iteration: steps of (H + damping diag H) change = -gradient, while the cost falls."""
+    """Levenberg-Marquardt iteration: each step solves (H + damping diag H) change = -gradient."""
     damping, pivots = 1e-4, np.empty(5, np.int32)
     cost, hessian, gradient = _normal_equations(r, t, current, previous, scale)
     for _ in range(MAX_ITERATIONS):
@@ -142,7 +142,7 @@ def _minimise(r, t, current, previous, scale):
         for k in range(5):
             damped[k, k] += damping * hessian[k, k] + 1e-12
         change = -gradient
-        _solve(ord("d"), 5, 1, damped.ctypes, 5, pivots.ctypes, change.ctypes, 5)
+        _solve(DOUBLE, 5, 1, damped.ctypes, 5, pivots.ctypes, change.ctypes, 5)
         r_new, t_new = _moved(r, t, change)
         cost_new, hessian_new, gradient_new = _normal_equations(r_new, t_new, current, previous, scale)
         if cost_new < cost:
@@ -160,15 +160,15 @@ def _minimise(r, t, current, previous, scale):
 
 @fast
 def cheirality_votes(rotation, t, current, previous, parallax):
-    """How many correspondences (N, 2) lie in front of both cameras under (rotation, t), and under (rotation, -t).
+    """Numbers of correspondences (N, 2) in front of both cameras under (rotation, t) and under (rotation, -t).
 
-    Points whose rays meet at less than `parallax` (the sine of an angle) say nothing about the sign and do not vote. So
-    that is what limits their depth, and not 50 translations, which in a slow step are a few metres.
+    Points whose rays meet at less than `parallax` (the sine of the angle) do not determine the sign, so they do not
+    vote. (pose.recover_pose leaves out points beyond 50 translations, which in a slow step are a few metres.)
     """
     forward, backward = 0, 0
     for k in range(len(current)):
         x, y = current[k, 0], current[k, 1]
-        # The rays a, turned into the previous camera's coordinates, and b; they meet where depth a + t = other b.
+        # Ray a in the previous camera's coordinates, and ray b; they meet where depth a + t = other b.
         a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
         a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
         a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
@@ -186,8 +186,21 @@ def cheirality_votes(rotation, t, current, previous, parallax):
 
 
 @inner
+def _multiply(a, b, product):
+    """Write the product of two 3x3 matrices; np.dot is compiled once, here, and without `product` takes longer."""
+    np.dot(a, b, product)
+
+
+@inner
+def _product(a, b):
+    product = np.empty((3, 3))
+    _multiply(a, b, product)
+    return product
+
+
+@inner
 def _skew(v):
-    """The matrix [v]x of the cross product with v (Equation 2.5)."""
+    """Matrix [v]x of the cross product with v (Equation 2.5)."""
     matrix = np.zeros((3, 3))
     matrix[0, 1], matrix[0, 2], matrix[1, 2] = -v[2], v[1], -v[0]
     matrix[1, 0], matrix[2, 0], matrix[2, 1] = v[2], -v[1], v[0]
@@ -196,7 +209,7 @@ def _skew(v):
 
 @inner
 def _normalised(v0, v1, v2):
-    """The unit vector (3) in the direction of three numbers."""
+    """Unit vector (3) in the direction of (v0, v1, v2)."""
     norm, vector = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2), np.empty(3)
     vector[0], vector[1], vector[2] = v0 / norm, v1 / norm, v2 / norm
     return vector
@@ -205,13 +218,13 @@ def _normalised(v0, v1, v2):
 @inner
 def _tangents(t):
     """Two unit vectors that are perpendicular to the unit vector t and to each other."""
-    if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):  # the first is at right angles to the axis t is farthest from
-        first = _normalised(0.0, t[2], -t[1])
+    if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):  # cross product with the axis that t is farthest from
+        x, y, z = 0.0, t[2], -t[1]
     elif abs(t[1]) <= abs(t[2]):
-        first = _normalised(-t[2], 0.0, t[0])
+        x, y, z = -t[2], 0.0, t[0]
     else:
-        first = _normalised(t[1], -t[0], 0.0)
-    second = np.empty(3)
+        x, y, z = t[1], -t[0], 0.0
+    first, second = _normalised(x, y, z), np.empty(3)
     second[0], second[1] = t[1] * first[2] - t[2] * first[1], t[2] * first[0] - t[0] * first[2]
     second[2] = t[0] * first[1] - t[1] * first[0]
     return first, second
@@ -219,45 +232,45 @@ def _tangents(t):
 
 @inner
 def _moved(r, t, change):
-    """The motion after a change of five parameters: exp([turn]x) R (Rodrigues' formula), t moved along its tangents."""
+    """Motion after a change (5) of its parameters: exp([turn]x) R (Rodrigues' formula), t moved along its tangents."""
     angle = np.sqrt(change[0] * change[0] + change[1] * change[1] + change[2] * change[2])
     cross, rodrigues = _skew(change), np.empty((3, 3))
-    square = np.dot(cross, cross)
+    square = _product(cross, cross)
     sine, cosine = (np.sin(angle) / angle, (1 - np.cos(angle)) / (angle * angle)) if angle > 1e-12 else (1.0, 0.0)
     for i in range(3):
         for j in range(3):
             rodrigues[i, j] = (i == j) + sine * cross[i, j] + cosine * square[i, j]
     first, second = _tangents(t)
-    return np.dot(rodrigues, r), _normalised(t[0] + change[3] * first[0] + change[4] * second[0],
+    return _product(rodrigues, r), _normalised(t[0] + change[3] * first[0] + change[4] * second[0],
                                              t[1] + change[3] * first[1] + change[4] * second[1],
                                              t[2] + change[3] * first[2] + change[4] * second[2])
 
 
 @inner
 def _essential_and_derivatives(r, t):
-    """E (6, 9), row by row, and its derivatives: [t]x [unit]x R by the rotation's three, [tangent]x R by t's two."""
+    """E = [t]x R and its five derivatives (6, 9), row by row: three [t]x [unit]x R, two [tangent]x R."""
     matrices, unit = np.empty((6, 3, 3)), np.zeros((3, 3))
     cross, (first, second) = _skew(t), _tangents(t)
-    np.dot(cross, r, matrices[0])
+    _multiply(cross, r, matrices[0])
     for k in range(3):
         unit[k, k] = 1.0
-        np.dot(cross, np.dot(_skew(unit[k]), r), matrices[1 + k])
-    np.dot(_skew(first), r, matrices[4])
-    np.dot(_skew(second), r, matrices[5])
+        _multiply(cross, _product(_skew(unit[k]), r), matrices[1 + k])
+    _multiply(_skew(first), r, matrices[4])
+    _multiply(_skew(second), r, matrices[5])
     return matrices.reshape(6, 9)
 
 
 @fast
 def _normal_equations(r, t, current, previous, scale):
-    """Cauchy cost of the Sampson distances, and its Gauss-Newton matrix (5, 5) and gradient (5) in the parameters.
+    """Cauchy cost of the Sampson distances, its Gauss-Newton matrix (5, 5) and its gradient (5).
 
-    With residual s and weight w = 1 / (1 + (s / scale)^2): sum of log(1 + (s / scale)^2), of w J^T J, and of w s J.
+    With residual s and weight w = 1 / (1 + (s / scale)^2): the sums of log(1 + (s / scale)^2), of w J^T J and of w s J.
     """
     matrices = _essential_and_derivatives(r, t)
     essential = epipolar.entries(matrices[0])
     cost, hessian, gradient = 0.0, np.zeros((5, 5)), np.zeros(5)
-    # In blocks, each quantity of all points at once, which the processor does several at a time; the sums go point by
-    # point, so the bits are those of one loop over all points.
+    # Points are handled in blocks, one quantity after the other, so that these loops are vectorised. The sums go point
+    # by point, so the bits are those of one loop over all points.
     size = POINTS_PER_BLOCK
     x, y, u, v = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     l0, l1, m0, m1 = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
@@ -271,8 +284,8 @@ def _normal_equations(r, t, current, previous, scale):
         for i in range(count):
             algebraic, l0[i], l1[i], m0[i], m1[i] = epipolar.sampson_terms(essential, x[i], y[i], u[i], v[i])
             square = l0[i] * l0[i] + l1[i] * l1[i] + m0[i] * m0[i] + m1[i] * m1[i]
-            inverse[i] = 1 / np.sqrt(square) if square >= 1e-18 else 0.0  # at the epipoles a point says nothing
-            residual[i] = algebraic * inverse[i]  # the Sampson distance, with its sign
+            inverse[i] = 1 / np.sqrt(square) if square >= 1e-18 else 0.0  # a point at an epipole has no residual
+            residual[i] = algebraic * inverse[i]  # signed Sampson distance
             ratio = residual[i] / scale
             rarity[i] = 1 + ratio * ratio
             weight[i] = 1 / rarity[i]
