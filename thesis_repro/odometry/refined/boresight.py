@@ -82,7 +82,8 @@ def estimate(paths: Sequence[Paths]) -> Boresight:
     blocks = [block for path in paths for block in _equation_blocks(*_vectors(*path))]
     steps = sum(len(right) for _, right, _, _ in blocks)
     if len(blocks) < 2:
-        return Boresight(*np.full((3, 3), np.nan), steps)
+        undetermined = np.full(3, np.nan)
+        return Boresight(undetermined, undetermined, undetermined, steps)
     free = np.ones(3, bool)
     best, reach = _with_interval(blocks, free)
     while reach.max() > MAX_HALF_INTERVAL:  # an undetermined angle must not change the others
