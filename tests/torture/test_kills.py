@@ -1,4 +1,4 @@
-"""Commands killed at random moments resume and leave the bytes of an undisturbed run, and no temporary files."""
+"""SIGKILL at moments nobody chose, then the same command again: the bytes of an undisturbed run, and nothing stray."""
 
 import random
 import shutil
@@ -7,8 +7,7 @@ import time
 
 import nbformat
 import pytest
-from trials import ROOT, contents, finish, kill, no_temporary_files, same, snapshot, start, succeed
-from waiting import wait_for
+from trials import ROOT, contents, finish, kill, nothing_stray, same, snapshot, start, succeed
 
 from thesis_repro.settings import read_settings
 
@@ -16,42 +15,45 @@ pytestmark = pytest.mark.torture
 
 
 def torture(command, where, results, kills, prepare=lambda: None, **environment):
-    """Kill a command `kills` times while it writes, then let it end.
+    """Kill a command `kills` times, each time a while after it has begun to write; then let it end.
 
-    `prepare` fills the folder `results` before the undisturbed run and before the killed one. The kills are spread over
-    the time of the undisturbed run. The results of a run that ends before it is killed are compared too.
+    The folder `results` below `where` is made anew by `prepare` for the undisturbed run and for the killed one. The
+    moments are spread over the time of the undisturbed run. A run that has ended before its moment is compared too.
     """
-    def clear():
+    def anew():
         shutil.rmtree(where / results, ignore_errors=True)
         prepare()
 
     def begin():
         """Start the command and wait until a file has changed."""
         before, process = snapshot(where), start(command, where, **environment)
-        wait_for(lambda: process.poll() is not None or snapshot(where) != before, 600)
+        while process.poll() is None and snapshot(where) == before:
+            time.sleep(0.005)
         return process
 
-    clear()
+    anew()
     process, started = begin(), time.monotonic()
-    assert finish(process).returncode == 0
-    seconds, expected = time.monotonic() - started, contents(where / results)
+    result = finish(process)
+    assert result.returncode == 0, result
+    seconds, wanted = time.monotonic() - started, contents(where / results)
     draw = random.Random(1)
-    clear()
+    anew()
     killed = 0
     for number in draw.sample(range(kills), kills):
         process = begin()
-        time.sleep((number + draw.random()) / kills * seconds / (1 + killed))  # a resumed run is shorter
+        time.sleep((number + draw.random()) / kills * seconds / (1 + killed))  # what goes on is shorter
         if process.poll() is None:
             kill(process)
             killed += 1
             continue
-        assert finish(process).returncode == 0
-        same(contents(where / results), expected)
-        clear()
+        result = finish(process)
+        assert result.returncode == 0, f"does not go on: {result}"
+        same(contents(where / results), wanted)
+        anew()
         killed = 0
     succeed(command, where, **environment)
-    same(contents(where / results), expected)
-    no_temporary_files(where)
+    same(contents(where / results), wanted)
+    nothing_stray(where)
 
 
 @pytest.mark.parametrize("name, kills", [("synthesize", 6), ("training", 4), ("predict", 4), ("study", 7)])

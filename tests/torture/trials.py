@@ -1,4 +1,4 @@
-"""Run commands as a user does, each as a process, and check how they end and what they leave."""
+"""Trials by the real command line: start a command as a process, and demand that it fails as it should."""
 
 import fnmatch
 import os
@@ -16,12 +16,12 @@ from thesis_repro import longrun
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 900  # seconds; a command that takes longer hangs
-# set by tests/conftest.py, and not by a user
-SET_BY_TESTS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
+# what tests/conftest.py sets for the tests' own process and a user does not have
+NOT_THE_USERS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
 
 
 class Result(NamedTuple):
-    """How a command ended. left: paths below its working folder that are new, changed or gone."""
+    """How a command ended. left: files and folders below its working folder that are new, changed or gone."""
 
     returncode: int
     stdout: str
@@ -34,21 +34,24 @@ def thesis(*words):
 
 
 def environment(**changes):
-    """A user's environment with some variables changed; None removes one."""
-    variables = {name: value for name, value in os.environ.items()
-                 if name not in SET_BY_TESTS and not name.startswith("THESIS_REPRO_")}
-    variables |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROGRESS": os.devnull} | changes
-    return {name: str(value) for name, value in variables.items() if value is not None}
+    """A user's environment: without what the tests set for themselves; None takes a variable out."""
+    own = {name: value for name, value in os.environ.items()
+           if name not in NOT_THE_USERS and not name.startswith("THESIS_REPRO_")}
+    own |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROGRESS": os.devnull} | changes
+    return {name: str(value) for name, value in own.items() if value is not None}
 
 
 def start(command, where, before=None, **changes):
-    """Start a command in a folder; `before` is called in the new process, `changes` are of the environment."""
+    """Start a command in a folder, as the leader of a process group of its own; returns the Popen.
+
+    before: called in the new process first, to take something from it. changes: of the environment.
+    """
     return subprocess.Popen(list(map(str, command)), cwd=where, env=environment(**changes), preexec_fn=before,
                             start_new_session=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def finish(process):
-    """Wait for a started command; one that hangs is killed."""
+    """Wait for what `start` started; a command that hangs is killed with all its processes."""
     try:
         stdout, stderr = process.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -58,7 +61,7 @@ def finish(process):
 
 
 def run(command, where, **options):
-    """Start a command and wait for it; options as for `start`."""
+    """Start a command and wait for it; see `start`."""
     before = snapshot(where)
     return finish(start(command, where, **options))._replace(left=changes(before, snapshot(where)))
 
@@ -70,14 +73,14 @@ def succeed(command, where, **options):
 
 
 def kill(process):
-    """SIGKILL a started command and its child processes."""
+    """SIGKILL a process that `start` started, and all that it started."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
 
 
 def snapshot(where):
-    """{path: (size, date)} of all files below a folder but logs; None for folders. Files may vanish meanwhile."""
+    """What lies below a folder but logs, {relative path: size and date}; None for folders. It may be in use."""
     versions = {}
     for path in (Path(folder, name) for folder, folders, names in os.walk(where) for name in (*folders, *names)):
         with suppress(FileNotFoundError):
@@ -93,17 +96,20 @@ def changes(before, after):
 
 
 def refused(result, named, code=1, left=()):
-    """Check the exit code, that one line of error has the text `named`, and that only `left` ("out/*") changed."""
+    """Demand of a command that it ended with `code` and one line of error that has the text `named`.
+
+    Nothing in its folder may be new or changed but what the patterns `left` allow ("out/*").
+    """
     output = f"exit {result.returncode}\n{result.stdout}\n{result.stderr}"
     assert result.returncode == code and "Traceback" not in result.stdout + result.stderr, output
-    errors = [line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))]
-    assert len(errors) == 1 and str(named) in errors[0], f"not one line that names {named}: {output}"
-    unexpected = [path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)]
-    assert not unexpected, f"left behind: {', '.join(unexpected)}\n{output}"
+    lines = [line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))]
+    assert len(lines) == 1 and str(named) in lines[0], f"not one line that names {named}: {output}"
+    more = [path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)]
+    assert not more, f"left behind: {', '.join(more)}\n{output}"
 
 
 def contents(folder):
-    """{path: content} of all files below a folder but logs; without times, which differ between runs."""
+    """Every file below a folder by path, without what no two runs share: times, dates and the log."""
     return {str(path.relative_to(folder)): _content(path) for path in sorted(Path(folder).rglob("*"))
             if path.is_file() and path.name not in (longrun.LOG, longrun.LIST)}
 
@@ -118,18 +124,19 @@ def _content(path):
     return path.read_bytes()
 
 
-def same(results, expected):
-    different = sorted(path for path in results.keys() | expected.keys() if results.get(path) != expected.get(path))
-    assert not different, f"not as in an undisturbed run: {', '.join(different)}"
+def same(results, wanted):
+    other = sorted(path for path in results.keys() | wanted.keys() if results.get(path) != wanted.get(path))
+    assert not other, f"not what an undisturbed run leaves: {', '.join(other)}"
 
 
-def resumes(words, name, where, output="out"):
-    """Run a disturbed command again: it must succeed and leave the files of an undisturbed run."""
+def whole_again(words, name, where, output="out"):
+    """What was disturbed now ends well, with nothing stray, and leaves what an undisturbed run does."""
     for folder in (output, "whole"):
         succeed(words(name, folder), where)
-    no_temporary_files(where)
+    nothing_stray(where)
     same(contents(where / output), contents(where / "whole"))
 
 
-def no_temporary_files(where):
-    assert [str(path) for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)] == []
+def nothing_stray(where):
+    stray = [path for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)]
+    assert not stray, f"left half written: {', '.join(map(str, stray))}"

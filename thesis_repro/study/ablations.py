@@ -1,11 +1,10 @@
-"""Ablations: what each switch of the odometry and of the masks does alone (notebook 09).
+"""Ablations: the effect of each single setting of the odometry and of the masks (notebook 09).
 
-Every run differs from a reference run in one thing. The tables have the columns of `runner.run`, so that `compare`
-reads them too.
+Every run differs from a reference run in one setting. The tables have the columns that `compare` needs.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from thesis_repro.kitti import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
 from thesis_repro.odometry.passes import Masks
+from thesis_repro.odometry.pose import normalise
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.controls import CORRECTED
 from thesis_repro.study.jobs import CONTROL_WIDTH
@@ -29,36 +29,28 @@ from thesis_repro.study.runner import measures
 
 Runs = dict[tuple[str, str, int], tuple[OdometrySettings, Masks | None]]  # by method, estimator, repetition
 ESTIMATORS = ("thesis", "inliers", "refined")
-REPETITIONS, BASELINE_REPETITIONS = 3, 8  # of every method, and of all keypoints under the thesis's estimator
+REPETITIONS, BASELINE_REPETITIONS = 3, 8  # the second: all keypoints under the thesis's estimator
 VEGETATION = (ID["vegetation"], ID["terrain"])
 FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesis's 2000
 
 
-# Masks that differ from the thesis's in one thing
+@dataclass(frozen=True)
+class FunctionMasks:
+    """Masks made by a function of the frame number: masks[i] for frame i."""
 
-
-class MadeMasks:
-    """Masks made by a function of the frame's number: masks[i] for frame i."""
-
-    def __init__(self, make: Callable[[int], np.ndarray]) -> None:
-        self.make = make
+    function: Callable[[int], np.ndarray]
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self.make(index)
-
-
-def without_classes(ids: Iterable[int], label_map: np.ndarray) -> np.ndarray:
-    """No boundaries: all of the frame but some classes (Section 5.2.2: trees and bushes)."""
-    return np.where(np.isin(label_map, list(ids)), np.uint8(0), np.uint8(255))
+        return self.function(index)
 
 
 def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.ndarray:
-    """A mask of single pixels: some of a frame's keypoints, drawn at random: a number (int), or a share (float)."""
+    """Return a mask that keeps randomly drawn keypoints of a frame, one pixel each: a number (int) or share (float)."""
     points = keypoints.detect(sequence.frame(index), THESIS).astype(int)
     number = amount if isinstance(amount, int) else round(amount * len(points))
-    chosen = np.random.default_rng((0, index)).permutation(len(points))[:number]
+    columns, rows = np.random.default_rng((0, index)).permutation(points)[:number].T
     mask = np.zeros(sequence.size, np.uint8)
-    mask[points[chosen, 1], points[chosen, 0]] = 255
+    mask[rows, columns] = 255
     return mask
 
 
@@ -69,12 +61,12 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, *, fr
             processes: int = 1, **options: Any) -> pd.DataFrame:
     """Run every ablation on every sequence; returns a table with one row a run.
 
-    kitti: the odometry root. labels: a folder with one folder of label maps a sequence. folder: keeps the runs of each
-    sequence, so that a stopped call goes on where it was. frames: of each sequence, None for all.
-    options: of `runs_of`.
+    kitti: the odometry root. labels: a folder with one folder of label maps a sequence. folder: for the results;
+    finished sequences in it are not run again. frames: number of frames of each sequence, None for all.
+    options: those of `runs_of`.
 
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in metres after an
-    alignment that may scale).
+    alignment with scale).
     """
     calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, frames, options) for name in names]
     work = joblib.Parallel(n_jobs=processes, return_as="generator", initializer=longrun.end_with_parent)(calls)
@@ -104,63 +96,66 @@ def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | N
 
 def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
             baseline_repetitions: int = BASELINE_REPETITIONS, dilation_width: int = CONTROL_WIDTH) -> Runs:
-    """The runs over one sequence: {(method, estimator, repetition): (settings, masks)}. labels: of its frames.
+    """Return the runs over one sequence: {(method, estimator, repetition): (settings, masks)}.
 
-    "baseline" (all keypoints) and "masked" are run under each of ESTIMATORS, the others under the thesis's and the
-    refined one. A repetition other than 0 is the seed that shuffles the matched points. All keypoints have
-    `baseline_repetitions` under the thesis's estimator, from which `null_distribution` draws.
+    labels: folder of the sequence's label maps. "baseline" (all keypoints) and "masked" are run with each of
+    ESTIMATORS, other methods with the thesis's and the refined estimator. A repetition other than 0 is the seed that
+    shuffles the matched points. There are `baseline_repetitions` with all keypoints and the thesis's estimator, from
+    which `null_distribution` draws.
     """
-    from_labels = partial(masks.LabelMasks, labels, sequence, dilation_width)
+    label_masks = partial(masks.LabelMasks, labels, sequence, dilation_width)
 
     def enlarged(index: int) -> np.ndarray:
         label_map = read_label_map(labels / sequence.frame_paths[index].name)
         return cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
 
-    own = from_labels()
+    thesis_masks = label_masks()
     sample = range(0, len(sequence), max(1, len(sequence) // 8))
-    number = round(np.mean([len(keypoints.detect(sequence.frame(index), THESIS, own[index])) for index in sample]))
+    number = round(np.mean([len(keypoints.detect(sequence.frame(index), THESIS, thesis_masks[index]))
+                            for index in sample]))
     methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
         "baseline": (THESIS, None),
-        "masked": (THESIS, own),
-        "filter": (replace(THESIS, mask_mode="filter"), own),
-        "nearest": (THESIS, MadeMasks(lambda index: masks.dilate(
+        "masked": (THESIS, thesis_masks),
+        "filter": (replace(THESIS, mask_mode="filter"), thesis_masks),
+        "nearest": (THESIS, FunctionMasks(lambda index: masks.dilate(
             cv2.Canny(enlarged(index), *MaskSettings().canny), dilation_width))),
-        "symmetric": (THESIS, from_labels(MaskSettings(symmetric=True))),
-        "corrected": (THESIS, from_labels(CORRECTED)),
-        "no-vegetation": (THESIS, MadeMasks(lambda index: without_classes(VEGETATION, enlarged(index)))),
+        "symmetric": (THESIS, label_masks(MaskSettings(symmetric=True))),
+        "corrected": (THESIS, label_masks(CORRECTED)),
+        "no-vegetation": (THESIS, FunctionMasks(lambda index: np.where(  # Section 5.2.2: trees and bushes
+            np.isin(enlarged(index), VEGETATION), np.uint8(0), np.uint8(255)))),
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
-        "random": (THESIS, MadeMasks(partial(random_keypoints, sequence, number))),
-        "dropout": (THESIS, MadeMasks(partial(random_keypoints, sequence, 0.9))),
+        "random": (THESIS, FunctionMasks(partial(random_keypoints, sequence, number))),
+        "dropout": (THESIS, FunctionMasks(partial(random_keypoints, sequence, 0.9))),
         **{f"strongest-{few}": (replace(THESIS, max_keypoints=few), None) for few in FEW_KEYPOINTS},
         "orb": (replace(THESIS, detector="orb"), None),
     }
     runs: Runs = {}
-    for method, (settings, its_masks) in methods.items():
+    for method, (settings, method_masks) in methods.items():
         for estimator in ESTIMATORS if method in ("baseline", "masked") else ("thesis", "refined"):
-            of_null = method == "baseline" and estimator == "thesis"
-            for repetition in range(max(repetitions, baseline_repetitions) if of_null else repetitions):
+            is_null = method == "baseline" and estimator == "thesis"
+            for repetition in range(max(repetitions, baseline_repetitions) if is_null else repetitions):
                 seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
-                runs[method, estimator, repetition] = seeded, its_masks
+                runs[method, estimator, repetition] = seeded, method_masks
     return runs
 
 
-# What the thesis's procedure reports of masks that do nothing (Section 4.2, Tables 4.2 and 4.3)
+# Results of the thesis's procedure if masks did nothing (Section 4.2, Tables 4.2 and 4.3)
 
 SEQUENCES, WIDTHS = 11, 15  # of the thesis
-STUDIES = 4000  # that are simulated
+STUDIES = 4000  # simulated ones
 
 
 def null_distribution(runs: pd.DataFrame, reported: pd.Series, widths: int = WIDTHS) -> pd.DataFrame:
-    """What the thesis's procedure reports where masks do nothing: rows mean, median and sum of the changes (%).
+    """Simulate what the thesis's procedure reports if masks do nothing; rows mean, median and sum of the changes (%).
 
     The thesis runs all keypoints once and masks of 15 widths once each, takes the best width of each sequence and
-    averages Equation 4.1. If masks did nothing, these 16 runs would be one run with differently shuffled points. So
-    16 errors are drawn for each sequence from the measured ones, and the procedure is applied, STUDIES times.
+    averages Equation 4.1. If masks did nothing, these 16 runs would differ only in the order of the matched points. So
+    the procedure is applied STUDIES times to 16 errors for each sequence, drawn with replacement from measured ones.
 
-    runs: with all keypoints under one estimator, several repetitions of each sequence, columns sequence and rmse.
-    reported: changes (%) of a study by sequence. Columns expected (mean of the studies), low, high (their middle LEVEL
-    percent), and share_as_low (percent of the studies that report as low a number or a lower one).
-    Errors are drawn with replacement, so the best of 15 is never better than the best error that was measured.
+    runs: all keypoints under one estimator, several repetitions of each sequence, columns sequence and rmse.
+    reported: the changes (%) that a study reports, by sequence. Columns: expected (mean of the simulated studies),
+    low, high (their middle LEVEL percent), share_as_low (percent of them with the reported number or a lower one).
+    The best of 15 drawn errors is never better than the best measured error.
     """
     errors = np.random.default_rng(0).choice(deviations(runs), (STUDIES, SEQUENCES, widths + 1))
     changes = metrics.percent_change(np.exp(errors[..., 1:].min(axis=-1)), np.exp(errors[..., 0]))
@@ -175,85 +170,81 @@ def null_distribution(runs: pd.DataFrame, reported: pd.Series, widths: int = WID
 
 
 def deviations(runs: pd.DataFrame) -> np.ndarray:
-    """Natural logarithms of errors less their mean over a sequence's repetitions, of all sequences together.
+    """Return the logarithms of all errors minus the mean logarithm of their sequence.
 
-    They are widened by sqrt(n / (n - 1)), since the mean was taken from the same n errors. Columns sequence, rmse.
+    They are scaled by sqrt(n / (n - 1)), since the mean comes from the same n repetitions. runs: sequence, rmse.
     """
     logarithms = np.log(runs["rmse"])
-    of_sequence = logarithms.groupby(runs["sequence"])
-    count = of_sequence.transform("size")
-    widened = (logarithms - of_sequence.transform("mean")) * np.sqrt(count / (count - 1))
+    by_sequence = logarithms.groupby(runs["sequence"])
+    count = by_sequence.transform("size")
+    widened = (logarithms - by_sequence.transform("mean")) * np.sqrt(count / (count - 1))
     return widened[count > 1].to_numpy()
 
 
-# Where keypoints lie, and what becomes of boundaries
+# Keypoints and boundaries one by one
 
 FIELDS = (16, 5)  # of a frame, across and down
-NEAR = 2  # pixels: a boundary this near to an edge has been found
+NEAR = 2  # pixels: a boundary with an edge within this distance counts as found
 PAIRS = (("road", "sidewalk"), ("vegetation", "sky"), ("building", "fence"))
 
 
-def tracks(sequence: Sequence, chosen: dict[str, Masks | None], pairs: int) -> pd.DataFrame:
-    """How well keypoints can be tracked and how they are spread: one row a kind of mask and pair of frames.
+def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: int) -> pd.DataFrame:
+    """Measure how well keypoints can be tracked and how they are spread: one row for each mask and pair of frames.
 
-    chosen: {name: masks, None for all keypoints}. pairs: frames, spread evenly, that are tracked to the next one.
+    masks_by_name: None for all keypoints. pairs: number of evenly spread frames that are tracked to the next frame.
     Columns: sequence, frame, method (the name), keypoints; residual, the median distance (pixels) of tracked points
-    from the epipolar lines of the true motion; outliers, the share (percent) of points beyond PySLAM's threshold;
-    fields, the share (percent) of the frame's 16 x 5 fields that hold a keypoint.
+    from the epipolar lines of the true motion; outliers, the percentage of points beyond PySLAM's threshold;
+    fields, the percentage of the frame's 16 x 5 fields with a keypoint.
     """
     rows = []
-    focal = sequence.intrinsics[0, 0]
     for index in np.unique(np.linspace(0, len(sequence) - 2, pairs).round().astype(int)):
         before, after = sequence.frame(index), sequence.frame(index + 1)
         motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
         if np.linalg.norm(motion[:3, 3]) < metrics.MIN_DIRECTED_STEP:
             continue
-        for name, its_masks in chosen.items():
-            points = keypoints.detect(before, THESIS, None if its_masks is None else its_masks[int(index)])
+        for name, frame_masks in masks_by_name.items():
+            points = keypoints.detect(before, THESIS, None if frame_masks is None else frame_masks[int(index)])
             if len(points) < 10:
                 continue
             moved, tracked = keypoints.track(before, after, points)
-            distances = _epipolar_distances(points[tracked], moved[tracked], motion, sequence.intrinsics)
+            distances = _sampson_distances(points[tracked], moved[tracked], motion, sequence.intrinsics)
             fields = (points // [sequence.size[1] / FIELDS[0], sequence.size[0] / FIELDS[1]]).astype(int)
             rows.append({"sequence": sequence.name, "frame": int(index), "method": name, "keypoints": len(points),
-                         "residual": focal * float(np.median(distances)),
+                         "residual": sequence.intrinsics[0, 0] * float(np.median(distances)),
                          "outliers": 100 * (distances > THESIS.threshold).mean(),
                          "fields": 100 * len(np.unique(fields, axis=0)) / (FIELDS[0] * FIELDS[1])})
     return pd.DataFrame(rows)
 
 
-def _epipolar_distances(previous: np.ndarray, current: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray
-                        ) -> np.ndarray:
-    """Sampson distances of matched pixels (n, 2) under a 4x4 motion, in units of the focal length, (n,)."""
-    seen, then = (np.column_stack([(points - intrinsics[:2, 2]) / intrinsics[0, 0], np.ones(len(points))])
-                  for points in (previous, current))
-    direction = motion[:3, 3] / np.linalg.norm(motion[:3, 3])
-    essential = np.cross(np.eye(3), direction) @ motion[:3, :3]
-    lines, back = then @ essential.T, seen @ essential
-    return np.abs((seen * lines).sum(axis=1)) / np.sqrt((lines[:, :2] ** 2).sum(axis=1)
-                                                        + (back[:, :2] ** 2).sum(axis=1))
+def _sampson_distances(previous: np.ndarray, current: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray
+                       ) -> np.ndarray:
+    """Return the Sampson distances (n,) of matched pixels (n, 2) under a 4x4 motion, in units of the focal length."""
+    essential = np.cross(np.eye(3), motion[:3, 3]) @ motion[:3, :3]
+    matches = zip(*(np.column_stack([normalise(points, intrinsics), np.ones(len(points))])
+                    for points in (current, previous)), strict=True)
+    return np.sqrt([cv2.sampsonDistance(*match, essential) for match in matches])
 
 
 def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]:
-    """What Canny on enlarged ids does to the boundaries of one label map (audit rows 10 and 11), in percent.
+    """Measure what Canny on enlarged ids does to the boundaries of a label map, in percent (audit rows 10 and 11).
 
-    lost: boundary pixels of the map enlarged by nearest neighbours with no edge within NEAR pixels, of all and of
-    PAIRS of classes ("road/sidewalk"; NaN where the map has fewer than 20). invented: pixels whose bilinear id is
-    neither that of the nearest neighbour nor of a class that lies within NEAR pixels.
+    lost: boundary pixels of the map, enlarged by nearest neighbour, without an edge within NEAR pixels. The same for
+    each of PAIRS of classes ("road/sidewalk"), NaN for fewer than 20 boundary pixels. invented: pixels of the bilinear
+    enlargement whose id no pixel within NEAR pixels has.
     """
     nearest = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
     bilinear = cv2.resize(label_map, size[::-1])
     exact = masks.edges(label_map, size, MaskSettings("exact")) > 0
     missed = masks.dilate(masks.edges(label_map, size), 2 * NEAR + 1) == 0
     around = np.ones((2 * NEAR + 1, 2 * NEAR + 1), np.uint8)
-    there = np.zeros(nearest.shape, bool)
+    real = np.zeros(nearest.shape, bool)
     for number in np.unique(bilinear):
-        there |= (bilinear == number) & (cv2.dilate((nearest == number).astype(np.uint8), around) > 0)
-    shares = {"lost": 100 * missed[exact].mean() if exact.any() else np.nan, "invented": 100 * float((~there).mean())}
+        real |= (bilinear == number) & (cv2.dilate((nearest == number).astype(np.uint8), around) > 0)
+    shares = {"lost": 100 * missed[exact].mean() if exact.any() else np.nan, "invented": 100 * float((~real).mean())}
     right, below = np.roll(nearest, -1, axis=1), np.roll(nearest, -1, axis=0)
     neighbour = np.where(nearest != right, right, below)
     for pair in PAIRS:
         ids = [ID[name] for name in pair]
-        of_pair = exact & np.isin(nearest, ids) & np.isin(neighbour, ids)
-        shares["/".join(pair)] = 100 * missed[of_pair].mean() if of_pair.sum() >= 20 else np.nan
+        pair_boundary = exact & np.isin(nearest, ids) & np.isin(neighbour, ids)
+        shares["/".join(pair)] = 100 * missed[pair_boundary].mean() if pair_boundary.sum() >= 20 else np.nan
     return shares

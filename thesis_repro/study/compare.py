@@ -1,18 +1,20 @@
-"""The one place that compares runs: a tidy table of runs in, a tidy table of comparisons out.
+"""The one place that compares: a table of runs goes in, a table of comparisons comes out.
 
-**Runs** (`runner.run`, one row a run): sequence, run, source, method, dilation_width, estimator, repetition, frames,
-mean_keypoints, flagged, and one column for each of METRICS.
+**Runs** (`runner.run`) have one row a run: sequence, run, source, method, dilation_width, estimator, repetition,
+frames, mean_keypoints, flagged, and one column for each of METRICS.
 
-**Comparisons** (`comparisons`, one row for each method, reference, metric and estimator): the ratio of the method's
-error to the reference's, its interval, and the ratio of every sequence in a column of its own.
+**Comparisons** (`comparisons`) have one row for each method, reference, metric and estimator: the ratio of the
+method's error to the reference's, the interval of this ratio, a verdict, and the ratio of every sequence.
 
-How a ratio is formed:
+A ratio is formed in three steps:
 
-1. Within a sequence, the geometric mean of the errors over the repetitions, divided by that of the reference. Half
-   and double are then equally far from 1, which percentages do not give.
-2. Over sequences, the geometric mean of these ratios.
-3. The interval is a bootstrap: whole sequences are drawn anew, DRAWS times. It says how far the mean could be off had
-   other sequences of the same kind been driven. Few sequences make it too narrow.
+1. For each sequence, the geometric mean of the method's errors over the repetitions is divided by that of the
+   reference. Half and double are then equally far from 1, which is not so for percentages.
+2. The ratio is the geometric mean of the ratios of the sequences.
+3. Its interval is a bootstrap over whole sequences with DRAWS draws. It estimates how far the ratio could be off if
+   other sequences of the same kind had been recorded. With few sequences it is too narrow.
+
+The verdict is that the ratio is lower than 1, higher than 1, or that there is no clear difference.
 """
 
 from collections.abc import Iterable
@@ -27,8 +29,8 @@ from thesis_repro.odometry.metrics import RELATIVE_LENGTH
 from thesis_repro.study.controls import MASKS
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
-# The errors that are compared, and what they are called. The first two decide (see `primary_comparison`): a constant
-# angle between camera and ground truth moves neither.
+# The compared errors and their names in tables. The judging metrics decide (see `primary_comparison`), because a
+# constant angle between camera and ground truth does not change them.
 JUDGING_METRICS = {"rmse_boresight_corrected": "RMSE, mounting angle removed", "rotation": "rotation error a frame"}
 SECONDARY_METRICS = {"rmse": "RMSE", "mae": "MAE", "se3": "aligned ATE",
                      "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
@@ -58,48 +60,48 @@ METHODS = {  # in the order in which they are shown
 }
 SEGMENTATION_FREE_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", "fewer", "spread")
 
-MIN_FOR_INTERVAL = 3  # sequences; drawing anew from fewer says nothing
-# With fewer sequences all of them lie on one side of 1 by chance more often than one time in twenty (2 / 2**n).
+MIN_FOR_INTERVAL = 3  # sequences
+# With fewer sequences, all ratios lie on the same side of 1 by chance in more than 5 % of cases (2 / 2**n).
 MIN_SEQUENCES = 6
 LEVEL = 95  # percent, of all intervals
-FAR_OFF = 3  # times the median: a sequence with such a ratio is named beside the mean
+FAR_OFF = 3  # a sequence is named beside the mean if its ratio differs from the median by more than this factor
 DRAWS = 10_000
 LOWER, HIGHER, NO_CLEAR_DIFFERENCE = ("lower", "higher", "no clear difference")
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
-    """Bootstrap interval (low, high) of the mean of one value a sequence; NaN values are left out.
+    """Return the bootstrap interval (low, high) of the mean of one value a sequence. NaN values are left out.
 
-    (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
+    Returns (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
     """
     numbers = np.asarray(values, float)
     numbers = numbers[~np.isnan(numbers)]
     if len(numbers) < MIN_FOR_INTERVAL:
         return np.nan, np.nan
-    drawn = np.random.default_rng(0).integers(0, len(numbers), (DRAWS, len(numbers)))
-    low, high = np.percentile(numbers[drawn].mean(axis=1), [(100 - LEVEL) / 2, (100 + LEVEL) / 2])
+    draws = np.random.default_rng(0).integers(0, len(numbers), (DRAWS, len(numbers)))
+    low, high = np.percentile(numbers[draws].mean(axis=1), [(100 - LEVEL) / 2, (100 + LEVEL) / 2])
     return float(low), float(high)
 
 
 def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
-    """{ratio, low, high, n, verdict} of one ratio a sequence: geometric mean and `mean_interval` of the logarithms.
+    """Return {ratio, low, high, n, verdict}: the geometric mean of one ratio a sequence, with its bootstrap interval.
 
-    The verdict is LOWER or HIGHER where the interval of at least MIN_SEQUENCES sequences excludes 1.
+    The verdict is LOWER or HIGHER if there are at least MIN_SEQUENCES sequences and the interval excludes 1.
     """
     logarithms = np.log(np.asarray(ratios, float))
     logarithms = logarithms[np.isfinite(logarithms)]
     low, high = np.exp(mean_interval(logarithms))
     ratio = float(np.exp(logarithms.mean())) if len(logarithms) else np.nan
-    low, high = np.minimum(low, ratio), np.maximum(high, ratio)  # of equal ratios, rounding may put the mean outside
+    low, high = np.minimum(low, ratio), np.maximum(high, ratio)  # rounding may put the mean of equal ratios outside
     verdict = LOWER if high < 1 else HIGHER if low > 1 else NO_CLEAR_DIFFERENCE
     return {"ratio": ratio, "low": float(low), "high": float(high), "n": len(logarithms),
             "verdict": verdict if len(logarithms) >= MIN_SEQUENCES else NO_CLEAR_DIFFERENCE}
 
 
 def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Series:
-    """The ratio of a metric in some rows of runs to that in the reference rows, by sequence.
+    """Return the ratio, by sequence, of a metric in some rows of a table of runs to the metric in the reference rows.
 
-    Sequences that only one side has, or whose error is zero or missing, are left out.
+    Sequences that are in only one of the two, and sequences whose error is zero or missing, are left out.
     """
     def logarithms(runs: pd.DataFrame) -> pd.Series:
         positive = runs.loc[runs[metric] > 0]
@@ -109,9 +111,10 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
 
 
 def far_off(ratios: pd.Series) -> list[str]:
-    """The sequences whose ratio is more than FAR_OFF times the median of all, or less than the FAR_OFF-th part of it.
+    """Return the sequences whose ratio differs from the median ratio by more than the factor FAR_OFF.
 
-    In one of the two runs they got lost. Fewer than MIN_FOR_INTERVAL sequences do not tell which of them.
+    On these sequences the odometry got lost with one of the two methods. The list is empty for fewer than
+    MIN_FOR_INTERVAL sequences, where the median does not show which sequence is the exception.
     """
     if len(ratios) < MIN_FOR_INTERVAL:
         return []
@@ -120,22 +123,23 @@ def far_off(ratios: pd.Series) -> list[str]:
 
 
 def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
-    """Every method against all keypoints, and masks against every control and every other source.
+    """Compare every method with all keypoints, and masks with every control and with the masks of other sources.
 
-    Columns: source, method, dilation_width (pixels), keypoints (mean number); reference_source, reference; metric,
-    estimator; tested (whether the width is the one put to the test, `tested_width`); ratio, low, high, n,
-    far_off (see `far_off`), verdict; then the ratio of each sequence, in a column with its name.
+    Returns a table with the columns source, method, dilation_width (pixels), keypoints (mean number); reference_source,
+    reference (the method compared with); metric, estimator; tested (whether the width is the `tested_width`); ratio,
+    low, high, n, far_off (see `far_off`), verdict; and one column for each sequence with its ratio.
     """
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
     for estimator in ESTIMATORS:
-        arms = _arms(runs[runs["estimator"] == estimator])
-        for (own, own_rows), (other, other_rows) in product(arms, arms):
-            if not _is_compared(own, other):
+        variants = _variants(runs[runs["estimator"] == estimator])
+        for (variant, variant_runs), (reference, reference_runs) in product(variants, variants):
+            if not _is_compared(variant, reference):
                 continue
-            row = {**own, "reference_source": other["source"], "reference": other["method"], "estimator": estimator}
+            row = {**variant, "reference_source": reference["source"], "reference": reference["method"],
+                   "estimator": estimator}
             for metric in metrics:
-                by_sequence = ratios(own_rows, other_rows, metric)
+                by_sequence = ratios(variant_runs, reference_runs, metric)
                 rows.append({**row, "metric": metric, "far_off": far_off(by_sequence),
                              **geometric_mean(by_sequence), **by_sequence})
     columns = ["source", "method", "dilation_width", "keypoints", "reference_source", "reference", "metric",
@@ -143,39 +147,40 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*columns, *sorted(runs["sequence"].unique())])
 
 
-def _arms(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    """What is compared: (source, method, dilation_width, keypoints, tested) with its rows; all keypoints first."""
-    order = list(METHODS)
-    known = runs[runs["method"].isin(order)]
-    widths = {source: tested_width(of_source(runs, source)) for source in known["source"].unique()}
-    arms = [({"source": source, "method": method, "dilation_width": width,
-              "keypoints": rows.groupby("sequence")["mean_keypoints"].mean().mean(),
-              "tested": bool(pd.isna(width) or width == widths[source])}, rows)
-            for (source, method, width), rows in known.groupby(["source", "method", "dilation_width"], dropna=False,
-                                                               sort=False)]
-    return sorted(arms, key=lambda arm: order.index(arm[0]["method"]))
+def _variants(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
+    """Split the runs by source, method and width; returns ({source, method, ...}, runs) pairs in METHODS' order."""
+    variants = []
+    for method in METHODS:
+        by_width = runs[runs["method"] == method].groupby(["source", "dilation_width"], dropna=False, sort=False)
+        for (source, width), rows in by_width:
+            tested = pd.isna(width) or width == tested_width(of_source(runs, source))
+            keypoints = rows.groupby("sequence")["mean_keypoints"].mean().mean()
+            variants.append(({"source": source, "method": method, "dilation_width": width, "keypoints": keypoints,
+                              "tested": bool(tested)}, rows))
+    return variants
 
 
-def _is_compared(own: dict[str, Any], other: dict[str, Any]) -> bool:
-    """All against all keypoints; masks of the tested width also against their controls and other sources' masks."""
-    are_tested = own["method"] == "masked" and own["tested"] and other["tested"] and other is not own
-    return other["method"] == "baseline" or are_tested and (own["source"] == other["source"]
-                                                            or other["method"] == "masked")
+def _is_compared(variant: dict[str, Any], reference: dict[str, Any]) -> bool:
+    """Return whether `comparisons` has a row for two variants."""
+    if reference["method"] == "baseline":
+        return True
+    if variant is reference or variant["method"] != "masked" or not (variant["tested"] and reference["tested"]):
+        return False
+    return variant["source"] == reference["source"] or reference["method"] == "masked"
 
 
 def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
-    """The rows of `comparisons` that answer the question of this project: do masks from a segmentation help?
+    """Return the rows of `comparisons` that answer the main question: do masks from a segmentation help?
 
-    Masks of the tested width against all keypoints, under the refined estimator where it was run, by JUDGING_METRICS.
-    Under the thesis's estimator, shuffling the matched points moves errors by more than the effect in question.
-    Masks help where both verdicts are LOWER; the segmentation helps where masks are LOWER than each of
-    SEGMENTATION_FREE_CONTROLS too (`against`).
+    They compare masks of the tested width with all keypoints by JUDGING_METRICS, under the `judging_estimator`.
+    Masks help if both verdicts are LOWER. The segmentation helps if masks are also LOWER than each of
+    SEGMENTATION_FREE_CONTROLS (see `against`). source: only this source of masks; by default all of them.
     """
     return against(table[table["tested"]], ["baseline"], source)
 
 
 def against(table: pd.DataFrame, references: Iterable[str], source: str | None = None) -> pd.DataFrame:
-    """The rows of `comparisons` that set masks against some references, judged as `primary_comparison` is."""
+    """Return the rows of `comparisons` for masks against the given methods, chosen as in `primary_comparison`."""
     rows = table[(table["method"] == "masked") & table["reference"].isin(list(references))
                  & table["metric"].isin(JUDGING_METRICS)]
     rows = rows if source is None else rows[rows["source"] == source]
@@ -183,20 +188,20 @@ def against(table: pd.DataFrame, references: Iterable[str], source: str | None =
 
 
 def overall(verdicts: Iterable[str]) -> str:
-    """The verdict of several metrics together: LOWER or HIGHER where all of them say so."""
+    """Return the verdict of several metrics together: LOWER or HIGHER if all of them agree."""
     distinct = set(verdicts)
     return distinct.pop() if len(distinct) == 1 else NO_CLEAR_DIFFERENCE
 
 
 def judging_estimator(table: pd.DataFrame) -> str:
-    """The estimator that decides: the refined one where the runs or comparisons have it."""
+    """Return the estimator that decides: the refined one if it was run, since shuffling changes its errors least."""
     return "refined" if (table["estimator"] == "refined").any() else "thesis"
 
 
 def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
-    """How much shuffling the matched points before RANSAC changes the RMSE, with all keypoints.
+    """Measure how much shuffling the matched points before RANSAC changes the RMSE, with all keypoints.
 
-    One row for each estimator and sequence: repetitions, lowest, highest, factor (highest over lowest).
+    Returns one row for each estimator and sequence: repetitions, lowest, highest, factor (highest over lowest).
     """
     rows = runs[runs["method"] == "baseline"].groupby(["estimator", "sequence"])["rmse"]
     table = rows.agg(repetitions="size", lowest="min", highest="max").reset_index()
@@ -207,9 +212,9 @@ def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None) -> pd.DataFrame:
-    """The rows of one method under one estimator.
+    """Return the runs of one method under one estimator.
 
-    estimator: by default the one of the thesis's tables, which is the thesis's own where it was run.
+    estimator: by default the thesis's estimator if it was run, as for the tables of the thesis.
     """
     if estimator is None:
         estimator = next((name for name in ESTIMATORS if (runs["estimator"] == name).any()), "thesis")
@@ -217,30 +222,30 @@ def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None) -> 
 
 
 def of_source(runs: pd.DataFrame, source: str) -> pd.DataFrame:
-    """The runs of one source of masks, and those with all keypoints, which belong to every one."""
+    """Return the runs of one source of masks and the runs with all keypoints, which belong to every source."""
     return runs[runs["source"].isin([source, ""])]
 
 
 def sources(runs: pd.DataFrame) -> list[str]:
-    """The names of the sources, in the order of their runs."""
+    """Return the names of the sources, in the order of their runs."""
     return [name for name in runs["source"].unique() if name]
 
 
 def tested_width(runs: pd.DataFrame) -> int | None:
-    """The dilation width (pixels) at which masks are put to the test: that of the controls, or the only one there is.
+    """Return the dilation width (pixels) at which masks are tested: that of the controls, or the only width.
 
-    CONTROL_WIDTH where neither says it; None for masks that came ready made.
+    Returns CONTROL_WIDTH if the width is not unique, and None for ready-made masks.
     """
     masked = runs.loc[runs["method"] == "masked", "dilation_width"]
     if len(masked) and masked.isna().all():
         return None
-    of_controls = runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique()
-    widths = of_controls if len(of_controls) else masked.unique()
+    control_widths = runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique()
+    widths = control_widths if len(control_widths) else masked.unique()
     return int(widths[0]) if len(widths) == 1 else CONTROL_WIDTH
 
 
 def keypoints_left(runs: pd.DataFrame) -> pd.Series:
-    """The mean number of keypoints that masks of the `tested_width` leave, by sequence."""
+    """Return the mean number of keypoints that masks of the `tested_width` leave, by sequence."""
     width = tested_width(runs)
     rows = runs[runs["method"] == "masked"]
     if width is not None:
@@ -249,7 +254,7 @@ def keypoints_left(runs: pd.DataFrame) -> pd.Series:
 
 
 def spread(rows: pd.DataFrame, column: str, by: str = "sequence") -> pd.DataFrame:
-    """Mean, lowest and highest of a column over the repetitions: a table with one row for each value of `by`."""
+    """Return mean, lowest and highest of a column over the repetitions: one row for each value of `by`."""
     table = rows.groupby(by)[column].agg(mean="mean", lowest="min", highest="max")
-    # rounding may put the mean of equal values outside their range, and an error bar would have a negative length
+    # rounding may put the mean of equal values outside their range, which gives an error bar of negative length
     return table.assign(mean=table["mean"].clip(table["lowest"], table["highest"]))

@@ -1,8 +1,8 @@
-"""The odometry runs of a study, as a plain list of jobs.
+"""The odometry runs of a study, as a list of jobs.
 
-Chapter 4 runs every sequence with all keypoints, with masks of each width and with plainly reduced keypoints. The
-controls beside them ask whether it is the segmentation that helps. Some jobs need the number of keypoints that masks
-leave (`reduced_jobs`, `keypoint_control_jobs`), so they follow in a second list.
+Chapter 4 runs every sequence with all keypoints, with masks of each width and with a reduced number of keypoints. The
+controls test whether it is the segmentation that helps. `reduced_jobs` and `keypoint_control_jobs` need the number of
+keypoints that masks leave, so they are made once the masked runs are done.
 """
 
 import math
@@ -19,23 +19,24 @@ from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.study import controls
 from thesis_repro.study.sources import Source
 
-# Pixels: the width of Section 3.6 and of Figures 3.6 and 4.5, at which masks are put to the test. It was fixed before
-# any run. (The code of appendix A.8 dilates by 5, audit row 26.)
+# Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It was fixed before any
+# run. (The code of appendix A.8 dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
-ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined estimator"}  # the second spreads far less
+ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined estimator"}  # the second varies far less
 KEYPOINT_CONTROLS = ("fewer", "spread")  # as many keypoints as masks leave, without a mask
 UNMASKED = ("baseline", "reduced", *KEYPOINT_CONTROLS)
-PIECES = 4  # passes for each of several workers, at the least
+PIECES = 4  # passes for each worker at least, if there are several workers
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of the odometry over one sequence. What is None or left out is as in the thesis.
+    """One run of the odometry over one sequence. The defaults are the thesis's settings.
 
     method: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
-    dilation_width: pixels, of masks from label maps; of KEYPOINT_CONTROLS, of the masks that leave as many keypoints.
-    source: name of where the masks come from, or those that a limit of keypoints was taken from; empty where there is
-    only one. max_keypoints, min_distance: of the detector. estimator: "thesis" or "refined", see OdometrySettings.
+    dilation_width: pixels, for masks from label maps; for KEYPOINT_CONTROLS, the width of the masks that leave as many
+    keypoints. source: name of the source of the masks, or of the masks that gave the number of keypoints; empty if
+    there is only one source. max_keypoints, min_distance (pixels): limits of the detector.
+    estimator: "thesis" or "refined", see OdometrySettings.
     repetition: 0 is the thesis's single run; any other number is the seed that shuffles the matched points.
     """
 
@@ -50,7 +51,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Unique in its sequence, and the stem of its file: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0."""
+        """The name of the run's file, unique in its sequence: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0."""
         has_no_mask = self.dilation_width is None or self.method in UNMASKED
         width = None if has_no_mask else f"{self.dilation_width:02d}"
         distance = None if self.min_distance is None else f"{self.min_distance:g}"
@@ -61,14 +62,14 @@ class Job:
 
     @property
     def settings(self) -> OdometrySettings:
-        """The settings of the odometry: the thesis's, but for what the job itself says."""
+        """The thesis's settings of the odometry, with the changes that the job asks for."""
         changes: dict[str, Any] = {"max_keypoints": self.max_keypoints, "min_distance": self.min_distance,
                                    "shuffle_seed": self.repetition or None, "estimator": self.estimator,
                                    "fallback": self.method == "fallback"}
         return replace(THESIS, **{name: value for name, value in changes.items() if value is not None})
 
     def masks(self, sequence: Sequence, sources: Mapping[str, Source]) -> controls.ControlMasks | None:
-        """Its masks; None where the detector may look everywhere. sources: by name."""
+        """Return the job's masks, or None for a job without masks. sources: by name."""
         if self.method in UNMASKED:
             return None
         source = sources[self.source]
@@ -79,29 +80,29 @@ class Job:
 
 def first_jobs(kitti: Path, names: Iterable[str], widths: Mapping[str, Iterable[int]], *, tested: int | None = None,
                sources: Iterable[Source] = (Source(Path()),), repetitions: int = 1) -> list[Job]:
-    """The runs that need no result of others: all keypoints, masks of every width and the controls that are masks.
+    """Return the jobs that need no other results: all keypoints, masks of every width, and controls that are masks.
 
-    names: of the sequences. widths: pixels, of masks from label maps, by estimator: {"thesis": range(1, 16)}.
-    tested: width (pixels) of the controls, None for no controls; it joins the widths of every estimator.
-    sources: of masks, side by side; all keypoints are run once for all of them.
+    names: of the sequences. widths: pixels, for masks from label maps, by estimator: {"thesis": range(1, 16)}.
+    tested: width (pixels) of the controls, None for no controls; it is added to the widths of every estimator.
+    sources: of masks. All keypoints are run once for all sources.
     """
     jobs: list[Job] = []
     for name in names:
         jobs += _repeated([Job(name, "baseline")], widths, repetitions)
         for source in sources:
-            if source.kind == "masks":  # they have no width
-                estimators_of: dict[int | None, list[str]] = {None: list(widths)}
-            else:
-                every = set().union(*widths.values(), [tested] if tested else [])
-                estimators_of = {width: [estimator for estimator, its_widths in widths.items()
-                                         if width in {*its_widths, tested}] for width in sorted(every)}
-            for width, estimators in estimators_of.items():
+            has_widths = source.kind == "labels"
+            all_widths = sorted(set().union(*widths.values(), [tested] if tested else [])) if has_widths else [None]
+            for width in all_widths:
+                estimators = [estimator for estimator, requested_widths in widths.items()
+                              if width in (None, tested) or width in requested_widths]
                 jobs += _repeated([Job(name, "masked", width, source=source.name)], estimators, repetitions)
-            methods = [method for method in controls.MASKS if tested and not (
-                source.kind == "masks" and method in controls.OF_LABEL_MAPS
-                or method == "true-labels" and not controls.true_labels(kitti, name).is_dir())]
-            jobs += _repeated([Job(name, method, None if source.kind == "masks" else tested, source=source.name)
-                               for method in methods], widths, repetitions)
+            for method in controls.MASKS if tested else ():
+                if method in controls.OF_LABEL_MAPS and not has_widths:
+                    continue
+                if method == "true-labels" and not controls.true_labels(kitti, name).is_dir():
+                    continue
+                jobs += _repeated([Job(name, method, tested if has_widths else None, source=source.name)], widths,
+                                  repetitions)
     return jobs
 
 
@@ -111,20 +112,21 @@ def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) 
 
 
 def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
-    """The detector limited to each sequence's mean number of keypoints at its best width (Figure 4.12).
+    """Return jobs that limit the detector to each sequence's mean number of keypoints at its best width (Figure 4.12).
 
     best: the table of `thesis_tables.best_widths`.
     """
-    return [Job(name, "reduced", max_keypoints=_whole(number), repetition=repetition)
-            for name, number in best["mean_keypoints"].items() for repetition in range(repetitions)]
+    return _repeated([Job(name, "reduced", max_keypoints=_whole(number))
+                      for name, number in best["mean_keypoints"].items()], ["thesis"], repetitions)
 
 
 def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: int | None = None,
                           repetitions: int = 1, estimators: Iterable[str] = tuple(ESTIMATORS), source: str = "",
                           width: int | None = None) -> list[Job]:
-    """As many keypoints as masks leave, {sequence: mean number}, without a mask: the strongest, or spread out.
+    """Return jobs without a mask that keep as many keypoints as masks leave.
 
-    "fewer" limits their number; "spread" keeps them farther apart. width: pixels, of those masks.
+    "fewer" keeps the strongest keypoints; "spread" keeps keypoints farther apart.
+    keypoints: {sequence: mean number that masks leave}. width: of these masks, pixels.
     """
     jobs: list[Job] = []
     for name, number in keypoints.items():
@@ -135,24 +137,25 @@ def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: i
 
 
 def _whole(number: float) -> int:
-    return max(1, round(number))  # 0 would lift the detector's limit
+    return max(1, round(number))  # OpenCV takes 0 as "no limit"
 
 
 def in_passes(jobs: Iterable[Job], frames: Mapping[str, int], workers: int) -> list[list[Job]]:
-    """Jobs cut into lists for one pass over a sequence each; frames: of each sequence.
+    """Divide jobs into lists, each for one pass over a sequence. frames: number of frames of each sequence.
 
-    A pass is at most 1 / PIECES of a worker's share, so that no worker is alone at the end; jobs with the same
-    keypoints stay together, since they share most. A worker on its own takes each sequence whole.
+    A pass is at most 1 / PIECES of a worker's share of the work, so that the workers end at about the same time. Jobs
+    with the same keypoints stay in one pass, where they share most of their work. A single worker gets one pass for
+    each sequence.
     """
     groups: dict[str, dict[Job, list[Job]]] = {name: {} for name in frames}
     for job in jobs:
         groups[job.sequence].setdefault(replace(job, estimator="", repetition=0), []).append(job)
-    everything = sum(len(groups[name]) * frames[name] for name in frames)
+    total = sum(len(groups[name]) * frames[name] for name in frames)
     passes = []
-    for name, of_name in groups.items():
-        share = len(of_name) * frames[name] / max(everything, 1)
-        pieces = min(len(of_name), math.ceil(share * (PIECES * workers if workers > 1 else 1)))
-        ends = [index * len(of_name) // max(pieces, 1) for index in range(pieces + 1)]
-        listed = list(of_name.values())
-        passes += [sum(listed[start:end], []) for start, end in pairwise(ends)]
+    for name, sequence_groups in groups.items():
+        share = len(sequence_groups) * frames[name] / max(total, 1)
+        pieces = min(len(sequence_groups), math.ceil(share * (PIECES * workers if workers > 1 else 1)))
+        ends = [index * len(sequence_groups) // max(pieces, 1) for index in range(pieces + 1)]
+        job_lists = list(sequence_groups.values())
+        passes += [sum(job_lists[start:end], []) for start, end in pairwise(ends)]
     return passes

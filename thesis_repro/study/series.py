@@ -1,6 +1,7 @@
-"""A study with masks of one's own: what is run, whether the data is there, and the running of it."""
+"""A study with your own masks: its settings, the check of its input, and its runs."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -11,15 +12,15 @@ from thesis_repro.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
-PATHS = "paths"  # folder of each run's path
+PATHS = "paths"  # folder of the estimated paths
 
 
 @dataclass(frozen=True)
 class Study:
-    """Sources of masks side by side, against all keypoints.
+    """One or several sources of masks, compared with all keypoints.
 
-    sequences: names. widths: pixels, of masks from label maps. tested: width of the controls, None for none.
-    estimators, of `jobs.ESTIMATORS`. frames: of each sequence, None for all.
+    sequences: their names. widths: pixels, for masks from label maps. tested: width of the controls, None for no
+    controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames of each sequence, None for all.
     """
 
     kitti: Path
@@ -32,11 +33,11 @@ class Study:
     frames: int | None = None
 
     def opened(self) -> list[Sequence]:
-        """The sequences, cut to their frames."""
+        """Return the sequences, cut to `frames` frames."""
         return [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
 
     def check(self) -> None:
-        """Raise InputError for the first thing that a run would need and that is not there."""
+        """Raise InputError for the first problem with the settings, the sequences or the masks."""
         if self.frames is not None and self.frames < 3:
             raise InputError(f"--frames {self.frames}: must be 3 or more")
         if not 1 <= self.repetitions <= MOST_REPETITIONS:
@@ -49,71 +50,65 @@ class Study:
 
     @property
     def shown_width(self) -> int | None:
-        """The dilation width (pixels) that is shown of masks: the tested one, or else the middle one."""
+        """The dilation width (pixels) of the masks in figures: the tested width, or else the middle one."""
         return self.tested or (self.widths[len(self.widths) // 2] if self.widths else None)
 
     def masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
-        """Each sequence with the masks of each source, of the width that is shown."""
+        """Return each sequence with the masks of each source, at the `shown_width`."""
         return [(sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
                 for sequence in self.opened()]
 
     def shown_jobs(self, name: str) -> list[jobs.Job]:
-        """The runs of a sequence whose paths are drawn: all keypoints, and the masks of each source."""
+        """Return the runs of a sequence whose paths are drawn: all keypoints and the masks of each source."""
         estimator = "refined" if "refined" in self.estimators else "thesis"
         return [jobs.Job(name, "baseline", estimator=estimator), *(
             jobs.Job(name, "masked", self.shown_width if source.kind == "labels" else None, estimator=estimator,
                      source=source.name) for source in self.sources)]
 
     def write_paths(self, runs: pd.DataFrame, folder: Path) -> None:
-        """Write repetition 0 of every run, and the truth, into folder/PATHS, in KITTI's and in TUM's form."""
-        estimated = runner.run_poses(runs[runs["repetition"] == 0], folder / "runs")
+        """Write the ground truth and repetition 0 of every run into folder/PATHS, in KITTI's and TUM's formats."""
+        first_runs = runs[runs["repetition"] == 0]
         for sequence in self.opened():
             name = sequence.name
-            of_sequence = {run: poses for (its_sequence, run), poses in estimated.items() if its_sequence == name}
-            for run, poses in {"truth": sequence.poses, **of_sequence}.items():
+            estimated = runner.run_poses(first_runs[first_runs["sequence"] == name], folder / "runs")
+            for (_, run), poses in {(name, "truth"): sequence.poses, **estimated}.items():
                 write_kitti_poses(folder / PATHS / "kitti" / name / f"{run}.txt", poses)
                 write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
     def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
-        """`check.path_oddities` of the runs with all keypoints."""
-        chosen = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)].drop_duplicates("sequence")
-        return [line for (name, _), poses in runner.run_poses(chosen, folder / "runs").items()
+        """Return the warnings of `check.path_oddities` for one run with all keypoints of each sequence."""
+        baselines = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)].drop_duplicates("sequence")
+        return [line for (name, _), poses in runner.run_poses(baselines, folder / "runs").items()
                 for line in check.path_oddities(name, poses, Sequence(self.kitti, name).poses[:len(poses)])]
 
     def first_jobs(self) -> list[jobs.Job]:
-        """The runs that need no result of others."""
+        """Return the jobs that need no other results."""
         return jobs.first_jobs(self.kitti, self.sequences, dict.fromkeys(self.estimators, self.widths),
                                tested=self.tested, sources=self.sources, repetitions=self.repetitions)
 
-    def second_jobs(self, runs: pd.DataFrame) -> list[jobs.Job]:
-        """The controls that need the number of keypoints that masks leave in `runs`."""
-        second: list[jobs.Job] = []
-        for source in self.sources if self.tested else ():
-            width = None if source.kind == "masks" else self.tested
-            left = compare.keypoints_left(compare.of_source(runs, source.name))
-            second += jobs.keypoint_control_jobs(left, self.kitti, self.frames, self.repetitions, self.estimators,
-                                                 source.name, width)
-        return second
-
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
-        """Run what the folder does not hold yet; returns the table of all runs, see `runner.run`.
+        """Run the jobs whose results are not in the folder yet; returns the table of all runs, see `runner.run`.
 
         Raises InputError for a folder with results of another number of frames.
         """
-        def run(listed: list[jobs.Job]) -> pd.DataFrame:
-            return runner.run(listed, self.kitti, self.sources, folder / "runs", frames=self.frames,
-                              processes=processes, scheduler=scheduler)
-
+        run = partial(runner.run, kitti=self.kitti, labels=self.sources, folder=folder / "runs", frames=self.frames,
+                      processes=processes, scheduler=scheduler)
         with longrun.claimed(folder):
             stages.stage(folder, replace=False, frames=self.frames)
-            runs = run(self.first_jobs())
+            study_jobs = self.first_jobs()
+            runs = run(study_jobs)
             if runs["mean_keypoints"].isna().all():
-                raise InputError(f"{self.kitti}: no frame has any structure (all are black, blown out or of one gray); "
+                raise InputError(f"{self.kitti}: no frame has any structure (all are black, white or of one gray); "
                                  "check how they were written")
-            second, made = self.second_jobs(runs), runs.attrs["made"]
-            if second:
-                runs = run([*self.first_jobs(), *second])
-                runs.attrs["made"] += made  # what the first call made, the second one kept
+            if self.tested:
+                made = runs.attrs["made"]
+                for source in self.sources:
+                    keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
+                    width = None if source.kind == "masks" else self.tested
+                    study_jobs += jobs.keypoint_control_jobs(keypoints, self.kitti, self.frames, self.repetitions,
+                                                             self.estimators, source.name, width)
+                runs = run(study_jobs)
+                runs.attrs["made"] += made  # the second call counts the runs of the first one as kept
                 runs.attrs["kept"] -= made
             self.write_paths(runs, folder)
         return runs

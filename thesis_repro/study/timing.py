@@ -1,7 +1,7 @@
-"""How long things take: every dilation width as the thesis times it (Figure 4.17), and a whole frame.
+"""Time every dilation width as the thesis does (Figure 4.17), and each stage from a frame's file to its pose.
 
-A whole frame goes from its file to its pose with the network included, which Section 5.2.2 asks for. It is timed as in
-a live system: one frame after the other, the network on one image at a time, all cores.
+The stages include the network, as Section 5.2.2 asks for. They are timed as in a live system: one frame after the
+other, the network on one image at a time, all cores.
 """
 
 import time
@@ -23,28 +23,28 @@ from thesis_repro.study.runner import by_name, masks_of
 from thesis_repro.study.sources import Source
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
-FRAMES = 20  # on which a whole frame is timed
-WARM_UP = 3  # frames before them that load compiled code and fill caches
+FRAMES = 20  # on which the stages are timed
+WARM_UP = 3  # frames before them, which load compiled code and fill caches
 
 
 @contextmanager
 def opencv_threads(count: int) -> Iterator[None]:
-    """Use `count` threads inside OpenCV's functions in this context; -1 for one a core."""
-    before = cv2.getNumThreads()
+    """Use `count` threads in OpenCV's functions inside a with block; -1 for one thread a core."""
+    previous_count = cv2.getNumThreads()
     cv2.setNumThreads(count)
     try:
         yield
     finally:
-        cv2.setNumThreads(before)
+        cv2.setNumThreads(previous_count)
 
 
 def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *, frames: int,
               processes: int = 1) -> pd.DataFrame:
-    """How long each job takes as a run of its own: a table of sequence, run, method, dilation_width and seconds.
+    """Time each job as a separate run; returns a table of sequence, run, method, dilation_width and seconds.
 
-    Only the first `frames` frames are timed; the first two steps are left out, since they load compiled code. The jobs
-    of a sequence take turns at every frame, so that what else the machine does falls on all of them alike.
-    To be called after `runner.run`, whose folder and whose label maps it shares.
+    Only the first `frames` frames are timed, without the first two steps, which load compiled code. The jobs of a
+    sequence take turns at every frame, so that other programs slow all of them equally.
+    Call it after `runner.run`, with the same folder and label maps. Times in the folder are not measured again.
     """
     jobs, sources = list(jobs), by_name(labels)
     names = sorted({job.sequence for job in jobs})
@@ -60,19 +60,18 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
         return kept
     scales = odometry.scales(sequence)
     masks_by_job, _ = masks_of(jobs, sequence, sources)
-    followers = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
+    odometries = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
     seconds = dict.fromkeys(masks_by_job, 0.0)
     with opencv_threads(1):  # one thread makes times comparable
         for index in range(len(sequence)):
             frame = sequence.frame(index)
-            for job, follower in followers.items():
-                masks.forget_edges()  # each run of its own would have to make them
-                its_masks = masks_by_job[job]
-                mask, masking = (None, 0.0) if its_masks is None else _timed(its_masks.__getitem__, index)
-                step = follower.step(frame, scales[index], mask)
+            for job, job_masks in masks_by_job.items():
+                masks.forget_edges()  # a separate run would have to find them
+                mask, mask_seconds = (None, 0.0) if job_masks is None else _timed(job_masks.__getitem__, index)
+                step = odometries[job].step(frame, scales[index], mask)
                 if index > 1:
-                    # Section 4.2 counts what happens from frame to frame and the making of the mask, not the prediction
-                    seconds[job] += masking + sum(step.seconds.values())
+                    # Section 4.2 counts the odometry and the making of the mask, not the prediction
+                    seconds[job] += mask_seconds + sum(step.seconds.values())
     table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "method": job.method,
                            "dilation_width": job.dilation_width, "seconds": value} for job, value in seconds.items()])
     write_text(path, table.to_csv(index=False))
@@ -80,9 +79,9 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
 
 
 def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
-    """Milliseconds a frame of each stage, with all keypoints and with masks: method, stage, milliseconds (medians).
+    """Time each stage of a frame, with all keypoints and with masks: a table of method, stage, milliseconds (medians).
 
-    Stages: read (the frame's file), segmentation (stretch to the model's input, network, class of every pixel), mask
+    Stages: read (the frame's file), segmentation (resize to the model's input, network, class of every pixel), mask
     (label map to 320x320, edges, dilation), detection, tracking, pose (essential matrix, then rotation and
     translation). model: a Keras model of `segmentation`. width: of the masks, pixels. The methods take turns.
     Raises InputError for a sequence with too few frames.
@@ -96,31 +95,31 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
     with opencv_threads(-1):
         for index in progress(range(len(sequence)), "timing"):
             frame, read = _timed(sequence.frame, index)
-            label_map, network = _timed(_segment, model, frame)
+            label_map, segmentation = _timed(_segment, model, frame)
             mask, masking = _timed(_mask, label_map, frame.shape, width)
             for name, run in runs.items():
                 seconds = run.step(frame, metres[index], mask if name == masked else None).seconds
-                before = {"read": read, **({"segmentation": network, "mask": masking} if name == masked else {})}
                 if index >= WARM_UP:
-                    rows.append({"method": name, **before, "detection": seconds["detect"],
+                    network_stages = {"segmentation": segmentation, "mask": masking} if name == masked else {}
+                    rows.append({"method": name, "read": read, **network_stages, "detection": seconds["detect"],
                                  "tracking": seconds["track"], "pose": seconds["essential"] + seconds["pose"]})
     medians = 1000 * pd.DataFrame(rows).groupby("method", sort=False)[list(STAGES)].median()
     return medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds").dropna().reset_index()
 
 
 def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
-    """The timings to draw: `measured`, which is written to a file; with `keep` those that the file already has.
+    """Write measured timings to a file and return them; with `keep`, return the timings of an existing file instead.
 
-    Figures in git keep the timings that came with them. Otherwise every machine and every run would change them.
+    Figures in git keep their timings, which would otherwise change with every machine and every run.
     """
     if not (keep and path.is_file()):
         write_text(path, measured.to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
-def _timed(work: Callable, *arguments: Any) -> tuple[Any, float]:
+def _timed(function: Callable, *arguments: Any) -> tuple[Any, float]:
     started = time.perf_counter()
-    result = work(*arguments)
+    result = function(*arguments)
     return result, time.perf_counter() - started
 
 
@@ -137,6 +136,6 @@ def _segment(model: Any, frame: np.ndarray) -> np.ndarray:
 def _mask(label_map: np.ndarray, size: tuple[int, int], width: int) -> np.ndarray:
     from thesis_repro.segmentation import prediction
 
-    # the same as from a written label map, whose size is the thesis's whatever the model's is
+    # label maps are written in the thesis's size, whatever the size of the model's output
     label_map = cv2.resize(label_map, (prediction.SIZE,) * 2, interpolation=cv2.INTER_NEAREST)
     return masks.keypoint_mask(label_map, size, width)
