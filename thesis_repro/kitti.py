@@ -1,4 +1,4 @@
-"""KITTI odometry: one sequence's frames, camera, times and true poses, and trajectory files."""
+"""KITTI odometry: the frames, camera, times and true poses of a sequence, and files of trajectories."""
 
 import warnings
 from collections import namedtuple
@@ -22,22 +22,22 @@ _CAMERA_04 = Camera(1226, 370, 707.0912, 707.0912, 601.8873, 183.1104)
 CAMERAS = {"00": _CAMERA_00, "01": _CAMERA_00, "02": _CAMERA_00, "03": _CAMERA_03,
            **{f"{n:02d}": _CAMERA_04 for n in range(4, 11)}}
 
-# Frames of the complete sequences (those with ground truth).
+# Numbers of frames of the complete sequences with ground truth.
 FRAME_COUNTS = dict(zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201), strict=True))
 
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")  # left gray, left colour, then the right ones
-MIN_FRAME_SIDE = 16  # pixels: in smaller frames no keypoint can be tracked
+MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
 MAX_MISSING_NAMED = 10_000  # frames
 MAX_SPEED = 10_000  # metres a second
 MAX_POSITION = 1e9  # metres
-ROTATION_TOLERANCE = 1e-3  # of R R^T against the identity: a file has few digits
-FRAME_TIME = 0.1  # seconds between KITTI's frames, and between those of a sequence that has no times
+ROTATION_TOLERANCE = 1e-3  # largest difference of R R^T from the identity; files have few digits
+FRAME_TIME = 0.1  # seconds between the frames of KITTI, and of a sequence without times.txt
 
 
 def sequences(root: str | Path) -> list[str]:
-    """Names of the sequences with frames and true poses, sorted. Raises InputError where there are none.
+    """Sorted names of the sequences that have frames and true poses. Raises InputError if there are none.
 
-    Of 00 to 10 only the frames need be there: if they have no poses, a file is missing, which `Sequence` says.
+    00 to 10 are listed even without poses, so that `Sequence` reports the missing file.
     """
     names = [name for name in with_frames(root)
              if name in FRAME_COUNTS or (Path(root) / "poses" / f"{name}.txt").is_file()]
@@ -47,8 +47,10 @@ def sequences(root: str | Path) -> list[str]:
 
 
 def with_frames(root: str | Path) -> list[str]:
-    """Names of all sequences with frames, sorted; the benchmark keeps the poses of 11 to 21 to itself. Raises
-    InputError for a folder of another layout."""
+    """Sorted names of all sequences that have frames (KITTI does not publish the poses of 11 to 21).
+
+    Raises InputError for a folder of another layout.
+    """
     root = Path(root)
     if not (root / "sequences").is_dir():
         raise InputError(f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt")
@@ -57,8 +59,8 @@ def with_frames(root: str | Path) -> list[str]:
 
 
 def images_of(folder: str | Path, camera: str | None = None) -> Path:
-    """Where the frames of a sequence's folder are: in `camera`, or else the first of IMAGE_FOLDERS that is there, or
-    else the folder itself. Raises InputError for another camera and for a folder that is not there.
+    """The folder of a sequence's frames: `camera`, or by default the first of IMAGE_FOLDERS that exists, or else the
+    sequence's folder itself. Raises InputError for an unknown camera and for a missing folder.
     """
     if camera is not None and camera not in IMAGE_FOLDERS:
         raise InputError(f"camera {camera!r}: unknown; choose one of {', '.join(sorted(IMAGE_FOLDERS))}")
@@ -72,20 +74,20 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
 class Sequence:
     """One odometry sequence in the official layout: sequences/NN/image_0, calib.txt, times.txt and poses/NN.txt.
 
-    Frames are PNG or JPEG, numbered without gaps; colour ones are read as gray. Without times.txt, `times` has KITTI's
-    ten frames a second. Without a file of poses, `has_truth` is False. (The true poses are those of image_0's camera,
-    6 cm beside image_2's.) Everything but the frames is read and checked when the object is made.
-    Raises InputError, naming the file, for whatever is missing or malformed.
+    Frames are PNG or JPEG, numbered without gaps; colour is read as gray. Without times.txt, `times` assumes ten frames
+    a second, as KITTI has. Without a file of poses, `has_truth` is False. (The true poses are those of the camera of
+    image_0, which is 6 cm beside that of image_2.) Everything except the frames is read and checked on creation.
+    Raises InputError, naming the file, if something is missing or malformed.
     """
 
     def __init__(self, root: str | Path | None, name: str | Path, camera: str | None = None,
                  speed: float | None = None) -> None:
-        """root: the folder that holds sequences and poses, and name: of the sequence, where "6" is as good as "06".
-        Or root None, and name a folder of one's own that holds calib.txt, the frames (in image_0 or itself) and
-        perhaps times.txt and poses.txt.
+        """root: folder that holds sequences and poses. name: of the sequence, "06" or "6".
 
-        camera: one of IMAGE_FOLDERS; by default see `images_of`. speed: metres a second, for a sequence without true
-        poses; by default one metre a frame.
+        For a sequence outside of KITTI, root is None and name is its folder, with calib.txt, the frames (in image_0 or
+        in the folder itself) and optionally times.txt and poses.txt.
+        camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence without true poses; by
+        default one metre a frame is assumed.
         """
         self.root, self.folder, self.poses_path = _places(root, name)
         self.name, self.speed = self.folder.name, speed
@@ -109,26 +111,26 @@ class Sequence:
 
     @property
     def poses(self) -> np.ndarray:
-        """True camera-to-world poses, (n, 4, 4), metres. Raises InputError where there are none."""
+        """True camera-to-world poses, (n, 4, 4), metres. Raises InputError if there are none."""
         if not self.has_truth:
             raise InputError(f"{self.poses_path}: no such file; true poses are needed")
         return self._poses
 
     @property
     def assumed_steps(self) -> np.ndarray:
-        """Metres from the frame before, (n,), 0 for the first, where no truth says them: those of the speed, or 1."""
+        """Step lengths without true poses, metres, (n,): from the speed, or 1; 0 for the first frame."""
         steps = np.ones(len(self) - 1) if self.speed is None else self.speed * np.diff(self.times)
         return np.concatenate([[0.0], steps])
 
     @property
     def files(self) -> list[Path]:
-        """All that is read of the sequence: frames, calibration, and times and true poses where there are any."""
+        """All files of the sequence: frames, calibration, and times and true poses if they exist."""
         texts = self.folder / "calib.txt", self.folder / "times.txt", self.poses_path
         return [*self.frame_paths, *filter(Path.is_file, texts)]
 
     @property
     def label_names(self) -> list[str]:
-        """What the label map or mask of each frame is called: as the frame, but always .png."""
+        """File names of the label maps and masks: those of the frames, always with the ending .png."""
         return [f"{path.stem}.png" for path in self.frame_paths]
 
     def __len__(self) -> int:
@@ -139,13 +141,13 @@ class Sequence:
 
     @cached_property
     def size(self) -> tuple[int, int]:
-        """(height, width) of the first frame; every frame must have it. Raises what `check_camera` raises."""
+        """(height, width) of all frames, from the first one. Raises InputError as `check_camera` does."""
         size = read_gray(self.frame_paths[0]).shape
         check_camera(self.folder / "calib.txt", self.intrinsics, self.frame_paths[0], size)
         return size
 
     def frame(self, index: int) -> np.ndarray:
-        """Frame `index` as 8-bit gray, (height, width). Raises InputError when unreadable or of another size."""
+        """Frame `index` as 8-bit gray, (height, width). Raises InputError if unreadable or of another size."""
         image = read_gray(self.frame_paths[index])
         check_size(self.frame_paths[index], image.shape, self.size)
         return image
@@ -156,7 +158,7 @@ class Sequence:
             yield self.frame(index)
 
     def subset(self, count: int | None) -> "Sequence":
-        """The same sequence cut to its first `count` frames (all of them where it has fewer, or for None)."""
+        """A copy with the first `count` frames only; None for all."""
         short = copy(self)
         short.frame_paths, short.times = self.frame_paths[:count], self.times[:count]
         if self.has_truth:
@@ -165,12 +167,12 @@ class Sequence:
 
 
 def _places(root, name):
-    """(root, folder, file of true poses) of a sequence, see Sequence."""
+    """(root, folder, file of true poses) of a sequence; arguments as in Sequence."""
     if root is None:
         folder = Path(name).resolve()
         if folder.parent.name != "sequences":
             return folder.parent, folder, folder / "poses.txt"
-        root, name = folder.parent.parent, folder.name  # it is one of KITTI's after all
+        root, name = folder.parent.parent, folder.name  # a folder in KITTI's layout
     root, name = Path(root), str(name)
     if name in ("", ".", "..") or "/" in name:
         raise InputError(f"sequence {name!r}: must be the name of a folder in {root / 'sequences'}, such as 00")
@@ -180,14 +182,14 @@ def _places(root, name):
 
 
 def name_of(root: str | Path, name: str) -> str:
-    """The name under which a sequence's results go: 06, where "6" may be given."""
+    """The full name of a sequence, "06" for "6", under which its results are stored."""
     return _places(root, name)[1].name
 
 
 def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """The true poses of a sequence, (n, 4, 4), and their times, (n,), seconds; the frames need not be there.
+    """True poses of a sequence, (n, 4, 4), and their times, (n,), seconds. The frames are not needed.
 
-    root and name as Sequence takes them; without times.txt KITTI's ten frames a second.
+    root, name: as in Sequence. Without times.txt ten frames a second are assumed.
     """
     _, folder, path = _places(root, name)
     poses, times = read_poses(path), folder / "times.txt"
@@ -195,9 +197,9 @@ def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np
 
 
 def check_numbering(paths: list[Path]) -> None:
-    """Raise InputError for two frames of one number, and for frames that count by one with a gap.
+    """Raise InputError if two frames have the same number, or if one is missing in a series that counts by one.
 
-    (Every fifth frame, say, or times are no count.)
+    Names that do not count by one (every fifth frame, or times) are accepted.
     """
     for (before, first), (after, second) in pairwise(zip(numbers_of(paths) or [], paths)):
         if before == after:
@@ -208,10 +210,10 @@ def check_numbering(paths: list[Path]) -> None:
 
 
 def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
-    """The files that are not there of frames that count by one, at most MAX_MISSING_NAMED.
+    """Missing files of frames that count by one, at most MAX_MISSING_NAMED.
 
-    count: of all frames, which then begin with 0 (KITTI's) or with 1, or else where the first of `paths` does: those
-    before the first and after the last are missing too.
+    count: the expected number of frames, if known. Then frames before the first and after the last are missing, too;
+    numbers start at 0 (as in KITTI), at 1, or at the first of `paths`.
     """
     numbers = numbers_of(paths)
     steps = [after - before for before, after in pairwise(numbers or [])]
@@ -228,7 +230,7 @@ def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
-    """Raise InputError unless a file has a line a frame."""
+    """Raise InputError unless a file has one line a frame."""
     if count != len(frame_paths):
         missing = missing_frames(frame_paths, max(count, len(frame_paths)))
         first = f" (the first missing: {missing[0].name})" if missing else ""
@@ -236,7 +238,7 @@ def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
 
 
 def check_size(path: Path, size: tuple[int, ...], wanted: tuple[int, int], of: str = "the first frame") -> None:
-    """Raise InputError for an image whose (height, width) is not that `of` another one."""
+    """Raise InputError if an image has another (height, width) than `of`, the image named."""
     if size != wanted:
         raise InputError(f"{path}: {size[1]}x{size[0]} pixels; {of} has {wanted[1]}x{wanted[0]}")
 
@@ -253,9 +255,9 @@ def _read_numbers(path, columns):
 
 
 def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
-    """The camera matrix of image_0 (Equation 2.4), the first 3x3 of P0, or of another camera: (3, 3), pixels.
+    """The camera matrix (Equation 2.4), (3, 3), pixels: the first three columns of P0, or of another camera's P.
 
-    Raises InputError for a file without it, and for numbers that are no camera's without distortion and skew.
+    Raises InputError if the file does not hold it, or if it is not that of a camera without distortion and skew.
     """
     key = f"P{camera[-1]}" if camera in IMAGE_FOLDERS else "P0"
     try:
@@ -274,7 +276,7 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
 
 
 def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[int, int]) -> None:
-    """Raise InputError where a camera matrix cannot be that of frames of (height, width), or these are too small."""
+    """Raise InputError if a camera matrix does not fit frames of (height, width), or if these are too small."""
     height, width = size
     if min(size) < MIN_FRAME_SIDE:
         raise InputError(f"{frame}: {width}x{height} pixels; a side needs {MIN_FRAME_SIDE} or more")
@@ -285,7 +287,7 @@ def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[in
 
 
 def read_times(path: str | Path) -> np.ndarray:
-    """The times of frames, (n,), seconds: one number a line. Raises InputError unless they increase."""
+    """Times of the frames, (n,), seconds, from one number a line. Raises InputError unless they increase."""
     times = _read_numbers(path, 1)[:, 0]
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
@@ -294,9 +296,9 @@ def read_times(path: str | Path) -> np.ndarray:
 
 
 def read_poses(path: str | Path) -> np.ndarray:
-    """Camera-to-world poses, (n, 4, 4), metres: one line of 12 numbers, the first three rows, a frame.
+    """Camera-to-world poses, (n, 4, 4), metres, from 12 numbers a line: the first three rows of each pose.
 
-    Raises InputError for what is no rotation (mirrored ones among it) and no position.
+    Raises InputError if a line is not a right-handed rotation and a position.
     """
     rows = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -312,24 +314,24 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
-    """Write (n, 4, 4) poses as KITTI does: 12 numbers a line, row by row, all digits kept."""
+    """Write (n, 4, 4) poses in KITTI's form: 12 numbers a line, row by row, with all digits."""
     _write_rows(path, np.asarray(poses)[:, :3].reshape(-1, 12))
 
 
 def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
-    """Write (n, 4, 4) poses with their times (n,), seconds, in TUM form: time, position, quaternion (x, y, z, w)."""
-    from scipy.spatial.transform import Rotation  # loads in 0.4 s, and every command loads this module
+    """Write (n, 4, 4) poses and their times (n,), seconds, in TUM's form: time, position, quaternion (x, y, z, w)."""
+    from scipy.spatial.transform import Rotation  # takes 0.4 s to load, and every command loads this module
 
     quaternions = Rotation.from_matrix(np.asarray(poses)[:, :3, :3]).as_quat(canonical=True)
     _write_rows(path, np.column_stack([times, np.asarray(poses)[:, :3, 3], quaternions]))
 
 
 def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The poses of a file in TUM's form that are nearest to times (n,), seconds, as evo finds them.
+    """Poses of a file in TUM's form, matched to the times (n,), seconds, of frames as evo does.
 
-    Returns the numbers of the times that have one, (m,), and their poses, (m, 4, 4); InputError for fewer than two.
+    Returns the indices of the matched times, (m,), and their poses, (m, 4, 4). Raises InputError for fewer than two.
     """
-    from evo import EvoException  # loads in 0.4 s, as above
+    from evo import EvoException  # takes 0.4 s to load, as above
     from evo.core.sync import matching_time_indices
     from evo.tools import file_interface
 

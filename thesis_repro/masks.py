@@ -1,6 +1,6 @@
-"""The keypoint mask filter (Section 3.6, A.8): label map to edges to dilated mask.
+"""The keypoint mask filter (Section 3.6, A.8): from a label map to edges to a dilated mask.
 
-A mask is uint8 of the frame's size: keypoints may lie where it is 255 and not where it is 0.
+A mask is uint8 of the frame's size. Keypoints are allowed where it is 255, and not where it is 0.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -16,28 +16,28 @@ from thesis_repro.files import is_whole, listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence
 
 BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
-CLASS_EDGE_WINDOW = 5  # pixels a side: a Canny edge within two pixels of a change of class belongs to that change
-MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked ones too
-# Where keypoints may lie: on the thesis's boundaries, or where SLAM systems with a segmentation leave them.
+CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a class boundary at most two pixels away
+MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked or not
+# Where keypoints may lie: on the thesis's boundaries, or where published SLAM systems with a segmentation allow them.
 KEEP = ("boundaries", "static", "inverse", "static-boundaries")
-DYNASLAM_MARGIN = 15  # pixels around movable things that DynaSLAM leaves out too (its Frame.cc), for its mask is rough
+DYNASLAM_MARGIN = 15  # pixels around movable things that DynaSLAM excludes as well (its Frame.cc)
 
 
 @dataclass(frozen=True)
 class MaskSettings:
-    """How a mask is made from a label map. The defaults are the thesis's way; each field is one correction of it.
+    """How a mask is made from a label map. The defaults are the thesis's way; each field is one change of it.
 
-    keep: "boundaries"; "static", all but movable things and DYNASLAM_MARGIN around them, whatever the boundaries;
-    "inverse", all but the widened boundaries; "static-boundaries", those between two classes that cannot move.
-    boundaries: "canny" finds edges in label ids, "exact" every change of class (see `edges`).
-    canny: both thresholds (Section 3.6); a 3x3 Sobel operator is OpenCV's default.
-    symmetric: the mask of a mirrored label map is the mirrored mask: no half pixel to one side (see `edges`, `dilate`).
-    classes: names of labels; boundaries of these alone, with whatever they touch. Empty: of all classes.
-    movable: no keypoints on people and vehicles, whose areas are first widened by so many pixels. None: allowed (but
-    for "static").
-    margin: no keypoints within so many pixels of the frame's border. Points there are lost in the next frame, and
-    networks that pad with zeros predict boundaries there that do not exist.
-    ids: what the files hold, Cityscapes' label ids or its train ids (`cityscapes.TRAINED`).
+    keep: "boundaries", the dilated boundaries; "inverse", everything else; "static", everything except movable things
+    and DYNASLAM_MARGIN around them; "static-boundaries", boundaries between two classes that cannot move.
+    boundaries: "canny" finds edges in label ids, "exact" marks every change of class (see `edges`).
+    canny: both thresholds (Section 3.6), with OpenCV's default 3x3 Sobel operator.
+    symmetric: no shift by half a pixel, so that a mirrored label map gives the mirrored mask (see `edges`, `dilate`).
+    classes: names of labels; only boundaries of these classes, with any neighbour. Empty: of all classes.
+    movable: no keypoints on people and vehicles, nor within this many pixels of them. None: allowed (except with
+    "static").
+    margin: no keypoints within this many pixels of the frame's border. Points there are lost in the next frame, and
+    networks that pad with zeros predict false boundaries there.
+    ids: ids in the files, Cityscapes' "labels" or its "train" ids (`cityscapes.TRAINED`).
     Raises InputError for an unknown name and a negative number.
     """
 
@@ -69,13 +69,13 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
 
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
 
-    boundaries "canny" is the thesis: enlarge bilinearly (which invents ids along every boundary), then Canny
-    on the ids themselves, so that a boundary shows only where two ids are far enough apart. "exact" is the correction:
+    boundaries "canny" is the thesis's way: enlarge bilinearly, which invents ids along every boundary, then run Canny
+    on the ids themselves, which finds a boundary only if its two ids differ enough. "exact" is the correction:
     enlarge with nearest neighbour and mark every pixel whose right or lower neighbour has another class.
     symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary. OpenCV's plain nearest
-    neighbour looks half a pixel to the upper left, and a mark on one side lies half a pixel beside the boundary.
-    classes, "static-boundaries": only some boundaries. Canny knows no classes, so a Canny edge belongs to them where
-    it lies within two pixels of such a boundary.
+    neighbour is shifted by half a pixel, and so is a mark on one side only.
+    classes, "static-boundaries": only some boundaries. Canny does not know classes, so its edges are kept where they
+    are within two pixels of such a boundary.
     """
     if settings.boundaries == "canny":
         canny = cv2.Canny(cv2.resize(label_map, size[::-1]), *settings.canny)
@@ -97,7 +97,7 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
 
 
 def _enlarged(label_map, size, symmetric):
-    """The label map at the frame's size, without ids that it does not hold."""
+    """The label map enlarged to the frame's size by nearest neighbour, which invents no ids."""
     nearest = cv2.INTER_NEAREST_EXACT if symmetric else cv2.INTER_NEAREST
     return cv2.resize(label_map, size[::-1], interpolation=nearest)
 
@@ -105,9 +105,9 @@ def _enlarged(label_map, size, symmetric):
 def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False) -> np.ndarray:
     """Widen edges with a square of ones, `dilation_width` pixels a side.
 
-    An even width has no centre pixel: OpenCV's anchor then shifts the mask half a pixel, and the thesis keeps that.
-    symmetric: an even square is made one pixel smaller. Around exact boundaries, which are then marked on both sides,
-    the mask is as wide as an even width says.
+    A square of even width has no centre pixel, so OpenCV shifts the mask by half a pixel, as in the thesis.
+    symmetric: an even square is made one pixel smaller. The mask keeps its width, because exact boundaries are then
+    marked on both sides.
     """
     check_width(dilation_width, edge_image.shape)
     side = dilation_width - (dilation_width % 2 == 0) if symmetric else dilation_width
@@ -116,14 +116,14 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
 
 def check_width(dilation_width: int, size: tuple[int, int]) -> None:
     """Raise InputError for a dilation width that frames of (height, width) cannot have."""
-    most = 2 * max(size)  # a square of that side reaches from one end of the frame to the other
+    most = 2 * max(size)  # a wider square always covers the whole frame
     if not 1 <= dilation_width <= most:
         raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels, and at most {most} for frames of "
                          f"{size[1]}x{size[0]}")
 
 
 def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> np.ndarray:
-    """Where no keypoint may lie, whatever the boundaries: (height, width) booleans, movable areas and the margin."""
+    """Pixels without keypoints, (height, width) booleans: movable things and the margin at the border."""
     height, width = size
     never = np.ones(size, bool)
     never[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
@@ -135,12 +135,12 @@ def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettin
 
 def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int,
                   settings: MaskSettings = MaskSettings()) -> np.ndarray:
-    """The mask of one frame from its label map: `dilate(edges(...))`, less what is `forbidden`."""
+    """The mask of one frame from its label map: `dilate(edges(...))` without the `forbidden` pixels."""
     return _widened(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
 
 
 def _edges_and_forbidden(label_map, size, settings):
-    """The parts of a mask that do not depend on its width; None where nothing is forbidden."""
+    """The parts of a mask that do not depend on its width: edges and forbidden pixels (None if there are none)."""
     if settings.keep == "static":
         movable = DYNASLAM_MARGIN if settings.movable is None else settings.movable
         return np.full(size, 255, np.uint8), forbidden(label_map, size, replace(settings, movable=movable))
@@ -160,9 +160,9 @@ def _widened(parts, dilation_width, settings):
 
 
 def boundaries_found(mask: np.ndarray, true_labels: np.ndarray) -> float:
-    """Share of the true boundary pixels that a mask keeps, 0 to 1; true_labels: (h, w) ids of the mask's frame.
+    """Share of the true boundary pixels that a mask keeps, 0 to 1. true_labels: (h, w) ids of the mask's frame.
 
-    True boundaries are marked on both sides (`edges`, exact and symmetric). NaN where there are none.
+    True boundaries are marked on both sides (`edges`, exact and symmetric). NaN if there are none.
     """
     true = edges(true_labels, mask.shape, MaskSettings("exact", symmetric=True)) > 0
     return float((mask[true] > 0).mean()) if true.any() else np.nan
@@ -174,11 +174,10 @@ def coverage(mask: np.ndarray) -> float:
 
 
 class LabelMasks:
-    """Masks of a sequence made from its label maps when they are asked for: masks[i] for frame i.
+    """Masks of a sequence, made from its label maps on access: masks[i] for frame i.
 
-    folder holds one label map a frame, of any size, named like the frame (for JPEG frames too, as .png). settings: as
-    in `keypoint_mask`.
-    Raises InputError when the folder or a frame's label map is missing.
+    folder: one label map a frame, of any size, a PNG with the frame's name. settings: as in `keypoint_mask`.
+    Raises InputError if the folder or a frame's label map is missing.
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int,
@@ -202,29 +201,29 @@ class LabelMasks:
 
 
 def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
-    """The label map, in label ids, that the mask of a frame is made from."""
+    """The label map of a frame, in label ids."""
     return read_label_map(masks.paths[index], masks.settings.ids == "train")
 
 
-@lru_cache(maxsize=8)  # a frame's masks of several widths have these parts in common
+@lru_cache(maxsize=8)  # shared by masks of several widths
 def _parts_of_file(path, size, settings):
     return _edges_and_forbidden(_read_once(path, settings.ids == "train"), size, settings)
 
 
-# masks of several settings have the label map in common, of a frame and of the one whose masks are a control
+# shared by masks of several settings; two, because one control uses the mask of another frame
 _read_once = lru_cache(maxsize=2)(read_label_map)
 
 
 def forget_edges() -> None:
-    """Drop the edges that LabelMasks keeps for its next width, so that the making of a mask can be timed."""
+    """Clear the caches of LabelMasks, so that the time to make a mask can be measured."""
     _parts_of_file.cache_clear()
     _read_once.cache_clear()
 
 
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:
-    """Write the mask of every frame as a PNG named like the frame (A.8), for `MaskFolder` to read.
+    """Write the mask of every frame as a PNG with the frame's name (A.8), which `MaskFolder` reads.
 
-    The folder is a stage (see stages): a stopped run goes on, masks of other label maps or widths in it are deleted.
+    The folder is a stage (see stages): a stopped run resumes; masks of other label maps or widths in it are deleted.
     """
     with longrun.claimed(folder):
         folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, **asdict(masks.settings),
@@ -236,10 +235,10 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 
 
 class MaskFolder:
-    """Masks of a sequence read from a folder of images named like the frames, or of one image of another name for all:
-    masks[i] for frame i. invert: no keypoints where the images are not 0.
+    """Masks of a sequence read from images with the frames' names: masks[i] for frame i.
 
-    Raises InputError when the folder or a frame's mask is missing, and for what `read_mask` refuses.
+    A folder with one image of another name, or an image file, is the mask of all frames. invert: keypoints are allowed
+    where the image is 0. Raises InputError if the folder or a frame's mask is missing, and as `read_mask` does.
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence, invert: bool = False) -> None:
@@ -256,9 +255,9 @@ class MaskFolder:
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """One mask of frames of (height, width), uint8 of two values: 0, and another where keypoints may lie.
+    """Read a mask of frames of (height, width): uint8 of two values, 0 and another one where keypoints are allowed.
 
-    Raises InputError for another size and for more values, as label maps have them.
+    Raises InputError for another size, and for more than two values, as in a label map.
     """
     mask = read_gray(path)
     check_mask_size(path, mask.shape, size)
@@ -269,7 +268,7 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def check_mask_size(path: str | Path, mask_size: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Raise InputError where a mask's (height, width) is not that of the frames."""
+    """Raise InputError if a mask's (height, width) is not that of the frames."""
     if mask_size != size:
         raise InputError(f"{path}: {mask_size[1]}x{mask_size[0]} pixels, but the frames have {size[1]}x{size[0]}; "
                          "masks must have the size of the frames")
@@ -283,10 +282,10 @@ def _files_of_frames(folder, sequence, what):
         raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence "
                          f"{sequence.name}")
     present = {path.name: path for path in listed(folder)}
-    # (a lone mask that is named like a frame is that frame's, and the others are missing)
+    # A single mask with a frame's name is the mask of that frame only.
     if what == "mask" and len(present) == 1 and not present.keys() & set(sequence.label_names):
         return list(present.values()) * len(sequence)
-    paths = [present.get(name) or present.get(f"{frame.name}.png")  # as some tools append it
+    paths = [present.get(name) or present.get(f"{frame.name}.png")  # some tools append .png to the whole name
              for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)]
     missing = [name for name, path in zip(sequence.label_names, paths, strict=True) if path is None]
     if missing:

@@ -1,8 +1,8 @@
 """Monocular visual odometry as PySLAM does it (Section 3.7): Shi-Tomasi, Lucas-Kanade, essential matrix, pose.
 
-`run(sequence)` is the plain way in; `run_many` makes many runs over one sequence for little more than the cost of
-their estimators. THESIS agrees with PySLAM of August 2021 on every frame. What PySLAM crashes on has a rule here,
-and what it takes for a motion has a flag:
+`run(sequence)` runs it once. `run_many` makes many runs over one sequence for little more than the cost of their
+estimators. THESIS agrees with PySLAM of August 2021 on every frame. Frames on which PySLAM crashes follow a rule here,
+and doubtful frames get a flag:
 
 | frame                                       | flag and rule (the pose is kept, but for "no keypoints")             |
 |---------------------------------------------|----------------------------------------------------------------------|
@@ -17,8 +17,9 @@ and what it takes for a motion has a flag:
 | the same picture, though the poses moved    | "still picture": moves on as PySLAM does                             |
 | turns by more than a car can                | "too large a turn": the same                                         |
 
-With settings.fallback and masks, "all keypoints used": the masked ones do not determine the motion, or it is far from
-the step's before. With estimator="refined" there are two more, and the pose moves on (see refined.motion_prior):
+With settings.fallback and masks, the flag "all keypoints used" says that the masked keypoints do not determine the
+motion, or that it differs too much from the previous step's. With estimator="refined" there are two more flags, and the
+pose is always moved (see refined.motion_prior):
 
 | motion                                        | flag and rule                                                      |
 |-----------------------------------------------|--------------------------------------------------------------------|

@@ -18,18 +18,18 @@ TRACKER = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS,
 NO_POINTS = np.empty((0, 2), np.float32)
 
 Corners = tuple[np.ndarray, np.ndarray]  # see find_corners
-Start = tuple[np.ndarray | None, np.ndarray]  # what a run tracks from: the previous frame, and its points there (N, 2)
+Start = tuple[np.ndarray | None, np.ndarray]  # a frame to track from, and points there (N, 2)
 
 
 def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None,
            corners: Corners | None = None) -> np.ndarray:
     """Keypoints of a frame (height, width), strongest first: (N, 2) float32, N = 0 where there are none.
 
-    `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the detector looks
-    inside the mask only and finds up to max_keypoints there; with "filter" it looks everywhere and what lies
-    outside is dropped. corners: what `find_corners` gives for the frame, where it was asked before.
+    `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the detector searches
+    inside the mask only and returns up to max_keypoints. With "filter" it searches the whole frame, and keypoints
+    outside the mask are dropped. corners: the result of `find_corners` for this frame, if it is known already.
 
-    Shi-Tomasi has the bits of cv2.goodFeaturesToTrack.
+    Shi-Tomasi keypoints equal those of cv2.goodFeaturesToTrack to the bit.
     """
     inside = mask if settings.mask_mode == "detect" else None
     if settings.detector == "orb":
@@ -37,7 +37,7 @@ def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | Non
         points = np.reshape(points, (-1, 2)).astype(np.float32, copy=False)
     else:
         strength, ranked = corners or find_corners(frame, settings.block_size)
-        # As OpenCV compares: the limit in double precision, rounded to single.
+        # OpenCV computes the limit in double precision and rounds it to single.
         limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * settings.quality)
         points = _spread(strength, ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
                          settings.max_keypoints, float(settings.min_distance))
@@ -54,13 +54,13 @@ def _orb(max_keypoints):
 
 def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: int = WINDOW,
           levels: int = LEVELS) -> tuple[np.ndarray, np.ndarray]:
-    """Where points (N, 2) of the previous frame are in the current one: (N, 2) float32, and N booleans: success.
+    """Track points (N, 2) from the previous frame into the current one: (N, 2) float32, and success, (N,) booleans.
 
     window, levels: as in OdometrySettings.
 
-    The bits of a plain call of OpenCV, for less: points close to each other follow one another, so that their pixels
-    are still in the processor's cache, and the matching error that nobody reads is not computed. Computing it, OpenCV
-    also gives up points whose window has left the frame, which therefore is done here.
+    The result equals that of a plain call of OpenCV to the bit, in less time. Points are sorted by row, so that the
+    pixels of neighbouring points are still in the processor's cache. The matching error, which is not used, is not
+    computed. With it OpenCV would also reject points whose window left the frame, so this is done here.
     """
     order = np.argsort(points[:, 1])
     tracked, success = np.empty_like(points), np.empty(len(points), bool)
@@ -73,18 +73,18 @@ def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray, window:
 
 
 class SharedKeypoints:
-    """`detect` and `track` with the same results for many runs over one frame, at little more than the cost of one.
+    """`detect` and `track` for many runs over one frame: the same results at little more than the cost of one run.
 
-    The corner strength does not depend on the mask (only its maximum and the choice do), and Lucas-Kanade tracks
-    every point on its own, so the first is computed once a frame and the second once for all points of all runs.
+    The corner strength does not depend on the mask, so it is computed once a frame. Lucas-Kanade tracks each point
+    independently, so all points of all runs are tracked in one call.
     """
 
     def __init__(self) -> None:
-        self._tracks: tuple[np.ndarray, ...] = ()  # both frames, the sorted keys of all points, what `track` returns
-        self._corners: tuple[np.ndarray, int, Corners] | None = None  # what `find_corners` was given and gave
+        self._tracks: tuple[np.ndarray, ...] = ()  # both frames, the sorted keys of all points, the result of `track`
+        self._corners: tuple[np.ndarray, int, Corners] | None = None  # frame, block size, result of `find_corners`
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
-        """Track to `frame` the points of all runs that come from the same previous frame (nearly always all)."""
+        """Track the points of all runs into `frame`, but for the few runs that start from another previous frame."""
         with_points = [(previous, points) for previous, points in starts if previous is not None and len(points)]
         if with_points:
             first, _ = with_points[0]
@@ -93,7 +93,7 @@ class SharedKeypoints:
 
     def track(self, previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: int = WINDOW,
               levels: int = LEVELS) -> tuple[np.ndarray, np.ndarray]:
-        is_shared = self._tracks and previous is self._tracks[0] and current is self._tracks[1]  # else resumed, say
+        is_shared = self._tracks and previous is self._tracks[0] and current is self._tracks[1]
         if not is_shared or (window, levels) != (WINDOW, LEVELS):
             return track(previous, current, points, window, levels)
         _, _, keys, tracked, success = self._tracks
@@ -112,9 +112,10 @@ def _key(points):
 
 
 def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
-    """The strength of each pixel of a frame, cv2.cornerMinEigenVal to the bit, and where its local maxima are.
+    """Corner strength of each pixel, equal to cv2.cornerMinEigenVal to the bit, and the ranked local maxima.
 
-    These are indices of the flattened image, strongest first, of equals the last first; none lies on the border.
+    The maxima are indices into the flattened image, strongest first; of equal ones the last comes first. None lies on
+    the border.
     """
     scale = 1 / (4 * BLOCK_SIZE * 255)  # 4: the sum of a smoothing of (1, 2, 1)
     dx, dy = (cv2.copyMakeBorder(cv2.Sobel(frame, cv2.CV_32F, *order, scale=scale), *[BLOCK_SIZE // 2] * 4,
@@ -123,13 +124,13 @@ def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
     is_peak = (strength == cv2.dilate(strength, None)) & (strength > 0)
     is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
     peaks = np.flatnonzero(is_peak)
-    # The bits of positive numbers are ordered as the numbers are, so one sort of integers ranks by both.
+    # Positive floats sort like their bit patterns, so one integer sort ranks by strength and then by index.
     return strength, np.sort(strength.ravel()[peaks].view(np.int32).astype(np.int64) << 32 | peaks)[::-1] & 0xFFFFFFFF
 
 
 @fast
 def _min_eigenvalues(dx, dy):
-    """The smaller eigenvalue of the sums of dx dx, dx dy, dy dy over a square of BLOCK_SIZE; the border is cut off."""
+    """Smaller eigenvalue of the gradient matrix, summed over squares of BLOCK_SIZE; the padded border is cut off."""
     height, width = dx.shape[0] - BLOCK_SIZE + 1, dx.shape[1] - BLOCK_SIZE + 1
     smaller = np.empty((height, width), np.float32)
     products, half = np.empty((3, dx.shape[1]), np.float32), np.float32(0.5)
@@ -154,14 +155,16 @@ def _min_eigenvalues(dx, dy):
 
 @fast
 def _spread(strength, ranked, limit, mask, max_keypoints, min_distance):
-    """The strongest corners above `limit` inside the mask (if any) that keep `min_distance` from stronger ones, which
-    are looked for in the neighbouring cells of a grid, as in OpenCV (so a fractional distance is not kept quite)."""
+    """The strongest corners above `limit`, inside the mask if there is one, at least `min_distance` apart.
+
+    As in OpenCV, neighbours are searched in adjacent grid cells, so a fractional distance is not kept exactly.
+    """
     height, width = strength.shape
     cell = max(int(np.rint(min_distance)), 1)
     grid_rows, grid_columns = height // cell + 1, width // cell + 1
     head = np.empty((grid_rows, grid_columns), np.int32)  # last corner taken in a cell
     head[:] = -1
-    below = np.empty(len(ranked), np.int32)  # the one taken before it in the same cell
+    below = np.empty(len(ranked), np.int32)  # the corner taken before it in the same cell
     taken = np.empty((len(ranked) if max_keypoints <= 0 else min(len(ranked), max_keypoints), 2), np.float32)
     count = 0
     for index in ranked:

@@ -1,4 +1,4 @@
-"""How far an estimated path is from the true one: the thesis's RMSE and MAE (Section 3.4) and the field's measures."""
+"""Errors of an estimated path: the thesis's RMSE and MAE (Section 3.4), and the measures that the field uses."""
 
 from typing import Any
 
@@ -15,22 +15,22 @@ from thesis_repro import InputError
 
 
 def rmse(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
-    """Equation 3.5, metres, over frames 1 to n-1 of two (n, 4, 4) paths laid over each other at frame 1."""
+    """Root mean square error (Equation 3.5), metres, over frames 1 to n-1 of two (n, 4, 4) paths aligned at frame 1."""
     return float(np.sqrt((_differences(estimated, true, alignment) ** 2).sum(axis=1).mean()))
 
 
 def mae(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
-    """Equation 3.6, metres: the mean over x, y, z and frames, laid over each other as in `rmse`."""
+    """Mean absolute error (Equation 3.6), metres, over x, y, z and frames, aligned as in `rmse`."""
     return float(np.abs(_differences(estimated, true, alignment)).mean())
 
 
 def percent_change(value: Any, benchmark: Any) -> Any:
-    """Equations 4.1 and 4.2: how much larger, in percent, a value is than its benchmark; negative where smaller."""
+    """Change of a value from its benchmark in percent (Equations 4.1 and 4.2); negative if it is smaller."""
     return (value - benchmark) / benchmark * 100
 
 
 def shifted(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> np.ndarray:
-    """The estimated path as `rmse` compares it: laid over the true one at frame 1. (n, 4, 4)"""
+    """The estimated path (n, 4, 4), aligned with the true one at frame 1 as in `rmse`."""
     estimated, true = checked(estimated, true)
     motion = np.eye(4)
     if alignment == "pose":
@@ -40,10 +40,10 @@ def shifted(estimated: np.ndarray, true: np.ndarray, alignment: str = "position"
 
 
 def _differences(estimated, true, alignment):
-    """(n - 1, 3) position differences from frame 1 on.
+    """Position differences from frame 1 on, (n - 1, 3).
 
-    alignment: "position" shifts the estimate so that frame 1 agrees, as PySLAM's 2021 version does; "pose" also turns
-    it so that the rotation of frame 1 agrees, as later versions do.
+    alignment: "position" shifts the estimate so that the position of frame 1 agrees, as PySLAM did in 2021; "pose" also
+    rotates it so that the rotation of frame 1 agrees, as later versions do.
     """
     estimated, true = checked(estimated, true)
     positions = estimated[1:, :3, 3] - estimated[1, :3, 3]
@@ -53,7 +53,7 @@ def _differences(estimated, true, alignment):
 
 
 def checked(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both paths as arrays. Raises InputError where they have not one pose a frame each, or fewer than two."""
+    """Both paths as arrays. Raises InputError if their lengths differ or are less than two."""
     estimated, true = np.asarray(estimated), np.asarray(true)
     if estimated.shape != true.shape:
         raise InputError(f"the estimated path has {len(estimated)} poses and the true one {len(true)}; "
@@ -63,7 +63,7 @@ def checked(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.nda
     return estimated, true
 
 
-# The field's measures
+# Measures that the field uses
 
 ALIGNMENTS = ("none", "se3", "sim3", "scale")
 STATISTICS = ("rmse", "mean", "median", "max")
@@ -73,7 +73,7 @@ def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dic
     """Absolute trajectory error, metres, over all frames: {rmse, mean, median, max, scale, note}.
 
     estimated, true: (n, 4, 4) poses. alignment: see `align`; its scale is returned.
-    Where no alignment is determined (a straight or standing path), the numbers are NaN and `note` says so.
+    If a path is straight or does not move, an alignment is not determined; then the numbers are NaN and `note` says so.
     """
     try:
         estimated, scale = align(estimated, true, alignment)
@@ -85,11 +85,11 @@ def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dic
 
 
 def align(estimated: np.ndarray, true: np.ndarray, alignment: str) -> tuple[np.ndarray, float]:
-    """The estimated path (n, 4, 4) laid over the true one, and the scale that this took.
+    """Align the estimated path (n, 4, 4) with the true one; returns the aligned path and the scale.
 
-    alignment: "none", "se3" (the rotation and shift that fit best, by Umeyama's method), "sim3" (and the scale) or
-    "scale" (the scale of "sim3" alone). Raises InputError for another, and evo.EvoException where none is determined:
-    the path is straight or does not move.
+    alignment: "none", "se3" (the best rotation and shift, by Umeyama's method), "sim3" (also the scale) or "scale" (the
+    scale of "sim3" alone). Raises InputError for another alignment, and evo.EvoException if the path does not
+    determine the alignment, because it is straight or does not move.
     """
     if alignment not in ALIGNMENTS:
         raise InputError(f"alignment={alignment!r}: unknown; choose one of {', '.join(ALIGNMENTS)}")
@@ -114,17 +114,17 @@ def _evo_paths(estimated, true):
     return tuple(PosePath3D(poses_se3=list(np.array(poses, np.float64))) for poses in (true, estimated))
 
 
-RELATIVE_LENGTH = 20.0  # metres: several of them in every path at hand
+RELATIVE_LENGTH = 20.0  # metres; even the short excerpts have several segments of this length
 
 
 def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = RELATIVE_LENGTH) -> dict[str, Any]:
-    """Mean errors over stretches of one length: {translation_percent, rotation_deg_per_100m, segments, note}.
+    """Mean errors over segments of one length: {translation_percent, rotation_deg_per_100m, segments, note}.
 
-    Neither a constant rotation between both frames nor the path's start can change them. A stretch goes from each frame
-    to the first one `length` metres of true path away. The camera's motion M over it is compared with the true one
-    after the one rotation B that brings all stretches nearest (B M B^T; Kabsch's solution for their translations and
-    rotation vectors). KITTI's own measure contains that rotation.
-    NaN, with a note, where the path is shorter than `length`.
+    A segment goes from each frame to the first frame that is `length` metres of true path away. The camera's motion M
+    over it is compared with the true motion after one rotation B, common to all segments, that fits best (B M B^T;
+    Kabsch's solution for their translations and rotation vectors). So neither a constant rotation between camera and
+    ground truth nor the start of the path changes the errors. KITTI's own measure contains that rotation.
+    NaN, with a note, if the path is shorter than `length`.
     """
     estimated, true = checked(estimated, true)
     along = travelled(true)
@@ -132,12 +132,12 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
     first = np.flatnonzero(last < len(true))
     if not len(first):
         return {"translation_percent": np.nan, "rotation_deg_per_100m": np.nan, "segments": 0,
-                "note": f"too short: {along[-1]:.1f} m, stretches of {length:g} m are compared"}
+                "note": f"too short: {along[-1]:.1f} m, segments of {length:g} m are compared"}
     motion, given = (np.linalg.inv(poses[first]) @ poses[last[first]] for poses in (estimated, true))
     vectors, goals = (np.concatenate([steps[:, :3, 3], length * _rotation_vectors(steps[:, :3, :3])])
                       for steps in (motion, given))
     moments = goals.T @ vectors
-    # a little of the identity: a direction that a straight path leaves undetermined stays as it is
+    # A small multiple of the identity: a rotation that a straight path does not determine stays zero.
     left, _, right = np.linalg.svd(moments + 1e-6 * np.trace(goals.T @ goals) * np.eye(3))
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     offsets = np.linalg.norm(given[:, :3, 3] - motion[:, :3, 3] @ turn.T, axis=1)
@@ -148,8 +148,8 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
 
 
 def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> dict[str, float]:
-    """The errors of a table of runs: rmse and mae (metres; alignment as in `rmse`), se3, the RMSE in metres after the
-    rotation and shift that fit best, and the two of `relative_errors`. NaN where a path is too short or too straight.
+    """Errors of one run: rmse and mae (metres; alignment as in `rmse`), se3 (RMSE in metres after the best rotation
+    and shift), and both of `relative_errors`. NaN if the path is too short or too straight.
     """
     relative = relative_errors(estimated, true)
     return {"rmse": rmse(estimated, true, alignment), "mae": mae(estimated, true, alignment),
@@ -157,19 +157,19 @@ def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position")
             **{name: relative[name] for name in ("translation_percent", "rotation_deg_per_100m")}}
 
 
-MIN_DIRECTED_STEP = 0.25  # metres; in a shorter step the direction of motion is lost in noise
-FAILED_ROTATION = 2.0  # degrees: such a step has failed if its rotation is further off
-TURN_RATE, STRAIGHT_RATE = 1.0, 0.3  # degrees a frame: a turn is more than the first, a straight less than the second
+MIN_DIRECTED_STEP = 0.25  # metres; the direction of a shorter step is mostly noise
+FAILED_ROTATION = 2.0  # degrees; a step with a larger rotation error has failed
+TURN_RATE, STRAIGHT_RATE = 1.0, 0.3  # degrees a frame: more is a turn, less is a straight
 
 
 def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """How far single steps of (n, 4, 4) camera-to-world paths are off, whatever came before them.
+    """Errors of the single steps of (n, 4, 4) camera-to-world paths, independent of the steps before.
 
-    rotation: mean angle between estimated and true rotation, degrees a frame; in_turns, on_straights: of the steps
-    that turn by more than TURN_RATE and by less than STRAIGHT_RATE. The others are of steps of MIN_DIRECTED_STEP or
-    more: direction, the median angle between estimated and true direction of motion, degrees; across, down, the
-    medians of its parts to the right and downwards, degrees (audit row 30); failed, the share, percent, that turn wrong
-    by more than FAILED_ROTATION or go backwards.
+    rotation: mean angle between estimated and true rotation, degrees a frame; in_turns, on_straights: the same of steps
+    that turn by more than TURN_RATE, and by less than STRAIGHT_RATE. The other errors are of steps of MIN_DIRECTED_STEP
+    or more. direction: median angle between estimated and true direction of motion, degrees; across, down: the median
+    differences to the right and downwards, degrees (audit row 30); failed: percent of the steps with a rotation error
+    above FAILED_ROTATION or a motion backwards.
     """
     steps, true_steps = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (estimated, true))
     rotation_error, turn = angles(np.linalg.inv(true_steps) @ steps), angles(true_steps)
@@ -192,7 +192,7 @@ def _mean(values: np.ndarray) -> float:
 
 
 def travelled(poses: np.ndarray) -> np.ndarray:
-    """Metres along a path (n, 4, 4) up to each of its poses, (n,)."""
+    """Length of a path (n, 4, 4) up to each of its poses, metres, (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
 
@@ -202,7 +202,7 @@ def _rotation_vectors(rotations: np.ndarray) -> np.ndarray:
 
 
 def angles(rotations: np.ndarray) -> np.ndarray:
-    """Degrees by which rotations (..., 3, 3) turn; of poses (..., 4, 4) the first three rows and columns count."""
+    """Rotation angles in degrees of rotations (..., 3, 3) or of the rotations in poses (..., 4, 4)."""
     trace = np.trace(rotations[..., :3, :3], axis1=-2, axis2=-1)
     return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
 
@@ -214,9 +214,8 @@ KITTI_EVERY = 10  # frames between the starts of segments
 def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
     """The KITTI odometry benchmark's errors: {translation_percent, rotation_deg_per_100m, segments, note}.
 
-    Means over segments: from every tenth frame, for each of KITTI_LENGTHS, up to the first frame more than that many
-    metres of true path away. NaN, with a note, where the path is too short for a single one; a zero would look like a
-    perfect result.
+    Means over segments. A segment starts at every tenth frame and ends, for each of KITTI_LENGTHS, at the first frame
+    that is more than this length of true path away. NaN, with a note, if the path is too short for a segment.
     """
     estimated, true = checked(estimated, true)
     along = travelled(true)

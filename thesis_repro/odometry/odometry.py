@@ -1,4 +1,4 @@
-"""The camera's path, frame by frame: what a frame brings, and how the pose moves on."""
+"""The odometry, frame by frame: keypoints, the motion between two frames, and the pose that follows from it."""
 
 import gc
 import time
@@ -18,26 +18,26 @@ from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 TIMED_PARTS = ("detect", "track", "essential", "pose")
 ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
-ALL_KEYPOINTS = "all keypoints used"  # flag of a step that fell back on them
-MIN_CONTRAST = 4.0  # gray levels: a standard deviation below it is no picture of a street (real frames: above 50)
+ALL_KEYPOINTS = "all keypoints used"  # flag of a step that used the fallback
+MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
 
 
 @dataclass
 class Step:
-    """What one frame brought. Arrays of one length N: `previous`, `current` (N, 2) pixels, and `inliers` (N)."""
+    """Everything computed for one frame. The N correspondences: `previous`, `current` (N, 2) pixels, `inliers` (N,)."""
 
     frame: int
-    scale: float = 0.0  # metres moved since the frame that the points come from
-    points: int | None = None  # given to the tracker
-    detected: int | None = None  # None: not detected on this frame
+    scale: float = 0.0  # metres moved since the previous frame used
+    points: int | None = None  # number of points given to the tracker
+    detected: int | None = None  # number of new keypoints; None if the detector did not run
     previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
-    keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)  # that the next frame starts from
+    keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)  # tracked into the next frame
     motion: Motion = Motion()
-    pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres; see compose
-    updated: bool = False
+    pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres
+    updated: bool = False  # whether the pose was moved by this step
     flags: list[str] = field(default_factory=list)
-    frames: tuple[np.ndarray, np.ndarray] | None = None  # previous and current, until a fallback is out of question
+    frames: tuple[np.ndarray, np.ndarray] | None = None  # previous and current, kept only while a fallback is possible
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
@@ -45,7 +45,7 @@ class Step:
         return np.zeros(len(self.current), bool) if self.motion.inliers is None else self.motion.inliers
 
     def copy(self) -> "Step":
-        """The same observation, for another estimate."""
+        """A copy with the same correspondences, for another estimator."""
         return replace(self, flags=list(self.flags), seconds=dict(self.seconds))
 
     def row(self) -> dict[str, Any]:
@@ -64,25 +64,25 @@ FRAME_COLUMNS = tuple(Step(0).row())
 
 
 class Odometry:
-    """The camera's path, frame by frame.
+    """Monocular visual odometry, frame by frame.
 
-    `step(frame, scale, mask)` takes the next gray frame (height, width), the metres moved since the frame before, and
-    an optional mask of the same size (0: no keypoints there), and returns a Step. It is the three methods below, one
-    after the other; only `estimate` is expensive, and it depends on nothing but its own step.
+    `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since the previous frame
+    in metres, and an optional mask of the same size (0: no keypoints there). It returns a Step. It calls the next
+    three methods in turn. Only `estimate` is expensive, and it uses no state of earlier steps.
     """
 
     def __init__(self, intrinsics: np.ndarray, settings: OdometrySettings = THESIS, start: np.ndarray | None = None,
                  shared: keypoints.SharedKeypoints | None = None):
-        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. shared: keypoints in common with other runs."""
+        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. shared: keypoints shared with other runs."""
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
-        self.prior = MotionPrior()  # of the refined estimator and the fallback alone
+        self.prior = MotionPrior()  # used by the refined estimator and the fallback only
         self.keypoints: Any = shared or keypoints  # both have `detect` and `track`
         self.count = 0
-        self.previous: np.ndarray | None = None  # the frame that self.points belong to
+        self.previous: np.ndarray | None = None  # the frame in which self.points lie
         self.points = keypoints.NO_POINTS
-        self.gap = 0.0  # metres from there to the last frame seen
+        self.gap = 0.0  # metres from self.previous to the last frame, if flat frames were skipped
         warm_up(settings.estimator == "refined" or settings.fallback)
 
     def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
@@ -91,7 +91,7 @@ class Odometry:
         return self.compose(step)
 
     def observe(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
-        """Track the points to this frame and detect new ones; returns a Step without a motion."""
+        """Track the points into this frame and detect new keypoints. Returns a Step that has no motion yet."""
         step = Step(frame=self.count, scale=float(scale))
         self._check(frame, scale, mask)
         self.count += 1
@@ -129,10 +129,10 @@ class Odometry:
         return step
 
     def estimate(self, step: Step, essential: "Essential | None" = None) -> "Essential | None":
-        """The motion from the step's correspondences; returns the essential matrix with what it was made from.
+        """Estimate the motion from the step's correspondences, and return the essential matrix.
 
-        essential: what another Odometry with the same settings but for `estimator` returned for the same
-        correspondences. Safe in threads: reads nothing that later steps change.
+        essential: the essential matrix of the same correspondences, if another Odometry has computed it; its settings
+        may differ in `estimator` only. Thread-safe, because it reads no state that later steps change.
         """
         if not step.points:
             return None
@@ -155,7 +155,7 @@ class Odometry:
         return essential
 
     def compose(self, step: Step) -> Step:
-        """Move the pose by the step's motion, unless a rule keeps it; see the package's table."""
+        """Move the pose by the step's motion, unless a rule says to keep it (see the table in odometry/__init__.py)."""
         settings = self.settings
         if step.frames is not None and step.scale > settings.scale_gate and self._in_doubt(step):
             self._use_all_keypoints(step)
@@ -235,13 +235,13 @@ class Odometry:
 
 @dataclass(frozen=True)
 class Essential:
-    """An essential matrix and the normalised correspondences (N, 2) that it was estimated from."""
+    """An essential matrix, and the normalised correspondences (N, 2) from which it was estimated."""
 
     current: np.ndarray
     previous: np.ndarray
-    order: np.ndarray | slice  # in which they were fed
+    order: np.ndarray | slice  # of the step's points, as they were given to RANSAC
     matrix: np.ndarray | None
-    inliers: np.ndarray  # (N,) booleans, as fed
+    inliers: np.ndarray  # (N,) booleans, in that order
     problem: str
     seconds: float
 
@@ -263,17 +263,17 @@ def _essential(step, settings, intrinsics):
 
 
 def _by_chance(inliers):
-    # Between frames with nothing in common the estimator finds 7 inliers among 20 points, 9 among 100, 12 among 300,
-    # and 1.5 to 2.7 % of 1600 (with PySLAM's threshold); between real neighbours, 45 to 85 % of them.
+    # Two unrelated frames still give 7 inliers among 20 points, 9 among 100, 12 among 300, and 1.5 to 2.7 % of 1600
+    # (with PySLAM's threshold). Consecutive real frames give 45 to 85 %.
     return inliers.sum() <= 8 + 0.03 * len(inliers)
 
 
-STILL = 0.3  # pixels, mean shift of the points: in a picture that did not change, noise moves them by less
-MAX_TURN = 6.0  # degrees a frame: KITTI's cars turn by up to 4.8
+STILL = 0.3  # pixels: in an unchanged picture, noise shifts the points by less than this on average
+MAX_TURN = 6.0  # degrees a frame; the cars of KITTI turn by at most 4.8
 
 
 def _implausible(step):
-    """Flags of a motion that is used as it is, and that no car makes."""
+    """Flags of a motion that a car cannot make. The motion is used all the same."""
     turn = np.degrees(np.arccos(np.clip((np.trace(step.motion.rotation) - 1) / 2, -1, 1)))
     return ["still picture"] * bool(_mean_shift(step) < STILL) + ["too large a turn"] * bool(turn > MAX_TURN)
 

@@ -1,4 +1,4 @@
-"""Passes of the odometry over a sequence: a single run, or many for little more than the cost of their estimators."""
+"""Runs of the odometry over a sequence: one, or many in one pass at little more than the cost of their estimators."""
 
 import hashlib
 import time
@@ -21,25 +21,25 @@ from thesis_repro.odometry.refined.motion_prior import MotionPrior
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 CHECKPOINT = 300  # frames
-# What the keypoints depend on, and what the essential matrix depends on besides. Runs that agree in these share them.
+# Runs that agree in the first share their keypoints; runs that also agree in the second share the essential matrix.
 KEYPOINT_SETTINGS = ("detector", "max_keypoints", "min_distance", "quality", "block_size", "window", "levels",
                      "mask_mode", "redetect_below", "fallback")
 ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
-SHARED_TIMES = ("detect_seconds", "track_seconds")  # belong to no run of a pass
+SHARED_TIMES = ("detect_seconds", "track_seconds")  # of all runs of a pass together
 DTYPES = {"frame": int, "updated": bool,
           **dict.fromkeys(("points", "detected", "tracked", "inliers", "pose_inliers"), "Int64")}
 NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "mask_seconds"]
 
 
 class Masks(Protocol):
-    """Anything that gives a (height, width) uint8 mask for a frame number; 0: no keypoints there."""
+    """An object whose item i is the mask of frame i, (height, width) uint8; 0: no keypoints there."""
 
     def __getitem__(self, index: int, /) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
 class Result:
-    """poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; blank where not applicable."""
+    """poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing values are blank."""
 
     poses: np.ndarray
     frames: pd.DataFrame
@@ -47,20 +47,20 @@ class Result:
 
     @property
     def flagged(self) -> pd.Series:
-        """Frames by flag: a Series of counts, empty where nothing was remarkable."""
+        """Number of frames with each flag."""
         return self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
 
     def with_poses(self, poses: np.ndarray) -> "Result":
-        """The same run with other poses (n, 4, 4), in the table of frames as well."""
+        """A copy with other poses (n, 4, 4), also in the table of frames."""
         columns = dict(zip("xyz", poses[:, :3, 3].T, strict=True)) | dict(
             zip(ROTATION_COLUMNS, poses[:, :3, :3].reshape(-1, 9).T, strict=True))
         return replace(self, poses=poses, frames=self.frames.assign(**columns))
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:
-    """Where the estimate starts: the identity, as in PySLAM, or the first true pose where that is another one.
+    """First pose of the estimate: the identity, as in PySLAM, or the first true pose if that is another one.
 
-    The first pose of every complete KITTI sequence is the identity up to 1e-10, an excerpt's is not.
+    Complete KITTI sequences start at the identity (up to 1e-10); excerpts do not.
     """
     if not sequence.has_truth:
         return np.eye(4)
@@ -69,9 +69,9 @@ def start_pose(sequence: Sequence) -> np.ndarray:
 
 
 def scales(sequence: Sequence) -> np.ndarray:
-    """Metres between the true positions of a frame and the one before; 0 for the first. (n,)
+    """Distances between the true positions of consecutive frames, metres, (n,); 0 for the first frame.
 
-    Without truth they are the sequence's `assumed_steps`.
+    Without true poses, these are the sequence's `assumed_steps`.
     """
     if not sequence.has_truth:
         return sequence.assumed_steps
@@ -80,34 +80,32 @@ def scales(sequence: Sequence) -> np.ndarray:
 
 def run(sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None,
         description: str | None = None) -> Result:
-    """The odometry over a kitti.Sequence; returns a Result.
+    """Run the odometry over a kitti.Sequence; returns a Result.
 
-    masks: anything that gives an (height, width) uint8 mask for a frame number (0: no keypoints there).
-    description: of a progress bar; None for no bar.
-    Raises InputError where a frame cannot be read or a mask has another size.
+    masks: see Masks. description: text of the progress bar; None for no bar.
+    Raises InputError if a frame cannot be read or a mask has another size.
     """
     return _run(sequence, {"": (settings, masks)}, None, description, None, 1)[""]
 
 
 def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
              description: str | None = None, checkpoint: Path | None = None, workers: int = 1) -> dict[str, Result]:
-    """Many runs over one sequence, {name: (settings, masks)}, as {name: Result}: the bits of separate runs.
+    """Make many runs over one sequence, {name: (settings, masks)}; returns {name: Result}, equal to separate runs.
 
-    Frames are decoded, corner strengths computed and points tracked once for all runs, so the times of detection and
-    tracking belong to no run and are blank. Runs with the same masks (one object) and settings that differ only after
-    the tracking also share their masks and keypoints. Those that differ only in `estimator` share their essential
-    matrices.
-    workers: threads for the estimators, which are most of what remains.
-    checkpoint: a file to keep the state in, every CHECKPOINT frames; a killed run that is started again with the same
-    file, sequence and settings goes on from there. Whoever names the file deletes it once the results are stored,
-    and gives other masks another file.
+    Frames are decoded, corner strengths computed and points tracked once for all runs. So the times of detection and
+    tracking cannot be told for one run, and are blank. Runs with the same masks object share masks and keypoints if
+    their settings agree in KEYPOINT_SETTINGS. Runs that differ only in `estimator` share their essential matrices.
+    workers: threads for the estimators.
+    checkpoint: file in which the state is stored every CHECKPOINT frames. A killed pass that is started again with the
+    same file, sequence and settings resumes there. The caller deletes the file after storing the results, and uses
+    another file for other masks.
     """
     return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
 
 
 @dataclass
 class _Run:
-    """One run of a pass, and what came of it so far: a row of numbers a frame, for a long sequence has a million."""
+    """One run of a pass with its results so far, one row of numbers a frame."""
 
     odometry: Odometry
     masks: Masks | None
@@ -117,7 +115,7 @@ class _Run:
 
 @dataclass
 class _Estimate:
-    """Runs of one essential matrix at one frame: each with its own copy of the step, and the thread at work on it."""
+    """Runs that share an essential matrix at one frame, their copies of the step, and the thread that estimates."""
 
     runs: list[_Run]
     steps: list[Step]
@@ -148,8 +146,8 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
                           np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan))
                for name, (settings, masks) in runs.items()}
     groups = _groups(members.values())
-    leaders = [alike[0][0] for alike in groups]  # the first of those with the same keypoints finds them for all
-    metres = scales(sequence)
+    leaders = [group[0][0] for group in groups]  # the first run of each group detects and tracks for the others
+    step_lengths = scales(sequence)
     job = _job(sequence, members)
     done = _resume(checkpoint, job, members, leaders)
     with ThreadPoolExecutor(workers) as pool:
@@ -166,15 +164,15 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
                 started = time.perf_counter()
                 mask = None if leader.masks is None else leader.masks[index]
                 mask_seconds = time.perf_counter() - started
-                step = leader.odometry.observe(frame, metres[index], mask)
-                for alike in group:
-                    estimate = _Estimate(alike, [step.copy() for _ in alike], mask_seconds)
+                step = leader.odometry.observe(frame, step_lengths[index], mask)
+                for sharing in group:
+                    estimate = _Estimate(sharing, [step.copy() for _ in sharing], mask_seconds)
                     if workers > 1:
                         estimate.future = pool.submit(estimate.work)
                     else:
                         estimate.work()
                     observed.append(estimate)
-            # What is tracked next does not depend on the pose, so the estimators may be one frame behind.
+            # Tracking does not depend on the pose, so the estimators may run one frame behind.
             _finish(waiting)
             waiting = observed
             if checkpoint and (index + 1) % CHECKPOINT == 0:
@@ -186,7 +184,7 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
 
 
 def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
-    """A list for each set of keypoints, in it a list of runs for each essential matrix."""
+    """Groups of runs with the same keypoints; each is a list of the runs of every essential matrix."""
     groups: dict[tuple, dict[tuple, list[_Run]]] = {}
     for member in members:
         settings = member.odometry.settings
@@ -201,11 +199,11 @@ def _finish(estimates: Iterable[_Estimate]) -> None:
         estimate.finish()
 
 
-# Going on after a stop
+# Checkpoints
 
 
 def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
-    """Everything that has to be the same for a checkpoint to go on from."""
+    """The inputs that must be equal for a pass to resume from a checkpoint."""
     arrays = (sequence.intrinsics, start_pose(sequence), scales(sequence))
     numbers = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     return {"sequence": sequence.name, "frames": len(sequence), "numbers": numbers, "opencv": cv2.__version__,
@@ -214,7 +212,7 @@ def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
 
 
 def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: list[_Run]) -> None:
-    last = leaders[0].odometry  # which frame was the last to be tracked to, all runs agree
+    last = leaders[0].odometry  # the previous frame is the same in all runs
     arrays = {"numbers": np.array([member.numbers[:done] for member in members.values()]),
               "poses": np.array([member.odometry.pose for member in members.values()]),
               **{f"prior {part}": np.array([getattr(member.odometry.prior, part) for member in members.values()])
@@ -227,10 +225,10 @@ def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], 
 
 
 def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
-    """Number of frames done according to the checkpoint, 0 where there is none of this job."""
+    """Restore the state from a checkpoint of this job; returns the number of finished frames, 0 without one."""
     try:
         stored = stages.resume(checkpoint) if checkpoint else None
-    except InputError:  # damaged: start from the beginning
+    except InputError:  # a damaged file: start from the first frame
         stored = None
     if stored is None or stored[0].get("job") != job:
         return 0
@@ -243,9 +241,9 @@ def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], lea
         member.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
         member.odometry.pose, member.odometry.prior = pose, MotionPrior(*prior)
     for index, leader in enumerate(leaders):
-        follower = leader.odometry
-        follower.count, follower.gap = done, state["gap"]
-        follower.previous, follower.points = arrays.get("previous"), arrays[f"points {index}"]
+        odometry = leader.odometry
+        odometry.count, odometry.gap = done, state["gap"]
+        odometry.previous, odometry.points = arrays.get("previous"), arrays[f"points {index}"]
     return done
 
 
@@ -260,7 +258,7 @@ def _result(member: _Run, blank: Iterable[str]) -> Result:
 
 
 def poses_of(frames: pd.DataFrame) -> np.ndarray:
-    """The poses (n, 4, 4) in a table of one row a frame."""
+    """The poses (n, 4, 4) of a table with one row a frame."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = frames[ROTATION_COLUMNS].to_numpy().reshape(-1, 3, 3)
     poses[:, :3, 3] = frames[["x", "y", "z"]]

@@ -13,8 +13,8 @@ from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import ransac
 
 PROBABILITY = 0.999  # of RANSAC
-MAX_DEPTH = 50.0  # in units of the translation: recoverPose lets no point beyond it vote
-LIMIT_MARGIN = 1e-7  # of a unit-norm homogeneous point: nearer to a limit, OpenCV decides
+MAX_DEPTH = 50.0  # in units of the translation; in recoverPose farther points do not vote
+LIMIT_MARGIN = 1e-7  # of a unit-norm homogeneous point; OpenCV decides about points nearer to a limit
 MIN_CORRESPONDENCES = 5
 
 ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
@@ -22,20 +22,20 @@ ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsa
 
 @dataclass(frozen=True)
 class Motion:
-    """What two frames say about the camera's motion; `rotation` is None where they say nothing (see `problem`)."""
+    """The camera's motion between two frames; `rotation` is None if it could not be estimated (see `problem`)."""
 
     rotation: np.ndarray | None = None  # 3x3
     translation: np.ndarray | None = None  # 3, unit length
     inliers: np.ndarray | None = None  # N booleans: correspondences that agree with the essential matrix
-    pose_inliers: int = 0  # correspondences that lie in front of both cameras and not too far away
+    pose_inliers: int = 0  # correspondences in front of both cameras and not too far away
     problem: str = ""
 
 
 def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Pixels (N, 2) to normalised image coordinates (N, 2) in double precision.
 
-    u * (1 / fx) + (-cx / fx), which is the inverse camera matrix times (u, v, 1) to the last bit. RANSAC amplifies the
-    last bit, so (u - cx) / fx would lead to another trajectory.
+    u * (1 / fx) + (-cx / fx) equals the inverse camera matrix times (u, v, 1) to the last bit. RANSAC amplifies a
+    difference in the last bit, so (u - cx) / fx would lead to another trajectory.
     """
     focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
     return points * (1 / focal) + (-intrinsics[:2, 2] / focal)
@@ -45,8 +45,8 @@ def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float
                      method: str = "ransac") -> tuple[np.ndarray | None, np.ndarray, str]:
     """The essential matrix of normalised correspondences (N, 2): (matrix, inliers, problem).
 
-    `matrix` is None, and `problem` says why, where there is none or more than one: OpenCV stacks all solutions of
-    exactly five correspondences, returns nothing for four, and raises for none.
+    If there is no matrix or more than one, `matrix` is None and `problem` says why. (For exactly five correspondences
+    OpenCV stacks all solutions, for four it returns nothing, and for none it raises an error.)
     """
     none = np.zeros(len(current), bool)
     if len(current) < MIN_CORRESPONDENCES:
@@ -71,24 +71,24 @@ def recover_pose(matrix: np.ndarray, current: np.ndarray,
                  previous: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
     """cv2.recoverPose(matrix, current, previous) without its inlier mask, to the last bit: (votes, R, t).
 
-    An essential matrix allows four motions; the one that puts most points in front of both cameras, and nearer than
-    MAX_DEPTH, wins. OpenCV triangulates every point four times with a singular value decomposition. But a vote only
-    depends on which side of a few limits a point lies. A few steps of inverse iteration decide that for nearly all
-    points, and for both signs of the translation at once. OpenCV itself triangulates the few points close to a limit.
+    An essential matrix allows four motions. The one that puts most points in front of both cameras, and nearer than
+    MAX_DEPTH, wins. OpenCV triangulates every point four times with a singular value decomposition. A vote depends
+    only on the side of a few limits on which a point lies. A few steps of inverse iteration decide that for nearly all
+    points, for both signs of the translation at once. OpenCV triangulates the few points close to a limit.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     motions = [(rotation, sign * translation) for sign in (1.0, -1.0) for rotation in (first, second)]
     votes, doubtful = np.zeros(4, np.int64), [np.empty(0, np.int64)] * 2
-    # A car's rotation is the smaller one. Once its votes are known, the other's are counted only while it may win.
+    # A car's rotation is the smaller one. Its votes are counted first; the other's only while it can still win.
     for index in (0, 1) if np.trace(first) >= np.trace(second) else (1, 0):
         votes[index], votes[index + 2], doubtful[index] = _count_in_front(
             current, previous, motions[index][0], translation.ravel(), votes.max())
     most_sure = votes.max()
     for index, motion in enumerate(motions):
         points = doubtful[index % 2]
-        if len(points) and votes[index] + len(points) >= most_sure:  # it may be the winner
+        if len(points) and votes[index] + len(points) >= most_sure:  # this motion can still win
             votes[index] += _triangulate_and_count(current[points], previous[points], *motion)
-    best = int(np.argmax(votes))  # the first of equals, as in OpenCV
+    best = int(np.argmax(votes))  # the first of equal ones, as in OpenCV
     rotation, translation = motions[best]
     return int(votes[best]), rotation, translation.ravel()
 
@@ -107,7 +107,7 @@ def _triangulate_and_count(current, previous, rotation, translation):
 def _count_in_front(current, previous, rotation, t, least):
     """Votes for (rotation, t), for (rotation, -t), and the indices of points too close to a limit to be sure.
 
-    Stops as soon as neither can have `least` votes any more.
+    Stops as soon as neither can reach `least` votes.
     """
     forward, backward, doubts = 0, 0, 0
     doubtful = np.empty(len(current), np.int64)
@@ -142,13 +142,13 @@ def _count_in_front(current, previous, rotation, t, least):
         elif 0 < z < MAX_DEPTH * w and 0 < depth < MAX_DEPTH * w:
             forward += 1
         elif 0 < -z < MAX_DEPTH * w and 0 < -depth < MAX_DEPTH * w:
-            backward += 1  # the other sign of t turns the sign of w and of both depths
+            backward += 1  # the opposite t changes the signs of w and of both depths
     return forward, backward, doubtful[:doubts]
 
 
 @inner
 def _least_eigenvector(b):
-    """Unit eigenvector of the least eigenvalue of b (lower triangle; overwritten) and whether it is sure."""
+    """Whether the iteration converged, and the unit eigenvector of the least eigenvalue of b (lower triangle)."""
     for j in range(4):  # Cholesky
         for k in range(j):
             b[j, j] -= b[j, k] * b[j, k]

@@ -1,4 +1,4 @@
-"""Settings of the odometry: the thesis's, those of a later PySLAM, and alternatives to try."""
+"""Settings of the odometry: the thesis's, those of a later PySLAM, and the alternatives."""
 
 import math
 from dataclasses import dataclass
@@ -13,27 +13,29 @@ CHOICES = {"detector": ("shi-tomasi", "orb"), "mask_mode": ("detect", "filter"),
 
 @dataclass(frozen=True)
 class OdometrySettings:
-    """What the odometry does; the defaults are the thesis's.
+    """The settings of the odometry; the defaults are the thesis's.
 
     detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
-    max_keypoints: limit of the detector, 0 for none. min_distance: between keypoints, pixels (Shi-Tomasi only).
-    quality: of a keypoint, as a share of the strongest one's. block_size: pixels a side in which gradients are summed
-    (both Shi-Tomasi only). window, levels: of the tracker, pixels a side and how often the frame is halved.
-    mask_mode: "detect" gives the mask to the detector, which fills its quota inside; "filter" drops what lies outside.
-    redetect_below: new keypoints replace all points on a frame to which fewer than this were tracked.
-    essential_method: how the essential matrix is searched for: "ransac", or OpenCV's "usac", "usac-magsac".
-    threshold: of that search, in normalised coordinates.
-    shuffle_seed: seed that shuffles the matched points before RANSAC, whose own seed is fixed; None: not shuffled.
+    max_keypoints: largest number of keypoints, 0 for no limit. min_distance: between keypoints, pixels (Shi-Tomasi).
+    quality: least strength of a keypoint, relative to the strongest one (Shi-Tomasi). block_size: side, in pixels, of
+    the square over which gradients are summed (Shi-Tomasi). window, levels: of the tracker; side of its window in
+    pixels, and number of times the frame is halved.
+    mask_mode: "detect" gives the mask to the detector, which returns up to max_keypoints inside it; "filter" drops
+    keypoints outside the mask.
+    redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all of them.
+    essential_method: search for the essential matrix: "ransac", or OpenCV's "usac" or "usac-magsac".
+    threshold: of that search, in normalised image coordinates.
+    shuffle_seed: seed with which the matched points are shuffled before RANSAC; None: not shuffled. RANSAC's own seed
+    is fixed.
     estimator: how the motion follows from the essential matrix. "thesis": all points vote on which of its four motions
-    is the right one, as in PySLAM. "inliers": the inliers alone vote (audit rows 13, 29). "refined": RANSAC's motion is
+    is the right one, as in PySLAM. "inliers": only the inliers vote (audit rows 13, 29). "refined": RANSAC's motion is
     refitted by least squares to all points near it, the rotation is the smaller of the two possible ones, and a motion
-    that no car can make from one frame to the next is searched again (refined.motion_prior).
-    fallback: a step whose motion the masked keypoints do not determine, or that differs too much from the step before
-    (refined.motion_prior), is estimated from all keypoints. It does nothing without masks.
-    scale_gate: metres; a smaller step leaves the pose as it was. shift_gate: the same for the mean shift of the
-    points, pixels.
-    rotate_first: turn the pose before moving it.
-    alignment: how the two paths are laid over each other for RMSE and MAE, see metrics.rmse.
+    that a car cannot make from one frame to the next is searched for again (refined.motion_prior).
+    fallback: a step is estimated from all keypoints if the masked ones do not determine its motion, or if the motion
+    differs too much from the previous step's (refined.motion_prior). Without masks it does nothing.
+    scale_gate: metres; a shorter step does not move the pose. shift_gate: pixels; the same for the points' mean shift.
+    rotate_first: rotate the pose before moving it.
+    alignment: of both paths, for RMSE and MAE, see metrics.rmse.
     """
 
     detector: str = "shi-tomasi"
