@@ -4,7 +4,6 @@ import fcntl
 import os
 import signal
 import subprocess
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,11 +14,12 @@ os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
 import cv2
 import numpy as np
 import pytest
+from waiting import wait_for
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
-# what these make or read takes seconds
-SLOW_FIXTURES = {"small_world", "small_labels", "kitti_real", "camvid_real", "reference"}
+# fixtures that take seconds
+SLOW_FIXTURES = {"small_world", "small_labels", "small_model", "kitti_real", "camvid_real", "reference"}
 
 
 def pytest_collection_modifyitems(items):
@@ -27,11 +27,11 @@ def pytest_collection_modifyitems(items):
         marked = item.get_closest_marker("notebooks") or item.get_closest_marker("torture")
         if marked or SLOW_FIXTURES & set(item.fixturenames):
             item.add_marker(pytest.mark.slow)
-    # what takes minutes begins first, so that no process is left alone with it at the end
+    # the longest tests begin first, so that other processes have work until they end
     items.sort(key=lambda item: item.path.name != "test_notebooks.py")
 
 
-def _shared(*parts):
+def _real_data(*parts):
     folder = SHARED.joinpath(*parts)
     if not folder.is_dir():
         pytest.skip(f"no real data: ../shared/{'/'.join(parts)} does not exist")
@@ -41,30 +41,28 @@ def _shared(*parts):
 @pytest.fixture(scope="session")
 def kitti_real():
     """Excerpts of real KITTI sequences in the official layout."""
-    return _shared("data", "kitti")
+    return _real_data("data", "kitti")
 
 
 @pytest.fixture(scope="session")
 def camvid_real():
     """Real street images with label maps in the flat layout."""
-    return _shared("data", "camvid")
+    return _real_data("data", "camvid")
 
 
 @pytest.fixture(scope="session")
 def reference():
-    """What PySLAM itself did on the real frames."""
-    return _shared("reference")
+    """PySLAM's own results on the real frames."""
+    return _real_data("reference")
 
 
 @pytest.fixture
 def kill_when():
-    """kill_when(command, condition): start a command, and kill it with all that it started once the condition holds."""
+    """kill_when(command, condition): start a command, and kill it and its child processes when the condition holds."""
     def start(command, condition):
         process = subprocess.Popen(list(map(str, command)), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True)
-        end = time.monotonic() + 600
-        while not condition():
-            assert process.poll() is None and time.monotonic() < end, "it ended before it could be killed"
-            time.sleep(0.002)
+        wait_for(lambda: process.poll() is not None or condition(), 600)
+        assert process.returncode is None, "it ended before it could be killed"
         os.killpg(process.pid, signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
 
@@ -72,8 +70,8 @@ def kill_when():
 
 
 @contextmanager
-def _held(tmp_path_factory, name):
-    """A folder that all processes of a test run share (pytest -n), held by one of them while it is filled."""
+def _shared_folder(tmp_path_factory, name):
+    """A folder shared by all processes of a test run (pytest -n), locked while one of them fills it."""
     root = tmp_path_factory.getbasetemp()
     root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
     with open(root / f"{name}.lock", "w") as lock:
@@ -83,27 +81,38 @@ def _held(tmp_path_factory, name):
 
 @pytest.fixture(scope="session")
 def small_world(tmp_path_factory):
-    """A small embedded world: two sequences of 12 frames and a few street images. It must not be changed."""
+    """A small embedded world: two sequences of 12 frames and a few street images. Tests must not change it."""
     from thesis_repro.settings import PROFILES
     from thesis_repro.world import dataset
 
-    with _held(tmp_path_factory, "small_world") as folder:  # what another process has rendered is left as it is
+    with _shared_folder(tmp_path_factory, "small_world") as folder:  # rendered once
         dataset.write(folder, **PROFILES["smoke"].world, seed=0)
     return folder
 
 
 @pytest.fixture(scope="session")
 def small_labels(small_world, tmp_path_factory):
-    """Label maps of the small world as notebook 5 leaves them, one folder a sequence: here the true ones, 320x320."""
+    """Exact label maps of the small world, 320x320, one folder a sequence, laid out as notebook 5 does."""
     from thesis_repro import stages
 
-    with _held(tmp_path_factory, "small_labels") as root:
+    with _shared_folder(tmp_path_factory, "small_labels") as root:
         for path in small_world.glob("kitti/sequences/*/labels_0/*.png") if not root.exists() else ():
             folder = root / path.parent.parent.name
             stages.stage(folder, model="none")
             label_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             cv2.imwrite(str(folder / path.name), cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST))
     return root
+
+
+@pytest.fixture(scope="session")
+def small_model(tmp_path_factory):
+    """The thesis's network at 64x64 with 4 filters, untrained, as a file."""
+    from thesis_repro.cityscapes import N_CLASSES
+    from thesis_repro.segmentation.unet import build_unet
+
+    path = tmp_path_factory.mktemp("model") / "model.keras"
+    build_unet((64, 64, 1), N_CLASSES, 4).save(path)
+    return path
 
 
 @pytest.fixture

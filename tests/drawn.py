@@ -1,4 +1,4 @@
-"""What is wrong with a drawn figure, as a reader would see it: raw TeX, missing glyphs, texts over each other."""
+"""Faults of a drawn figure: raw TeX, missing glyphs and texts that overlap."""
 
 import itertools
 import warnings
@@ -7,22 +7,22 @@ from matplotlib.text import Text
 
 
 def problems(figure):
-    """A list of sentences, empty where all is well."""
+    """Messages about the faults of a figure; none if it has no faults."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         figure.draw_without_rendering()
-    wrong = [str(warning.message) for warning in caught]
+    faults = [str(warning.message) for warning in caught]
     texts = _visible_texts(figure)
-    wrong += [f"raw TeX: {text.get_text()}" for text in texts
+    faults += [f"raw TeX: {text.get_text()}" for text in texts
               if "mathdefault" in text.get_text() or "$" in text.get_text() and not text.get_parse_math()]
-    boxes = {text: Text.get_window_extent(text).padded(-1) for text in texts}  # a pixel may be shared
-    wrong += [f"{text.get_text()!r} lies over {other.get_text()!r}" for text, other in itertools.combinations(texts, 2)
+    boxes = {text: Text.get_window_extent(text).padded(-1) for text in texts}  # an overlap of one pixel is allowed
+    faults += [f"{text.get_text()!r} lies over {other.get_text()!r}" for text, other in itertools.combinations(texts, 2)
               if boxes[text].overlaps(boxes[other])]
-    return wrong
+    return faults
 
 
 def _visible_texts(figure):
-    hidden = set()  # what matplotlib holds but does not draw
+    hidden = set()  # texts that matplotlib holds but does not draw
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
@@ -31,6 +31,6 @@ def _visible_texts(figure):
             for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
                 if not axes.axison or not low <= tick.get_loc() <= high:
                     hidden |= {tick.label1, tick.label2}
-    # the box of a slanted text is much larger than the text
+    # slanted texts are left out, since their boxes are much larger than they are
     return [text for text in figure.findobj(Text) if text not in hidden and text.get_visible()
             and text.get_text().strip() and text.get_rotation() % 90 == 0]

@@ -8,13 +8,12 @@ from thesis_repro.study.jobs import ESTIMATORS, Job
 
 
 def runs(names, errors, widths, *, sources=("",), estimators=tuple(ESTIMATORS), repetitions=3, noise=0.0):
-    """errors(sequence, method, width): of every metric, but half of it for the MAE.
+    """Runs in which every metric is errors(sequence, method, width), and the MAE half of it.
 
-    widths: {method: its widths}; [None] where it has none, and then it has no source. noise: relative spread of the
-    repetitions.
+    widths: {method: widths}; a method with widths [None] has no source. noise: relative spread of the repetitions.
     """
     random, rows = np.random.default_rng(0), []
-    arms = [(method, width, source) for method, own in widths.items() for width in own
+    arms = [(method, width, source) for method, method_widths in widths.items() for width in method_widths
             for source in (sources if width else [""])]
     for name in names:
         for method, width, source in arms:

@@ -1,11 +1,11 @@
-"""Paths for the tests of errors and trajectories."""
+"""A path for tests of errors and trajectories."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 
 def winding(count=160, seed=None, stretch=1.0):
-    """A path with turns about all axes, and one metre a step; with a seed, noise in every step."""
+    """Poses of a path with rotations about all axes and steps of one metre; with a seed, steps have noise."""
     random, noise = np.random.RandomState(seed), seed is not None
     poses = np.tile(np.eye(4), (count, 1, 1))
     for index in range(1, count):

@@ -1,11 +1,11 @@
-"""A street of noise for the odometry's tests, rendered with exact arithmetic: every machine gets the same pixels."""
+"""A street of noise for tests of the odometry; it is rendered with exact arithmetic, the same on every machine."""
 
 import cv2
 import numpy as np
 
 
 def street(count, step=0.4, size=(160, 480), start=0.0):
-    """Frames of a drive between two walls along z, turning a little: (frames, intrinsics, poses)."""
+    """(frames, intrinsics, poses) of a drive between two walls along z with a slight turn."""
     height, width = size
     texture = np.random.RandomState(0).randint(0, 256, (512, 512)).astype(np.uint8)
     texture = cv2.resize(texture, (2048, 2048), interpolation=cv2.INTER_LINEAR)
@@ -14,7 +14,7 @@ def street(count, step=0.4, size=(160, 480), start=0.0):
     rays = np.stack([(u - camera[0, 2]) / 300, (v - camera[1, 2]) / 300, np.ones_like(u)], axis=-1)
     frames, poses = [], np.tile(np.eye(4), (count, 1, 1))
     for index in range(count):
-        half = 0.002 * index  # rational rotation about y: no sine, which machines may round differently
+        half = 0.002 * index  # rotation about y without sines, which machines may round differently
         cosine, sine = (1 - half * half) / (1 + half * half), 2 * half / (1 + half * half)
         poses[index, :3, :3] = [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
         poses[index, :3, 3] = 0.1 * step * index, 0, start + step * index
@@ -35,7 +35,7 @@ def street(count, step=0.4, size=(160, 480), start=0.0):
 
 
 class Street:
-    """What `run` needs of a sequence."""
+    """A sequence, as far as `odometry.run` needs one."""
 
     name = "street"
     has_truth = True
@@ -51,7 +51,7 @@ class Street:
 
 
 class Stripes:
-    """A mask that keeps vertical stripes of a width in pixels, shifted by some with every frame."""
+    """Masks that keep vertical stripes of a width in pixels, 5 pixels further with every frame."""
 
     def __init__(self, width, size=(160, 480)):
         self.width, self.size = width, size

@@ -1,7 +1,7 @@
 """A reproduction of a thesis on keypoint masks from semantic segmentation for monocular visual odometry.
 
-What is most needed is here by name: Sequence, keypoint_mask, Odometry, OdometrySettings, THESIS, run, build_unet and
-InputError. Each is loaded when it is asked for, so that TensorFlow is, only for build_unet.
+The main names: Sequence, keypoint_mask, Odometry, OdometrySettings, THESIS, run, build_unet and InputError.
+Names are imported on first use, so TensorFlow is loaded only for build_unet.
 """
 
 from importlib import import_module
@@ -13,19 +13,19 @@ __all__ = ["InputError", *_HOMES]
 
 
 def one_line(text):
-    """A message as one line that a terminal shows as it is: line ends and control characters are spelled out."""
+    """Return a text as one printable line: line breaks and control characters become escape sequences such as \\n."""
     return "".join(letter if letter.isprintable() else letter.encode("unicode_escape", "surrogatepass").decode()
                    for letter in str(text))
 
 
 class InputError(ValueError):
-    """Bad input: one line that says what, which file or setting, and what to do about it."""
+    """Bad input. The message is one line that names the file or setting, the problem, and what to do."""
 
     def __str__(self):
-        return one_line(super().__str__())  # the names of files may hold anything
+        return one_line(super().__str__())  # file names may hold any character
 
     def _render_traceback_(self):
-        """What IPython shows of it: the line alone."""
+        """Let IPython show only the message, without a traceback."""
         return [f"InputError: {self}"]
 
 

@@ -1,4 +1,4 @@
-"""One way to compile the inner loops."""
+"""Compile the inner loops with Numba."""
 
 import hashlib
 import os
@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numba
 
-DIGEST_NAME = "compiled-from"  # the file beside Numba's
+DIGEST_NAME = "compiled-from"  # a file in the folder of Numba's cache
 
 
 def forget_stale(folder):
-    """Delete Numba's files of the modules in and below a folder where one of these has changed since, by its bytes.
+    """Delete Numba's cache of the modules in and below a folder if the bytes of one of them have changed.
 
-    Numba itself only notices a change of a function's own file, by its date and size. It does not notice a change of a
-    function that is called from another file. A clock can jump, so dates cannot be relied on.
+    Numba compares only the date and size of the file that defines a function. It misses changes of functions that are
+    called from other files, and changes that a jumping clock hides.
     """
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.rglob("*.py")))).hexdigest()
     record = folder / "__pycache__" / DIGEST_NAME
@@ -26,7 +26,7 @@ def forget_stale(folder):
         temporary = record.with_name(f"{DIGEST_NAME}.{os.getpid()}")
         temporary.write_text(digest)
         os.replace(temporary, record)
-    except OSError:  # nothing may be written here, so that nothing can be stale
+    except OSError:  # the folder is read-only, so it holds no stale cache
         pass
 
 
@@ -35,25 +35,24 @@ for _folder in (path.parent for path in Path(__file__).parent.glob("*/__init__.p
 
 
 def fast(function, **options):
-    """Compile a function of numbers and arrays; kept on disk where possible, free to run beside other threads.
+    """Compile a function of numbers and arrays. The machine code is cached on disk and runs without Python's lock.
 
-    Compiled functions call only what lies in their own folder of the package or below it. Division by zero gives
-    infinity or NaN, as in numpy and OpenCV, not an exception.
+    Compiled functions may only call functions from their own folder of the package or below it (see `forget_stale`).
+    Division by zero gives infinity or NaN, as in numpy and OpenCV.
 
-    Numba compiles a function again for every combination of types and layouts, and every numpy call in it is compiled
-    as well. So callers pass C-contiguous arrays of one type, and loops over single numbers take less time to compile
-    than array expressions.
+    Numba compiles a function anew for each combination of types and memory layouts, and compiles the numpy calls in it
+    as well. So callers pass C-contiguous arrays of one type. Loops over numbers compile faster than array expressions.
     """
     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder that numba may write its cache to
+    except RuntimeError:  # Numba finds no folder that it may write its cache to
         return numba.njit(**options)(function)
 
 
 def inner(function):
-    """Compile a function, as `fast` does, into the compiled ones that call it. Python cannot call it.
+    """Compile a function for calls from compiled functions only: it is inlined there, and Python cannot call it.
 
-    Without an entry from Python it takes less time to compile, and as part of its callers, less to run.
+    This saves compile time and run time.
     """
     return fast(function, forceinline=True, no_cpython_wrapper=True)

@@ -1,6 +1,6 @@
-"""Long runs: a folder for one run at a time, a log, a summary at the end, and one line for what the machine lacks.
+"""Long runs: locks on folders, the log, the summary at the end, and one-line errors for a lack of space or memory.
 
-Nothing here needs another package, so that it works where the memory for one is lacking.
+This module imports only the standard library, so it still works if there is too little memory for other packages.
 """
 
 import ctypes
@@ -24,17 +24,17 @@ from thesis_repro import InputError, one_line
 
 LOG = "log.txt"
 RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
-LIST = "written.log"  # beside the record: what was written there, see `files.atomic`
-TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")  # the names that `temporary` gives
-# what a user can do about an error of the system, by its number
+LIST = "written.log"  # beside the record: the files that were written there, see `files.atomic`
+TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")  # matches the names that `temporary` returns
+# what a user can do about a system error, by its number
 ROOM, ACCESS = "make room on its disk, or name a folder on another", "name a folder that you may write to"
 REMEDIES = {errno.ENOSPC: ROOM, errno.EDQUOT: ROOM, errno.EFBIG: "allow larger files (ulimit -f)", errno.EROFS: ACCESS,
             errno.EACCES: ACCESS, errno.EPERM: ACCESS, errno.EMFILE: "allow more open files (ulimit -n)",
             errno.EIO: "check its disk, or the connection to it"}
-NO_MEMORY = "memory ran out; free some, or work with fewer processes (--jobs, JOBS), and start again"
+NO_MEMORY = "memory ran out; free some, or use fewer processes (--jobs, JOBS), and start again"
 WORKER_KILLED = ("a process was killed, most likely because memory ran out; start again with fewer processes (--jobs, "
-                 "JOBS), and it goes on")
-# what libraries write in errors of their own
+                 "JOBS) to resume")
+# texts of libraries' own errors
 NO_MEMORY_TEXTS = ("MemoryError", "nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc",
                   "ut of memory", "ResourceExhausted", "failed to map segment", "can't start new thread")
 
@@ -45,46 +45,46 @@ _log.propagate = False
 
 
 def explain(error):
-    """One line for bad input, or for what the machine lacks: space, permission, memory; None for any other error.
+    """Return one line for an InputError or for a lack of space, permission or memory; None for any other error.
 
-    It names the file, where there is one, and says what to do. The errors that led to this one count too.
+    The line names the file, if it is known, and says what to do. The causes of the error are searched too.
     """
     if isinstance(error, InputError):
         return str(error)
     while error is not None:
-        number, name, text = number_of(error), getattr(error, "filename", None), f"{type(error).__name__}: {error}"
+        number, path, text = number_of(error), getattr(error, "filename", None), f"{type(error).__name__}: {error}"
         if number == errno.ENOMEM or any(words in text for words in NO_MEMORY_TEXTS):
             return NO_MEMORY
         if text.startswith("TerminatedWorkerError"):  # of joblib
             return WORKER_KILLED
-        if number in REMEDIES or isinstance(error, OSError) and name is not None and number is not None:
-            return f"{name or 'a file'}: {os.strerror(number)}; {REMEDIES.get(number, 'check the path')}"
+        if number in REMEDIES or isinstance(error, OSError) and path is not None and number is not None:
+            return f"{path or 'a file'}: {os.strerror(number)}; {REMEDIES.get(number, 'check the path')}"
         error = error.__cause__ or error.__context__
     return None
 
 
 def number_of(error):
-    """The system's number of an error, or None. HDF5 and others give the system's text alone."""
-    named = (number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error))
-    return getattr(error, "errno", None) or next(named, None)
+    """Return the system's number of an error, or None. HDF5 and other libraries give the system's text only."""
+    numbers = (number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error))
+    return getattr(error, "errno", None) or next(numbers, None)
 
 
 def need_addresses(gigabytes):
-    """Raise InputError where `ulimit -v` is too little for the libraries, some of which then end without a message."""
+    """Raise InputError if `ulimit -v` is too low. Some libraries would then end the process without a message."""
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < gigabytes * 2**30:
         raise InputError(f"ulimit -v {limit // 1024}: too little memory; allow {gigabytes * 2**20} or more")
 
 
 def remedy(text):
-    """What to do about an error of which only the text is known, to be put behind it; empty for most errors."""
+    """Return what to do about an error, to be appended to its text; empty for an unknown text."""
     remedies = dict.fromkeys(NO_MEMORY_TEXTS, NO_MEMORY)
     remedies |= {os.strerror(number): remedy for number, remedy in REMEDIES.items()}
     return next((f"; {remedy}" for words, remedy in remedies.items() if words in text), "")
 
 
 def report_error(error):
-    """Print why a command ends, and return its exit status. Raises an error that `explain` does not know."""
+    """Print the error that ends a command, and return the exit status. Raises an error that `explain` does not know."""
     line = explain(error)
     if line is None:
         raise error
@@ -93,25 +93,25 @@ def report_error(error):
 
 
 def temporary(path):
-    """A path beside `path` that nobody can foresee, under which it is written."""
+    """Return a temporary path beside `path`, with a random name that nobody can predict."""
     return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
 
 
 def sweep(folder):
-    """Delete half-written files of killed runs below a folder of results; no other run may be at work in it."""
+    """Delete the temporary files of killed runs in and below a folder. The caller must hold its lock."""
     for path in Path(folder).rglob(".*"):
         if TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
 
 
-_held = set()  # the folders that this process holds, by device and inode
+_held = set()  # device and inode of each path that this process has locked
 
 
 @contextmanager
 def claimed(folder):
-    """Hold a folder, made where there is none, for this process until the block ends, in whatever way it ends.
+    """Create a folder if needed, and lock it until the block ends. Raises InputError if another process has locked it.
 
-    Raises InputError where another process holds it.
+    Folders that were created here and are still empty at the end are removed.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
@@ -123,26 +123,26 @@ def claimed(folder):
             yield
     finally:
         with suppress(OSError):
-            for path in new:  # those that are still empty
+            for path in new:
                 path.rmdir()
 
 
 @contextmanager
 def locked(path):
-    """Hold a folder or file that is there, as `claimed` does; within the block, this process may hold it again."""
+    """Lock an existing folder or file until the block ends. The same process may lock it again within the block."""
     status = os.stat(path)
     key = status.st_dev, status.st_ino
     if key in _held:
         yield
         return
-    descriptor = os.open(path, os.O_RDONLY)  # its lock ends with the process, so a killed run leaves none
+    descriptor = os.open(path, os.O_RDONLY)  # the lock ends with the process, even if it is killed
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(f"{path}: another run is at work there; wait, or name another folder") from None
+            raise InputError(f"{path}: another run uses it; wait, or name another folder") from None
         except OSError:
-            pass  # a file system without locks
+            pass  # the file system has no locks
         _held.add(key)
         yield
     finally:
@@ -154,37 +154,38 @@ def locked(path):
 
 
 class _LogFile(MemoryHandler):
-    """The log of a run. It starts once the folder holds results, so that a run which is refused leaves nothing."""
+    """The log of a run. It is written once the folder holds results, so a refused run leaves no files."""
 
-    def __init__(self, folder, ours):
+    def __init__(self, folder, has_results):
         super().__init__(1, target=logging.FileHandler(folder / LOG, delay=True, encoding="utf-8"), flushOnClose=False)
         self.target.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-        self.target.handleError = lambda record: None  # the results report a full disk; the log need not
-        self.folder, self.ours, self.warnings, self.started = folder, ours, 0, time.monotonic()
+        self.target.handleError = lambda record: None  # a full disk is reported when results are written
+        self.folder, self.has_results, self.warnings, self.started = folder, has_results, 0, time.monotonic()
 
     def shouldFlush(self, record):
         self.warnings += record.levelno == logging.WARNING
-        self.ours = self.ours or any(self.folder.glob(RECORD)) or any(self.folder.glob(f"*/{RECORD}"))
-        return self.ours
+        self.has_results = (self.has_results or (self.folder / RECORD).exists()
+                            or any(self.folder.glob(f"*/{RECORD}")))
+        return self.has_results
 
     def end(self, text):
-        """Print what came of the run, how long it took, how many warnings there were, and where the log is."""
+        """Print a summary of the run, the time it took, its number of warnings, and the path of the log."""
         seconds = timedelta(seconds=round(time.monotonic() - self.started))
         say(f"{text}\n{seconds} h; warnings: {self.warnings}; log: {self.folder / LOG}")
 
 
 @contextmanager
-def logged(folder, what, ours=False):
-    """Log what is printed, every warning, and the error that ends the block, in a folder; yields the `_LogFile`.
+def logged(folder, title, has_results=False):
+    """Log into a folder what `say` and `remark` print, warnings, and the error that ends the block.
 
-    what: the first line. ours: the folder holds results already; otherwise the log starts with its record.
+    Yields the `_LogFile`. title: the first line. has_results: write the log at once, not only when results appear.
     """
-    handler = _LogFile(Path(folder), ours)
+    handler = _LogFile(Path(folder), has_results)
     loggers = _log, logging.getLogger("py.warnings")
     for logger in loggers:
         logger.addHandler(handler)
     logging.captureWarnings(True)
-    _log.info(what)
+    _log.info(title)
     try:
         yield handler
     except Exception as error:
@@ -208,8 +209,14 @@ def say(text, warning=False):
     note(text, logging.WARNING if warning else logging.INFO)
 
 
+def note(text, level=logging.ERROR):
+    """Log each line of a text."""
+    for line in text.splitlines():
+        _log.log(level, line)
+
+
 def remark(text, warning=False):
-    """Print a line beside the results, on standard error, and log it."""
+    """Print a line on standard error, where it does not mix with results, and log it."""
     print(f"warning: {one_line(text)}" if warning else one_line(text), file=sys.stderr, flush=True)
     note(text, logging.WARNING if warning else logging.INFO)
 
@@ -218,14 +225,14 @@ def remark(text, warning=False):
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal that asks this process to end; its number is the argument."""
+    """Raised by a signal that asks this process to end. The argument is the signal's number."""
 
 
 @contextmanager
 def stoppable():
-    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that its processes end with it.
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that worker processes end too.
 
-    A signal that the caller ignores (nohup) stays ignored.
+    An ignored signal (nohup) stays ignored.
     """
     def stop(number, _):
         raise Stopped(number)
@@ -243,14 +250,8 @@ def stoppable():
 
 
 def end_with_parent():
-    """Let the system kill this process when the one that started it ends, in whatever way (Linux alone)."""
+    """Let the system kill this worker process when its parent ends, even if the parent is killed (Linux only)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
         if os.getppid() == 1:
-            os._exit(1)  # it has ended already
-
-
-def note(text, level=logging.ERROR):
-    """Log a text."""
-    for line in text.splitlines():
-        _log.log(level, line)
+            os._exit(1)  # the parent has ended already

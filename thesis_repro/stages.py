@@ -1,8 +1,8 @@
-"""Results on disk that know what they were made from, and going on after a stop.
+"""Stages, checkpoints and digests: which inputs results were made from, and how a stopped job resumes.
 
-A *stage* is a folder with a record of what its results were made from, and with a list of them (`stage`). A *state* is
-one file with what a long job needs to go on, written whole or not at all (`store`, `resume`). A digest names an input
-in twelve letters.
+A *stage* is a folder of results with a record of their inputs and a list of the files written there (`stage`). A
+*checkpoint* is one file from which a long job resumes (`store`, `resume`). A *digest* stands for the content of an
+input and has twelve hexadecimal digits.
 """
 
 import ast
@@ -32,129 +32,132 @@ _PACKAGE = Path(__file__).parent
 
 
 def stage(folder, *, replace=True, **inputs):
-    """The folder of one stage, holding only results that were made from `inputs` (JSON values).
+    """Prepare a folder for results that are made from `inputs` (JSON values), and return its path.
 
-    What an earlier run with the same inputs finished is kept; half-written files of a killed run are deleted, and so
-    are results of other inputs, after a line that says so. Raises InputError for those if `replace` is False, for
-    results of another kind (most of whose inputs have other names), for a folder that another run holds, and for files
-    that would have to be deleted and are not on the list of what was written here, or have changed since.
+    Results that an earlier run made from the same inputs stay. Temporary files of killed runs are deleted. Results
+    of other inputs are deleted after a message, or InputError is raised if `replace` is False. Raises InputError also
+    if another run uses the folder, if most of its inputs have other names (results of another kind), and if a file
+    that would be deleted is not on the list of files written there or was changed since.
     """
     folder = Path(folder)
     with longrun.claimed(folder):
-        wanted, earlier = json.loads(json.dumps(inputs, default=str)), record(folder)
+        inputs, earlier = json.loads(json.dumps(inputs, default=str)), record(folder)
         names = [path.name for path in folder.iterdir()]
         if earlier is None and not all(name in (LOG, LIST) or longrun.TEMPORARY.fullmatch(name) for name in names):
             raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
-        if earlier is not None and earlier != wanted:
-            changed = ", ".join(sorted(key for key in wanted | earlier if wanted.get(key) != earlier.get(key)))
+        if earlier is not None and earlier != inputs:
+            changed = ", ".join(sorted(key for key in inputs | earlier if inputs.get(key) != earlier.get(key)))
             if not replace:
                 raise InputError(f"{folder}: holds results of other settings ({changed}); name another folder")
-            if 2 * len(earlier.keys() & wanted.keys()) <= len(earlier.keys() | wanted.keys()):
+            if 2 * len(earlier.keys() & inputs.keys()) <= len(earlier.keys() | inputs.keys()):
                 raise InputError(f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
                                  "choose another folder")
-            _empty(folder, changed)
+            _delete_results(folder, changed)
         longrun.sweep(folder)
-        if earlier != wanted:
-            write_text(folder / RECORD, json.dumps(wanted, indent=1, sort_keys=True))
+        if earlier != inputs:
+            write_text(folder / RECORD, json.dumps(inputs, indent=1, sort_keys=True))
     return folder
 
 
-def _empty(folder, changed):
-    """Delete what is listed (see `files.atomic`), the records last: what is left when this is killed is ours. Raises
-    InputError, before anything is deleted, for a file that is not ours."""
-    listed, results, records = defaultdict(set), [], []
+def _delete_results(folder, changed):
+    """Delete the results in a folder, unless one of its files is not on the list or was changed since."""
+    written, results, records = defaultdict(set), [], []  # written: digests by path
     for path in folder.rglob(LIST):
         for line in path.read_text(encoding="utf-8").splitlines():
-            with suppress(ValueError):  # a line that was cut off
+            with suppress(ValueError):  # a kill may cut off a line
                 digest, name = line.split(" ", 1)
-                listed[path.parent / json.loads(name)].add(digest)
+                written[path.parent / json.loads(name)].add(digest)
     for path in (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()):
         if path.name in (RECORD, LIST):
             records.append(path)
         elif path.name != LOG and not longrun.TEMPORARY.fullmatch(path.name):
-            if path not in listed or path.is_symlink() or _sha256(path) not in listed[path]:
-                raise InputError(f"{folder}: its results have to go, for {changed} changed; but {path} was not "
-                                 "written here, or was changed since; move it away, or name another folder")
+            if path.is_symlink() or path not in written or _sha256(path) not in written[path]:
+                raise InputError(f"{folder}: cannot delete its results, made with another {changed}: {path} was not "
+                                 "written by this project, or was changed since; move it away, or name another folder")
             results.append(path)
     if results:
-        longrun.say(f"{folder}: deleting {len(results):,} files, the results of another {changed}")
+        longrun.say(f"{folder}: deleting {len(results):,} files, made with another {changed}")
+    # the folder's record goes last, so that a killed deletion can be repeated
     for path in (*results, *sorted(records, key=lambda path: (-len(path.parts), path.name == RECORD))):
         path.unlink()
-        with suppress(OSError):  # not empty
+        with suppress(OSError):  # the folder is not empty yet
             path.parent.rmdir()
     folder.mkdir(exist_ok=True)
 
 
 def record(folder):
-    """What the results in a stage's folder were made from: a dict, or None where the folder is no stage."""
+    """Return the inputs of the results in a stage's folder as a dict, or None if the folder is not a stage."""
     path = Path(folder) / RECORD
     if not path.is_file():
         return None
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError):
-        raise InputError(f"{path}: is damaged; remove its folder") from None
+        raise InputError(f"{path}: is damaged; delete its folder") from None
 
 
 def made_from(folder):
-    """A digest of what the results in a stage's folder were made from."""
+    """Return a digest of the inputs of the results in a stage's folder."""
     return content(Path(folder) / RECORD)
 
 
 def check_worker(folder, made_from, **here):
-    """Raise InputError where this worker does not see the record of a stage that the others see, or has other inputs.
+    """Raise InputError if this worker sees another record in a stage's folder, or has other inputs.
 
-    made_from: the record that the others see. here: inputs as this worker has them, such as versions of packages.
+    made_from: the record that the main process sees. here: inputs as this worker has them, such as package versions.
     """
     if record(folder) != made_from:
-        raise InputError(f"{folder}: this worker does not see what the others see there; all of them need the same "
-                         "folders under the same paths")
+        raise InputError(f"{folder}: this worker sees other files there; all workers need the same folders under the "
+                         "same paths")
     if made_from | here != made_from:
         raise InputError("this worker has another model, or another version of thesis_repro or its packages; give all "
-                         "of them the same, and start them again")
+                         "workers the same, and restart them")
 
 
 TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
 
 
 def kept_table(path, rows=None, **options):
-    """The table that an earlier run left in a file, or None: where there is none, and where it is empty, cut off, has
-    another number of rows or holds text in another column than TEXT_COLUMNS."""
+    """Return the table that an earlier run wrote to a CSV file, or None if there is none or it is damaged.
+
+    Damaged means empty, cut off, with another number of rows than `rows`, or with text outside TEXT_COLUMNS.
+    """
     path = Path(path)
     if not path.is_file():
         return None
     with suppress(ValueError, UnicodeError):  # pandas' errors are ValueErrors
         table = pd.read_csv(path, **options)
-        plain = all(name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table)
-        if plain and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
+        numeric = all(name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table)
+        if numeric and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
             return table
-    longrun.say(f"{path}: is damaged, and made again", warning=True)
+    longrun.say(f"{path}: is damaged and will be made again", warning=True)
     return None
 
 
-# The state of a long job
+# Checkpoints
 
 
 def store(path, job, arrays):
-    """Write what a long job needs to go on: `job` (JSON values) and arrays by name."""
+    """Write a checkpoint: `job` (JSON values) and arrays by name."""
     with atomic(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, job=json.dumps(job), **{f"array {name}": array for name, array in arrays.items()})
 
 
 def resume(path, arrays=True):
-    """What `store` wrote, (job, arrays), or with `arrays` False the job alone, {}; None where there is nothing.
+    """Return (job, arrays) of a checkpoint that `store` wrote, or None if there is no file.
 
-    Raises InputError for a damaged file.
+    `arrays` False leaves the arrays out, which is faster. Raises InputError for a damaged file.
     """
     path = Path(path)
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as state:
-            names = [name for name in state.files if name != "job"] if arrays else []
-            return json.loads(str(state["job"])), {name.removeprefix("array "): state[name] for name in names}
+        with np.load(path, allow_pickle=False) as checkpoint:
+            names = [name for name in checkpoint.files if name != "job"] if arrays else []
+            return (json.loads(str(checkpoint["job"])),
+                    {name.removeprefix("array "): checkpoint[name] for name in names})
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        raise InputError(f"{path}: is damaged; remove it to begin anew") from None
+        raise InputError(f"{path}: is damaged; delete it to start from the beginning") from None
 
 
 # Digests
@@ -162,9 +165,9 @@ def resume(path, arrays=True):
 
 @lru_cache
 def code(*places):
-    """A digest of what folders ("odometry") or modules ("study/controls") of this package do.
+    """Return a digest of the code of folders ("odometry") or modules ("study/controls") of this package.
 
-    Everything of the package that they import counts with them. Comments and docstrings do not.
+    The modules of this package that they import are included. Comments and docstrings are not.
     """
     digest = hashlib.sha256()
     for path in _modules(places):
@@ -177,7 +180,7 @@ def code(*places):
 
 
 class _PackageFinder(ModuleFinder):
-    """Finds what is imported of this package, and nothing of those that are installed beside it."""
+    """Finds the imported modules of this package, but not those of other packages."""
 
     def find_module(self, name, path, parent=None):
         if path is None and name != _PACKAGE.name:
@@ -186,7 +189,7 @@ class _PackageFinder(ModuleFinder):
 
 
 def _modules(places):
-    """The files of some places and of all of the package that they import, sorted."""
+    """Files of folders or modules of this package and of all its modules that they import, sorted."""
     finder = _PackageFinder([str(_PACKAGE.parent)])
     for place in places:
         for path in sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"]:
@@ -195,43 +198,45 @@ def _modules(places):
 
 
 def made_with(*packages):
-    """What bits depend on beside the data and the code: versions, and how TensorFlow is told to calculate."""
+    """Return what results depend on besides data and code: package versions and TensorFlow's oneDNN switch."""
     versions = {name: importlib.metadata.version(name) for name in packages}
     return {"versions": versions, "onednn": os.environ.get("TF_ENABLE_ONEDNN_OPTS")}
 
 
 def listing(paths):
-    """A digest of files by name and content."""
+    """Return one digest of the names and contents of files."""
     paths = [Path(path) for path in paths]
     lines = [f"{path.name}:{digest}\n" for path, digest in zip(paths, contents(paths), strict=True)]
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
 
 
 def content(path):
-    """A digest of one file's bytes."""
+    """Return a digest of the bytes of one file."""
     return contents([path])[0]
 
 
-SETTLED = 0.1  # seconds: a file that is younger may change again within one tick of the file system's clock
+SETTLED = 0.1  # seconds; a younger file may change again without a new date, so its digest is not remembered
 
 
 def contents(paths):
-    """Digests of the bytes of files. They are remembered in the build folder, so a file is read again only where
-    its path, size, dates or inode are others: gigabytes cost their reading once."""
+    """Return digests of the bytes of files, in order. Raises InputError for a path that is not a regular file.
+
+    The digests are remembered in the build folder. A file is read again only if its path, size, dates or inode differ.
+    """
     paths = [Path(path).absolute() for path in paths]
     identities = {path: _identity(path) for path in paths}
     keys = {path: (json.dumps(str(path)), json.dumps(identity)) for path, identity in identities.items()}
     digests = {}
-    with suppress(OSError, sqlite3.Error), _remembered() as database:
+    with suppress(OSError, sqlite3.Error), _digest_database() as database:
         query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
         rows = ((path, database.execute(query, key).fetchone()) for path, key in keys.items())
         digests = {path: row[0] for path, row in rows if row}
     unknown = [path for path in keys if path not in digests]
     with ThreadPoolExecutor(4) as pool:
         read = pool.map(_sha256, unknown)
-        digests |= zip(unknown, progress(read, "looking at the data once", len(unknown), unit="file"))
+        digests |= zip(unknown, progress(read, "reading the data once", len(unknown), unit="file"))
     settled = [path for path in unknown if max(identities[path][1:3]) < time.time_ns() - SETTLED * 1e9]
-    with suppress(OSError, sqlite3.Error), _remembered() as database:
+    with suppress(OSError, sqlite3.Error), _digest_database() as database:
         database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)",
                              [(*keys[path], digests[path]) for path in settled])
     return [digests[path][:12] for path in paths]
@@ -240,13 +245,13 @@ def contents(paths):
 def _identity(path):
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path}: is no file; data must be in files")
+        raise InputError(f"{path}: is not a file; data must be in files")
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
 
 
 @contextmanager
-def _remembered():
-    """The database of digests. Where none can be kept, files are read again."""
+def _digest_database():
+    """Open the database of digests. The caller ignores its errors and then reads the files again."""
     folder = Path(os.environ.get("THESIS_REPRO_BUILD") or _PACKAGE.parent / "build")
     folder.mkdir(parents=True, exist_ok=True)
     with closing(sqlite3.connect(folder / "digests.sqlite", timeout=2)) as database, database:

@@ -21,12 +21,12 @@ def sequence(small_world):
 
 @pytest.fixture(scope="module")
 def made(sequence, small_labels):
-    """Every control's masks and the thesis's own."""
+    """Masks of every control and of the thesis, by method."""
     return {method: controls.masks(method, Source(small_labels), sequence, WIDTH) for method in controls.MASKS} | {
         "masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
 
 
-def test_every_control_gives_masks_that_the_odometry_takes_and_always_the_same(sequence, made):
+def test_masks_of_controls_are_valid_and_repeatable(sequence, made):
     for method, source in made.items():
         assert len(source) == len(sequence)
         mask = source[3]
@@ -37,7 +37,7 @@ def test_every_control_gives_masks_that_the_odometry_takes_and_always_the_same(s
         assert np.array_equal(mask, made["masked"][3]) == (method in ("masked", "fallback")), method
 
 
-def test_masks_come_from_the_frame_and_settings_that_their_name_says(sequence, small_world, small_labels, made):
+def test_controls_use_the_frame_and_settings_of_their_name(sequence, small_world, small_labels, made):
     for index, other in ((0, 6), (5, 11), (6, 0), (11, 5)):
         assert np.array_equal(made["other-frame"][index], made["masked"][other])
         assert np.array_equal(made["mirrored"][index], cv2.flip(made["masked"][index], 1))
@@ -49,14 +49,14 @@ def test_masks_come_from_the_frame_and_settings_that_their_name_says(sequence, s
         assert np.array_equal(made[method][5], masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)), method
 
 
-def test_random_lines_and_image_edges_cover_what_the_mask_covers(sequence, made):
+def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
     for index in range(12):
-        wanted = masks.coverage(made["masked"][index])
-        assert 0.05 < wanted < 0.95
-        assert masks.coverage(made["random-lines"][index]) == pytest.approx(wanted, abs=0.01)
-        assert masks.coverage(made["image-edges"][index]) == pytest.approx(wanted, abs=0.01)
+        expected = masks.coverage(made["masked"][index])
+        assert 0.05 < expected < 0.95
+        assert masks.coverage(made["random-lines"][index]) == pytest.approx(expected, abs=0.01)
+        assert masks.coverage(made["image-edges"][index]) == pytest.approx(expected, abs=0.01)
     assert not np.array_equal(made["random-lines"][0], made["random-lines"][1])
-    # segments are dilated like boundaries: opening with the square of ones changes nothing but at the border
+    # segments are dilated like boundaries, so opening changes only the border
     mask = made["random-lines"][2]
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((WIDTH - 1, WIDTH - 1), np.uint8))
     assert np.array_equal(opened[WIDTH:-WIDTH, WIDTH:-WIDTH], mask[WIDTH:-WIDTH, WIDTH:-WIDTH])
@@ -68,23 +68,20 @@ def test_random_lines_and_image_edges_cover_what_the_mask_covers(sequence, made)
 
 
 @pytest.mark.parametrize("value", [0, 255])
-def test_masks_that_are_empty_or_full_have_controls_of_their_kind(sequence, made, monkeypatch, value):
+def test_controls_of_empty_and_full_masks(sequence, made, monkeypatch, value):
     monkeypatch.setattr(masks.LabelMasks, "__getitem__", lambda self, index: np.full(self.size, value, np.uint8))
-    covered = {method: masks.coverage(made[method][0]) for method in ("random-lines", "image-edges")}
-    if value == 0:
-        assert set(covered.values()) == {0.0}
-    else:
-        assert covered["random-lines"] > 0.99 and covered["image-edges"] > 0.5
+    lines, edges = (masks.coverage(made[method][0]) for method in ("random-lines", "image-edges"))
+    assert lines > 0.99 and edges > 0.5 if value else lines == edges == 0
 
 
-def test_keypoints_spread_out_are_as_many_as_asked_for(sequence):
+def test_spread_keypoints_have_the_asked_number(sequence):
     counts = [len(keypoints.detect(frame, odometry.THESIS)) for frame in sequence.frames()]
-    wanted = np.mean(counts) / 2
-    distance = controls.min_distance(sequence, wanted)
+    target = np.mean(counts) / 2
+    distance = controls.min_distance(sequence, target)
     assert distance > odometry.THESIS.min_distance and distance == round(distance, 1)
     spread = replace(odometry.THESIS, min_distance=distance)
     left = np.mean([len(keypoints.detect(frame, spread)) for frame in sequence.frames()])
-    assert left == pytest.approx(wanted, rel=0.03)
+    assert left == pytest.approx(target, rel=0.03)
     assert controls.min_distance(sequence, max(counts)) == odometry.THESIS.min_distance
 
 

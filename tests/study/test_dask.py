@@ -1,17 +1,17 @@
-"""The runs on a real Dask cluster: a scheduler and two workers, each a process of its own on this machine."""
+"""Runs on a real Dask cluster on this machine: a scheduler and two workers, each a process."""
 
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter
 from functools import partial
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from waiting import wait_for
 
 from thesis_repro import InputError, longrun
 from thesis_repro.kitti import Sequence
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES, CHECKPOINT = 12, 4
-# loaded by the workers: slow enough to be killed in the middle, and telling which frames they read
+# loaded by the workers: makes them slow enough to be killed in a pass, and logs the frames that they read
 PRELOAD = """
 import os, time
 from thesis_repro.odometry import passes
@@ -63,7 +63,7 @@ def scheduler(tmp_path):
 
 @pytest.fixture
 def workers(scheduler, tmp_path):
-    """Two worker processes, by process number, and the file that they log the frames they read to."""
+    """({process number: process} of two workers, the file that logs the frames they read)."""
     log = tmp_path / "frames.log"
     log.touch()
     (tmp_path / "slow.py").write_text(PRELOAD.format(checkpoint=CHECKPOINT, log=str(log)))
@@ -82,25 +82,18 @@ def workers(scheduler, tmp_path):
             process.wait()
 
 
-def wait_for(condition):
-    end = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def reads(log):
     return [(int(process), (name, int(index))) for process, name, index in map(str.split, log.open())]
 
 
-def test_a_killed_worker_loses_nothing(small_world, small_labels, workers, scheduler, tmp_path):
+def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, scheduler, tmp_path):
     jobs = first_jobs(small_world / "kitti", ["00", "01"], {"thesis": (5, 15)}, repetitions=2)
     kitti, (processes, log) = small_world / "kitti", workers
     here = runner.run(jobs, kitti, small_labels, tmp_path / "here")
     there, killed, finished = tmp_path / "there", [], {}
 
     def kill():
-        """A worker in the middle of a pass that has a checkpoint, when others have finished some."""
+        """Kill a worker within a pass that has a checkpoint, once other runs have finished."""
         def victims():
             last = dict(reads(log))  # the frame that each worker read last
             return [process for process, (_, index) in last.items() if index >= CHECKPOINT + 1 and index < FRAMES - 3]
@@ -121,7 +114,7 @@ def test_a_killed_worker_loses_nothing(small_world, small_labels, workers, sched
         one, two = (pd.read_csv(tmp_path / where / job.sequence / f"{job.name}.csv") for where in ("here", "there"))
         exact = [column for column in one if not column.endswith("_seconds")]
         pd.testing.assert_frame_equal(one[exact], two[exact], check_exact=True)
-    # nothing finished was done again, and what was half done went on from its checkpoint
+    # finished runs were kept, and the stopped pass resumed from its checkpoint
     assert 0 < len(finished) < len(jobs)
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
     assert not list(there.rglob("pass-*"))
@@ -132,7 +125,7 @@ def test_a_killed_worker_loses_nothing(small_world, small_labels, workers, sched
     assert set(times.values()) == {passes, passes + 1} and len(times) == 2 * FRAMES
 
 
-def test_a_scheduler_that_cannot_be_used_is_one_line(scheduler, monkeypatch):
+def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 1)
     for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):  # without workers, none, no address
         with pytest.raises(InputError, match=address) as error:
@@ -141,7 +134,7 @@ def test_a_scheduler_that_cannot_be_used_is_one_line(scheduler, monkeypatch):
         assert "\n" not in str(error.value)
 
 
-def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, small_labels, tmp_path, monkeypatch):
+def test_a_worker_with_other_folders_or_other_code_is_reported(small_world, small_labels, tmp_path, monkeypatch):
     jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
     record = runner.stages.record(tmp_path / "00")
@@ -153,22 +146,20 @@ def test_a_worker_with_other_folders_or_other_code_is_told_apart(small_world, sm
     assert elsewhere[jobs[0]] != older[jobs[0]] and not (tmp_path / "00" / "baseline-0.csv").exists()
 
 
-def test_label_maps_of_workers_have_the_bits_of_one_process(workers, scheduler, small_world, tmp_path, monkeypatch):
-    from thesis_repro.cityscapes import N_CLASSES
+def test_label_maps_of_workers_have_the_bits_of_one_process(workers, scheduler, small_world, small_model, tmp_path,
+                                                            monkeypatch):
     from thesis_repro.cli import main
     from thesis_repro.segmentation import prediction
-    from thesis_repro.segmentation.unet import build_unet
 
-    build_unet((64, 64, 1), N_CLASSES, 4).save(tmp_path / "model.keras")
     monkeypatch.setattr(prediction, "PART", 4)
     monkeypatch.setattr(prediction, "spread_label_maps", partial(prediction.spread_label_maps, batch_size=4))
     monkeypatch.setattr(prediction, "write_label_maps", partial(prediction.write_label_maps, batch_size=4))
-    command = ["predict", "--images", small_world / "kitti", "--model", tmp_path / "model.keras"]  # 00 and 01
+    command = ["predict", "--images", small_world / "kitti", "--model", small_model]  # 00 and 01
     assert main([*map(str, command), "--output", str(tmp_path / "alone")]) == 0
     assert main([*map(str, command), "--output", str(tmp_path / "spread"), "--dask", scheduler]) == 0
 
     def contents(folder):
-        return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*.*"))
+        return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")
                 if path.name not in (longrun.LOG, longrun.LIST)}
 
     assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)

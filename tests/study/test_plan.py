@@ -1,4 +1,4 @@
-"""The plan: every notebook that runs odometry is in it, and it is near what a run really takes."""
+"""The planned time: it includes every notebook that runs odometry and is near the real time."""
 
 import time
 
@@ -12,14 +12,13 @@ from thesis_repro.study.sources import Source
 pytestmark = pytest.mark.slow
 
 
-def test_every_notebook_is_counted(small_world, monkeypatch):
-    # 80 thesis runs, 10 refined ones, 11 controls and 5 others times 5 and two estimators
-    runs, first = 16 * 5 + 2 * 5 + 11 * 2 * 5 + 5 * 5, 16 * 5 + 2 * 5 + 11 * 2 * 5
+def test_the_plan_includes_every_notebook(small_world, monkeypatch):
+    first = 16 * 5 + 2 * 5 + 11 * 2 * 5  # thesis runs, refined runs, and 11 controls with two estimators
+    runs = first + 5 * 5
     monkeypatch.setattr(plan, "_seconds_a_frame", lambda run: 0.1)
     monkeypatch.setattr(plan, "cores", lambda: 2)
     planned = plan.of_thesis(small_world / "kitti", PROFILES["thesis"])
     seconds = {name: seconds for name, _, _, seconds in planned["steps"]}
-    # all that is timed takes 0.1 seconds a frame
     assert seconds == pytest.approx({"05: label maps": 2.4, "07: one sequence": 12 * plan.RUNS_IN_07 * 0.1,
                                      "08: odometry": 24 * runs / first * 0.1,
                                      "08: timing of every width": 24 * 16 * 0.1, "09: ablations": 2.4})
@@ -27,7 +26,6 @@ def test_every_notebook_is_counted(small_world, monkeypatch):
 
 
 def test_a_study_takes_about_as_long_as_planned(small_world, small_labels, tmp_path):
-    """Loosely, since machines are busy."""
     study = series.Study(small_world / "kitti", ("00",), (Source(small_labels, name="net"),), (5, 10))
     planned = plan.of_study(study)
     assert planned["steps"][0][1:3] == (3, "runs")
@@ -36,14 +34,11 @@ def test_a_study_takes_about_as_long_as_planned(small_world, small_labels, tmp_p
     assert 1 / 3 < planned["seconds"] / (time.process_time() - started) < 3
 
 
-def test_the_command_prints_a_table(small_world, small_labels, tmp_path, capsys):
+def test_the_command_prints_a_table(small_world, small_labels, tiny_kitti, tmp_path, capsys):
     assert main(["study", "--kitti", str(small_world / "kitti"), "--labels", str(small_labels), "--widths", "5",
                  "--output", str(tmp_path / "out"), "--plan"]) == 0
     text = capsys.readouterr().out
     assert "2 sequences, 24 frames" in text and "20 runs" in text and " min\n" in text
-    assert "2 sequences: no verdict" in text  # for fewer than six
-
-
-def test_sequences_that_are_too_short_are_one_clear_line(tiny_kitti, capsys):
+    assert "2 sequences: no verdict" in text  # there is one for six or more
     assert main(["plan", "--kitti", str(tiny_kitti)]) == 1
     assert "too short" in capsys.readouterr().err

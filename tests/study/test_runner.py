@@ -24,7 +24,7 @@ def finished(small_world, small_labels, tmp_path_factory):
     return folder, jobs, runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
 
 
-def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finished):
+def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, finished):
     folder, _, summary = finished
     assert len(summary) == 10
     sequence = Sequence(small_world / "kitti", "01")
@@ -34,14 +34,14 @@ def test_a_run_is_the_odometry_of_its_sequence(small_world, small_labels, finish
     assert {name: row[name] for name in expected} == pytest.approx(expected, nan_ok=True, rel=0)
     assert row["se3"] <= row["rmse"]
     best = thesis_tables.best_widths(compare.of_method(summary, "masked")).loc["01"]
-    of_name = summary[summary["sequence"] == "01"].groupby("method")[["rmse", "max_keypoints"]].min()
-    assert best["rmse"] == of_name.loc["masked", "rmse"]
-    assert of_name.loc["reduced", "max_keypoints"] == round(best["mean_keypoints"])
+    least = summary[summary["sequence"] == "01"].groupby("method")[["rmse", "max_keypoints"]].min()
+    assert best["rmse"] == least.loc["masked", "rmse"]
+    assert least.loc["reduced", "max_keypoints"] == round(best["mean_keypoints"])
     assert np.array_equal(runner.run_poses(summary, folder)["01", "masked-15-0"], alone.poses)
 
 
 @pytest.mark.parametrize("frames, t_rel", [(151, 2.02), (99, np.nan)])
-def test_kittis_errors_are_those_of_paths_of_100_metres_and_more(frames, t_rel):
+def test_kittis_errors_need_paths_of_100_metres(frames, t_rel):
     true = np.tile(np.eye(4), (frames, 1, 1))
     true[:, 2, 3] = np.arange(frames)
     table = pd.DataFrame({"detected": [9.0] * frames, "flag": ""})
@@ -50,7 +50,7 @@ def test_kittis_errors_are_those_of_paths_of_100_metres_and_more(frames, t_rel):
     assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
 
 
-def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, small_labels, finished, monkeypatch):
+def test_only_missing_runs_are_run_again(small_world, small_labels, finished, monkeypatch):
     folder, jobs, summary = finished
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
     lost = folder / "00" / "masked-05-0.csv"
@@ -61,17 +61,17 @@ def test_finished_runs_are_not_run_again_and_missing_ones_are(small_world, small
 
 
 @pytest.mark.parametrize("error", [OSError("pulled the plug"), KeyboardInterrupt()])
-def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small_labels, finished, tmp_path,
+def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(small_world, small_labels, finished, tmp_path,
                                                               monkeypatch, error):
     folder, jobs, _ = finished
     jobs = [job for job in jobs if job.method != "reduced"]
     monkeypatch.setattr(odometry.passes, "CHECKPOINT", 5)
-    read, plugged = [], []
+    read, raised = [], []
 
     def frame(self, index, original=Sequence.frame):
         read.append((self.name, index))
-        if self.name == "01" and index == 8 and not plugged:
-            plugged.append(True)
+        if self.name == "01" and index == 8 and not raised:
+            raised.append(True)
             raise error
         return original(self, index)
 
@@ -84,7 +84,7 @@ def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small
     assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".log", ".npz"}
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
     read.clear()
-    # by however many processes: what has a checkpoint goes on as it was
+    # jobs with a checkpoint resume in their old passes
     runner.run(jobs + [Job("01", "masked", 7)], small_world / "kitti", small_labels, tmp_path)
     assert [index for name, index in read if name == "01"] == [*range(5, 12), *range(12)]
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
@@ -95,7 +95,7 @@ def test_a_stopped_run_goes_on_and_ends_as_an_undisturbed_one(small_world, small
         pd.testing.assert_frame_equal(whole[exact], resumed[exact], check_exact=True)
 
 
-def test_what_fails_is_reported_and_stops_no_other_run(small_world, small_labels, tmp_path, capsys):
+def test_a_failed_run_is_reported_and_stops_no_other_run(small_world, small_labels, tmp_path, capsys):
     shutil.copytree(small_labels, tmp_path / "labels")
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
@@ -110,7 +110,7 @@ def test_what_fails_is_reported_and_stops_no_other_run(small_world, small_labels
         runner.run(jobs[-1:], small_world / "kitti", small_labels, tmp_path / "none")
 
 
-def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_path):
+def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path):
     kitti, jobs = small_world / "kitti", [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)]
 
     def keypoints(*settings):
@@ -119,7 +119,7 @@ def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_pat
 
     thesis = keypoints()
     assert thesis["masked"] != thesis["exact-boundaries"]
-    exact = keypoints(MaskSettings("exact"))  # in the same folder: nothing of the others is left
+    exact = keypoints(MaskSettings("exact"))  # the same folder: the first results are replaced
     assert exact["masked"] == exact["exact-boundaries"] == thesis["exact-boundaries"]
     chosen = MaskSettings("exact", symmetric=True, classes=("road", "building"), movable=3, margin=20)
     few = keypoints(chosen)
@@ -128,7 +128,7 @@ def test_how_all_masks_are_made_can_be_chosen(small_world, small_labels, tmp_pat
     assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
 
 
-def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finished, monkeypatch):
+def test_runs_are_timed_once(small_world, small_labels, finished, monkeypatch):
     folder, jobs, _ = finished
     first = [job for job in jobs if job.method != "reduced"]
     timed = timing.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
@@ -137,18 +137,18 @@ def test_runs_are_timed_once_and_on_their_own(small_world, small_labels, finishe
     pd.testing.assert_frame_equal(timed, again)
 
 
-def test_the_mounting_angle_of_other_sequences_is_removed(small_world, small_labels, tmp_path):
+def test_without_a_mounting_angle_the_rmse_stays(small_world, small_labels, tmp_path):
     kitti = small_world / "kitti"
     jobs = first_jobs(kitti, ["00", "01"], {"refined": (10,)})
     runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=6)
     corrected = runner.with_boresight_correction(runs, kitti, tmp_path, frames=6)["rmse_boresight_corrected"]
     # no angle is determined on six frames, so nothing is removed
     assert corrected.tolist() == pytest.approx(runs["rmse"].tolist())
-    of_thesis = runs.assign(estimator="thesis")
-    assert runner.with_boresight_correction(of_thesis, kitti, tmp_path)["rmse_boresight_corrected"].isna().all()
+    thesis_runs = runner.with_boresight_correction(runs.assign(estimator="thesis"), kitti, tmp_path)
+    assert thesis_runs["rmse_boresight_corrected"].isna().all()
 
 
-def test_the_first_jobs_are_all_that_was_asked_for_and_no_two_share_a_name(small_world, tiny_kitti):
+def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitti):
     label_maps, ready = Source(tiny_kitti, name="net"), Source(tiny_kitti, "masks", "ready")
     jobs = first_jobs(small_world / "kitti", ["00"], {"thesis": (5, 10), "refined": ()}, tested=10,
                       sources=(label_maps, ready), repetitions=2)
@@ -159,8 +159,7 @@ def test_the_first_jobs_are_all_that_was_asked_for_and_no_two_share_a_name(small
     assert count["net", "masked", "thesis"] == 4 and count["net", "masked", "refined"] == 2
     assert count["ready", "masked", "refined"] == 2
     assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()
-    of = {name: set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready")}
-    assert of["net"] == {"masked", *controls.MASKS}
-    assert of["net"] - of["ready"] == set(controls.OF_LABEL_MAPS)
+    net, ready_made = (set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready"))
+    assert net == {"masked", *controls.MASKS} and net - ready_made == set(controls.OF_LABEL_MAPS)
     without_truth = first_jobs(tiny_kitti, ["00"], {"thesis": (5,)}, tested=5)
     assert "true-labels" not in {job.method for job in without_truth}

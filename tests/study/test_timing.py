@@ -1,25 +1,22 @@
-"""The time of a frame: the stages are those of the chain that the label maps, masks and runs on disk go through."""
+"""The time of a frame, stage by stage; the timed steps are the steps of a real run."""
 
 import time
 
-import keras
 import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro import InputError, cityscapes, masks, odometry
+from thesis_repro import InputError, masks, odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.segmentation import prediction
-from thesis_repro.segmentation.unet import build_unet
+from thesis_repro.segmentation import prediction, training
 from thesis_repro.study import timing
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def model():
-    keras.utils.set_random_seed(0)
-    return build_unet((64, 64, 1), cityscapes.N_CLASSES, 4)
+def model(small_model):
+    return training.load_model(small_model)
 
 
 @pytest.fixture
@@ -28,7 +25,7 @@ def sequence(small_world, monkeypatch):
     return Sequence(small_world / "kitti", "00")
 
 
-def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
+def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
     keypoint_mask = masks.keypoint_mask
     monkeypatch.setattr(masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0])
     table = timing.measure(sequence, model, width=5)
@@ -40,7 +37,7 @@ def test_a_slow_stage_shows_where_it_is(sequence, model, monkeypatch):
     assert slow["masked, width 5", "mask"] > 500 > slow.drop(("masked, width 5", "mask")).max()
 
 
-def test_its_masks_and_steps_are_those_of_a_run(sequence, model, tmp_path, monkeypatch):
+def test_timed_steps_equal_the_steps_of_a_run(sequence, model, tmp_path, monkeypatch):
     steps = []
     step = odometry.Odometry.step
     monkeypatch.setattr(odometry.Odometry, "step", lambda *given: steps.append(step(*given)) or steps[-1])
@@ -48,9 +45,9 @@ def test_its_masks_and_steps_are_those_of_a_run(sequence, model, tmp_path, monke
     short = sequence.subset(5)
     prediction.write_label_maps(model, short.frame_paths, tmp_path)
     made = masks.LabelMasks(tmp_path, short, 5)
-    for of_method, expected in ((steps[:10:2], odometry.run(short)), (steps[1:10:2], odometry.run(short, masks=made))):
-        assert np.array_equal([each.pose for each in of_method], expected.poses)
-        assert [each.detected for each in of_method] == expected.frames["detected"].tolist()
+    for timed, expected in ((steps[:10:2], odometry.run(short)), (steps[1:10:2], odometry.run(short, masks=made))):
+        assert np.array_equal([timed_step.pose for timed_step in timed], expected.poses)
+        assert [timed_step.detected for timed_step in timed] == expected.frames["detected"].tolist()
 
 
 def test_too_few_frames_are_refused(sequence, model):
@@ -58,9 +55,9 @@ def test_too_few_frames_are_refused(sequence, model):
         timing.measure(sequence.subset(3), model)
 
 
-def test_figures_in_git_keep_the_timings_that_came_with_them(tmp_path):
+def test_recorded_timings_are_kept(tmp_path):
     path = tmp_path / "timings" / "seconds.csv"
     first, second = (pd.DataFrame({"sequence": ["00"], "seconds": [value]}) for value in (1.5, 2.5))
-    assert timing.recorded(first, path, keep=True).equals(first)  # there were none
+    assert timing.recorded(first, path, keep=True).equals(first)  # nothing was recorded
     assert timing.recorded(second, path, keep=True).equals(first)
     assert timing.recorded(second, path, keep=False).equals(second)

@@ -1,7 +1,4 @@
-"""Torture: kills, faults and bad input tried on purpose, by real commands run as processes.
-
-`make test` runs the quick trials; those marked `torture` are run by `make torture` alone.
-"""
+"""Kills, faults and bad input, tried on real commands; trials marked `torture` are run by `make torture` alone."""
 
 import sys
 from pathlib import Path
@@ -11,7 +8,7 @@ import numpy as np
 import pytest
 from trials import thesis
 
-# the fit of notebook 4 on a few made-up images, as a command
+# the training of tests/segmentation/test_training.py as a command
 TRAINING = f"""
 import sys
 sys.path.insert(0, {str(Path(__file__).parents[1] / "segmentation")!r})
@@ -26,42 +23,29 @@ except Exception as error:
 """
 
 
-@pytest.fixture(scope="session")
-def small_model(tmp_path_factory):
-    """The thesis's network at 64x64 with 4 filters, untrained, as a file."""
-    from thesis_repro.cityscapes import N_CLASSES
-    from thesis_repro.segmentation.unet import build_unet
-
-    path = tmp_path_factory.mktemp("model") / "model.keras"
-    build_unet((64, 64, 1), N_CLASSES, 4).save(path)
-    return path
-
-
 @pytest.fixture
 def words(small_world, small_labels, small_model):
-    """words(name, output): a command that writes into `output`. "odometry.png" writes a plot there, and so on."""
-    kitti = ["--kitti", small_world / "kitti"]
-    frames = [*kitti, "--sequence", "00"]
+    """words(name, output): a command that writes `output`. The ending of "odometry.png" says which output it is."""
+    kitti = small_world / "kitti"
+    options = {".txt": "--output", ".png": "--plot", ".mp4": "--video"}
 
-    def command(name, output="out", labels=small_labels):
-        options = {".txt": "--output", ".tum": "--tum", ".svg": "--plot", ".png": "--plot", ".mp4": "--video"}
+    def command(name, output="out"):
         if name.startswith("odometry"):
-            return thesis("odometry", *frames, options[name[-4:]], f"{output}{name[-4:]}")
+            return thesis("odometry", "--kitti", kitti, "--sequence", "00", options[name[-4:]], f"{output}{name[-4:]}")
         return {
             "synthesize": thesis("synthesize", output, "--profile", "smoke"),
             "training": [sys.executable, "-c", TRAINING, output],
-            "predict": thesis("predict", "--images", small_world / "kitti/sequences/00", "--model", small_model,
-                              "--output", output),
-            "masks": thesis("masks", *frames, "--labels", small_labels / "00", "--dilation", 5, "--output", output),
-            "study": thesis("study", *kitti, "--labels", labels, "--widths", 5, "--repetitions", 1, "--jobs", 2,
-                            "--output", output)}[name]
+            "predict": thesis("predict", "--images", kitti / "sequences/00", "--model", small_model, "--output",
+                              output),
+            "study": thesis("study", "--kitti", kitti, "--labels", small_labels, "--widths", 5, "--repetitions", 1,
+                            "--jobs", 2, "--output", output)}[name]
 
     return command
 
 
 @pytest.fixture
 def folder(tmp_path, tiny_kitti, tiny_cityscapes):
-    """kitti, cityscapes, label maps and masks of sequence 00, and a file that is somebody's."""
+    """A folder with kitti, cityscapes, labels and masks of sequence 00, path.txt, and a user's own mine/letter.txt."""
     for name, picture in (("labels", np.repeat([[7], [23]], 16, axis=0).repeat(40, axis=1)),
                           ("masks", np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1))):
         (tmp_path / name).mkdir()

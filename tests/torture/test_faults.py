@@ -1,4 +1,4 @@
-"""What a machine does to long runs: full and read-only disks, a second run, dead workers, no memory."""
+"""Faults of the machine: full and read-only disks, a second run, dead workers, too little memory."""
 
 import fcntl
 import os
@@ -11,17 +11,18 @@ from functools import partial
 
 import psutil
 import pytest
-from trials import finish, nothing_stray, refused, run, start, whole_again
+from trials import finish, no_temporary_files, refused, resumes, run, start
+from waiting import wait_for
 
 
 def quick_and_long(quick, *cases):
-    """Cases of which the first runs among all tests, and the others in `make torture`."""
+    """The first case runs in `make test`, the others in `make torture`."""
     return [quick, *(pytest.param(*case, marks=pytest.mark.torture) for case in cases)]
 
 
 @pytest.fixture
 def disk(tmp_path):
-    """A small disk below `tmp_path`: disk(kilobytes) makes or resizes it; with "ro" nothing can be written."""
+    """disk(kilobytes, "ro" or "rw"): make or resize a small disk below `tmp_path`."""
     folder = tmp_path / "disk"
     folder.mkdir()
 
@@ -35,43 +36,31 @@ def disk(tmp_path):
     subprocess.run(["umount", "-l", folder], capture_output=True)
 
 
-def wait_for(condition, seconds=120):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, f"waited {seconds} s"
-        time.sleep(0.01)
-
-
 @pytest.mark.parametrize("name, kilobytes", quick_and_long(
     ("odometry.txt", 0), ("odometry.mp4", 0), ("synthesize", 300), ("training", 40), ("predict", 24), ("study", 40)))
-def test_a_full_disk(words, disk, tmp_path, name, kilobytes):
-    """It is named, and with room made the same command goes on to what an undisturbed run leaves."""
-    (disk(max(4, kilobytes)) / "other").write_bytes(bytes(0 if kilobytes else 4096))
-    refused(run(words(name, "disk/out"), tmp_path), "disk/out", left=["disk/*"])
-    nothing_stray(tmp_path)
-    disk(100_000)
-    whole_again(words, name, tmp_path, "disk/out")
-
-
-@pytest.mark.parametrize("name", quick_and_long("odometry.txt", ["synthesize"], ["training"], ["study"]))
-def test_results_that_cannot_be_written(words, disk, tmp_path, name):
+def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes):
+    """The error names the output; with room made, the same command resumes."""
     disk(1000, "ro")
     refused(run(words(name, "disk/out"), tmp_path), "disk/")
+    (disk(max(4, kilobytes), "rw") / "other").write_bytes(bytes(0 if kilobytes else 4096))
+    refused(run(words(name, "disk/out"), tmp_path), "disk/out", left=["disk/*"])
+    no_temporary_files(tmp_path)
+    disk(100_000)
+    resumes(words, name, tmp_path, "disk/out")
 
 
 @pytest.mark.parametrize("name, limit, megabytes, named", quick_and_long(
     ("odometry.txt", resource.RLIMIT_AS, 300, "memory"), ("synthesize", resource.RLIMIT_AS, 700, "memory"),
     ("predict", resource.RLIMIT_AS, 3080, "memory"), ("study", resource.RLIMIT_AS, 2000, "memory"),
     ("odometry.png", resource.RLIMIT_FSIZE, 1 / 256, "out.png")))
-def test_limits_of_a_process(words, tmp_path, name, limit, megabytes, named):
-    """Of its memory, and of its files, as a quota or `ulimit` has them."""
+def test_limits_of_memory_and_of_file_size(words, tmp_path, name, limit, megabytes, named):
     set_limit = partial(resource.setrlimit, limit, (int(megabytes * 2**20),) * 2)
     refused(run(words(name), tmp_path, before=set_limit), named, left=["out", "out/*"])
 
 
 @pytest.mark.torture
 @pytest.mark.parametrize("name", ["synthesize", "training", "predict", "study"])
-def test_a_folder_that_another_run_holds(words, tmp_path, name):
+def test_a_folder_locked_by_another_run(words, tmp_path, name):
     (tmp_path / "out").mkdir()
     descriptor = os.open(tmp_path / "out", os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -81,23 +70,22 @@ def test_a_folder_that_another_run_holds(words, tmp_path, name):
 
 @pytest.mark.torture
 @pytest.mark.parametrize("name", ["synthesize", "study"])
-def test_a_process_that_dies(words, tmp_path, name):
-    """As the system ends one where memory runs out."""
+def test_a_killed_worker(words, tmp_path, name):
     def workers():
         return [child for child in psutil.Process(process.pid).children() if "popen_loky" in " ".join(child.cmdline())]
 
     process = start(words(name), tmp_path)
     wait_for(lambda: process.poll() is not None or workers())
     time.sleep(0.5)
-    assert process.poll() is None, "it ended before one could be killed"
+    assert process.poll() is None, "it ended before a worker could be killed"
     workers()[0].kill()
     refused(finish(process), "a process was killed")
-    whole_again(words, name, tmp_path)
+    resumes(words, name, tmp_path)
 
 
 @pytest.mark.torture
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_a_study_that_is_ended_ends_its_workers(words, tmp_path, number):
+def test_a_terminated_study_ends_its_workers(words, tmp_path, number):
     process = start(words("study"), tmp_path)
     wait_for(lambda: list((tmp_path / "out").rglob("pass-*")) or process.poll() is not None
              or len(psutil.Process(process.pid).children()) > 2)
@@ -106,9 +94,9 @@ def test_a_study_that_is_ended_ends_its_workers(words, tmp_path, number):
     process.communicate(timeout=60)
     assert process.returncode in (128 + number, -signal.SIGKILL) and workers
     assert psutil.wait_procs(workers, 20)[1] == []
-    whole_again(words, "study", tmp_path)
+    resumes(words, "study", tmp_path)
 
 
-def test_a_reader_that_has_seen_enough(words, tmp_path):
+def test_a_closed_pipe_is_no_error(words, tmp_path):
     result = run(["bash", "-c", f"{shlex.join(map(str, words('odometry.txt')))} | head -1"], tmp_path)
     assert "Traceback" not in result.stderr and len(result.stdout.splitlines()) == 1 and (tmp_path / "out.txt").exists()

@@ -1,4 +1,4 @@
-"""SIGKILL at moments nobody chose, then the same command again: the bytes of an undisturbed run, and nothing stray."""
+"""Commands killed at random moments resume and leave the bytes of an undisturbed run, and no temporary files."""
 
 import random
 import shutil
@@ -7,7 +7,8 @@ import time
 
 import nbformat
 import pytest
-from trials import ROOT, contents, finish, kill, nothing_stray, same, snapshot, start, succeed
+from trials import ROOT, contents, finish, kill, no_temporary_files, same, snapshot, start, succeed
+from waiting import wait_for
 
 from thesis_repro.settings import read_settings
 
@@ -15,45 +16,42 @@ pytestmark = pytest.mark.torture
 
 
 def torture(command, where, results, kills, prepare=lambda: None, **environment):
-    """Kill a command `kills` times, each time a while after it has begun to write; then let it end.
+    """Kill a command `kills` times while it writes, then let it end.
 
-    The folder `results` below `where` is made anew by `prepare` for the undisturbed run and for the killed one. The
-    moments are spread over the time of the undisturbed run. A run that has ended before its moment is compared too.
+    `prepare` fills the folder `results` before the undisturbed run and before the killed one. The kills are spread over
+    the time of the undisturbed run. The results of a run that ends before it is killed are compared too.
     """
-    def anew():
+    def clear():
         shutil.rmtree(where / results, ignore_errors=True)
         prepare()
 
     def begin():
         """Start the command and wait until a file has changed."""
         before, process = snapshot(where), start(command, where, **environment)
-        while process.poll() is None and snapshot(where) == before:
-            time.sleep(0.005)
+        wait_for(lambda: process.poll() is not None or snapshot(where) != before, 600)
         return process
 
-    anew()
+    clear()
     process, started = begin(), time.monotonic()
-    result = finish(process)
-    assert result.returncode == 0, result
-    seconds, wanted = time.monotonic() - started, contents(where / results)
+    assert finish(process).returncode == 0
+    seconds, expected = time.monotonic() - started, contents(where / results)
     draw = random.Random(1)
-    anew()
+    clear()
     killed = 0
     for number in draw.sample(range(kills), kills):
         process = begin()
-        time.sleep((number + draw.random()) / kills * seconds / (1 + killed))  # what goes on is shorter
+        time.sleep((number + draw.random()) / kills * seconds / (1 + killed))  # a resumed run is shorter
         if process.poll() is None:
             kill(process)
             killed += 1
             continue
-        result = finish(process)
-        assert result.returncode == 0, f"does not go on: {result}"
-        same(contents(where / results), wanted)
-        anew()
+        assert finish(process).returncode == 0
+        same(contents(where / results), expected)
+        clear()
         killed = 0
     succeed(command, where, **environment)
-    same(contents(where / results), wanted)
-    nothing_stray(where)
+    same(contents(where / results), expected)
+    no_temporary_files(where)
 
 
 @pytest.mark.parametrize("name, kills", [("synthesize", 6), ("training", 4), ("predict", 4), ("study", 7)])

@@ -1,4 +1,4 @@
-"""Odd input that must work: names of every kind, no network, no cache; and what a run must not touch."""
+"""Odd names, no network and a read-only cache must work; data must not be changed."""
 
 import ctypes
 import os
@@ -12,24 +12,23 @@ pytestmark = pytest.mark.torture
 
 ODD = "it's \"50%\" <script>&$x$_ é漢\n{b} #[1]*"
 SEQUENCE = "<b>&\"'$_$ %s é"
-CLONE_NEWNET = 0x40000000  # Linux's word for a network of one's own
+CLONE_NEWNET = 0x40000000  # Linux's flag for a new network namespace
 
 
 def without_network():
-    """Takes the network from a process, which only root may do."""
+    """Take the network from a process, which only root may do."""
     if os.geteuid() == 0:
         ctypes.CDLL(None).unshare(CLONE_NEWNET)
 
 
-def without_roots_rights():
-    """Takes from root what lets it read and write everywhere, so that permissions hold for it as for everybody."""
+def without_root_privileges():
+    """Drop the capabilities of root that ignore permissions of files."""
     if os.geteuid() == 0:
         for capability in (1, 2, 3):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAP_FOWNER
             ctypes.CDLL(None).prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
 
 
 def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
-    """Every command that reads or makes data."""
     root = tmp_path / ODD
     root.mkdir()
     out, labels = root / 'out %d "x"', (folder / "labels").rename(root / "labels <i>&")
@@ -62,13 +61,13 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
 
 
 def make(*words):
-    """What make says, without setting anything up."""
+    """Run make without its target `setup`."""
     return subprocess.run(["make", "-C", trials.ROOT, "-o", ".venv/ready", *words], capture_output=True, text=True,
                           env=trials.environment())
 
 
-def test_make_takes_folders_of_any_name_and_refuses_what_it_does_not_know(tiny_kitti, tmp_path):
-    odd = tmp_path / ODD.replace("$x$_", "").replace("\n", " ")  # make has its own idea of dollars, and none of lines
+def test_make_takes_odd_folders_and_refuses_unknown_settings(tiny_kitti, tmp_path):
+    odd = tmp_path / ODD.replace("$x$_", "").replace("\n", " ")  # make expands $ and ends at a line break
     tiny_kitti.rename(odd)
     assert make("check-data", f"KITTI={odd}").returncode == 0
     planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={odd}", f"BUILD={tmp_path / 'build'}")
@@ -80,7 +79,7 @@ def test_make_takes_folders_of_any_name_and_refuses_what_it_does_not_know(tiny_k
         assert named in refused.stderr and "Traceback" not in refused.stderr, refused
 
 
-def test_a_user_who_may_write_to_no_cache(tmp_path, tiny_kitti):
+def test_caches_that_cannot_be_written(tmp_path, tiny_kitti):
     package, home = tmp_path / "package" / "thesis_repro", tmp_path / "home"
     shutil.copytree(trials.ROOT / "thesis_repro", package, ignore=shutil.ignore_patterns("__pycache__"))
     home.mkdir()
@@ -88,9 +87,9 @@ def test_a_user_who_may_write_to_no_cache(tmp_path, tiny_kitti):
     for folder in folders:
         folder.chmod(0o555)
     no_caches = dict.fromkeys(("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "NUMBA_CACHE_DIR", "KERAS_HOME"))
-    for words, output in ((["odometry", "--kitti", "kitti", "--sequence", "00", "--plot", "path.png"], "path.png"),
-                          (["predict", "--images", "kitti/sequences/00", "--output", "out"], "out")):
-        result = trials.succeed(trials.thesis(*words), tmp_path, before=without_roots_rights,
+    for words, output in (("odometry --kitti kitti --sequence 00 --plot path.png", "path.png"),
+                          ("predict --images kitti/sequences/00 --output out", "out")):
+        result = trials.succeed(trials.thesis(*words.split()), tmp_path, before=without_root_privileges,
                                 PYTHONPATH=package.parent, HOME=home, **no_caches)
         assert {path.split("/")[0] for path in result.left} == {output} and "Traceback" not in result.stderr
     for folder in folders:

@@ -1,4 +1,4 @@
-"""Trials by the real command line: start a command as a process, and demand that it fails as it should."""
+"""Run commands as a user does, each as a process, and check how they end and what they leave."""
 
 import fnmatch
 import os
@@ -16,12 +16,12 @@ from thesis_repro import longrun
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 900  # seconds; a command that takes longer hangs
-# what tests/conftest.py sets for the tests' own process and a user does not have
-NOT_THE_USERS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
+# set by tests/conftest.py, and not by a user
+SET_BY_TESTS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
 
 
 class Result(NamedTuple):
-    """How a command ended. left: files and folders below its working folder that are new, changed or gone."""
+    """How a command ended. left: paths below its working folder that are new, changed or gone."""
 
     returncode: int
     stdout: str
@@ -34,24 +34,21 @@ def thesis(*words):
 
 
 def environment(**changes):
-    """A user's environment: without what the tests set for themselves; None takes a variable out."""
-    own = {name: value for name, value in os.environ.items()
-           if name not in NOT_THE_USERS and not name.startswith("THESIS_REPRO_")}
-    own |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROGRESS": os.devnull} | changes
-    return {name: str(value) for name, value in own.items() if value is not None}
+    """A user's environment with some variables changed; None removes one."""
+    variables = {name: value for name, value in os.environ.items()
+                 if name not in SET_BY_TESTS and not name.startswith("THESIS_REPRO_")}
+    variables |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROGRESS": os.devnull} | changes
+    return {name: str(value) for name, value in variables.items() if value is not None}
 
 
 def start(command, where, before=None, **changes):
-    """Start a command in a folder, as the leader of a process group of its own; returns the Popen.
-
-    before: called in the new process first, to take something from it. changes: of the environment.
-    """
+    """Start a command in a folder; `before` is called in the new process, `changes` are of the environment."""
     return subprocess.Popen(list(map(str, command)), cwd=where, env=environment(**changes), preexec_fn=before,
                             start_new_session=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def finish(process):
-    """Wait for what `start` started; a command that hangs is killed with all its processes."""
+    """Wait for a started command; one that hangs is killed."""
     try:
         stdout, stderr = process.communicate(timeout=TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -61,7 +58,7 @@ def finish(process):
 
 
 def run(command, where, **options):
-    """Start a command and wait for it; see `start`."""
+    """Start a command and wait for it; options as for `start`."""
     before = snapshot(where)
     return finish(start(command, where, **options))._replace(left=changes(before, snapshot(where)))
 
@@ -73,14 +70,14 @@ def succeed(command, where, **options):
 
 
 def kill(process):
-    """SIGKILL a process that `start` started, and all that it started."""
+    """SIGKILL a started command and its child processes."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
 
 
 def snapshot(where):
-    """What lies below a folder but logs, {relative path: size and date}; None for folders. It may be in use."""
+    """{path: (size, date)} of all files below a folder but logs; None for folders. Files may vanish meanwhile."""
     versions = {}
     for path in (Path(folder, name) for folder, folders, names in os.walk(where) for name in (*folders, *names)):
         with suppress(FileNotFoundError):
@@ -96,20 +93,17 @@ def changes(before, after):
 
 
 def refused(result, named, code=1, left=()):
-    """Demand of a command that it ended with `code` and one line of error that has the text `named`.
-
-    Nothing in its folder may be new or changed but what the patterns `left` allow ("out/*").
-    """
+    """Check the exit code, that one line of error has the text `named`, and that only `left` ("out/*") changed."""
     output = f"exit {result.returncode}\n{result.stdout}\n{result.stderr}"
     assert result.returncode == code and "Traceback" not in result.stdout + result.stderr, output
-    lines = [line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))]
-    assert len(lines) == 1 and str(named) in lines[0], f"not one line that names {named}: {output}"
-    more = [path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)]
-    assert not more, f"left behind: {', '.join(more)}\n{output}"
+    errors = [line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))]
+    assert len(errors) == 1 and str(named) in errors[0], f"not one line that names {named}: {output}"
+    unexpected = [path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)]
+    assert not unexpected, f"left behind: {', '.join(unexpected)}\n{output}"
 
 
 def contents(folder):
-    """Every file below a folder by path, without what no two runs share: times, dates and the log."""
+    """{path: content} of all files below a folder but logs; without times, which differ between runs."""
     return {str(path.relative_to(folder)): _content(path) for path in sorted(Path(folder).rglob("*"))
             if path.is_file() and path.name not in (longrun.LOG, longrun.LIST)}
 
@@ -124,19 +118,18 @@ def _content(path):
     return path.read_bytes()
 
 
-def same(results, wanted):
-    other = sorted(path for path in results.keys() | wanted.keys() if results.get(path) != wanted.get(path))
-    assert not other, f"not what an undisturbed run leaves: {', '.join(other)}"
+def same(results, expected):
+    different = sorted(path for path in results.keys() | expected.keys() if results.get(path) != expected.get(path))
+    assert not different, f"not as in an undisturbed run: {', '.join(different)}"
 
 
-def whole_again(words, name, where, output="out"):
-    """What was disturbed now ends well, with nothing stray, and leaves what an undisturbed run does."""
+def resumes(words, name, where, output="out"):
+    """Run a disturbed command again: it must succeed and leave the files of an undisturbed run."""
     for folder in (output, "whole"):
         succeed(words(name, folder), where)
-    nothing_stray(where)
+    no_temporary_files(where)
     same(contents(where / output), contents(where / "whole"))
 
 
-def nothing_stray(where):
-    stray = [path for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)]
-    assert not stray, f"left half written: {', '.join(map(str, stray))}"
+def no_temporary_files(where):
+    assert [str(path) for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)] == []

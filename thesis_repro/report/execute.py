@@ -33,7 +33,7 @@ class Execution(ExecutePreprocessor):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
-            with longrun.locked(path), longrun.logged(path.parent, f"make figures, {name}", ours=True), \
+            with longrun.locked(path), longrun.logged(path.parent, f"make figures, {name}", has_results=True), \
                     open(path, "w", encoding="utf-8") as self._log:
                 longrun.say(name)
                 try:
