@@ -1,4 +1,4 @@
-# make figures KITTI=/path CITYSCAPES=/path PROFILE=smoke|lab|demo|thesis; make help lists the rest.
+# Usage: make figures KITTI=/path CITYSCAPES=/path PROFILE=smoke|lab|demo|thesis. make help lists all commands.
 SHELL := /bin/bash
 .SHELLFLAGS := -o pipefail -c
 .DELETE_ON_ERROR:
@@ -8,7 +8,7 @@ MAKEFLAGS += --no-print-directory
 PYTHON ?= python3
 BIN := .venv/bin
 
-# A misspelled setting must not pass for the default.
+# Refuse a misspelled setting, for which the default would silently be used.
 SIZES := IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
 KNOWN := KITTI CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON GPU $(SIZES)
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
@@ -16,7 +16,7 @@ UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
 $(error $(firstword $(UNKNOWN)): unknown setting; known are $(KNOWN))
 endif
-# Nor may one that is empty, as of a shell's variable that is not set, or one that a command does not look at.
+# Refuse an empty setting, such as an unset shell variable, and settings that make evidence ignores.
 EMPTY := $(strip $(foreach name,$(filter $(KNOWN),$(GIVEN)),$(if $(strip $($(name))),,$(name))))
 ifneq (,$(EMPTY))
 $(error $(firstword $(EMPTY))= is empty; give it a value, or leave it out)
@@ -24,64 +24,64 @@ endif
 ifneq (,$(filter evidence,$(MAKECMDGOALS)))
 UNUSED := $(filter-out KITTI FRAMES REPETITIONS JOBS PYTHON,$(filter $(KNOWN),$(GIVEN)))
 ifneq (,$(UNUSED))
-$(error $(firstword $(UNUSED)): make evidence takes KITTI, FRAMES, REPETITIONS and JOBS alone)
+$(error $(firstword $(UNUSED)): make evidence takes only KITTI, FRAMES, REPETITIONS and JOBS)
 endif
 endif
-# What the environment says to the package directly, it says to make too.
+# Take settings from the package's THESIS_REPRO_ variables, too.
 $(foreach name,KITTI CITYSCAPES KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER $(SIZES),\
   $(if $($(name)),,$(if $(THESIS_REPRO_$(name)),$(eval $(name) := $$(THESIS_REPRO_$(name))))))
 PROFILE ?= $(if $(filter lab,$(MAKECMDGOALS)),lab,demo)
 ifneq (1 1,$(words x$(BUILD)) $(words x$(FIGURES)))
-$(error BUILD and FIGURES: make knows no file with a space in its name; name another folder)
+$(error BUILD and FIGURES: make allows no space in a file name; name another folder)
 endif
 ifneq (,$(filter-out 0 1,$(GPU)))
 $(error GPU=$(GPU): must be 1 or 0)
 endif
 
-# notebooks run in their own folder, so relative paths are made absolute here (and may hold spaces)
+# Make relative paths absolute, because notebooks run in their own folder. Paths may contain spaces.
 absolute = $(if $(filter /% ~%,$(firstword $(1))),$(1),$(CURDIR)/$(1))
 
 export THESIS_REPRO_PROFILE := $(PROFILE)
 $(foreach name,KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES,$(if $($(name)),\
   $(eval export THESIS_REPRO_$(name) = $$(call absolute,$$($(name))))))
 $(foreach name,JOBS DASK_SCHEDULER $(SIZES),$(if $($(name)),$(eval export THESIS_REPRO_$(name) := $($(name)))))
-# (the shell takes them from the environment, so that they may hold quotes)
+# The shell reads these paths from the environment, so they may contain quotes.
 DATA_OPTIONS := $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI") \
                 $(if $(CITYSCAPES),--cityscapes "$$THESIS_REPRO_CITYSCAPES") \
                 $(if $(KITTI_SEMANTIC),--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC")
-# what the libraries would otherwise say or look up
+# Silence the libraries, and stop their look-ups at import.
 export SM_FRAMEWORK := tf.keras
 export NO_ALBUMENTATIONS_UPDATE := 1
 export TF_CPP_MIN_LOG_LEVEL := 3
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
-# pip leaves the compiling to Python; where it may keep nothing, each start of TensorFlow would take 20 s instead of 5
+# Without bytecode files, each start of TensorFlow takes 20 s instead of 5 s (pip runs with --no-compile).
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup figures evidence test torture lint lab bench weights clean check-data plan
 
 help:
-	@echo "make figures     every table and figure into figures/, on embedded data"
-	@echo "                 KITTI=/path CITYSCAPES=/path   on your own data"
-	@echo "                 KITTI_SEMANTIC=/path           label maps judged on KITTI's street scenes too"
-	@echo "                 PROFILE=smoke|lab|demo|thesis  how large (demo), or one by one: IMAGE_SIZE BASE_FILTERS"
-	@echo "                 BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS"
-	@echo "make plan        what that would take, KITTI=/path, with the same settings"
-	@echo "make test        unit tests, and every notebook on the smallest profile"
-	@echo "make torture     kills, faults and bad input tried on purpose, some minutes"
-	@echo "make lint        style (Ruff) and types (mypy)"
-	@echo "make lab         JupyterLab on the notebooks, PROFILE=lab: each under a minute"
-	@echo "make check-data  what is missing or wrong in KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
-	@echo "make evidence    the answer and the audit on real frames, KITTI=/path, into figures/kitti_excerpts"
-	@echo "make bench       what odometry and network cost, as ratios, into build/bench.json (KITTI=/path)"
-	@echo "make weights     trains a model as the shipped one into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path"
-	@echo "make setup       only .venv with the pinned packages; GPU=1 adds CUDA for an NVIDIA GPU"
-	@echo "make clean       removes .venv, build and the figures of other data and profiles"
+	@echo "make figures     write every table and figure to figures/, from embedded data"
+	@echo "                 KITTI=/path CITYSCAPES=/path   from your own data"
+	@echo "                 KITTI_SEMANTIC=/path           also test the label maps on KITTI's street scenes"
+	@echo "                 PROFILE=smoke|lab|demo|thesis  size of the run (demo); single sizes: IMAGE_SIZE BASE_FILTERS"
+	@echo "                 BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS; number of processes: JOBS"
+	@echo "make plan        estimate the time and disk space of make figures KITTI=/path, with the same settings"
+	@echo "make test        run the unit tests, and every notebook with PROFILE=smoke"
+	@echo "make torture     run the tests of kills, faults and bad input (some minutes)"
+	@echo "make lint        check style (Ruff) and types (mypy)"
+	@echo "make lab         open the notebooks in JupyterLab with PROFILE=lab (a minute each)"
+	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
+	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts"
+	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
+	@echo "make weights     train a model like the shipped one into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path"
+	@echo "make setup       only install the pinned packages into .venv; GPU=1 adds CUDA for an NVIDIA GPU"
+	@echo "make clean       delete .venv, build and the figures of other data and profiles"
 
 setup: .venv/ready $(if $(filter-out 0,$(GPU)),.venv/ready-gpu)
 
-# uv installs many packages at once, in a third of pip's time. It does not know pip's settings: where it reaches no
-# index, pip does the same. (130: Ctrl-C)
+# uv takes a third of pip's time. It ignores pip's settings, so pip is used if uv cannot reach a package index. Exit
+# status 130 is Ctrl-C.
 install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --no-deps $(1) 2>/dev/null || { \
             [ $$? != 130 ] && $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile $(1); }
 
@@ -103,23 +103,23 @@ install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --
 	@$(BIN)/python -c 'import tensorflow as tf; print("GPUs that TensorFlow sees:", len(tf.config.list_physical_devices("GPU")))'
 	@touch $@
 
-# The name of the run follows from the data and the profile; settings.py needs no package to say it.
+# settings.py names the folder of the run, which depends on the settings. It needs no installed package.
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 ifneq (,$(filter figures,$(MAKECMDGOALS)))
-# ($(shell) of this make does not see what is exported.)
+# $(shell) does not see exported variables in older versions of make, so they are passed on.
 RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS DASK_SCHEDULER $(SIZES),THESIS_REPRO_$(name)='$(subst ','\'',$(THESIS_REPRO_$(name)))') \
          $(PYTHON) -m thesis_repro.settings)
 ifeq (,$(RUN))
 $(error the settings above are wrong)
 endif
-# With real frames and no Cityscapes the model in the package makes the label maps: nothing is rendered or trained.
+# With real frames and no Cityscapes, the shipped model makes the label maps, so nothing is rendered or trained.
 ifneq (,$(THESIS_REPRO_KITTI))
 ifeq (,$(THESIS_REPRO_CITYSCAPES))
 NOTEBOOKS := $(filter-out notebooks/01_% notebooks/02_% notebooks/04_%,$(NOTEBOOKS))
 endif
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
-# (the page shows what the notebooks leave, so they need not run again for it)
+# A change of the page does not rerun the notebooks.
 SOURCES := $(shell find thesis_repro -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html.j2' \
              -not -name 'page.css' -not -name 'captions.json')
 
@@ -128,16 +128,15 @@ figures: $(EXECUTED)
 	@$(BIN)/python -m thesis_repro.settings figures
 	@for notebook in $(EXECUTED); do [ -e $$notebook ] || exit 1; done
 
-# (It is written anew where a byte of the data has changed, and only then is what follows made anew.)
+# This file is rewritten only if a byte of the data has changed. Then the notebooks run again.
 $(RUN)/checked: .venv/ready FORCE
 	@mkdir -p $(@D)
 	@$(if $(strip $(DATA_OPTIONS)),$(BIN)/python -m thesis_repro.check $@,[ -e $@ ] || touch $@)
 
 FORCE:
 
-# What a notebook needs of others, by their numbers: they hand results on through files. One that is not listed needs
-# the one before it. Two that do not need each other are executed beside each other, for most are at times at work with
-# one core alone, and the training all the time.
+# Which notebooks each notebook needs, because it reads their files; one that is not listed needs the one before it.
+# Two notebooks run at once if neither needs the other: most use only one core at times, and training always does.
 NEEDS_01 :=
 NEEDS_02 := 01
 NEEDS_03 :=
@@ -152,8 +151,8 @@ MAKEFLAGS += -j2
 endif
 needed = $(foreach number,$(NEEDS_$(1)),$(filter $(RUN)/notebooks/$(number)_%,$(EXECUTED)))
 
-# A notebook that fails costs those that need it, but not the page, which says what is missing; make then ends with an
-# error. One that is interrupted (any other status than 1) ends make.
+# If a notebook fails, those that need it are skipped. The page is written and says what is missing, and make ends with
+# an error. If a notebook is interrupted (exit status other than 1), make stops.
 define execute
 $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 	@mkdir -p $$(@D)
@@ -169,11 +168,11 @@ $(foreach notebook,$(notdir $(NOTEBOOKS)),\
   $(eval $(call execute,$(notebook),$(if $(filter undefined,$(origin NEEDS_$(number))),$(previous),$(call needed,$(number)))))\
   $(eval previous := $(RUN)/notebooks/$(notebook)))
 
-# Notebook 8 does not wait for 7, which writes its knobs at once and has them read at the end of 8.
+# Notebook 8 does not wait for 7: it needs only the settings that 7 writes at its start, and reads them at its end.
 $(filter $(RUN)/notebooks/08_%,$(EXECUTED)): notebooks/07_visual_odometry.ipynb
 
-# The drives of the embedded world are rendered and the odometry is compiled while the network is trained. That is a
-# head start alone: notebook 5 asks for the same drives, and says what is wrong with them.
+# Render the drives of the embedded world and compile the odometry while the network is trained. This only saves time:
+# notebook 5 renders the same drives if they are missing, and reports errors.
 ifeq (,$(THESIS_REPRO_KITTI))
 $(filter $(RUN)/notebooks/05_%,$(EXECUTED)): $(RUN)/drives
 $(RUN)/drives: $(filter $(RUN)/notebooks/01_%,$(EXECUTED)) $(RUN)/checked
@@ -189,7 +188,7 @@ plan: setup
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS)
 
-# (a file's tests stay with one process, for they share what takes seconds to make)
+# All tests of a file run in one process, because they share fixtures that take seconds.
 test: setup
 	@$(BIN)/python -m pytest -q -n $(shell nproc) --dist loadfile --no-loadscope-reorder
 
@@ -207,7 +206,6 @@ bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
 	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}" --output build/bench.json
 
-.PHONY: evidence
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
 	@$(BIN)/python -m thesis_repro.report.evidence

@@ -168,10 +168,11 @@ class _LogFile(MemoryHandler):
                             or any(self.folder.glob(f"*/{RECORD}")))
         return self.has_results
 
-    def end(self, text):
-        """Print a summary of the run, the time it took, its number of warnings, and the path of the log."""
+    def end(self, text, reused=0):
+        """Print a summary of the run, its time, the number of results reused from an earlier run, and its warnings."""
         seconds = timedelta(seconds=round(time.monotonic() - self.started))
-        say(f"{text}\n{seconds} h; warnings: {self.warnings}; log: {self.folder / LOG}")
+        reused_text = f"from an earlier run: {reused:,}; " if reused else ""
+        say(f"{text}\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}")
 
 
 @contextmanager

@@ -43,35 +43,30 @@ class Profile:
     timed_frames: int  # frames of each sequence on which the odometry is timed for each dilation width
     widths: tuple  # dilation widths, pixels
     repetitions: int  # of each run; each repetition shuffles the matched points with another seed
-    # the embedded world
-    world_sequences: int
-    world_frames: int | None  # frames of each sequence; None for its whole drive, 41 to 132 frames
-    world_training_images: int
-    world_validation_images: int
+    world: dict  # sizes of the embedded world, as arguments of `world.write`
 
-    @property
-    def world(self):
-        """Sizes of the embedded world, as keyword arguments of `world.write`."""
-        return {"sequences": tuple(f"{number:02d}" for number in range(self.world_sequences)),
-                "frames": self.world_frames,
-                "train_images": self.world_training_images, "validation_images": self.world_validation_images}
+
+def _world(sequences, frames, train_images, validation_images):
+    """Sizes of the embedded world. frames: of each sequence; None for its whole drive, 41 to 132 frames."""
+    return {"sequences": tuple(f"{number:02d}" for number in range(sequences)), "frames": frames,
+            "train_images": train_images, "validation_images": validation_images}
 
 
 PROFILES = {
     "smoke": Profile(image_size=64, base_filters=4, batch_size=4, learning_rate=0.001, threads=1, epochs=2,
                      patience=5, training_images=16, frames=12, timed_frames=5, widths=(1, 5, 10, 15), repetitions=2,
-                     world_sequences=2, world_frames=12, world_training_images=12, world_validation_images=4),
+                     world=_world(2, 12, 12, 4)),
     # For a course: a notebook takes a minute on two cores. The one drive has a bend.
     "lab": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, threads=1, epochs=6, patience=5,
                    training_images=60, frames=40, timed_frames=5, widths=(1, 5, 10, 15), repetitions=2,
-                   world_sequences=1, world_frames=40, world_training_images=60, world_validation_images=12),
+                   world=_world(1, 40, 60, 12)),
     # The thesis's loss needs many steps. Small batches and a higher learning rate get further in the same time.
     "demo": Profile(image_size=128, base_filters=8, batch_size=2, learning_rate=0.004, threads=1, epochs=16,
                     patience=5, training_images=200, frames=200, timed_frames=5, widths=ALL_WIDTHS, repetitions=2,
-                    world_sequences=11, world_frames=None, world_training_images=100, world_validation_images=20),
+                    world=_world(11, None, 100, 20)),
     "thesis": Profile(image_size=320, base_filters=64, batch_size=16, learning_rate=0.001, threads=8, epochs=100,
                       patience=5, training_images=None, frames=None, timed_frames=200, widths=ALL_WIDTHS, repetitions=5,
-                      world_sequences=11, world_frames=300, world_training_images=2975, world_validation_images=500),
+                      world=_world(11, 300, 2975, 500)),
 }
 SEED = 0
 
@@ -150,8 +145,8 @@ def read_settings(environment=None):
         cityscapes_is_embedded="CITYSCAPES" not in folders, run=run, build=build / run,
         # figures/ holds the figures of the default run; every other run gets a folder in it
         figures=figures if run == "embedded-demo" else figures / run,
-        world=world, jobs=processes(values.get("JOBS", str(cores()))), kitti_semantic=folders.get("KITTI_SEMANTIC"),
-        scheduler=scheduler_address(values.get("DASK_SCHEDULER")))
+        world=world, jobs=number("JOBS", values.get("JOBS", str(cores()))),
+        scheduler=scheduler_address(values.get("DASK_SCHEDULER")), kitti_semantic=folders.get("KITTI_SEMANTIC"))
 
 
 def _run_name(folders, profile, sizes):
@@ -189,21 +184,13 @@ def number(name, text):
     return value
 
 
-def processes(text):
-    """Return the number of processes in a text. Raises InputError for a bad number."""
-    return number("JOBS", text)
-
-
 def frames(text):
     """Return the number of frames in a text, or None for "all". Raises InputError for a bad number."""
     return None if text == "all" else number("FRAMES", text)
 
 
 def widths(text):
-    """Return the dilation widths, pixels, in a text such as "5,10", "1-15" or "1-3,10" as a sorted tuple.
-
-    Raises InputError for anything else.
-    """
+    """Return the dilation widths, pixels, in a text such as "1-3,10", sorted. Raises InputError for another text."""
     matches = [re.fullmatch("([0-9]{1,4})(?:-([0-9]{1,4}))?", word) for word in text.replace(",", " ").split()]
     ranges = [range(int(match[1]), int(match[2] or match[1]) + 1) for match in matches if match]
     numbers = sorted(set().union(*ranges))

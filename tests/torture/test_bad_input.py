@@ -120,7 +120,6 @@ plan --kitti kitti --cityscapes nowhere -> nowhere
 synthesize mine --profile smoke -> mine
 predict --images labels mine/../labels --output out -> --images
 predict --images labels --output labels -> --output labels
-predict --images labels --output out --dask inproc://1 -> inproc://1
 {PREDICT} --model nowhere.keras -> nowhere.keras
 """.strip().splitlines()]
 
@@ -156,5 +155,5 @@ def test_every_option_refuses_a_missing_or_wrong_value(inside):
         for words in cases:
             trials.refused(inside(words), option, code=2)
     for words, named in ((["nonsense"], "'nonsense'"), (f"{LABELLED} --masks masks".split(), "--masks"),
-                         (f"{STUDY} --jobs 0".split(), "--jobs")):
+                         (f"{STUDY} --jobs 0".split(), "--jobs"), (f"{STUDY} --dask inproc://1".split(), "--dask")):
         trials.refused(inside(words), named, code=2)
