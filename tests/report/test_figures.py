@@ -1,4 +1,4 @@
-"""Figures of chapter 2 and of frames: they show what the data says, and all can be read."""
+"""Figures of chapter 2 and of frames show the numbers of the data, and their texts can be read."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from thesis_repro.study import flicker
 
 
 def texts(figure):
-    # without the labels of ticks, which only exist once drawn
     return [item.get_text() for item in figure.findobj(Text) if item.get_text()]
 
 
@@ -40,6 +39,7 @@ def convolution(channels=1):
 
 
 FRAME, LATER = textured(), textured(5)
+BLANK = np.zeros_like(FRAME)
 LABEL_MAP = np.full(FRAME.shape, ID["road"], np.uint8)
 LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = ID["car"], ID["sky"], ID["license plate"]
 MOVED = np.roll(LABEL_MAP, 14, axis=1)
@@ -50,7 +50,7 @@ DRAWN = {
     "2.2 of three channels": lambda: chapter2.figure_2_02(*convolution(3)),
     "2.8": lambda: chapter2.figure_2_08(turning(), "sequence 00"),
     "2.9": lambda: chapter2.figure_2_09(FRAME, LATER, "sequence 00"),
-    "2.9 without corners": lambda: chapter2.figure_2_09(MASK, np.zeros_like(MASK), "sequence 00"),
+    "2.9 without corners": lambda: chapter2.figure_2_09(MASK, BLANK, "sequence 00"),
     "2.11": lambda: chapter2.figure_2_11(FRAME, LATER, (POINTS, POINTS), POINTS[:0], POINTS, ("frame 0", "frame 5")),
     "2.12": lambda: chapter2.figure_2_12(FRAME, POINTS, LABEL_MAP, POINTS, ("frame 0", "its label map")),
     "3.3": lambda: frames.figure_3_03(FRAME, LABEL_MAP, np.roll(LABEL_MAP, 9), LABELS[ID["car"]]),
@@ -61,18 +61,18 @@ DRAWN = {
     "4.4": lambda: frames.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
     "4.5": lambda: frames.figure_4_05(FRAME, POINTS, LABEL_MAP, MASK, POINTS, 10, "sequence 00"),
     "4.8": lambda: frames.figure_4_08(flicker.follow([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"),
-    "4.8 without keypoints": lambda: frames.figure_4_08(flicker.follow([FRAME] * 2, [0 * FRAME] * 2, 5), "00"),
+    "4.8 without keypoints": lambda: frames.figure_4_08(flicker.follow([FRAME] * 2, [BLANK] * 2, 5), "00"),
     "paths": lambda: trajectories.figure({"masked": turning(), "$all$": 2 * turning()}, turning(), "sequence 00"),
     "paths without truth": lambda: trajectories.figure({"masked": turning()}, None, "sequence 11"),
 }
 
 
 @pytest.mark.parametrize("name", DRAWN)
-def test_nothing_in_a_figure_is_raw_missing_or_covered(name):
+def test_texts_of_figures_can_be_read(name):
     assert [problem for problem in problems(DRAWN[name]()) if "raw TeX: $all$" not in problem] == []
 
 
-def test_numbers_of_the_convolution_add_up_to_its_response():
+def test_numbers_of_the_convolution_sum_to_its_response():
     figure = chapter2.figure_2_02(*convolution())
     field, weights, products = ([float(text.get_text()) for text in axes.texts] for axes in figure.axes[3:6])
     assert products == pytest.approx(np.multiply(field, weights), abs=0.02)
@@ -80,7 +80,7 @@ def test_numbers_of_the_convolution_add_up_to_its_response():
     assert f"{convolution()[3][6, 4]:.2f}" in figure.get_supxlabel()
 
 
-def test_iou_figure_states_the_areas_and_their_ratio():
+def test_the_iou_figure_shows_areas_and_their_ratio():
     label_map, prediction = (np.full((20, 20), ID["road"], np.uint8) for _ in range(2))
     label_map[:10], prediction[:15] = ID["car"], ID["car"]  # 200 and 300 pixels, one inside the other
     shown = " ".join(texts(frames.figure_3_03(label_map, label_map, prediction, LABELS[ID["car"]])))
@@ -88,7 +88,7 @@ def test_iou_figure_states_the_areas_and_their_ratio():
 
 
 @pytest.mark.slow
-def test_unet_figure_is_read_from_the_model():
+def test_the_unet_figure_shows_the_sizes_of_the_model():
     from thesis_repro.segmentation.unet import build_unet
 
     figure = chapter2.figure_2_07(build_unet((32, 32, 1), 35, base_filters=2))
@@ -97,27 +97,25 @@ def test_unet_figure_is_read_from_the_model():
     assert sum(getattr(text, "arrow_patch", None) is not None for text in figure.axes[0].texts) == 4  # skip connections
 
 
-def test_relative_motions_are_measured_between_the_poses():
+def test_relative_motions_are_shown():
     shown = texts(chapter2.figure_2_08(turning(), "title"))
     assert any("{1,0}" in text and "2.0 m, 0.0°" in text for text in shown)
     assert any("{3,2}" in text and "1.4 m, 30.0°" in text for text in shown)
 
 
-def test_a_pure_shift_is_found_again():
+def test_matched_points_of_a_shifted_frame():
     in_first, in_second, lost, _ = flicker.found_again(FRAME, LATER)
     assert len(in_first) > 3 * len(lost)
     assert np.median(in_second - in_first, axis=0) == pytest.approx((5, 0), abs=0.1)
-    blank = np.zeros_like(FRAME)
-    for first, second in ((FRAME, blank), (blank, FRAME), (blank, blank)):
+    for first, second in ((FRAME, BLANK), (BLANK, FRAME), (BLANK, BLANK)):
         in_first, _, lost, new = flicker.found_again(first, second)
         assert (len(in_first), len(lost) > 0, len(new) > 0) == (0, first is FRAME, second is FRAME)
-    left = np.zeros_like(FRAME)
-    left[:, :100] = 255
+    left = np.where(np.arange(FRAME.shape[1]) < 100, np.uint8(255), BLANK)
     in_first, _, lost, new = flicker.found_again(FRAME, LATER, left, left)
     assert max(in_first[:, 0].max(), lost[:, 0].max(), new[:, 0].max()) < 100 and len(in_first) > len(lost)
 
 
-def test_keypoints_jump_with_the_boundary_and_stay_without():
+def test_keypoints_jump_with_a_moving_boundary_alone():
     frame = textured(size=(120, 240))
     car = np.where(MASK[:, :240] > 0, ID["car"], ID["road"]).astype(np.uint8)
     still, jumping = (flicker.follow([frame, frame], [car, later], 5, first=7) for later in (car, np.roll(car, 14, 1)))
@@ -126,13 +124,12 @@ def test_keypoints_jump_with_the_boundary_and_stay_without():
     assert jumping[1].jumped > len(jumping[1].expected) / 3 and still[0].crop.shape == still[0].edges.shape
 
 
-def test_the_same_figure_gives_the_same_files_with_its_note(tmp_path):
+def test_saved_figures_have_repeatable_bytes_and_a_note(tmp_path):
     for folder in (tmp_path / "first", tmp_path / "second"):
         style.save_figure(chapter2.figure_2_08(turning(), "title"), folder, "plot", "a note")
         style.save_figure(chapter2.figure_2_09(MASK, MASK, "title"), folder, "picture", "a note")
-        assert sorted(path.name for path in folder.iterdir()) == ["picture.webp", "plot.svg"]
     for name in ("plot.svg", "picture.webp"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
         assert b"a note" in (tmp_path / "first" / name).read_bytes()
-    style.save_figure(chapter2.figure_2_08(turning(), "title"), tmp_path / "first", "picture", "a note")  # now a plot
+    style.save_figure(chapter2.figure_2_08(turning(), "title"), tmp_path / "first", "picture", "a note")
     assert sorted(path.name for path in (tmp_path / "first").iterdir()) == ["picture.svg", "plot.svg"]

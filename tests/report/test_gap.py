@@ -1,4 +1,4 @@
-"""The gap between domains: on scores written by hand."""
+"""The gap between domains, on made-up scores."""
 
 import pandas as pd
 
@@ -9,7 +9,7 @@ VALIDATION, STREETS = "validation images", "KITTI's street scenes"
 
 
 class Gap:
-    """Two models on two domains; the second domain of the first model has no sky."""
+    """Scores of two models on two domains; the second domain of the first model has no sky."""
 
     scores = pd.DataFrame(
         [(OWN, VALIDATION, 20, 2, 0.6, 0.9), (OWN, STREETS, 7, 1, 0.3, float("nan")),
@@ -26,20 +26,21 @@ def test_the_table_has_a_column_for_each_model_and_domain():
     table = gap.table(Gap).set_index("measure")
     assert list(table) == [f"{OWN}: {VALIDATION}", f"{OWN}: {STREETS}", f"{SHIPPED}: {VALIDATION}",
                            f"{SHIPPED}: {STREETS}", EXACT]
-    own = table[f"{OWN}: {VALIDATION}"]
-    assert own[["images", "classes present", "mean IoU over these", "IoU: sky"]].tolist() == [20, 2, 0.6, 0.7]
-    assert own["dark ground taken for something else (%)"] == 40 and pd.isna(table.loc["IoU: sky", f"{OWN}: {STREETS}"])
+    scores = table[f"{OWN}: {VALIDATION}"]
+    assert scores[["images", "classes present", "mean IoU over these", "IoU: sky"]].tolist() == [20, 2, 0.6, 0.7]
+    assert scores["dark ground taken for something else (%)"] == 40
+    assert pd.isna(table.loc["IoU: sky", f"{OWN}: {STREETS}"])
     assert table.loc["pixels that flicker (%)"].dropna().tolist() == [5, 3, 1]
-    assert table.index.is_unique and list(table.index).index("IoU: road") < list(table.index).index("IoU: sky")
+    assert table.index.is_unique
 
 
-def test_the_figure_has_a_panel_a_model_and_a_bar_where_there_is_a_class():
+def test_the_figure_has_a_panel_for_each_model_and_a_bar_for_each_class():
     figure = gap.figure(Gap)
     assert [axes.get_title() for axes in figure.axes] == [OWN, SHIPPED]
     assert sorted(bar.get_height() for bar in figure.axes[0].patches if bar.get_height() > 0) == [0.7, 0.8, 0.8]
 
 
-def test_the_quality_of_a_runs_label_maps_is_kept(tmp_path):
+def test_the_quality_of_label_maps_is_recorded(tmp_path):
     assert gap.label_map_quality(tmp_path) == []
     style.save_table(Gap.scores.assign(used=Gap.scores["model"] == SHIPPED), tmp_path, gap.RECORD, "note")
     rows = gap.label_map_quality(tmp_path)

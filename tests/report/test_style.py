@@ -1,4 +1,4 @@
-"""Axes, files and tables that every figure shares."""
+"""Axes that figures share."""
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -10,35 +10,35 @@ from thesis_repro import InputError
 from thesis_repro.odometry import Odometry
 from thesis_repro.report import video
 
-BLUE = 178, 114, 0  # of the estimate, as OpenCV has colours
+BLUE = 178, 114, 0  # colour of the estimate in OpenCV's order
 
 
-class TimedStreet(Street):
-    times, size = 0.1 * np.arange(4), (160, 480)
-
-    def __init__(self):
-        super().__init__(4)
+@pytest.fixture
+def drive():
+    street = Street(4)
+    street.times, street.size = 0.1 * np.arange(4), (160, 480)
+    return street
 
 
 def painted(image, color):
     return (image == np.array(color)).all(axis=2)
 
 
-def test_a_frame_shows_what_the_mask_keeps_and_discards():
-    drive, mask = TimedStreet(), Stripes(60)[0]
+def test_a_frame_shows_kept_and_discarded_keypoints(drive):
+    mask = Stripes(60)[0]
     odometry = Odometry(drive.intrinsics)
     odometry.step(drive.frame(0), mask=mask)
     step = odometry.step(drive.frame(1), 0.4, mask)
     image = video.draw_frame(drive.frame(1), step, mask=mask)
-    inside = cv2.erode(mask, np.ones((7, 7))) > 0  # dots reach over the edge
+    inside = cv2.erode(mask, np.ones((7, 7))) > 0  # away from the edges, which dots cross
     outside = cv2.dilate(mask, np.ones((7, 7))) == 0
     assert painted(image, video.KEPT)[inside].sum() > 500 and not painted(image, video.KEPT)[outside].any()
     assert painted(image, video.DISCARDED)[outside].sum() > 500 and not painted(image, video.DISCARDED)[inside].any()
     assert painted(image, video.OUTLINE).any() and painted(image, video.INLIER).any()
 
 
-def test_the_video_has_every_frame_and_grows(tmp_path):
-    video.write_video(tmp_path / "drive.mp4", TimedStreet(), masks=Stripes(60))
+def test_the_video_has_every_frame(drive, tmp_path):
+    video.write_video(tmp_path / "drive.mp4", drive, masks=Stripes(60))
     with av.open(str(tmp_path / "drive.mp4")) as file:
         stream = file.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")  # browsers play it
@@ -49,8 +49,7 @@ def test_the_video_has_every_frame_and_grows(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["drive.mp4"]
 
 
-def test_the_map_shows_both_paths_and_without_truth_the_estimate_alone():
-    drive = TimedStreet()
+def test_the_map_shows_the_ground_truth_if_there_is_one(drive):
     last = list(video.pictures(drive))[-1][160:]
     assert painted(last, BLUE).sum() > 20 and painted(last[:90], (0, 0, 0)).sum() > 20
     drive.has_truth, drive.assumed_steps = False, np.array([0.0, 1, 1, 1])
@@ -59,8 +58,7 @@ def test_the_map_shows_both_paths_and_without_truth_the_estimate_alone():
     assert painted(without, BLUE).sum() > 20 and (without != last).any()
 
 
-def test_a_video_that_fails_leaves_nothing(tmp_path):
-    drive = TimedStreet()
+def test_a_failed_video_leaves_no_file(drive, tmp_path):
     drive.images[2] = drive.images[2][:50]
     with pytest.raises(InputError, match="frame 2: shape"):
         video.write_video(tmp_path / "drive.mp4", drive)
