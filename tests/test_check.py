@@ -13,7 +13,7 @@ from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
 IMAGES = "sequences/00/image_0"
 
 
-def test_every_problem_is_listed_and_the_exit_code_says_so(tiny_kitti, tiny_cityscapes, capsys):
+def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_cityscapes, capsys):
     frame = tiny_kitti / IMAGES / "000001.png"
     frame.write_bytes(frame.read_bytes()[:100])
     cv2.imwrite(str(tiny_kitti / IMAGES / "000003.png"), np.zeros((9, 9), np.uint8))
@@ -30,7 +30,7 @@ def test_every_problem_is_listed_and_the_exit_code_says_so(tiny_kitti, tiny_city
         assert sum(text in problem for problem in problems) == 1, text
 
 
-def test_damage_in_the_middle_is_found_by_a_deep_look_alone(tiny_kitti, tiny_cityscapes, monkeypatch):
+def test_damage_within_a_file_is_found_by_a_deep_check(tiny_kitti, tiny_cityscapes, monkeypatch):
     frame, label = tiny_kitti / IMAGES / "000001.png", tiny_cityscapes / "trainannot/street_1.png"
     data = bytearray(frame.read_bytes())
     data[len(data) // 2] ^= 1
@@ -45,7 +45,7 @@ def test_damage_in_the_middle_is_found_by_a_deep_look_alone(tiny_kitti, tiny_cit
         assert len(problems) == 1 and problems[0].startswith(f"{path}: ")
 
 
-def test_what_is_missing_is_counted_and_named(tiny_kitti, tiny_cityscapes):
+def test_missing_files_are_counted_and_named(tiny_kitti, tiny_cityscapes):
     images = tiny_kitti / IMAGES
     for index in range(4, 40):
         shutil.copy(images / "000000.png", images / f"{index:06d}.png")
@@ -60,20 +60,13 @@ def test_what_is_missing_is_counted_and_named(tiny_kitti, tiny_cityscapes):
         (tiny_cityscapes / "trainannot" / f"street_{index}.png").unlink()
     for index in range(12):
         (tiny_cityscapes / "val" / f"lonely_{index}.png").write_bytes(b"")
-    counts = [len(check_cityscapes(tiny_cityscapes, deep)[1]) for deep in (False, True)]
-    # four images without label maps and so no pair; of twelve such ones ten are named, and the count of the others
-    assert counts == [4 + 12, 4 + 12]
+    counts = [len(check_cityscapes(tiny_cityscapes, deep, splits)[1]) for deep, splits in (
+        (False, ("train", "val")), (True, ("train", "val")), (False, ("train",)))]
+    # four images without label maps, and twelve more: ten are named, the others counted, and there is no pair
+    assert counts == [4 + 12, 4 + 12, 4]
 
 
-def test_street_scenes_need_no_validation_split(tiny_cityscapes):
-    for split in ("val", "valannot"):
-        shutil.rmtree(tiny_cityscapes / split)
-    assert check_cityscapes(tiny_cityscapes, splits=("train",))[1] == [] != check_cityscapes(tiny_cityscapes)[1]
-    (tiny_cityscapes / "trainannot" / "street_0.png").unlink()
-    assert len(check_cityscapes(tiny_cityscapes, splits=("train",))[1]) == 1
-
-
-def test_sequences_without_truth_are_described_and_missing_poses_named(tiny_kitti):
+def test_sequences_without_ground_truth_need_no_poses(tiny_kitti):
     folder = tiny_kitti / "sequences/11"
     shutil.copytree(tiny_kitti / "sequences/00", folder)
     (folder / "times.txt").unlink()
@@ -85,16 +78,16 @@ def test_sequences_without_truth_are_described_and_missing_poses_named(tiny_kitt
     assert len(problems) == 1 and "poses/00.txt" in problems[0]
 
 
-def test_data_that_did_not_change_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsys):
+def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
     for frame, reports in ((None, True), (None, False), (0, True), (9, True)):
         if frame is not None:
             shutil.copy(tiny_kitti / IMAGES / "000001.png", tiny_kitti / IMAGES / f"{frame:06d}.png")
-        assert check.main(tmp_path / "checked") == (frame == 9)  # a gap
+        assert check.main(tmp_path / "checked") == (frame == 9)  # a missing frame
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
 
-# What can be read, and is hardly what it is taken for: one line, with the number that was seen
+# Data that can be read but is implausible: one line with the measured number
 
 
 def poses(*rows):
@@ -107,7 +100,7 @@ def poses(*rows):
     ("poses/00.txt", poses(0, -1, -2, -3), "-1.00"), ("sequences/00/times.txt", "0\n100\n200\n300\n", "100 s"),
     ("sequences/00/calib.txt", "P0: 50 0 20 0 0 50 24 0 0 0 1 0\n", "20, 24"),
     (f"{IMAGES}/000002.png", None, "000002")])
-def test_odd_data_is_a_line_with_the_number(tiny_kitti, path, text, seen):
+def test_implausible_data_is_one_line_with_the_number(tiny_kitti, path, text, seen):
     assert oddities(Sequence(tiny_kitti, "00")) == []
     if text:
         (tiny_kitti / path).write_text(text)
@@ -117,7 +110,7 @@ def test_odd_data_is_a_line_with_the_number(tiny_kitti, path, text, seen):
     assert seen in line
 
 
-def test_paths_of_two_drives_are_told_apart():
+def test_a_path_of_another_drive_is_reported():
     def drive(seed):
         path = np.tile(np.eye(4), (40, 1, 1))
         for pose, angle in zip(path, np.cumsum(np.random.default_rng(seed).normal(0, 0.02, 40))):
@@ -139,11 +132,11 @@ HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
     ("labels", STREET.T, 4, {}, "48x64"), ("labels", STREET, 5, {}, "5 files"),
     ("masks", HALF, 4, {}, None), ("masks", HALF, 1, {}, None), ("masks", 0 * HALF, 4, {}, "--invert"),
     ("masks", HALF | 255, 4, {}, "100.0%"), ("masks", HALF, 4, {"flat": True}, "--invert")])
-def test_odd_masks_are_a_line_with_the_option(tiny_kitti, tmp_path, kind, picture, count, options, seen):
+def test_implausible_masks_are_one_line_with_the_option(tiny_kitti, tmp_path, kind, picture, count, options, seen):
     folder = tmp_path / "masks"
     for index in range(count):
         files.write_png(folder / ("bonnet.png" if count == 1 else f"{index:06d}.png"), picture)
-    for path in (tiny_kitti / IMAGES).iterdir() if options.pop("flat", False) else ():  # where the mask keeps
+    for path in (tiny_kitti / IMAGES).iterdir() if options.pop("flat", False) else ():  # where the mask is 255
         image = cv2.imread(str(path), 0)
         image[:, 33:] = 100
         cv2.imwrite(str(path), image)
@@ -153,7 +146,7 @@ def test_odd_masks_are_a_line_with_the_option(tiny_kitti, tmp_path, kind, pictur
     assert "%" in line and [seen in text for text in odd] == ([True] if seen else [])
 
 
-def test_masks_of_other_frames_and_other_ways_to_name_them(tiny_kitti, tmp_path):
+def test_masks_of_other_frames_and_other_names_of_files(tiny_kitti, tmp_path):
     sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
     stages.stage(folder, frames=stages.listing(sequence.frame_paths))
     for path in sequence.frame_paths:
@@ -164,6 +157,6 @@ def test_masks_of_other_frames_and_other_ways_to_name_them(tiny_kitti, tmp_path)
     assert np.array_equal(MaskFolder(made.paths[0], sequence)[3], read_mask(made.paths[0], sequence.size))
     cv2.imwrite(str(sequence.frame_paths[0]), np.zeros((48, 64), np.uint8))
     assert len(of_masks(made, sequence)[1]) == 1
-    files.write_png(tmp_path / "unfinished" / "000000.png", HALF)  # the mask of one frame, not one for all
+    files.write_png(tmp_path / "unfinished" / "000000.png", HALF)  # the mask of one frame is not one for all frames
     with pytest.raises(InputError, match="000001.png"):
         MaskFolder(tmp_path / "unfinished", sequence)

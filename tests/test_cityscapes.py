@@ -28,7 +28,7 @@ def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
     assert len(cityscapes.pairs(official, "train", limit=99)) == 4
 
 
-def test_colour_is_read_where_it_is_asked_for(tiny_cityscapes):
+def test_images_are_read_in_colour_or_gray(tiny_cityscapes):
     pairs = cityscapes.pairs(tiny_cityscapes, "train")
     cv2.imwrite(str(pairs[0].image), np.full((16, 32, 3), (10, 100, 200), np.uint8))
     images, labels = cityscapes.load(pairs, 16, channels=3)
@@ -52,7 +52,7 @@ def test_faults_are_named(tiny_cityscapes):
             cityscapes.pairs(root, split)
 
 
-def test_train_ids_are_label_ids_in_another_order(tmp_path):
+def test_train_ids_become_label_ids(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.array([[*range(19), 255]], np.uint8))
     names = [cityscapes.LABELS[label].name for label in cityscapes.read_label_map(tmp_path / "a.png", True)[0]]
     assert names == [*cityscapes.TRAINED, "unlabeled"]

@@ -22,7 +22,10 @@ def printed(capsys):
     return json.loads(capsys.readouterr().out)
 
 
-def test_the_console_script_is_the_same_and_tells_its_version():
+COMMANDS = next(action for action in build_parser()._actions if action.dest == "command").choices
+
+
+def test_the_console_script_prints_the_version():
     script = Path(sys.executable).with_name("thesis-repro")
     assert script.is_file(), "install the package: make setup"
     outputs = [subprocess.run([*command, "--version"], capture_output=True, text=True, check=True).stdout
@@ -30,26 +33,17 @@ def test_the_console_script_is_the_same_and_tells_its_version():
     assert outputs[0] == outputs[1] == f"thesis-repro {metadata.version('thesis-repro')}\n"
 
 
-COMMANDS = next(action for action in build_parser()._actions if action.dest == "command").choices
-
-
-def test_an_option_counts_only_in_full():
-    assert not any(parser.allow_abbrev for parser in (build_parser(), *COMMANDS.values()))
-
-
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_shows_two_examples_that_it_takes(name):
+def test_a_command_shows_two_valid_examples_and_takes_no_abbreviations(name):
     examples = [shlex.split(line) for line in COMMANDS[name].epilog.splitlines()[1:]]
-    assert len(examples) == 2
+    assert len(examples) == 2 and not COMMANDS[name].allow_abbrev and not build_parser().allow_abbrev
     assert [build_parser().parse_args(words).command for _, *words in examples] == [name, name]
 
 
-def test_widths_and_frames_have_one_form_everywhere():
+def test_forms_of_widths_and_frames():
     for words, widths in ((["1-3,10"], {1, 2, 3, 10}), (["5", "10"], {5, 10}), (["1-2", "4"], {1, 2, 4})):
         options = build_parser().parse_args(["study", "--kitti", "a", "--output", "b", "--widths", *words])
         assert set().union(*options.widths) == widths
-    assert {name for name, parser in COMMANDS.items() if "--frames" in parser._option_string_actions} == {
-        "predict", "masks", "odometry", "boresight", "study", "evaluate"}
     for text, frames in (("all", None), ("40", 40)):
         assert build_parser().parse_args(["evaluate", "a.txt", "--frames", text]).frames == frames
     for wrong in (["boresight", "--kitti", "a", "--frames", "some"], ["study", "--kitti", "a", "--widths", "5-1"]):
@@ -57,7 +51,7 @@ def test_widths_and_frames_have_one_form_everywhere():
             main(wrong)
 
 
-def test_written_masks_are_read_by_the_odometry_and_give_the_same_path(small_world, small_labels, tmp_path):
+def test_written_masks_give_the_same_path_as_label_maps(small_world, small_labels, tmp_path):
     where = ["--kitti", small_world / "kitti", "--sequence", "00"]
     labels = ["--labels", small_labels / "00"]
     corrected = ["--boundaries", "exact", "--symmetric", "--without-movable", "--classes", "road", "--margin", 4]
@@ -75,26 +69,23 @@ def test_written_masks_are_read_by_the_odometry_and_give_the_same_path(small_wor
     assert [len(list((tmp_path / "both" / name).glob("*.png"))) for name in ("mask1", "mask2")] == [5, 5]
 
 
-def test_odometry_writes_and_prints_one_path(small_world, tmp_path, capsys):
-    poses, tum = tmp_path / "poses.txt", tmp_path / "path.tum"
-    assert run("odometry", "--kitti", small_world / "kitti", "--sequence", "00", "--json", "--frames", 8,
-               "--output", poses, "--tum", tum) == 0
-    out, err = capsys.readouterr()
-    assert json.loads(out)["frames"] == len(read_poses(poses)) == 8 and json.loads(out)["rmse_m"] > 0
-    assert str(poses) in err and str(tum) in err
+def test_the_odometry_writes_poses_and_prints_a_summary(small_world, tmp_path, capsys):
+    poses, tum, kitti = tmp_path / "poses.txt", tmp_path / "path.tum", small_world / "kitti"
+    keypoints = []
+    for options in ((), ("--labels", kitti / "sequences/00/labels_0", "--dilation", 3), ("--max-keypoints", 50)):
+        assert run("odometry", "--kitti", kitti, "--sequence", "00", "--json", "--frames", 8, "--output", poses,
+                   "--tum", tum, *options) == 0
+        out, err = capsys.readouterr()
+        summary = json.loads(out)
+        assert summary["frames"] == len(read_poses(poses)) == 8 and summary["rmse_m"] > 0
+        assert str(poses) in err and str(tum) in err
+        keypoints.append(summary["mean_keypoints"])
+    assert keypoints[0] > keypoints[1] and keypoints[2] == 50
     positions = pd.read_csv(tum, sep=" ", header=None).to_numpy()[:, 1:4]
     assert np.array_equal(read_poses(poses)[:, :3, 3], positions)
 
 
-def test_limited_and_masked_runs_use_fewer_keypoints(small_world, capsys):
-    kitti, numbers = small_world / "kitti", []
-    for options in ((), ("--labels", kitti / "sequences/00/labels_0", "--dilation", 3), ("--max-keypoints", 50)):
-        assert run("odometry", "--kitti", kitti, "--sequence", "00", "--json", *options) == 0
-        numbers.append(printed(capsys)["mean_keypoints"])
-    assert numbers[0] > numbers[1] and numbers[2] == 50
-
-
-def test_jpeg_frames_without_truth_run_with_masks_named_png(tiny_kitti, tmp_path, capsys):
+def test_jpeg_frames_without_ground_truth_and_png_masks(tiny_kitti, tmp_path, capsys):
     (tiny_kitti / "poses/00.txt").unlink()
     (tmp_path / "labels").mkdir()
     for path in sorted((tiny_kitti / "sequences/00/image_0").glob("*.png")):
@@ -112,7 +103,7 @@ def test_jpeg_frames_without_truth_run_with_masks_named_png(tiny_kitti, tmp_path
     assert cv2.imread(str(tmp_path / "path.png")) is not None
 
 
-def test_frames_without_any_keypoint_end_well(tiny_kitti, capsys):
+def test_frames_without_keypoints(tiny_kitti, capsys):
     for path in (tiny_kitti / "sequences/00/image_0").iterdir():
         cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
     assert run("odometry", "--kitti", tiny_kitti, "--sequence", "00", "--json") == 0

@@ -1,4 +1,4 @@
-"""What a cell changes reaches the last table of notebook 8: the cells that an edit goes through, in one process."""
+"""An edit of a cell reaches the last table of notebook 8; the cells concerned run in one process."""
 
 import json
 import os
@@ -20,7 +20,7 @@ THESIS, YOURS = ("thesis's, all keypoints", "thesis's, masked"), ("yours, all ke
 
 
 def code(number, edits):
-    """The cells of a notebook that an edit goes through, edited: {number: {old text: new text}}."""
+    """Code of the cells of a notebook, with edits {number: {old text: new text}}."""
     (path,) = (ROOT / "notebooks").glob(f"{number}_*.ipynb")
     sources = ["".join(cell["source"]) for cell in json.loads(path.read_text())["cells"]
                if cell["id"].removeprefix(f"{number}-") in CELLS[number].split()]
@@ -38,7 +38,7 @@ def environment(world, build):
 
 
 def run(world, build, *texts):
-    threads = code("04", {}).split("# Knobs")[0]  # TensorFlow's can be set at the beginning alone
+    threads = code("04", {}).split("# Knobs")[0]  # TensorFlow takes them only before its first use
     settings = environment(world, build) | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
     return subprocess.run([sys.executable, "-c", "\n".join([threads, *texts])], env=os.environ | settings,
                           capture_output=True, text=True)
@@ -55,7 +55,7 @@ def tables(world, build, numbers, edits):
     return [json.loads(line[6:]) for line in done.stdout.splitlines() if line.startswith("TABLE ")]
 
 
-def test_knobs_of_masks_and_odometry_move_their_rows(small_world, small_labels, tmp_path):
+def test_knobs_of_masks_and_odometry_change_their_rows(small_world, small_labels, tmp_path):
     shutil.copytree(small_labels, read_settings(environment(small_world, tmp_path)).build / "labels")
     none, *edited = tables(small_world, tmp_path, [], [
         {}, {"06": {"CANNY = (5, 15)": "CANNY = (1, 3)"}}, {"06": {'"canny", ()': '"canny", ("road",)'}},
@@ -72,7 +72,7 @@ def test_knobs_of_masks_and_odometry_move_their_rows(small_world, small_labels, 
 
 
 @pytest.mark.torture
-def test_network_and_loss_move_the_masked_row(small_world, tmp_path):
+def test_network_and_loss_change_the_masked_row(small_world, tmp_path):
     assert run(small_world, tmp_path, code("01", {}), code("02", {})).returncode == 0
     width = {"06": {"DILATION_WIDTH = 10": "DILATION_WIDTH = 5"}}  # so that there is a table
     rows = tables(small_world, tmp_path, ["03", "04", "05"], [
@@ -83,10 +83,8 @@ def test_network_and_loss_move_the_masked_row(small_world, tmp_path):
 
 
 @pytest.mark.torture
-def test_sizes_that_do_not_fit_name_their_knobs(small_world, tmp_path):
-    half = {"03": {"SIZE = settings.sizes.image_size": "SIZE = 32"}}
-    done = run(small_world, tmp_path, *(code(number, half) for number in ("01", "02", "03", "04")))
-    assert done.returncode != 0 and "SIZE in notebooks 1 and 3" in done.stderr.splitlines()[-1]
-    odd = {"03": {"SIZE = settings.sizes.image_size": "SIZE = 40"}}
-    done = run(small_world, tmp_path, code("03", odd))
-    assert done.returncode != 0 and "SIZE=40" in done.stderr.splitlines()[-1]
+def test_wrong_sizes_name_their_knobs(small_world, tmp_path):
+    for size, numbers, named in ((32, ("01", "02", "03", "04"), "SIZE in notebooks 1 and 3"), (40, ["03"], "SIZE=40")):
+        edits = {"03": {"SIZE = settings.sizes.image_size": f"SIZE = {size}"}}
+        done = run(small_world, tmp_path, *(code(number, edits) for number in numbers))
+        assert done.returncode != 0 and named in done.stderr.splitlines()[-1]

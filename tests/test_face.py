@@ -1,4 +1,4 @@
-"""What the package offers by name, and the example on the front page."""
+"""The public names of the package, and the example and the numbers of the README."""
 
 import re
 import subprocess
@@ -12,17 +12,16 @@ import thesis_repro as tr
 from thesis_repro.cityscapes import read_label_map
 
 ROOT = Path(__file__).resolve().parent.parent
-README = ROOT / "README.md"
 
 
-def test_what_is_offered_is_there():
+def test_public_names():
     assert set(tr.__all__) <= set(dir(tr)) and not hasattr(tr, "mistyped")
     assert tr.THESIS == tr.OdometrySettings() and tr.Sequence.__module__ == "thesis_repro.kitti"
     assert tr.keypoint_mask(np.full((8, 8), 7, np.uint8), (16, 32), 3).shape == (16, 32)
     assert tr.build_unet((32, 32, 1), 35, 2).output_shape == (None, 32, 32, 35)
 
 
-def test_tensorflow_is_not_loaded_before_it_is_asked_for():
+def test_tensorflow_is_loaded_on_first_use():
     code = ("import sys, thesis_repro as tr; tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run; "
             "assert 'tensorflow' not in sys.modules and 'keras' not in sys.modules; tr.build_unet; "
             "assert 'keras' in sys.modules")
@@ -34,14 +33,11 @@ def test_bad_input_is_one_line_in_a_notebook():
 
 
 def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (tmp_path / "world").symlink_to(small_world)
     monkeypatch.chdir(tmp_path)
-
-    def label_map_of(index):
-        return read_label_map(small_world / "kitti" / "sequences" / "00" / "labels_0" / f"{index:06d}.png")
-
-    names = {"label_map_of": label_map_of}
+    labels = small_world / "kitti/sequences/00/labels_0"
+    names = {"label_map_of": lambda index: read_label_map(labels / f"{index:06d}.png")}
     exec(example, names)
     assert len(names["every"].poses) == len(names["masked"].poses) == 12
     assert names["masked"].frames["detected"].mean() < names["every"].frames["detected"].mean()
@@ -49,8 +45,8 @@ def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize("text", ["README.md", "docs/answer.md"])
-def test_every_ratio_stands_in_a_table_that_a_command_writes(text):
-    """Each "1.09 (95 % CI 0.98-1.32)" is one row of a table, or of a line of words, rounded to two places."""
+def test_ratios_in_texts_are_in_tables(text):
+    """Each "1.09 (95 % CI 0.98-1.32)" is one line of a file in figures/, rounded to two digits."""
     ratios = re.findall(r"(\d+\.\d\d) \(95 % CI (\d+\.\d\d)-(\d+\.\d\d)\)", (ROOT / text).read_text())
     written = [path for folder in ("figures", "figures/kitti_excerpts") for path in (ROOT / folder).iterdir()
                if path.suffix in (".csv", ".md")]

@@ -11,7 +11,7 @@ from thesis_repro.files import atomic, check_output, glance, progress, read_colo
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
 
 
-def test_reads_back_what_was_written(tmp_path):
+def test_a_written_image_is_read_back(tmp_path):
     write_png(tmp_path / "folder" / "a.png", IMAGE)
     assert np.array_equal(read_gray(tmp_path / "folder" / "a.png"), IMAGE)
     assert os.listdir(tmp_path / "folder") == ["a.png"]
@@ -35,8 +35,8 @@ GRAY = Image.fromarray(np.where(IMAGE > 99, np.uint8(255), np.uint8(0)))
 
 @pytest.mark.parametrize("image, ids", [
     (GRAY.convert("RGB"), True), (Image.merge("LA", (GRAY, GRAY)), True),  # three equal channels; transparency
-    (GRAY.convert("P"), False), (GRAY.convert("1"), False)])  # of which the numbers stored are not the pixels
-def test_harmless_kinds_of_png_have_the_right_pixels(tmp_path, image, ids):
+    (GRAY.convert("P"), False), (GRAY.convert("1"), False)])  # the stored numbers are not the pixels
+def test_other_kinds_of_gray_png_have_the_right_pixels(tmp_path, image, ids):
     path = tmp_path / "a.png"
     image.save(path)
     assert np.array_equal(read_gray(path), GRAY) and glance(path) == (40, 60)
@@ -48,7 +48,7 @@ def test_harmless_kinds_of_png_have_the_right_pixels(tmp_path, image, ids):
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
-def test_pixels_are_those_of_opencv(tmp_path, ending):
+def test_pixels_equal_opencvs(tmp_path, ending):
     path = tmp_path / f"a.{ending}"
     colours = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (101, 67, 3), np.uint8), (0, 0), 2)
     for image in (colours, colours[..., 0]):
@@ -57,14 +57,14 @@ def test_pixels_are_those_of_opencv(tmp_path, ending):
         assert np.array_equal(read_color(path)[..., ::-1], cv2.imread(str(path)))
 
 
-def test_too_little_memory_is_not_taken_for_damage(tmp_path, monkeypatch):
+def test_too_little_memory_is_not_reported_as_damage(tmp_path, monkeypatch):
     write_png(tmp_path / "a.png", IMAGE)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: None)
     with pytest.raises(MemoryError):
         read_gray(tmp_path / "a.png")
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path):
+def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
     with pytest.raises(RuntimeError), atomic(path) as temporary:
@@ -73,7 +73,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.txt"]
 
 
-def test_links_are_followed_and_streams_written_to(tmp_path, capsysbinary):
+def test_output_to_links_pipes_and_streams(tmp_path, capsysbinary):
     (tmp_path / "link").symlink_to("file")
     files.write_text(tmp_path / "link", "new")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "file").read_text() == "new"
@@ -89,7 +89,7 @@ def test_links_are_followed_and_streams_written_to(tmp_path, capsysbinary):
         read_gray(tmp_path / "pipe")
 
 
-def test_a_result_is_no_place_for_other_output(tmp_path):
+def test_output_into_a_folder_of_results_is_refused(tmp_path):
     check_output(tmp_path / "a" / "b.txt")
     check_output(tmp_path / "-")
     (tmp_path / longrun.RECORD).touch()
@@ -97,7 +97,7 @@ def test_a_result_is_no_place_for_other_output(tmp_path):
         check_output(tmp_path / "a" / "b.txt")
 
 
-def test_progress_goes_to_the_named_file(tmp_path, monkeypatch):
+def test_progress_is_written_to_the_named_file(tmp_path, monkeypatch):
     monkeypatch.setenv("THESIS_REPRO_PROGRESS", str(tmp_path / "log"))
     monkeypatch.setattr("thesis_repro.files.BAR_DELAY", 0)
     assert list(progress(range(3), "counting")) == [0, 1, 2]

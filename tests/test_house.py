@@ -1,4 +1,4 @@
-"""The house: which folder may import which, no import in a circle, types of the method, nothing unsafe."""
+"""Imports between folders, types of public functions, and no unsafe reading of files."""
 
 import ast
 import graphlib
@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent.parent / "thesis_repro"
-# what each folder, or module at the top, must not import; nothing may import `tools`, which is not installed
+# {folder or module: folders it must not import}; nothing may import `tools`, which is not installed
 NOT_IMPORTED = {
     "odometry": {"segmentation", "world", "study", "report"},
     "masks": {"odometry", "segmentation", "world", "study", "report"},
@@ -26,7 +26,7 @@ def tree_of(path):
 
 
 def imported_names(tree):
-    """Dotted names of all that a module imports."""
+    """Dotted names of all imports of a module."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -35,13 +35,13 @@ def imported_names(tree):
 
 
 def imports(tree, folder=None):
-    """The package's modules that a module in a folder imports, as dotted names without the package's own."""
+    """The package's modules that a module in a folder imports, as dotted names without `thesis_repro`."""
     inner = {name.removeprefix("thesis_repro.") for name in imported_names(tree) if name.startswith("thesis_repro.")}
-    # from outside, a folder's name stands for what its __init__ gathers; inside, for the way to a neighbour
+    # outside a folder, its name means its __init__; inside, it is part of a neighbour's name
     return inner & MODULES.keys() | {f"{name}.__init__" for name in inner & FOLDERS if name != folder}
 
 
-def test_no_folder_imports_what_it_must_not():
+def test_folders_import_only_allowed_folders():
     wrong = [f"{name} imports {other}" for name, path in MODULES.items() for other in imports(tree_of(path))
              if other.split(".")[0] in NOT_IMPORTED.get(name.split(".")[0], ())]
     wrong += [f"{name} imports tools" for name, path in MODULES.items()
@@ -49,33 +49,34 @@ def test_no_folder_imports_what_it_must_not():
     assert wrong == []
 
 
-def test_no_import_leads_in_a_circle():
+def test_no_circular_imports():
     graphlib.TopologicalSorter({name: imports(tree_of(path), name.split(".")[0]) - {name}
                                 for name, path in MODULES.items()}).prepare()
 
 
-def test_the_check_of_the_imports_can_fail():
+def test_imports_are_found():
     tree = ast.parse("from thesis_repro.study import runner\nimport numpy\n"
                      "from thesis_repro.report.style import BLUE\n")
     assert imports(tree) == {"study.__init__", "study.runner", "report.style"}
     assert imports(tree, "study") == {"study.runner", "report.style"}
 
 
-def test_public_signatures_of_the_method_have_types():
-    bare = []
-    for path in (path for path in PATHS if path.relative_to(PACKAGE).parts[0] in ("masks.py", "kitti.py", "odometry",
-                                                                                  "study")):
+def test_public_functions_have_types():
+    untyped = []
+    for name, path in MODULES.items():
+        if name.split(".")[0] not in ("masks", "kitti", "odometry", "study"):
+            continue
         body = tree_of(path).body
-        for node in [*body, *(inner for each in body if isinstance(each, ast.ClassDef) for inner in each.body)]:
+        for node in [*body, *(member for item in body if isinstance(item, ast.ClassDef) for member in item.body)]:
             if not isinstance(node, ast.FunctionDef) or node.name.startswith("_") or any(
-                    isinstance(name, ast.Name) and name.id in ("fast", "inner") for name in node.decorator_list):
-                continue  # what is compiled gets its types from its arguments
+                    ast.unparse(decorator) in ("fast", "inner") for decorator in node.decorator_list):
+                continue  # compiled functions get their types from their arguments
             arguments = [*node.args.args, *node.args.kwonlyargs]
             if node.returns is None or not all(a.annotation for a in arguments if a.arg not in ("self", "cls")):
-                bare.append(f"{path.relative_to(PACKAGE)}: {node.name}")
-    assert bare == []
+                untyped.append(f"{name}: {node.name}")
+    assert untyped == []
 
 
-def test_nothing_that_a_file_carries_is_executed():
-    # ruff refuses functions that could (pyproject.toml), and not these keywords of others
+def test_no_file_is_read_with_code_in_it():
+    # ruff forbids unsafe functions (pyproject.toml), but not these arguments
     assert [path.name for path in PATHS if re.search("allow_pickle=True|safe_mode=False", path.read_text())] == []

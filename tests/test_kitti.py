@@ -10,7 +10,7 @@ from thesis_repro.kitti import Sequence, name_of, sequences, true_path, with_fra
 
 
 def test_reads_a_sequence(tiny_kitti):
-    (tiny_kitti / "sequences/00/image_0/.000002.4711.png").write_bytes(b"half")  # a killed run left it: no frame
+    (tiny_kitti / "sequences/00/image_0/.000002.4711.png").write_bytes(b"half")  # a temporary file of a killed run
     assert sequences(tiny_kitti) == ["00"]
     sequence = Sequence(tiny_kitti, "00")
     assert len(sequence) == 4 and sequence.size == (48, 64) and len(list(sequence.frames())) == 4
@@ -26,7 +26,7 @@ def test_tum_files_are_read_by_evo(tmp_path):
     random = np.random.default_rng(0)
     poses, times = np.tile(np.eye(4), (50, 1, 1)), np.sort(random.random(50))
     poses[:, :3, 3] = random.normal(size=(50, 3))
-    poses[1:, :3, :3] = [cv2.Rodrigues(vector)[0] for vector in random.normal(size=(49, 3))]  # to beyond half a turn
+    poses[1:, :3, :3] = [cv2.Rodrigues(vector)[0] for vector in random.normal(size=(49, 3))]  # up to half a turn
     write_tum(tmp_path / "path.tum", poses, times)
     trajectory = file_interface.read_tum_trajectory_file(tmp_path / "path.tum")
     assert np.array_equal(trajectory.timestamps, times) and np.array_equal(trajectory.positions_xyz, poses[:, :3, 3])
@@ -34,7 +34,7 @@ def test_tum_files_are_read_by_evo(tmp_path):
     assert (trajectory.orientations_quat_wxyz[:, 0] >= 0).all()
 
 
-# of the excerpts in ../shared/data/kitti, as its README says
+# frames of the excerpts in ../shared/data/kitti
 REAL_FRAMES = {"00": 200, "01": 51, "02": 200, "05": 150, "06": 51, "07": 120}
 
 
@@ -47,13 +47,13 @@ def test_reads_real_sequences(kitti_real):
     assert Sequence(kitti_real, "00").intrinsics[0, 0] == 718.856
 
 
-def test_sequences_without_published_poses_are_left_out(tiny_kitti):
+def test_sequences_with_and_without_published_poses(tiny_kitti):
     for name in ("03", "11"):
         (tiny_kitti / "sequences" / name / "image_0").mkdir(parents=True)
     assert sequences(tiny_kitti) == ["00", "03"] and with_frames(tiny_kitti) == ["00", "03", "11"]
 
 
-def test_colour_jpeg_frames_are_read_as_gray_with_their_own_camera(tiny_kitti):
+def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
     calibration = tiny_kitti / "sequences/00/calib.txt"
     calibration.write_text(calibration.read_text() + "P2: 60 0 30 5 0 60 20 0 0 0 1 0\n")
     before = Sequence(tiny_kitti, "00").frame(3)
@@ -81,21 +81,20 @@ def test_the_camera_can_be_chosen(tiny_kitti):
     assert abs(int(Sequence(tiny_kitti, "00", camera="image_2").frame(0)[0, 0]) - 0.299 * 200) < 2
 
 
-def test_frames_come_in_the_order_of_their_numbers_and_a_gap_is_named(tiny_kitti):
+def test_frames_are_ordered_by_number_and_a_missing_one_is_named(tiny_kitti):
     images = tiny_kitti / "sequences/00/image_0"
     for index, path in enumerate(sorted(images.glob("*.png"))):
         path.rename(images / f"drive_{index + 8}.png")
-    assert [path.stem for path in Sequence(tiny_kitti, "00").frame_paths] == ["drive_8", "drive_9", "drive_10",
-                                                                             "drive_11"]
+    assert [path.stem for path in Sequence(tiny_kitti, "00").frame_paths] == [f"drive_{n}" for n in (8, 9, 10, 11)]
     (images / "drive_11.png").rename(images / "drive_15.png")
     with pytest.raises(InputError, match="drive_11.png"):
         Sequence(tiny_kitti, "00")
-    for index, name in enumerate((8, 9, 10, 15)):  # every fifth frame of something is no gap
+    for index, name in enumerate((8, 9, 10, 15)):  # every fifth frame of a drive has no gap
         (images / f"drive_{name}.png").rename(images / f"drive_{100 + 5 * index}.png")
     assert len(Sequence(tiny_kitti, "00")) == 4
 
 
-def test_without_truth_steps_are_assumed(tiny_kitti):
+def test_without_ground_truth_steps_are_assumed(tiny_kitti):
     (tiny_kitti / "poses/00.txt").rename(tiny_kitti / "poses/away.txt")
     (tiny_kitti / "sequences/00/times.txt").write_text("0\n0.1\n0.3\n0.4\n")
     sequence = Sequence(tiny_kitti, "00")
@@ -113,7 +112,7 @@ def test_without_truth_steps_are_assumed(tiny_kitti):
         Sequence(tiny_kitti, "00", speed=5)
 
 
-def test_a_folder_of_ones_own_needs_no_layout(tiny_kitti, tmp_path):
+def test_a_folder_of_frames_needs_no_layout(tiny_kitti, tmp_path):
     folder = tmp_path / "mine"
     shutil.copytree(tiny_kitti / "sequences/00/image_0", folder)
     shutil.copy(tiny_kitti / "sequences/00/calib.txt", folder)

@@ -1,4 +1,4 @@
-"""What long runs rest on: folders that one process holds, logs, and one line for what the machine lacks."""
+"""Locks of folders, deletion of old results, logs, and one line for errors of the machine."""
 
 import errno
 import fcntl
@@ -11,11 +11,11 @@ import pytest
 from thesis_repro import InputError, files, longrun, stages
 
 
-def test_a_folder_is_held_by_one_process(tmp_path):
+def test_a_folder_is_locked_by_one_process(tmp_path):
     folder = tmp_path / "out"
-    with longrun.claimed(folder), longrun.claimed(folder):  # by one process as often as it likes
+    with longrun.claimed(folder), longrun.claimed(folder):  # one process may lock it twice
         stages.stage(folder, size=3)
-        other = os.open(folder, os.O_RDONLY)  # as another process has it
+        other = os.open(folder, os.O_RDONLY)  # as in another process
         with pytest.raises(BlockingIOError):
             fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
     fcntl.flock(other, fcntl.LOCK_EX)
@@ -26,7 +26,7 @@ def test_a_folder_is_held_by_one_process(tmp_path):
     assert not longrun._held
 
 
-def test_a_claim_of_which_nothing_comes_leaves_nothing(tmp_path):
+def test_a_failed_run_leaves_no_empty_folders(tmp_path):
     with pytest.raises(ZeroDivisionError), longrun.claimed(tmp_path / "a" / "b"):
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
@@ -35,22 +35,22 @@ def test_a_claim_of_which_nothing_comes_leaves_nothing(tmp_path):
         pass
 
 
-def test_what_a_killed_run_left_half_written_is_deleted_and_nothing_else(tmp_path):
+def test_temporary_files_of_a_killed_run_are_deleted(tmp_path):
     folder = stages.stage(tmp_path / "out", size=3)
     (folder / "in").mkdir()
-    half, own = longrun.temporary(folder / "in" / "a.png"), folder / "in" / ".hidden"
-    half.touch()
-    own.touch()
+    temporary, hidden = longrun.temporary(folder / "in" / "a.png"), folder / "in" / ".hidden"
+    temporary.touch()
+    hidden.touch()
     stages.stage(folder, size=3)
-    assert not half.exists() and own.exists()
-    # a run that was killed while it wrote its very record
+    assert not temporary.exists() and hidden.exists()
+    # a run that was killed while it wrote its record
     other = tmp_path / "other"
     other.mkdir()
     longrun.temporary(other / stages.RECORD).touch()
     assert [path.name for path in stages.stage(other, size=3).iterdir()] == [stages.RECORD]
 
 
-def test_results_are_deleted_with_their_records_last_and_the_log_is_kept(tmp_path, monkeypatch):
+def test_results_are_deleted_before_their_records_and_the_log_is_kept(tmp_path, monkeypatch):
     folder, gone = stages.stage(tmp_path / "out", size=3), []
     stages.stage(folder / "in", size=3)
     for path in (folder / "result", folder / "in" / "result"):
@@ -88,24 +88,24 @@ def chained(inner, outer):
     (RuntimeError("can't start new thread"), "memory"),
     (InputError("a.png: truncated"), "a.png"),
 ])
-def test_what_the_machine_lacks_is_one_line(error, says, capsys):
+def test_errors_of_the_machine_are_one_line(error, says, capsys):
     assert longrun.report_error(error) == 1
     line = capsys.readouterr().err
     assert line.startswith("error: ") and says in line and line.count("\n") == 1
-    with pytest.raises(ZeroDivisionError):  # what nobody expects is raised
+    with pytest.raises(ZeroDivisionError):  # unexpected errors are raised
         longrun.report_error(ZeroDivisionError("1/0"))
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_a_full_disk_names_the_file_and_not_its_temporary_name(tmp_path, named):
+def test_a_full_disk_names_the_file_and_not_the_temporary_file(tmp_path, named):
     with pytest.raises(OSError, match="No space left on device") as caught:
         with files.atomic(tmp_path / "a.txt") as temporary:
             raise OSError(errno.ENOSPC, "x", str(temporary) if named else None)
     assert caught.value.filename == str(tmp_path / "a.txt") and list(tmp_path.iterdir()) == []
 
 
-def test_a_log_has_what_was_said_every_warning_and_the_error(tmp_path, capsys):
-    warnings.simplefilter("always")  # whatever the environment says; pytest puts it back
+def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
+    warnings.simplefilter("always")  # pytest restores the filters
     with pytest.raises(InputError), longrun.logged(tmp_path / "out", "thesis-repro study") as run:
         stages.stage(tmp_path / "out", size=3)
         warnings.warn("odd", stacklevel=1)

@@ -16,17 +16,11 @@ def bands(*names):
 
 
 def streets():
-    """A label map of blocks of a few classes; none of its boundaries lies on a pixel's centre when enlarged to SIZE."""
+    """A label map of blocks; enlarged to SIZE, no boundary lies on the centre of a pixel."""
     return np.random.default_rng(0).choice([7, 8, 11, 23, 26], (20, 20)).astype(np.uint8).repeat(16, 0).repeat(16, 1)
 
 
-def point():
-    image = np.zeros((41, 41), np.uint8)
-    image[20, 20] = 255
-    return image
-
-
-def test_canny_misses_neighbouring_ids_and_exact_does_not():
+def test_canny_misses_boundaries_of_neighbouring_ids_and_exact_finds_them():
     # road 7 and sidewalk 8 differ by one: too little for thresholds of 5 and 15
     assert not masks.edges(bands("road", "sidewalk"), (64, 96)).any()
     exact = masks.edges(bands("road", "sidewalk"), (64, 96), MaskSettings("exact"))
@@ -37,23 +31,22 @@ def test_canny_misses_neighbouring_ids_and_exact_does_not():
 
 @pytest.mark.parametrize("width", [1, 2, 5, 10, 15])
 def test_dilation_gives_a_square_of_that_width(width):
-    rows, columns = np.nonzero(masks.dilate(point(), width))
+    image = np.zeros((41, 41), np.uint8)
+    image[20, 20] = 255
+    rows, columns = np.nonzero(masks.dilate(image, width))
     assert np.ptp(rows) + 1 == np.ptp(columns) + 1 == width and len(rows) == width**2
-    # an even square has no centre: it lies half a pixel off, as the thesis's does
+    # a square of even width is half a pixel off, as in the thesis
     assert abs(rows.mean() - 20) == (0.5 if width % 2 == 0 else 0)
 
 
-def test_without_corrections_masks_are_the_thesiss_to_the_bit():
+def test_without_corrections_masks_have_the_thesiss_bits():
     enlarged = cv2.resize(streets(), SIZE[::-1])
     theirs = cv2.dilate(cv2.Canny(enlarged, 5, 15), np.ones((10, 10), np.uint8))
     assert np.array_equal(masks.keypoint_mask(streets(), SIZE, 10), theirs)
 
 
-# The corrections, each by itself
-
-
 @pytest.mark.parametrize("width", [2, 5, 10])
-def test_a_symmetric_mask_of_a_mirrored_label_map_is_the_mirrored_mask(width):
+def test_symmetric_masks_commute_with_mirroring(width):
     def differing(settings):
         made = masks.keypoint_mask(streets(), SIZE, width, settings)
         return [(masks.keypoint_mask(cv2.flip(streets(), axis), SIZE, width, settings) != cv2.flip(made, axis)).mean()
@@ -63,7 +56,7 @@ def test_a_symmetric_mask_of_a_mirrored_label_map_is_the_mirrored_mask(width):
     assert max(differing(MaskSettings("exact"))) > 0.01
 
 
-def test_a_symmetric_band_lies_in_the_middle_of_its_boundary():
+def test_a_symmetric_band_is_centred_on_its_boundary():
     def columns(width, settings):  # the boundary is between columns 47 and 48
         return np.unique(np.nonzero(masks.keypoint_mask(bands("road", "sky"), (64, 96), width, settings))[1]).tolist()
 
@@ -73,8 +66,8 @@ def test_a_symmetric_band_lies_in_the_middle_of_its_boundary():
 
 
 @pytest.mark.parametrize("boundaries", masks.BOUNDARIES)
-def test_boundaries_of_chosen_classes_alone(boundaries):
-    def around(*classes):  # whether the boundaries road/car, at column 32, and car/building, at 64, are in the mask
+def test_only_boundaries_of_chosen_classes(boundaries):
+    def around(*classes):  # (road/car at column 32, car/building at 64): whether each boundary is in the mask
         columns = masks.keypoint_mask(bands("road", "car", "building"), (64, 96), 3,
                                       MaskSettings(boundaries, classes=classes)).any(axis=0)
         assert not np.delete(columns, np.r_[28:37, 60:69]).any()
@@ -86,11 +79,13 @@ def test_boundaries_of_chosen_classes_alone(boundaries):
 
 
 def test_no_keypoints_on_movable_classes_and_within_the_margin():
-    without = {grown: masks.keypoint_mask(bands("road", "car", "building"), (64, 96), 9,
-                                          MaskSettings("exact", movable=grown)) > 0 for grown in (None, 0, 2)}
-    assert without[None][:, 32:36].all()  # on the car, along its boundary
-    assert not without[0][:, 32:64].any() and without[0][:, 28:32].all() and without[0][:, 64:68].all()
-    assert not without[2][:, 30:66].any() and without[2][:, 28:30].all() and without[2][:, 66:68].all()
+    def columns(movable):
+        settings = MaskSettings("exact", movable=movable)
+        return np.flatnonzero(masks.keypoint_mask(bands("road", "car", "building"), (64, 96), 9, settings).all(axis=0))
+
+    assert columns(None).tolist() == [*range(27, 36), *range(59, 68)]
+    assert columns(0).tolist() == [*range(27, 32), *range(64, 68)]  # the car is at columns 32 to 63
+    assert columns(2).tolist() == [*range(27, 30), *range(66, 68)]
     plain, inside = (masks.keypoint_mask(streets(), SIZE, 5, MaskSettings(margin=margin)) for margin in (0, 7))
     expected = np.zeros_like(plain)
     expected[7:-7, 7:-7] = plain[7:-7, 7:-7]
@@ -99,22 +94,19 @@ def test_no_keypoints_on_movable_classes_and_within_the_margin():
 
 
 @pytest.mark.parametrize("boundaries", masks.BOUNDARIES)
-def test_where_the_literature_keeps_keypoints(boundaries):
+def test_other_masks_of_the_literature(boundaries):
     label_map = bands("road", "building", "car").repeat(2, axis=1)  # bands of 32 pixels
 
     def kept(**options):  # the columns
         mask = masks.keypoint_mask(label_map, label_map.shape, 5, MaskSettings(boundaries, **options))
         return set(np.flatnonzero(mask.all(axis=0)))
 
-    own = kept()
-    assert {31, 32, 63, 64} <= own and len(own) < 16
-    assert kept(keep="inverse") == set(range(96)) - own
-    assert kept(keep="static-boundaries") == {column for column in own if column < 40}
+    thesis = kept()
+    assert {31, 32, 63, 64} <= thesis and len(thesis) < 16
+    assert kept(keep="inverse") == set(range(96)) - thesis
+    assert kept(keep="static-boundaries") == {column for column in thesis if column < 40}
     assert kept(keep="static") == set(range(64 - masks.DYNASLAM_MARGIN))
     assert kept(keep="static", movable=0) == set(range(64))
-
-
-# Of a sequence
 
 
 @pytest.fixture
@@ -127,10 +119,10 @@ def labelled(tiny_kitti, tmp_path):
     return sequence, folder
 
 
-def test_label_masks_and_written_ones_are_the_filter_of_each_frame(labelled, tmp_path):
+def test_label_masks_and_written_masks_equal_the_filter(labelled, tmp_path):
     sequence, folder = labelled
     corrections = MaskSettings("exact", symmetric=True, classes=("sky",), movable=1, margin=3)
-    for settings in (corrections, MaskSettings()):  # nothing of the first is left
+    for settings in (corrections, MaskSettings()):  # the second replaces the first
         made = masks.LabelMasks(folder, sequence, 4, settings)
         expected = masks.keypoint_mask(bands("road", "sky"), (48, 64), 4, settings)
         masks.write_masks(made, tmp_path / "masks")
@@ -140,11 +132,10 @@ def test_label_masks_and_written_ones_are_the_filter_of_each_frame(labelled, tmp
 
 def test_wrong_settings_and_missing_files_are_named(labelled, tmp_path):
     sequence, folder = labelled
-    for settings, name in (({"boundaries": "fuzzy"}, "fuzzy"), ({"classes": ("hedge",)}, "hedge"),
-                           ({"movable": -1}, "movable"), ({"margin": -3}, "margin"),
-                           ({"keep": "most"}, "most")):
-        with pytest.raises(InputError, match=name):
-            MaskSettings(**settings)
+    for setting, value in (("boundaries", "fuzzy"), ("classes", ("hedge",)), ("movable", -1), ("margin", -3),
+                           ("keep", "most")):
+        with pytest.raises(InputError, match=setting):
+            MaskSettings(**{setting: value})
     with pytest.raises(InputError, match="dilation width 0"):
         masks.LabelMasks(folder, sequence, 0)
     with pytest.raises(InputError, match="nowhere"):

@@ -1,4 +1,4 @@
-"""Notebooks as they are in git, and as they run: on the smallest profile, executed once for all that looks at them."""
+"""Notebooks as they are in git and as they run; they are executed once, on the smallest profile."""
 
 import ast
 import json
@@ -13,12 +13,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
-SECTIONS = {"01": "A.2", "02": "A.3", "03": "A.4", "04": "A.5 and A.6", "05": "A.7", "06": "A.8", "07": "3.7"}
 TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]
 FIGURES = [*(f"figure_2_{n:02d}" for n in range(1, 13)), *(f"figure_3_{n:02d}" for n in range(1, 7)),
            *(f"figure_4_{n:02d}" for n in range(1, 18)), "figure_a_01"]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
-EXECUTED = re.compile(r"nbconvert .* --output \.(\d\d)_")  # in what make prints
+EXECUTED = re.compile(r"nbconvert .* --output \.(\d\d)_")  # in the output of make
 JUPYTER = ROOT / ".venv" / "bin" / "jupyter-nbconvert"
 
 
@@ -28,7 +27,7 @@ def cells(name, kind):
 
 
 def execute(name, build, output):
-    """Plain nbconvert, with nothing in the environment that the Makefile sets but the profile."""
+    """Execute a notebook by nbconvert with no setting of the Makefile but the profile and the folders."""
     environment = {key: os.environ[key] for key in ("PATH", "HOME", "LANG") if key in os.environ}
     environment |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROFILE": "smoke", "THESIS_REPRO_BUILD": str(build),
                     "THESIS_REPRO_FIGURES": str(build.parent / "figures")}
@@ -38,7 +37,7 @@ def execute(name, build, output):
 
 
 def make_figures(tmp_path, *options, root=ROOT):
-    # make's own variables would hand the outer make's options on to this one
+    # MAKEFLAGS would pass the options of an outer make on to this one
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(("MAKE", "MFLAGS", "THESIS_REPRO_"))}
     return subprocess.run(["make", "figures", "PROFILE=smoke", f"BUILD={tmp_path / 'build'}",
@@ -48,21 +47,21 @@ def make_figures(tmp_path, *options, root=ROOT):
 
 @pytest.fixture(scope="module")
 def executed(tmp_path_factory):
-    """The folder of a run in which every notebook was executed: build and figures."""
+    """A folder with build and figures of a run in which every notebook was executed."""
     folder = tmp_path_factory.mktemp("run")
     run = folder / "build" / "embedded-smoke"
     run.mkdir(parents=True)
-    (run / "checked").touch()  # what `make figures` would otherwise do before a notebook
+    (run / "checked").touch()  # as if make had checked the data
     for name in NOTEBOOKS:
         done = execute(name, folder / "build", run / "notebooks")
         assert done.returncode == 0, done.stderr[-3000:]
         if name == NOTEBOOKS[0]:
-            (run / "drives").touch()  # what it would do beside the training
+            (run / "drives").touch()  # as if make had rendered the drives
     return folder
 
 
 @pytest.mark.notebooks
-def test_every_artefact_is_there_and_says_where_its_data_come_from(executed):
+def test_every_artefact_is_written_and_names_its_data(executed):
     figures = executed / "figures" / "embedded-smoke"
     written = {path.stem: path for path in figures.iterdir() if path.suffix in (".svg", ".webp")}
     assert set(FIGURES) <= written.keys() and len(FIGURES) == 36
@@ -73,21 +72,21 @@ def test_every_artefact_is_there_and_says_where_its_data_come_from(executed):
 
 
 @pytest.mark.notebooks
-def test_the_cells_do_what_the_package_does(executed):
+def test_cells_and_package_agree_to_the_bit(executed):
     outputs = "".join(json.dumps(cell.get("outputs", [])) for name in NOTEBOOKS for cell in
                       json.loads((executed / "build/embedded-smoke/notebooks" / name).read_text())["cells"])
     assert outputs.count("to the bit: True") >= 10 and "to the bit: False" not in outputs and "EDITED" not in outputs
 
 
 @pytest.mark.notebooks
-def test_make_figures_takes_executed_notebooks_as_they_are(executed):
+def test_make_figures_executes_no_notebook_twice(executed):
     done = make_figures(executed)
     assert done.returncode == 0 and not re.findall(r"^\d\d_\w+", done.stdout, re.MULTILINE), done.stdout + done.stderr
     assert "41 of 41" in (executed / "figures" / "embedded-smoke" / "index.html").read_text()
 
 
 @pytest.mark.notebooks
-def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path):
+def test_a_notebook_without_its_input_names_the_one_to_run_first(tmp_path):
     done = execute("02_augmentation.ipynb", tmp_path / "build", tmp_path)
     assert done.returncode != 0 and "01_load_images_and_labels" in done.stderr
 
@@ -98,15 +97,14 @@ def test_a_notebook_opened_alone_says_which_one_to_run_first(tmp_path):
     ("notebooks/07_visual_odometry.ipynb", ["07", "08", "09"]),
     ("thesis_repro/masks.py", [name[:2] for name in NOTEBOOKS]), ("thesis_repro/report/page.py", [])])
 def test_only_what_changed_is_made_again(executed, changed, again):
-    """What make would do, asked of it without doing it."""
-    # (the check of the data is always made, and touches its file where the data has changed)
+    # -o: the check of the data is always made, and touches its file if the data has changed
     planned = make_figures(executed, "-n", "-W", changed, "-o", executed / "build" / "embedded-smoke" / "checked")
     assert planned.returncode == 0
     assert EXECUTED.findall(planned.stdout.replace("\\\n", "")) == again, planned.stdout
 
 
 @pytest.mark.notebooks
-def test_a_notebook_that_fails_costs_the_others_nothing(tmp_path):
+def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     """On a copy of the project with two small notebooks."""
     root = tmp_path / "project"
     shutil.copytree(ROOT / "thesis_repro", root / "thesis_repro", ignore=shutil.ignore_patterns("__pycache__"))
@@ -125,8 +123,7 @@ def test_a_notebook_that_fails_costs_the_others_nothing(tmp_path):
 
 
 @pytest.mark.notebooks
-def test_real_frames_alone_ask_for_no_training(tmp_path, tiny_kitti):
-    """What make would do, asked of it without doing it."""
+def test_real_frames_alone_need_no_training(tmp_path, tiny_kitti):
     planned = make_figures(tmp_path, f"KITTI={tiny_kitti}", "-n")
     assert planned.returncode == 0, planned.stderr
     assert EXECUTED.findall(planned.stdout.replace("\\\n", "")) == ["03", "05", "06", "07", "08", "09"]
@@ -134,10 +131,10 @@ def test_real_frames_alone_ask_for_no_training(tmp_path, tiny_kitti):
 
 @pytest.mark.torture
 def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
-    """On the small world's frames, given as if they were real; one size is not the profile's."""
+    """On frames of the small world, given as if they were real."""
     done = make_figures(tmp_path, f"KITTI={small_world / 'kitti'}", "WIDTHS=5,10", "REPETITIONS=1")
     assert done.returncode == 0, done.stdout + done.stderr
-    (build,) = (tmp_path / "build").iterdir()  # no world beside it
+    (build,) = (tmp_path / "build").iterdir()  # no world is rendered
     assert build.name.endswith("-smoke-widths-5_10-repetitions-1") and not (build / "model").exists()
     figures = {path.stem for path in (tmp_path / "figures" / build.name).iterdir() if path.suffix in (".svg", ".webp")}
     left_out = {"figure_4_01", "figure_4_02", *(f"figure_3_{n:02d}" for n in range(1, 6))}
@@ -155,7 +152,7 @@ def test_bad_data_stops_before_the_notebooks(tmp_path, tiny_kitti):
 
 
 def assigned(code):
-    """{name: value} of all assignments, as text; those of tuples one by one."""
+    """{name: value} of all assignments as text; assignments of tuples are split."""
     values = {}
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
@@ -166,35 +163,30 @@ def assigned(code):
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_the_last_cell_puts_all_knobs_back(name):
+def test_the_last_cell_resets_all_knobs(name):
     (knobs,), last = [code for code in cells(name, "code") if code.startswith("# Knobs")], cells(name, "code")[-1]
     assert assigned(last) == assigned(knobs) | {"PUT_BACK": "False"}
 
 
-def test_the_order_of_the_notebooks_has_what_each_of_them_asks_for():
+def test_the_makefile_lists_the_notebooks_that_each_one_needs():
     listed = dict(re.findall(r"^NEEDS_(\d\d) :=(.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    before = {}
+    earlier = {}
     for number, needs in sorted(listed.items()):
-        before[number] = {*needs.split(), *(earlier for need in needs.split() for earlier in before[need])}
-    asked = {name[:2]: set(re.findall(r'"(\d\d)_\w+"', "\n".join(cells(name, "code")))) for name in NOTEBOOKS}
-    assert listed.keys() == asked.keys() and sum(map(len, asked.values())) > 10
-    assert {number: names - before[number] for number, names in asked.items() if names - before[number]} == {}
+        earlier[number] = {*needs.split()}.union(*(earlier[need] for need in needs.split()))
+    needed = {name[:2]: set(re.findall(r'"(\d\d)_\w+"', "\n".join(cells(name, "code")))) for name in NOTEBOOKS}
+    assert listed.keys() == needed.keys() and sum(map(len, needed.values())) > 10
+    assert [number for number, names in needed.items() if names - earlier[number]] == []
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_notebooks_in_git_hold_no_outputs(name):
-    read = json.loads((ROOT / "notebooks" / name).read_text())["cells"]
-    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in read)
+def test_notebooks_in_git_have_no_outputs_and_set_what_libraries_read(name):
+    in_git = json.loads((ROOT / "notebooks" / name).read_text())["cells"]
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in in_git)
+    first = cells(name, "code")[0]
+    assert name > "08" or "%env SM_FRAMEWORK=tf.keras" in first and "%env NO_ALBUMENTATIONS_UPDATE=1" in first
 
 
-@pytest.mark.parametrize("name", [name for name in NOTEBOOKS if name[:2] in SECTIONS])
-def test_a_notebook_says_what_it_mirrors_and_sets_what_libraries_read(name):
-    assert SECTIONS[name[:2]] in cells(name, "markdown")[0] and "**Written:**" in cells(name, "markdown")[-1]
-    first, *others = cells(name, "code")
-    assert "%env SM_FRAMEWORK=tf.keras" in first and "%env NO_ALBUMENTATIONS_UPDATE=1" in first
-
-
-def test_every_call_of_the_appendix_is_where_the_table_says():
+def test_every_call_of_the_appendix_is_in_the_notebook_that_the_table_names():
     table = (ROOT / "docs" / "appendix-calls.md").read_text()
     rows = re.findall(r"^\|[^|]*\|(?: `[^|]*` \|)? (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
     code = {name[:2]: "\n".join(cells(name, "code")) for name in NOTEBOOKS}

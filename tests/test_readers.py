@@ -1,4 +1,4 @@
-"""Whatever a file or a setting holds: it is read to something sound, or refused in one line that names it."""
+"""Any content of a file or setting is read to valid values or refused with one line that names it."""
 
 import re
 import string
@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from thesis_repro import InputError, files, kitti
 from thesis_repro.settings import LIMITS, PROFILES, SIZES, read_settings
 
-# the same examples in every run; a loaded machine is no reason to fail
+# the same examples in every run, and no time limits
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=200,
                           suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 settings.load_profile("repeatable")
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True) | st.integers(-10**400, 10**400).map(str)
 WORDS = NUMBERS.map(str) | st.sampled_from(["nan", "inf", "1e999", "-0", "1_0", "0x1", "٣", "½", "", "#", "P0:"])
-# anything, and what looks like the files that are meant
+# any text, and text that looks like a file of poses, times or calibration
 TEXTS = st.text() | st.text(string.digits + " .-+eE\n\r\t\x0b\x1c\x85\u2028nanif") | st.lists(
     st.lists(WORDS, max_size=13).map(" ".join), max_size=5).map("\n".join)
 
@@ -30,7 +30,7 @@ def path(tmp_path_factory):
 
 
 def read(function, path, text, *arguments):
-    """What a reader makes of a text; None where it refuses it, as it should."""
+    """Result of a reader for a file with this text; None if it raises InputError with the file's name."""
     path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass"))
     try:
         return function(path, *arguments)
@@ -68,7 +68,7 @@ def test_any_text_as_calibration(path, text, with_key, camera):
 
 
 @given(st.lists(st.floats(1, 1e5), min_size=4, max_size=4), st.integers(1, 4000), st.integers(1, 4000))
-def test_a_camera_is_that_of_its_frames_or_refused(path, numbers, height, width):
+def test_a_camera_fits_its_frames_or_is_refused(path, numbers, height, width):
     fx, fy, u, v = numbers
     text = f"P0: {fx!r} 0 {u!r} 0 0 {fy!r} {v!r} 0 0 0 1 0\n"
     matrix = read(kitti.read_intrinsics, path, text)
@@ -83,7 +83,7 @@ def test_a_camera_is_that_of_its_frames_or_refused(path, numbers, height, width)
 
 
 @given(st.lists(st.tuples(*[st.floats(-3, 3)] * 3, *[st.floats(-1e6, 1e6)] * 3), min_size=1, max_size=20))
-def test_written_trajectories_come_back_to_the_last_bit(path, motions):
+def test_written_trajectories_are_read_back_to_the_bit(path, motions):
     poses = np.tile(np.eye(4), (len(motions), 1, 1))
     for pose, motion in zip(poses, np.array(motions)):
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(motion[:3])[0], motion[3:]
@@ -92,7 +92,7 @@ def test_written_trajectories_come_back_to_the_last_bit(path, motions):
 
 
 @given(st.sets(st.integers(0, 300), min_size=3, max_size=300), st.integers(1, 6), st.sampled_from(["", "a_"]))
-def test_every_missing_frame_is_named_or_the_numbers_are_no_count(path, numbers, digits, prefix):
+def test_missing_frames_are_named_if_frames_are_counted_one_by_one(path, numbers, digits, prefix):
     ordered = sorted(numbers)
     paths = [path.with_name(f"{prefix}{number:0{digits}d}.png") for number in ordered]
     missing = kitti.missing_frames(paths)
@@ -112,12 +112,11 @@ VALUES = st.text(max_size=30) | st.integers(-10**30, 10**30).map(str) | st.sampl
 
 
 @given(st.dictionaries(st.sampled_from([*LIMITS, "PROFILE"]), VALUES, max_size=4))
-def test_any_settings(given):
-    environment = {f"THESIS_REPRO_{name}": value for name, value in given.items()}
+def test_any_settings(values):
     try:
-        chosen = read_settings(environment)
+        chosen = read_settings({f"THESIS_REPRO_{name}": value for name, value in values.items()})
     except InputError as error:
-        assert str(error).split("=")[0] in given and str(error).isprintable()
+        assert str(error).split("=")[0] in values and str(error).isprintable()
         return
     assert chosen.profile in PROFILES and 1 <= chosen.jobs <= LIMITS["JOBS"][1]
     for name in SIZES:
@@ -130,11 +129,11 @@ def test_any_settings(given):
 
 @given(st.text(min_size=1, max_size=40).filter(lambda text: "/" not in text and "\0" not in text
                                                   and text not in (".", "..")))
-def test_a_run_is_named_in_letters_that_make_knows(tmp_path_factory, name):
+def test_names_of_runs_are_safe_for_make(tmp_path_factory, name):
     try:
         folder = tmp_path_factory.getbasetemp() / "data" / name
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, UnicodeEncodeError):  # the file system knows no such name
+    except (OSError, UnicodeEncodeError):  # not a valid name of a folder
         return
     chosen = read_settings({"THESIS_REPRO_KITTI": str(folder)})
     assert re.fullmatch(r"[\w.+-]+", chosen.run) and chosen.kitti == folder
@@ -146,8 +145,8 @@ def test_any_bytes_as_an_image(path, data):
     for reader in (files.read_gray, files.read_ids):
         image = read(reader, path, data)
         assert image is None or image.ndim == 2
-    looked = read(files.glance, path, data)
-    assert looked is None or len(looked) == 2
+    size = read(files.glance, path, data)
+    assert size is None or len(size) == 2
 
 
 PICTURE = cv2.imencode(".png", np.random.default_rng(0).integers(0, 35, (20, 30), np.uint8))[1].tobytes()
@@ -155,8 +154,7 @@ PICTURE = cv2.imencode(".png", np.random.default_rng(0).integers(0, 35, (20, 30)
 
 @given(st.integers(0, len(PICTURE) - 1), st.integers(1, 255))
 @example(place=len(PICTURE) - 12, change=1)  # the length of the last chunk
-def test_no_changed_byte_of_a_png_goes_unnoticed(path, place, change):
+def test_every_changed_byte_of_a_png_is_detected(path, place, change):
     data = bytearray(PICTURE)
     data[place] ^= change
-    image = read(files.read_gray, path, bytes(data))
-    assert image is None
+    assert read(files.read_gray, path, bytes(data)) is None

@@ -7,7 +7,7 @@ import pytest
 from thesis_repro import InputError, files, stages
 
 
-def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
+def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
     folder = stages.stage(tmp_path / "a", data="one", size=3)
     files.write_text(folder / "result", "kept")
     assert stages.stage(tmp_path / "a", size=3, data="one") == folder and (folder / "result").exists()
@@ -19,7 +19,7 @@ def test_a_stage_keeps_results_of_the_same_inputs_only(tmp_path):
     assert stages.record(folder) == {"data": "other", "size": 3}
 
 
-def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
+def test_a_folder_with_other_files_is_refused_and_kept(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(InputError, match=str(tmp_path)):
         stages.stage(tmp_path, data="one")
@@ -31,7 +31,7 @@ def test_a_folder_of_somebody_else_is_refused_and_kept(tmp_path):
         stages.stage(tmp_path, data="one")
 
 
-def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):
+def test_a_checkpoint_is_read_back_and_holds_no_code(tmp_path):
     file = tmp_path / "state.npz"
     assert stages.resume(file) is None
     stages.store(file, {"epoch": 3}, {"0": np.eye(2), "job": np.arange(3)})
@@ -47,12 +47,12 @@ def test_a_state_comes_back_as_it_was_and_carries_no_code(tmp_path):
         stages.resume(file)
 
 
-def test_code_ignores_comments_and_docstrings_and_follows_imports(tmp_path, monkeypatch):
+def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "_PACKAGE", tmp_path / "package")
     plain = {"__init__": "", "room____init__": "", "house": "def f():\n    return 1\n", "garden": "x = 1\n",
              "room__table": "import beside\nfrom package.room import chair\n",
              "room__chair": "from package import house\n"}
-    (tmp_path / "beside.py").touch()  # as other packages are where this one is installed
+    (tmp_path / "beside.py").touch()  # another package beside this one
 
     def version(place="room", **changed):
         for name, text in {**plain, **changed}.items():
@@ -71,14 +71,14 @@ def test_code_ignores_comments_and_docstrings_and_follows_imports(tmp_path, monk
     stages.code.cache_clear()
 
 
-def test_what_a_run_depends_on_is_found():
+def test_modules_that_a_run_depends_on():
     paths = stages._modules(["odometry", "study/jobs"])
     names = {str(path.relative_to(stages._PACKAGE).with_suffix("")) for path in paths}
     assert {"kitti", "masks", "odometry/opencv_exact/five_point", "study/controls", "cityscapes"} <= names
     assert not {name for name in names if name.startswith(("report", "segmentation", "world", "study/runner"))}
 
 
-def test_listing_notices_other_bytes_and_reads_them_once(tmp_path, monkeypatch):
+def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeypatch):
     monkeypatch.setenv("THESIS_REPRO_BUILD", str(tmp_path / "build"))
     monkeypatch.setattr(stages, "SETTLED", -1)
     paths = [tmp_path / "a", tmp_path / "b"]
@@ -88,7 +88,7 @@ def test_listing_notices_other_bytes_and_reads_them_once(tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     assert stages.listing([shutil.copy(path, tmp_path / "elsewhere") for path in paths]) == first
     date = paths[1].stat().st_mtime_ns
-    paths[1].write_text("21")  # as long, and of the same date
+    paths[1].write_text("21")  # the same length and date
     os.utime(paths[1], ns=(date, date))
     changed = stages.listing(paths)
     assert changed != first
@@ -99,18 +99,14 @@ def test_listing_notices_other_bytes_and_reads_them_once(tmp_path, monkeypatch):
         stages.listing([tmp_path / "pipe"])
 
 
-def harm(path):
-    path.write_text("corrected")
-
-
-@pytest.mark.parametrize("do, named", [
-    (lambda folder: harm(folder / "notes.txt"), "notes.txt"), (lambda folder: harm(folder / "in/.env.1"), "in/.env.1"),
-    (lambda folder: harm(folder / "in/result"), "in/result"),
-    (lambda folder: (folder / "link").symlink_to("/nowhere"), "link")])
-def test_what_is_not_ours_or_was_changed_is_not_deleted(tmp_path, capsys, do, named):
+@pytest.mark.parametrize("named", ["notes.txt", "in/.env.1", "in/result", "link"])
+def test_changed_and_foreign_files_are_not_deleted(tmp_path, capsys, named):
     folder = stages.stage(tmp_path / "a", size=3)
-    files.write_text(folder / "in" / "result", "ours")
-    do(folder)
+    files.write_text(folder / "in" / "result", "result")
+    if named == "link":
+        (folder / named).symlink_to("/nowhere")
+    else:
+        (folder / named).write_text("by hand")
     before = {path: path.is_file() and path.read_text() for path in folder.rglob("*")}
     stages.stage(folder, size=3)
     with pytest.raises(InputError, match=named):
@@ -123,7 +119,7 @@ def test_what_is_not_ours_or_was_changed_is_not_deleted(tmp_path, capsys, do, na
 
 
 @pytest.mark.parametrize("text", ["", "frame,x\n0,1.0\n1,2", "frame,x\n0,1.0\n1,two\n", "frame,x\n0,1.0\n"])
-def test_a_damaged_table_is_made_again(tmp_path, text):
+def test_a_damaged_table_is_not_kept(tmp_path, text):
     for content, whole in (("frame,x\n0,1.0\n1,2.0\n", True), (text, False)):
         (tmp_path / "a.csv").write_text(content)
         assert (stages.kept_table(tmp_path / "a.csv", rows=2) is not None) == whole
