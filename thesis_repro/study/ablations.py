@@ -98,10 +98,9 @@ def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,
             baseline_repetitions: int = BASELINE_REPETITIONS, dilation_width: int = CONTROL_WIDTH) -> Runs:
     """Return the runs over one sequence: {(method, estimator, repetition): (settings, masks)}.
 
-    labels: folder of the sequence's label maps. "baseline" (all keypoints) and "masked" are run with each of
-    ESTIMATORS, other methods with the thesis's and the refined estimator. A repetition other than 0 is the seed that
-    shuffles the matched points. There are `baseline_repetitions` with all keypoints and the thesis's estimator, from
-    which `null_distribution` draws.
+    labels: folder of the sequence's label maps. "baseline" (all keypoints) and "masked" use each of ESTIMATORS, other
+    methods the thesis's and the refined one. A repetition other than 0 is the seed that shuffles the matched points.
+    `null_distribution` needs the `baseline_repetitions` with all keypoints and the thesis's estimator.
     """
     label_masks = partial(masks.LabelMasks, labels, sequence, dilation_width)
 
@@ -150,7 +149,7 @@ def null_distribution(runs: pd.DataFrame, reported: pd.Series, widths: int = WID
 
     The thesis runs all keypoints once and masks of 15 widths once each, takes the best width of each sequence and
     averages Equation 4.1. If masks did nothing, these 16 runs would differ only in the order of the matched points. So
-    the procedure is applied STUDIES times to 16 errors for each sequence, drawn with replacement from measured ones.
+    the procedure is applied STUDIES times to 16 errors for each sequence, drawn with replacement from measured errors.
 
     runs: all keypoints under one estimator, several repetitions of each sequence, columns sequence and rmse.
     reported: the changes (%) that a study reports, by sequence. Columns: expected (mean of the simulated studies),

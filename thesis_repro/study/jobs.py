@@ -5,10 +5,8 @@ controls test whether it is the segmentation that helps. `reduced_jobs` and `key
 keypoints that masks leave, so they are made once the masked runs are done.
 """
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ CONTROL_WIDTH = 10
 ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined estimator"}  # the second varies far less
 KEYPOINT_CONTROLS = ("fewer", "spread")  # as many keypoints as masks leave, without a mask
 UNMASKED = ("baseline", "reduced", *KEYPOINT_CONTROLS)
-PIECES = 4  # passes for each worker at least, if there are several workers
+PIECES = 4  # passes for each of several workers
 
 
 @dataclass(frozen=True)
@@ -140,22 +138,19 @@ def _whole(number: float) -> int:
     return max(1, round(number))  # OpenCV takes 0 as "no limit"
 
 
-def in_passes(jobs: Iterable[Job], frames: Mapping[str, int], workers: int) -> list[list[Job]]:
-    """Divide jobs into lists, each for one pass over a sequence. frames: number of frames of each sequence.
+def in_passes(jobs: Iterable[Job], sequences: Mapping[str, Sequence], workers: int) -> list[list[Job]]:
+    """Divide jobs into lists, each for one pass over a sequence. sequences: by name.
 
-    A pass is at most 1 / PIECES of a worker's share of the work, so that the workers end at about the same time. Jobs
-    with the same keypoints stay in one pass, where they share most of their work. A single worker gets one pass for
-    each sequence.
+    Each of several workers gets about PIECES passes, so that all end at about the same time. Jobs with the same
+    keypoints stay in one pass, where they share most of their work. A single worker gets one pass a sequence.
     """
-    groups: dict[str, dict[Job, list[Job]]] = {name: {} for name in frames}
+    groups: dict[str, dict[Job, list[Job]]] = {}
     for job in jobs:
-        groups[job.sequence].setdefault(replace(job, estimator="", repetition=0), []).append(job)
-    total = sum(len(groups[name]) * frames[name] for name in frames)
+        groups.setdefault(job.sequence, {}).setdefault(replace(job, estimator="", repetition=0), []).append(job)
+    total = sum(len(alike) * len(sequences[name]) for name, alike in groups.items())
     passes = []
-    for name, sequence_groups in groups.items():
-        share = len(sequence_groups) * frames[name] / max(total, 1)
-        pieces = min(len(sequence_groups), math.ceil(share * (PIECES * workers if workers > 1 else 1)))
-        ends = [index * len(sequence_groups) // max(pieces, 1) for index in range(pieces + 1)]
-        job_lists = list(sequence_groups.values())
-        passes += [sum(job_lists[start:end], []) for start, end in pairwise(ends)]
+    for name, alike in groups.items():
+        job_lists = list(alike.values())
+        size = max(1, round(total / (PIECES * workers) / len(sequences[name]))) if workers > 1 else len(job_lists)
+        passes += [sum(job_lists[start:start + size], []) for start in range(0, len(job_lists), size)]
     return passes

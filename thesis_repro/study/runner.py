@@ -5,7 +5,6 @@ Each finished run is one CSV file with one row a frame. A study that stopped or 
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -49,10 +48,9 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
     scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then do the work with the same results.
     They need this package, and the three folders under the same paths. One thread a worker is best.
 
-    Jobs over the same sequence run in one pass (`odometry.run_many`), or in several passes if that keeps all workers
-    busy. The results are those of separate runs. A job that fails is printed with its reason and does not stop other
-    jobs. An interrupted pass resumes from its checkpoint.
-    The table's `attrs` say how many jobs were "made" now, "kept" from before, and "failed".
+    Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results of separate runs.
+    An interrupted pass resumes from its checkpoint. A job that fails is printed with its reason and does not stop
+    other jobs. The table's `attrs` say how many jobs were "made" now, "kept" from before, and "failed".
     Raises InputError if another run is using the folder, if all jobs fail, or if the machine lacks disk space or
     memory. Finished results are kept.
     """
@@ -85,14 +83,14 @@ def _run_passes(jobs: list[Job], sequences: dict[str, Sequence], sources: dict[s
                 processes: int, scheduler: str | None) -> dict[Job, str]:
     """Run the jobs without a result and print which of them failed; returns {job: reason} for the failed ones."""
     failures: dict[Job, str] = {}
-    lengths = {name: len(sequence) for name, sequence in sequences.items()}
     with cluster.open_pool(processes, scheduler) as pool:
-        passes = _passes(jobs, lengths, folder, pool.size)
+        passes = _passes(jobs, sequences, folder, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
-        names = [pass_jobs[0].sequence for pass_jobs in passes]
-        calls = [(pass_jobs, sequences[name], sources, folder, stages.record(folder / name), threads)
-                 for pass_jobs, name in zip(passes, names)]
-        frames = [len(pass_jobs) * lengths[name] for pass_jobs, name in zip(passes, names)]  # counted for each run
+        calls, frames = [], []
+        for pass_jobs in passes:
+            sequence = sequences[pass_jobs[0].sequence]
+            calls.append((pass_jobs, sequence, sources, folder, stages.record(folder / sequence.name), threads))
+            frames.append(len(pass_jobs) * len(sequence))
         with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
             for index, failed in pool.run(_run_pass, calls):
                 failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
@@ -126,11 +124,11 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
     if not sequence.has_truth:
         raise InputError(f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
                          "errors to compare; leave it out (the odometry command runs it)")
-    true_labels, folder = controls.true_labels(sequence.root, sequence.name), folder / sequence.name
+    folder /= sequence.name
+    true_labels = listed(controls.true_labels(sequence.root, sequence.name))
     records = {source.name: source.record(sequence.name) for source in sources.values()}
     stages.stage(folder, **_versions(), sequence=stages.listing(sequence.files),
-                 true_labels=stages.listing(listed(true_labels)) if true_labels.is_dir() else None,
-                 **records.pop("", {}))
+                 true_labels=stages.listing(true_labels), **records.pop("", {}))
     for source, record in records.items():
         if stages.record(folder / source) != record:  # a checkpoint may come from the source's old masks
             for checkpoint in folder.glob(CHECKPOINTS):
@@ -143,21 +141,18 @@ def _versions() -> dict[str, Any]:
             **stages.made_with("opencv-python-headless", "numpy", "numba")}
 
 
-def _passes(jobs: list[Job], frames: Mapping[str, int], folder: Path, workers: int) -> list[list[Job]]:
-    """Divide the jobs without a result into passes over one sequence, the longest pass first.
-
-    A pass with a checkpoint keeps its jobs, so that it can resume. frames: number of frames of each sequence.
-    """
+def _passes(jobs: list[Job], sequences: Mapping[str, Sequence], folder: Path, workers: int) -> list[list[Job]]:
+    """Divide the jobs without a result into passes, the longest first. A pass with a checkpoint keeps its jobs."""
     passes: list[list[Job]] = []
     jobs_without_checkpoint: list[Job] = []
-    for name in frames:
+    for name in sequences:
         sequence_jobs = {job.name: job for job in jobs if job.sequence == name}
         waiting = {key: job for key, job in sequence_jobs.items() if not _result(folder, job).is_file()}
         for path in sorted((folder / name).glob(CHECKPOINTS)):
-            checkpoint = None
-            with suppress(InputError):  # a damaged checkpoint is deleted below
-                checkpoint = stages.resume(path, arrays=False)
-            keys = checkpoint[0]["job"]["runs"] if checkpoint else []
+            try:
+                keys = stages.resume(path, arrays=False)[0]["job"]["runs"]
+            except InputError:  # a damaged checkpoint is deleted below
+                keys = []
             if not sequence_jobs.keys() >= set(keys):
                 continue  # it holds jobs that are not requested now but may be later
             if waiting.keys().isdisjoint(keys):
@@ -166,8 +161,8 @@ def _passes(jobs: list[Job], frames: Mapping[str, int], folder: Path, workers: i
                 passes.append([sequence_jobs[key] for key in keys])
                 waiting = {key: job for key, job in waiting.items() if key not in keys}
         jobs_without_checkpoint += waiting.values()
-    return sorted(passes + in_passes(jobs_without_checkpoint, frames, workers),
-                  key=lambda pass_jobs: -len(pass_jobs) * frames[pass_jobs[0].sequence])
+    return sorted(passes + in_passes(jobs_without_checkpoint, sequences, workers),
+                  key=lambda pass_jobs: -len(pass_jobs) * len(sequences[pass_jobs[0].sequence]))
 
 
 def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]

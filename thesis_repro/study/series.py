@@ -38,15 +38,13 @@ class Study:
 
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
-        if self.frames is not None and self.frames < 3:
-            raise InputError(f"--frames {self.frames}: must be 3 or more")
         if not 1 <= self.repetitions <= MOST_REPETITIONS:
             raise InputError(f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}")
         sequences = self.opened()
         for sequence in sequences:
             if len(sequence) < 3:
                 raise InputError(f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more")
-        sources.check(self.sources, sequences, {*self.widths, *([] if self.tested is None else [self.tested])})
+        sources.check(self.sources, sequences, (*self.widths, self.tested) if self.tested else self.widths)
 
     @property
     def shown_width(self) -> int | None:

@@ -68,13 +68,12 @@ def named(folders: Iterable[tuple[str, Path]], names: Iterable[str], settings: M
     settings: for all masks from label maps. invert: for all ready-made masks.
     Raises InputError for a name that cannot be a folder's name, for equal names, and for more names than folders.
     """
-    kinds_and_folders, given_names = list(folders), list(names)
+    folders, names = list(folders), list(names)
     sources: list[Source] = []
-    if len(given_names) > len(kinds_and_folders):
-        raise InputError(f"--name {given_names[len(kinds_and_folders)]}: {len(given_names)} names for "
-                         f"{len(kinds_and_folders)} folders of masks; give one --name for each --labels or --masks, in "
-                         "their order")
-    for (kind, folder), given_name in zip_longest(kinds_and_folders, given_names):
+    if len(names) > len(folders):
+        raise InputError(f"--name {names[len(folders)]}: {len(names)} names for {len(folders)} folders of masks; give "
+                         "one --name for each --labels or --masks, in their order")
+    for (kind, folder), given_name in zip_longest(folders, names):
         if given_name is not None and not re.fullmatch(r"[\w+-]+", given_name):
             raise InputError(f"--name {given_name}: a name may have letters, digits, '_', '+' and '-'")
         name = given_name or re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-") or "masks"
