@@ -111,8 +111,8 @@ def odometry(options):
         write_kitti_poses(options.output, result.poses)
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
-    for line in check.path_oddities(sequence.name, result.poses, sequence.poses) if sequence.has_truth else ():
-        longrun.remark(line, warning=True)
+    if sequence.has_truth:
+        longrun.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
     record = terminal.run(result, sequence, settings.alignment)
     if options.video:
         from thesis_repro.report import video
@@ -175,9 +175,7 @@ def study(options):
     with longrun.logged(folder, options.command_line) as run, longrun.claimed(folder):
         warnings = [line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)]
         summary = planned.run(folder, options.jobs or cores(), options.dask)
-        for line in planned.path_oddities(summary, folder):
-            longrun.remark(line, warning=True)
-            warnings.append(line)
+        warnings += longrun.warn(planned.path_oddities(summary, folder))
         counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
         failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
         run.end(f"{len(summary):,} runs{failed}; open {page} in a browser", counts["kept"])
@@ -199,8 +197,7 @@ def evaluate(options):
         truth, times = (values[:options.frames] for values in true_path(options.kitti, sequence))
         paths = {name: trajectories.read(file, times, options.frames) for name, file in files.items()}
         for name, (matched, poses) in paths.items():
-            for line in check.path_oddities(name, poses, truth[matched]):
-                longrun.remark(line, warning=True)
+            longrun.warn(check.path_oddities(name, poses, truth[matched]))
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
         drawing = trajectories.figure(trajectories.aligned(paths, truth, options.align), truth, f"sequence {sequence}",
@@ -242,9 +239,7 @@ def _print_oddities(sequence, mask_sets):
             line, mask_warnings = check.of_masks(masks, sequence)
             longrun.remark(line)
             warnings += mask_warnings
-    for line in warnings:
-        longrun.remark(line, warning=True)
-    return warnings
+    return longrun.warn(warnings)
 
 
 def _image_folders(root):

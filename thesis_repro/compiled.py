@@ -1,7 +1,6 @@
 """Compile the inner loops with Numba."""
 
 import hashlib
-import os
 from pathlib import Path
 
 import numba
@@ -23,9 +22,7 @@ def forget_stale(folder):
         for index in folder.rglob("__pycache__/*.nbi"):
             index.unlink(missing_ok=True)
         record.parent.mkdir(exist_ok=True)
-        temporary = record.with_name(f"{DIGEST_NAME}.{os.getpid()}")
-        temporary.write_text(digest)
-        os.replace(temporary, record)
+        record.write_text(digest)
     except OSError:  # the folder is read-only, so it holds no stale cache
         pass
 

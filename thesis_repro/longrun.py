@@ -13,7 +13,6 @@ import resource
 import secrets
 import signal
 import sys
-import threading
 import time
 from contextlib import contextmanager, suppress
 from datetime import timedelta
@@ -177,7 +176,7 @@ class _LogFile(MemoryHandler):
 
 @contextmanager
 def logged(folder, title, has_results=False):
-    """Log into a folder what `say` and `remark` print, warnings, and the error that ends the block.
+    """Log into a folder what `say`, `remark` and `warn` print, Python's warnings, and the error that ends the block.
 
     Yields the `_LogFile`. title: the first line. has_results: write the log at once, not only when results appear.
     """
@@ -194,7 +193,7 @@ def logged(folder, title, has_results=False):
         _log.error(reason or type(error).__name__, exc_info=reason is None)
         raise
     except BaseException as error:
-        _log.error("stopped: %s", type(error).__name__)
+        _log.error("stopped: %r", error)
         raise
     finally:
         logging.captureWarnings(False)
@@ -216,31 +215,33 @@ def note(text, level=logging.ERROR):
         _log.log(level, line)
 
 
-def remark(text, warning=False):
+def remark(text):
     """Print a line on standard error, where it does not mix with results, and log it."""
-    print(f"warning: {one_line(text)}" if warning else one_line(text), file=sys.stderr, flush=True)
-    note(text, logging.WARNING if warning else logging.INFO)
+    print(one_line(text), file=sys.stderr, flush=True)
+    note(text, logging.INFO)
+
+
+def warn(lines):
+    """Print warnings on standard error, log them, and return them."""
+    for line in lines:
+        print(f"warning: {one_line(line)}", file=sys.stderr, flush=True)
+        note(line, logging.WARNING)
+    return lines
 
 
 # The end of a process
-
-
-class Stopped(KeyboardInterrupt):
-    """Raised by a signal that asks this process to end. The argument is the signal's number."""
 
 
 @contextmanager
 def stoppable():
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that worker processes end too.
 
-    An ignored signal (nohup) stays ignored.
+    They raise KeyboardInterrupt with the signal's number. An ignored signal (nohup) stays ignored.
     """
     def stop(number, _):
-        raise Stopped(number)
+        raise KeyboardInterrupt(number)
 
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    numbers = [number for number in (signal.SIGTERM, signal.SIGHUP)
-               if in_main_thread and signal.getsignal(number) == signal.SIG_DFL]
+    numbers = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) == signal.SIG_DFL]
     for number in numbers:
         signal.signal(number, stop)
     try:
