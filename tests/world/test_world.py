@@ -139,7 +139,7 @@ def one_square(z=10.0, half=2.0, texture="stone", label="building"):
 
 def view(faces, size=(80, 120)):
     intrinsics = np.array([[100.0, 0, 59.5], [0, 100.0, 39.5], [0, 0, 1]])
-    environment = street.environment(street.Style())
+    environment = street.environment(drives.Style())
     return raster.render(faces, textures.build(0).packed, np.eye(4), intrinsics, size, environment)
 
 

@@ -1,4 +1,4 @@
-"""`python -m thesis_repro.world`: the embedded drives of the settings in force, as notebook 5 asks for them."""
+"""`python -m thesis_repro.world` renders the drives of the current settings, as notebook 5 does."""
 
 import sys
 

@@ -1,8 +1,8 @@
 """The embedded world: rendered street drives with exact poses and label maps, written in the two real file layouts.
 
-OUT/kitti is laid out as the KITTI odometry benchmark (plus sequences/NN/labels_0, the exact label map of every frame),
-OUT/cityscapes as Cityscapes; its images show other streets than the sequences. Each picture depends on the seed and
-its own name alone, so that neither the number of processes nor an interruption changes a byte.
+OUT/kitti has the layout of the KITTI odometry benchmark, plus sequences/NN/labels_0 with the exact label maps.
+OUT/cityscapes has the layout of Cityscapes and shows other streets than the sequences. Each picture depends only on
+the seed and its own name, so neither the number of processes nor an interruption changes a byte.
 """
 
 import dataclasses
@@ -15,49 +15,36 @@ from joblib import Parallel, delayed, effective_n_jobs
 from thesis_repro import InputError, kitti, longrun, stages
 from thesis_repro.files import is_whole, progress, write_png, write_text
 from thesis_repro.world import drives, street, textures
-from thesis_repro.world.raster import compile_for_all
 
 SEQUENCES = tuple(drives.DRIVES)
-BASELINE = 0.537  # metres between KITTI's cameras, for the calibration file's P1 and P3
-IMAGE_SIZE = (512, 1024)  # of the training images at scale 1
+BASELINE = 0.537  # metres between KITTI's cameras, for P1 and P3 of the calibration file
+IMAGE_SIZE = (512, 1024)  # height and width of the training images at scale 1
 CITIES = {"train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfeld"),
           "val": ("nebelburg", "quellheim")}
 
 
-@dataclasses.dataclass
-class Scene:
-    """A street with the camera's way along it: scene poses, and the way driven (metres) at each frame."""
-
-    street: street.Street
-    poses: np.ndarray
-    driven: np.ndarray
-    intrinsics: np.ndarray
-    size: tuple
-
-
 @lru_cache(maxsize=2)
-def drive(name, frames, scale, seed):
-    """The `Scene` of one sequence."""
+def _drive(name, frames, seed):
+    """Return a sequence's street, camera-to-world poses in it, (frames, 4, 4), and metres driven, (frames,)."""
     track, poses, driven = drives.way(name, frames, seed)
-    size, intrinsics = drives.scaled_camera(name, scale)
     rng = drives.generator(seed, drives.STREET, int(name))
-    crossing = drives.crossing(track, drives.DRIVES[name].style)
-    scenery = street.build(rng, textures.build(seed), track, drives.DRIVES[name].style, crossing)
-    return Scene(scenery, poses, driven, intrinsics, size)
+    return street.build(rng, textures.build(seed), track, drives.DRIVES[name].style), poses, driven
 
 
 def render_frame(name, index, frames=None, scale=0.5, seed=0):
-    """Frame `index` of a sequence of that many frames: image and label map, both uint8 (height, width).
+    """Render frame `index` of a sequence: image and label map, both uint8 (height, width).
 
-    frames: None for the drive's own number.
+    frames: length of the sequence, on which the street depends; None for the whole drive.
     """
-    scene, plan = drive(name, frames or drives.DRIVES[name].frames, scale, seed), drives.DRIVES[name]
-    image, labels = scene.street.view(scene.poses[index], scene.intrinsics, scene.size, index, scene.driven[index])
+    plan = drives.DRIVES[name]
+    scenery, poses, driven = _drive(name, frames or plan.frames, seed)
+    size, intrinsics = drives.scaled_camera(name, scale)
+    image, labels = scenery.view(poses[index], intrinsics, size, index, driven[index])
     return _expose(drives.generator(seed, drives.SENSOR, int(name), index), image, plan.level, plan.noise), labels
 
 
 def render_image(split, index, scale=0.5, seed=0):
-    """Training or validation image `index` ("train", "val"): image and label map, both uint8 (height, width)."""
+    """Render training or validation image `index` ("train", "val"): image and label map, both uint8 (height, width)."""
     rng = drives.generator(seed, drives.IMAGE, ("train", "val").index(split), index)
     plan = drives.DRIVES[SEQUENCES[int(rng.integers(0, len(SEQUENCES)))]]
     bend = rng.uniform(-70, 70)
@@ -81,11 +68,12 @@ def render_image(split, index, scale=0.5, seed=0):
 
 
 def _expose(rng, image, level, noise):
-    """8-bit picture: automatic exposure (rounded, so that it is the same everywhere), vignette, sensor noise.
+    """Return an 8-bit picture with automatic exposure, vignette and sensor noise.
 
-    level: the mean gray that the exposure aims at; noise: its deviation at gray 120.
+    level: mean gray value that the exposure aims at; noise: standard deviation at gray value 120.
     """
     mean = float(np.mean(image, dtype=np.float64))
+    # The gain is rounded, so that machines whose sums round differently use the same one.
     gain = round((level / max(mean, 1.0)) ** 0.8 * (1 + 0.01 * rng.standard_normal()) * 512) / 512
     rows, columns = image.shape
     y = np.linspace(-1, 1, rows, dtype=np.float32)[:, None]
@@ -99,56 +87,54 @@ def _expose(rng, image, level, noise):
 
 def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100, validation_images=20, seed=0, jobs=-1,
           replace=False, only=None):
-    """Write the embedded world to OUT/kitti and OUT/cityscapes; goes on where a stopped run left off.
+    """Write the embedded world to OUT/kitti and OUT/cityscapes; resumes a stopped run.
 
-    sequences: names among 00 to 10; frames: of each, None for as many as show its whole drive, from 41 to 132; scale:
-    of KITTI's image size (and of 1024x512 for the training images); jobs: processes, -1 for one a core. A complete
-    world of the same parameters is left as it is.
-    replace: delete an embedded world of other parameters first; nothing else is ever deleted.
-    only: "kitti" or "cityscapes", to write one of the two now.
-    Returns how many pictures were rendered, and how many there are.
-    Raises InputError for a folder that holds something else or that another run is at work in, a world of other
-    parameters, or a bad parameter.
+    sequences: names among 00 to 10; frames: frames of each sequence, None for its whole drive (41 to 132); scale: of
+    KITTI's image size, and of 1024x512 for the training images; jobs: number of processes, -1 for one a core.
+    replace: delete an embedded world of other parameters first; other files are never deleted. A complete world of the
+    same parameters is kept.
+    only: "kitti" or "cityscapes", to write one of the two.
+    Returns (number of pictures rendered, number of pictures in total).
+    Raises InputError for a folder that holds other files or is in use by another run, a world of other parameters, or
+    a bad parameter.
     """
     out = Path(out)
-    parameters = _parameters(sequences, frames, scale, train_images, validation_images, seed)
+    parameters = {"sequences": list(sequences), "frames": frames, "scale": scale, "train_images": train_images,
+                  "validation_images": validation_images, "seed": seed}
+    _check(**parameters)
     with longrun.claimed(out):
         stages.stage(out, replace=replace, code=stages.code("world"), **parameters)
         pictures = [picture for picture in _pictures(out, **parameters)
                     if only in (None, picture[1].relative_to(out).parts[0])]
         missing = [picture for picture in pictures if not all(map(is_whole, picture[1:]))]
         workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
-        if workers > 1:
-            compile_for_all()
         with progress(description="rendering the embedded world", total=len(missing), unit="picture") as bar:
-            # Ten at a time: pictures of one sequence share its street.
-            work = (delayed(_write_some)(missing[k:k + 10]) for k in range(0, len(missing), 10))
+            bar.update(_write_pictures(missing[:1]))  # compiles the rasteriser once, for all worker processes
+            # Ten at a time, because pictures of one sequence share its street.
+            work = (delayed(_write_pictures)(missing[k:k + 10]) for k in range(1, len(missing), 10))
             for count in Parallel(n_jobs=workers, return_as="generator_unordered",
                                   initializer=longrun.end_with_parent)(work):
                 bar.update(count)
-        for name in parameters["sequences"] if only != "cityscapes" else ():
-            if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # the last of them
-                _write_sequence_texts(out, name, parameters["frames"] or drives.DRIVES[name].frames, scale, seed)
+        for name in sequences if only != "cityscapes" else ():
+            if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # written last
+                _write_sequence_texts(out, name, frames or drives.DRIVES[name].frames, scale, seed)
     return len(missing), len(pictures)
 
 
-def _parameters(sequences, frames, scale, train_images, validation_images, seed):
-    """What a world is made from, checked. Raises InputError for a value that names no world."""
-    unknown = [name for name in sequences if name not in drives.DRIVES]
-    if unknown or not sequences:
-        raise InputError(f"sequences: the embedded world has 00 to 10, not {unknown[0] if unknown else 'none'!r}")
-    for name, value, low in (("frames", 2 if frames is None else frames, 2), ("train_images", train_images, 0),
-                             ("validation_images", validation_images, 0), ("seed", seed, 0)):
-        if value != int(value) or value < low:
-            raise InputError(f"{name}: must be a whole number of at least {low}, not {value!r}")
+def _check(sequences, frames, scale, **numbers):
+    """Raise InputError for a parameter of `write` that describes no world."""
+    if not sequences or not set(sequences) <= set(SEQUENCES):
+        raise InputError(f"sequences: must be among 00 to 10, not {' '.join(map(str, sequences)) or 'none'}")
     if not 0.1 <= scale <= 1:
         raise InputError(f"scale: must lie between 0.1 and 1 (KITTI's full size), not {scale!r}")
-    return {"sequences": list(sequences), "frames": None if frames is None else int(frames), "scale": float(scale),
-            "train_images": int(train_images), "validation_images": int(validation_images), "seed": int(seed)}
+    for name, value in {"frames": 2 if frames is None else frames, **numbers}.items():
+        least = 2 if name == "frames" else 0
+        if not isinstance(value, int) or value < least:
+            raise InputError(f"{name}: must be a whole number of at least {least}, not {value!r}")
 
 
 def _pictures(root, sequences, frames, scale, train_images, validation_images, seed):
-    """Every picture of a world: (function that renders it, image path, label path)."""
+    """Yield (function that renders it, image path, label map path) for every picture of a world."""
     for name in sequences:
         folder = root / "kitti" / "sequences" / name
         for index in range(frames or drives.DRIVES[name].frames):
@@ -164,7 +150,7 @@ def _pictures(root, sequences, frames, scale, train_images, validation_images, s
                    root / "cityscapes" / "gtFine" / split / city / f"{stem}_gtFine_labelIds.png")
 
 
-def _write_some(pictures):
+def _write_pictures(pictures):
     for render, image_path, label_path in pictures:
         image, labels = render()
         write_png(label_path, labels)
@@ -173,7 +159,7 @@ def _write_some(pictures):
 
 
 def _write_sequence_texts(root, name, frames, scale, seed):
-    """calib.txt, times.txt and the true poses of one sequence."""
+    """Write calib.txt, times.txt and the ground-truth poses of one sequence."""
     folder = root / "kitti" / "sequences" / name
     _, intrinsics = drives.scaled_camera(name, scale)
     lines = []

@@ -1,6 +1,6 @@
-"""The drives of the embedded world: eleven sequences, their roads and cameras, and how a car is driven along them.
+"""The drives of the embedded world: eleven sequences, their roads and cameras, and how the camera's car moves.
 
-A place on a street is (s, d): metres along the road's middle and metres to the right of it.
+A place on a street is (s, d): metres along the middle line of the road, and metres to the right of that line.
 """
 
 from dataclasses import dataclass
@@ -9,42 +9,62 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesis_repro import kitti
-from thesis_repro.world.street import Style
 
 STEP = 0.25  # metres between the stored points of a track
-SMOOTHING = 3.0  # metres; a driver turns the wheel, the curvature does not jump
+SMOOTHING = 3.0  # metres over which the curvature changes, because a driver turns the wheel gradually
 BEHIND, AHEAD = 30.0, 170.0  # metres of street behind the first and ahead of the last camera
 CAMERA_HEIGHT = 1.65
-TURN_RATE = np.radians(4.4)  # a driver slows down for more than this a frame
+TURN_RATE = np.radians(4.4)  # most radians a frame; the driver slows down in sharper bends
 ACCELERATION = 0.03  # metres a frame, a frame: 3 m/s^2
-BRAKING, WAITING, STARTING, ROUND = 16, 12, 18, 150  # frames at a stop, and from one to the next
+BRAKING, WAITING, STARTING, ROUND = 16, 12, 18, 150  # frames: the parts of a stop, and from one stop to the next
+ZONES = ("row", "gardens", "park", "wall")  # what lies beside a road; row: houses side by side
+
+
+@dataclass(frozen=True)
+class Style:
+    """The look of a street; widths in metres."""
+
+    half: float = 5.5  # half of the road's width
+    road: str = "road"  # its texture
+    sidewalk: float = 2.6  # 0: a highway, with low walls
+    parked: tuple = (0.0, 0.0)  # share of the parking places that are taken, left and right
+    zones: tuple = (0.55, 0.2, 0.15, 0.1)  # shares of ZONES
+    trees: float = 0.5  # density of street trees
+    persons: float = 0.05  # for each metre of sidewalk
+    traffic: float = 0.01  # oncoming cars for each metre
+    sunny: bool = True
+    sun: tuple = (0.5, 0.8)  # azimuth and elevation of the sun (radians)
+    sky: tuple = (150.0, 205.0)  # gray of the sky between the clouds, and of the haze at the horizon
+    haze: float = 0.003  # extinction, 1/m
+    leaders: tuple = ()  # distances of cars that drive ahead at the camera's pace
+    crossing: float | None = None  # s of a crossing with cars that pass ahead of a waiting camera
 
 
 class Track:
-    """The middle line of a road, its points stored every STEP metres.
+    """The middle line of a road, with points stored every STEP metres.
 
     s, x, z, heading, curvature: (n,), metres, radians to the right of z, and 1/m, positive to the right.
-    closed: whether it ends where it starts, so that s goes on round it.
+    closed: whether the road ends at its start, so that larger s begin another round.
     """
 
     def __init__(self, pieces, start, stop, origin=(0.0, 0.0), heading=0.0, closed=False):
-        """pieces: (metres, degrees to the right) each, from s = 0, repeated up to `stop`.
+        """pieces: (metres, degrees to the right) of each piece from s = 0, repeated up to `stop`.
 
         start, stop: s of both ends, start <= 0; before s = 0 the road is straight. origin, heading: at s = 0.
         """
         self.s = start + STEP * np.arange(int(np.ceil((stop - start) / STEP)) + 1)
         self.closed = closed
         curvature = np.zeros(len(self.s))
-        where = 0.0
-        while pieces and where < stop:
+        begin = 0.0
+        while pieces and begin < stop:
             for length, degrees in pieces:
-                curvature[(self.s >= where) & (self.s < where + length)] = np.radians(degrees) / length
-                where += length
+                curvature[(self.s >= begin) & (self.s < begin + length)] = np.radians(degrees) / length
+                begin += length
         window = int(SMOOTHING / STEP)
         padded = np.pad(curvature, (window // 2, window - 1 - window // 2), mode="edge")
         total = np.concatenate([[0.0], np.cumsum(padded)])
         self.curvature = (total[window:] - total[:-window]) / window
-        # The heading is the integral of the curvature, the place that of the heading's direction (both by trapezia).
+        # The trapezoidal rule integrates the curvature to the heading, and its direction to the position.
         first = int(round(-start / STEP))
         turn = np.concatenate([[0.0], np.cumsum(0.5 * (self.curvature[1:] + self.curvature[:-1])) * STEP])
         self.heading = heading + turn - turn[first]
@@ -54,11 +74,11 @@ class Track:
         self.x, self.z = origin[0] + x - x[first], origin[1] + z - z[first]
 
     def along(self, s):
-        """s itself, or on a closed track the same place between both ends."""
+        """Return s, on a closed track reduced to its first round."""
         return s % self.s[-1] if self.closed else s
 
     def at(self, s, d=0.0):
-        """(x, z, heading) of places (s, d), numbers or arrays of one shape."""
+        """Return (x, z, heading) of places (s, d), numbers or arrays of one shape."""
         s = self.along(s)
         heading = np.interp(s, self.s, self.heading)
         x = np.interp(s, self.s, self.x) + d * np.cos(heading)
@@ -68,20 +88,20 @@ class Track:
 
 @dataclass(frozen=True)
 class Drive:
-    """One sequence: where the road leads, how it is driven and what it looks like."""
+    """One sequence: the course of its road, the way it is driven and its look."""
 
-    pieces: tuple  # of the road, repeated: metres, degrees to the right
+    pieces: tuple  # (metres, degrees to the right) of the road's pieces, repeated
     pace: float  # metres a frame
-    frames: int  # how many show all of the drive
+    frames: int  # length of the whole drive
     style: Style
     lane: float = 1.7  # metres right of the road's middle
     closed: bool = False  # the pieces lead back to the start, on the same road
-    stop: int | None = None  # frame at which it has come to a stop, and every ROUND frames
-    noise: float = 2.0  # deviation of the sensor's noise, gray values
-    level: float = 104.0  # the mean gray that the exposure aims at
+    stop: int | None = None  # frame at which the car has stopped; it stops again every ROUND frames
+    noise: float = 2.0  # standard deviation of the sensor's noise, gray values
+    level: float = 104.0  # mean gray that the exposure aims at
 
 
-# Shares of ZONES: houses in a row, gardens, parks, walls.
+# Shares of ZONES.
 _CITY, _SUBURB, _GREEN = (0.55, 0.2, 0.15, 0.1), (0.2, 0.55, 0.15, 0.1), (0.0, 0.3, 0.65, 0.05)
 
 DRIVES = {
@@ -107,7 +127,7 @@ DRIVES = {
     "05": Drive(((12, 0), (16, -90), (34, 0), (15, 90), (25, 0), (24, 50)), 1.21, 61,
                 Style(half=5.0, sidewalk=2.2, parked=(0.6, 0), zones=(0.75, 0.1, 0.1, 0.05), trees=0.2, persons=0.1,
                       sunny=False, sky=(175, 222)), noise=2.4),
-    # Up a wide street, round its end and back beside it.
+    # Up a street, round its end and back beside it.
     "06": Drive(((20, 0), (12, -90), (5, 0), (12, -90), (60, 0), (12, -90), (5, 0), (12, -90), (40, 0)), 1.38, 78,
                 Style(half=4.0, zones=(0.1, 0.25, 0.6, 0.05), trees=0.8, sun=(0.2, 0.55), sky=(120, 165)),
                 noise=1.6),
@@ -128,19 +148,19 @@ DRIVES = {
 }
 
 
-# What random numbers are drawn for; each has generators of its own.
+# Purposes of random numbers; each purpose has separate generators.
 SWAY, SENSOR, IMAGE, STREET = 1, 2, 3, 4
 
 
 def generator(seed, purpose, *key):
-    """A random generator that depends on the seed, the purpose and further whole numbers alone."""
+    """Return a random generator that depends only on the seed, the purpose and further whole numbers."""
     return np.random.default_rng(np.random.SeedSequence((seed, purpose, *key)))
 
 
 def scaled_camera(name, scale):
-    """Size (height, width) and intrinsics (3x3, pixels) of a sequence's camera at a scale.
+    """Return size (height, width) and intrinsics (3x3, pixels) of a sequence's camera at a scale.
 
-    Whole coordinates are pixel centres, so the principal point moves by half a pixel before and after scaling.
+    Whole coordinates are pixel centres, so half a pixel is added before and subtracted after scaling.
     """
     camera = kitti.CAMERAS[name]
     width, height = round(camera.width * scale), round(camera.height * scale)
@@ -150,9 +170,9 @@ def scaled_camera(name, scale):
 
 
 def _driven(drive, track, frames, phase):
-    """Metres along the road at each frame, (frames,): the pace, slower before and in bends, and the stops.
+    """Return the metres driven until each frame, (frames,); the car slows down for bends and stops.
 
-    Under a steady acceleration a the pace v keeps v^2 within 2 a ds of its neighbour's, from behind and from ahead.
+    With acceleration a, the squared pace changes by at most 2 a ds over a distance ds, forwards and backwards.
     """
     limit = drive.pace * (1 + 0.12 * np.sin(track.s / 11 + phase))
     limit = np.minimum(limit, TURN_RATE / np.maximum(np.abs(track.curvature), 1e-9))
@@ -173,7 +193,7 @@ def _driven(drive, track, frames, phase):
 
 
 def poses_of(places, angles):
-    """Camera-to-world, (n, 4, 4); places: (n, 3) metres; angles: (n, 3) radians right, up, and clockwise."""
+    """Return camera-to-world poses (n, 4, 4); places: (n, 3) metres; angles: (n, 3) radians right, up, clockwise."""
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("YXZ", angles).as_matrix()
     poses[:, :3, 3] = places
@@ -181,7 +201,7 @@ def poses_of(places, angles):
 
 
 def way(name, frames, seed):
-    """One sequence's `Track`, camera-to-world poses in the street, (frames, 4, 4), and metres driven, (frames,)."""
+    """Return a sequence's `Track`, camera-to-world poses in the street (frames, 4, 4), and metres driven (frames,)."""
     drive = DRIVES[name]
     if drive.closed:
         track = Track(drive.pieces, 0.0, sum(length for length, _ in drive.pieces), closed=True)
@@ -189,7 +209,7 @@ def way(name, frames, seed):
         track = Track(drive.pieces, -BEHIND, frames * drive.pace * 1.15 + AHEAD)
     phase = generator(seed, SWAY, int(name)).uniform(0, 2 * np.pi, 6)
     driven = _driven(drive, track, frames, phase[0])
-    # The body sways with the way driven, so that a standing car stands still.
+    # The sway depends on the metres driven, so the camera does not move while the car waits.
     x, z, heading = track.at(driven, drive.lane + 0.06 * np.sin(driven / 6 + phase[1]))
     pitch = np.radians(0.12) * np.sin(driven / 1.9 + phase[2]) + np.radians(0.08) * np.sin(driven / 0.83 + phase[3])
     roll = np.radians(0.12) * np.sin(driven / 2.7 + phase[4])
@@ -197,16 +217,8 @@ def way(name, frames, seed):
     return track, poses_of(np.stack([x, y, z], axis=1), np.stack([heading, pitch, roll], axis=1)), driven
 
 
-def crossing(track, style):
-    """The road that crosses a street, a straight `Track`, or None."""
-    if style.crossing is None:
-        return None
-    x, z, heading = track.at(style.crossing)
-    return Track((), -75.0, 75.0, (x, z), heading - np.pi / 2)
-
-
 def relative_to_first(poses):
-    """The same poses, (n, 4, 4), in the first camera's frame; the first is the identity to the last bit."""
+    """Return poses (n, 4, 4) relative to the first one, which becomes exactly the identity."""
     result = poses.copy()
     result[:, :3, 3] -= poses[0, :3, 3]
     result[:, :3] = np.einsum("ji,njk->nik", poses[0, :3, :3], result[:, :3])

@@ -1,22 +1,22 @@
 """Rendering one view of a street: a gray image with a label map that is exact to the pixel.
 
-Both come from the same 2x2 samples a pixel: the image is their mean, the label is that of most of them (of the nearest
-surface where they are even). Coordinates are those of KITTI: x right, y down, z forward, metres.
+Image and label map come from the same 2x2 samples a pixel. The image is their mean. The label is the most frequent one;
+of two equally frequent ones, the label of the nearer surface. Coordinates as in KITTI: x right, y down, z forward, in
+metres.
 
-A face is a parallelogram or a triangle, the points corner + s edge_s + t edge_t. A sample's ray consists of the points
-p / w with p = (x, y, 1) in camera coordinates and the inverse depth w = 1 / z. Where they meet, Cramer's rule gives
+A face is a parallelogram or a triangle with the points corner + s edge_s + t edge_t. The ray of a sample has the points
+p / w, with p = (x, y, 1) in camera coordinates and the inverse depth w = 1 / z. Cramer's rule gives the intersection
 
     w   = p . (edge_s x edge_t) / volume         volume = corner . (edge_s x edge_t)
     w s = p . (edge_t x corner) / volume
     w t = p . (corner x edge_s) / volume
 
-all three linear in the sample's coordinates. So no face has to be clipped and every sample is exact: it lies inside
-where s and t do, the largest w is the nearest surface, and (w s) / w and (w t) / w are its place on the texture.
+All three are linear in the sample's coordinates, so no face has to be clipped. The sample is inside the face if s and t
+are between 0 and 1, the largest w is the nearest surface, and (w s) / w and (w t) / w give the position on the texture.
 
-All compiled code lies in this module, as do the numbers of its columns, because numba looks at no other file when it
-decides whether what it kept on disk still holds. No fast-math and no threads: the same input gives the same bytes.
-Arrays are taken out of their named tuples, and rows out of matrices, outside the inner loops: each time counts a
-reference, which costs more than the work.
+The same input gives the same bytes, because no fast-math and no threads are used. Arrays are taken out of named tuples,
+and rows out of matrices, outside the inner loops, because each access counts a reference, which costs more than the
+arithmetic.
 """
 
 import math
@@ -27,42 +27,42 @@ import numpy as np
 from thesis_repro.cityscapes import ID
 from thesis_repro.compiled import fast, inner
 
-# Columns of the face matrix, one row a face.
+# Columns of the face matrix; each row is a face.
 CORNER, EDGE_S, EDGE_T = 0, 3, 6  # three each; CORNER + Y is the corner's y
 X, Y, Z = 0, 1, 2
 U, U_S, U_T = 9, 10, 11  # u = f[U] + f[U_S] s + f[U_T] t, in repeats of the texture, to the right
 V, V_S, V_T = 12, 13, 14  # v likewise, downwards
 TEXTURE, LABEL, GAIN = 15, 16, 17
 TRIANGLE = 18  # 1: s + t <= 1; 0: parallelogram
-GROUND = 19  # 1: part of the ground, which alone receives shadows; 0: the rest, which alone casts them
-LIT = 20  # 1: shaded by its outward normal (edge_s x edge_t), 0: evenly, as leaves and grass
+GROUND = 19  # 1: part of the ground, which receives shadows; 0: a thing, which casts them
+LIT = 20  # 1: shaded by its outward normal (edge_s x edge_t); 0: shaded evenly, such as leaves
 COLUMNS = 21
 
-# Columns of the coefficients: w s = c[S] + c[S_X] x + c[S_Y] y at sample (x, y), w t and w likewise.
+# Columns of the coefficients: w s = c[S] + c[S_X] x + c[S_Y] y at sample (x, y); w t and w likewise.
 S, S_X, S_Y, T, T_X, T_Y, W, W_X, W_Y = range(9)
 
 NEAR = 0.25  # metres
-SHADOW_FAR = 70.0  # metres; sky and forest around the street lie farther off, so that they cast none
-LEVELS = 12  # sides up to 2048
-ALPHA_LEVELS = 5  # thinner than that, cut-outs flicker rather than vanish
+SHADOW_FAR = 70.0  # metres; sky and forest are farther away, so they cast no shadow
+LEVELS = 12  # for textures with sides up to 2048
+ALPHA_LEVELS = 5  # at coarser levels, thin cut-outs would vanish
 SUPERSAMPLING = 2  # samples a pixel, each way
 OPAQUE = 128
-UNLIT = 0.6  # how much of the sun falls on what has no side, such as leaves
-SHARPNESS = 0.75  # part of a pixel that a texture is averaged over; the rest is contrast against a little aliasing
+UNLIT = 0.6  # share of the sun on evenly shaded faces
+SHARPNESS = 0.75  # share of a pixel that a texture is averaged over; less means more contrast and more aliasing
 SKY = ID["sky"]
 
 
 class Textures(NamedTuple):
-    """All textures in one array of bytes; those of level (j, i) are reduced j times along v and i times along u."""
+    """All textures in one array of bytes. Level (j, i) is halved j times along v and i times along u."""
 
-    data: np.ndarray  # uint8: the gray values of a level and, of cut-outs, their alphas behind them
-    start: np.ndarray  # (n, LEVELS, LEVELS) where each level of a texture starts
+    data: np.ndarray  # uint8: gray values of each level, followed by its alphas if the texture is a cut-out
+    start: np.ndarray  # (n, LEVELS, LEVELS) index of the first byte of each level
     sides: np.ndarray  # (n, 2) log2 of rows and columns
-    cut_out: np.ndarray  # (n,) whether it has alphas
+    cut_out: np.ndarray  # (n,) whether the texture has alphas
 
 
 class View(NamedTuple):
-    """A camera over the samples; sample (0, 0) is the origin."""
+    """A camera in sample coordinates; sample (0, 0) is the origin."""
 
     rotation: np.ndarray  # (3, 3) street to camera
     position: np.ndarray  # (3,) metres
@@ -74,11 +74,11 @@ class View(NamedTuple):
 class Environment(NamedTuple):
     """The light of a street; brightnesses are gray values."""
 
-    sun: np.ndarray  # (3,) direction of travel of the light, unit length, y > 0
-    ambient: float  # how much of the albedo is seen without the sun
-    direct: float  # what the sun adds where it falls straight on a face
-    shadow: float  # how much of the ground's brightness is left in shadow
-    horizon: float  # what everything fades to with the distance
+    sun: np.ndarray  # (3,) direction in which the light travels, unit length, y > 0
+    ambient: float  # share of the albedo that is seen without the sun
+    direct: float  # share that the sun adds on a face at right angles to the light
+    shadow: float  # share of the ground's brightness that is left in shadow
+    horizon: float  # gray value that distant surfaces fade to
     haze: float  # extinction, 1/m
 
 
@@ -87,7 +87,7 @@ class Environment(NamedTuple):
 
 @inner
 def _between(place, log_size):
-    """Which two of the texels along one axis a place (in repeats) lies between, and how near to the second one."""
+    """Return the two texels along one axis that a place (in repeats) lies between, and the second one's weight."""
     size = 1 << log_size
     x = place * size - 0.5
     x0 = int(x)
@@ -98,7 +98,7 @@ def _between(place, log_size):
 
 @inner
 def _mix(data, offset, log_width, x, y):
-    """A texture's level between its texels: offset: where it starts; x, y: of `_between`."""
+    """Interpolate one level of a texture; offset: its first byte; x, y: results of `_between`."""
     (x0, x1, fx), (y0, y1, fy) = x, y
     row0, row1 = offset + (y0 << log_width), offset + (y1 << log_width)
     top = data[row0 + x0] * (1 - fx) + data[row0 + x1] * fx
@@ -108,7 +108,7 @@ def _mix(data, offset, log_width, x, y):
 
 @inner
 def _level(step, levels):
-    """Which reduced level suits a step of so many texels, and the part of the next one: log2, linear between powers."""
+    """Return the level for a step of that many texels, and the weight of the next level (log2, linear between)."""
     level = 0
     while step >= 2.0 and level < levels:
         step *= 0.5
@@ -118,7 +118,7 @@ def _level(step, levels):
 
 @inner
 def _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step):
-    """Texture value for a sample that covers u_step by v_step repeats; blends neighbouring levels of both axes."""
+    """Return a texture's value for a sample that covers u_step by v_step repeats; blends neighbouring levels."""
     i, u_part = _level(u_step * (1 << log_width), log_width)
     j, v_part = _level(v_step * (1 << log_height), log_height)
     rows, columns = log_height - j, log_width - i
@@ -138,9 +138,9 @@ def _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step)
 
 @inner
 def _place(coefficients, faces, index, row, x, w):
-    """Where a sample lies on a face's texture, and how far that moves to the next sample: u, v, their steps.
+    """Return a sample's position u, v on a face's texture, and the steps of u and v to the next sample.
 
-    The steps are the larger of both image directions. By the quotient rule ds/dx = (d(w s)/dx - s dw/dx) / w.
+    The steps are the larger ones of both image directions. The quotient rule gives ds/dx = (d(w s)/dx - s dw/dx) / w.
     """
     c, f, n, z = coefficients, faces, index, 1.0 / w
     s = (c[n, S] + c[n, S_Y] * row + c[n, S_X] * x) * z
@@ -154,7 +154,7 @@ def _place(coefficients, faces, index, row, x, w):
 
 @inner
 def _alpha_level(start, sides, coefficients, faces, index, row, x):
-    """The level of a face's alpha that suits one row of it: where it starts, rows and columns."""
+    """Return the level of a face's alpha for one row of samples: its first byte, rows and columns."""
     texture = int(faces[index, TEXTURE])
     log_height, log_width = sides[texture, 0], sides[texture, 1]
     w = coefficients[index, W] + coefficients[index, W_Y] * row + coefficients[index, W_X] * x
@@ -172,7 +172,7 @@ def _alpha_level(start, sides, coefficients, faces, index, row, x):
 
 @inner
 def _turn(rotation, x, y, z):
-    """A vector in the street in camera coordinates."""
+    """Rotate a vector from street to camera coordinates."""
     return (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
             rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
             rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z)
@@ -180,9 +180,9 @@ def _turn(rotation, x, y, z):
 
 @inner
 def _set_up(corner, edge_s, edge_t, view, c):
-    """Fill in a face's coefficients; returns the first and last row that it may cover (0, -1: none).
+    """Fill in the nine coefficients `c` of a face; return the first and last row that it may cover (0, -1: none).
 
-    corner, edge_s and edge_t are in camera coordinates; `c` receives the nine coefficients.
+    corner, edge_s and edge_t are in camera coordinates.
     """
     focal, centre = view.focal, view.centre
     height, width = view.size
@@ -226,7 +226,7 @@ def _set_up(corner, edge_s, edge_t, view, c):
 
 @inner
 def _narrow(value, slope, low, high):
-    """Keep the part of [low, high] where value + slope x >= 0."""
+    """Return the part of [low, high] where value + slope x >= 0."""
     if slope > 0:
         low = max(low, -value / slope)
     elif slope < 0:
@@ -238,10 +238,10 @@ def _narrow(value, slope, low, high):
 
 @inner
 def _span(c, triangle, row, width):
-    """First and last sample of a row inside the face: w > 0, z > NEAR, s >= 0, t >= 0, and s, t or s + t <= 1."""
+    """Return the first and last sample of a row inside a face: z > NEAR, s >= 0, t >= 0, and s, t or s + t <= 1."""
     ws, wt, w = c[S] + c[S_Y] * row, c[T] + c[T_Y] * row, c[W] + c[W_Y] * row
     low, high = 0.0, width - 1.0
-    slack = 1e-7  # neighbours overlap by this part of their edges, so that no crack opens between them
+    slack = 1e-7  # neighbouring faces overlap by this share of their edges, so no crack opens between them
     low, high = _narrow(w - 1e-6, c[W_X], low, high)
     low, high = _narrow(1.0 / NEAR - w, -c[W_X], low, high)
     low, high = _narrow(ws + slack * w, c[S_X] + slack * c[W_X], low, high)
@@ -258,9 +258,9 @@ def _span(c, triangle, row, width):
 
 @fast
 def _draw(faces, textures, view, coefficients, depth, nearest):
-    """The nearest face at each sample: fills `depth` (w), `nearest` (row of `faces`) and the faces' coefficients.
+    """Find the nearest face at each sample: fills `depth` (w), `nearest` (row of `faces`) and `coefficients`.
 
-    Nothing is drawn where `depth` is larger already.
+    A face is drawn only where its w is larger than the value in `depth`.
     """
     data, start, sides, cut_out = textures.data, textures.start, textures.sides, textures.cut_out
     rotation, position, width = view.rotation, view.position, view.size[1]
@@ -289,7 +289,7 @@ def _draw(faces, textures, view, coefficients, depth, nearest):
                             nearest[row, x] = index
             else:
                 depths, hits = depth[row, first:last + 1], nearest[row, first:last + 1]
-                for k in range(len(depths)):  # from 0, so that many are compared at once
+                for k in range(len(depths)):  # a loop from 0 is vectorised
                     w = w_row + w_x * (first + k)
                     if w > depths[k]:
                         depths[k] = w
@@ -297,10 +297,10 @@ def _draw(faces, textures, view, coefficients, depth, nearest):
 
 
 def _shadows(faces, sun, position):
-    """The shadows of faces on the ground y = 0, as faces.
+    """Return the shadows of faces on the ground y = 0, as faces.
 
-    A point falls along the sun by -y / sun_y to the ground, so an edge e becomes e - sun e_y / sun_y, and the shadow of
-    a face is again corner, edge_s and edge_t, with the same (s, t) and so the same alpha.
+    A point p casts its shadow at p - sun p_y / sun_y. This is linear, so the shadow of a face has a corner, edge_s and
+    edge_t, with the same (s, t) and so the same alpha.
     """
     away = np.hypot(faces[:, CORNER + X] - position[X], faces[:, CORNER + Z] - position[Z])
     shadows = faces[(faces[:, GROUND] == 0) & (away < SHADOW_FAR)]
@@ -314,7 +314,7 @@ def _shadows(faces, sun, position):
 
 @inner
 def _most(labels, depths):
-    """The label of most of a pixel's samples; where two have as many, that of the nearer surface."""
+    """Return the most frequent label of a pixel's samples; of two equally frequent ones, the nearer surface's."""
     best, best_count, best_depth = labels[0], 0, -1.0
     for k in range(4):
         count, closest = 0, 0.0
@@ -335,18 +335,18 @@ def render(faces, textures, pose, intrinsics, size, environment):
     """
     middle = (faces[:, CORNER:CORNER + 3] + 0.5 * (faces[:, EDGE_S:EDGE_S + 3] + faces[:, EDGE_T:EDGE_T + 3])
               - pose[:3, 3])
-    # From near to far, so that most of what is hidden costs one comparison.
+    # Near faces are drawn first, so most hidden samples cost one comparison.
     faces = faces[np.argsort((middle * middle).sum(axis=1), kind="stable")]
     view = View(
         rotation=np.ascontiguousarray(pose[:3, :3].T), position=np.ascontiguousarray(pose[:3, 3]),
         focal=np.array([intrinsics[0, 0], intrinsics[1, 1]]) * SUPERSAMPLING,
-        # Sample 0 of pixel 0 lies a quarter pixel before its centre.
+        # Sample 0 lies a quarter pixel before the centre of pixel 0.
         centre=(np.array([intrinsics[0, 2], intrinsics[1, 2]]) + 0.5) * SUPERSAMPLING - 0.5,
         size=(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING))
     depth, nearest = np.zeros(view.size, np.float32), np.full(view.size, -1, np.int32)
     coefficients = np.empty((len(faces), 9))
     _draw(faces, textures, view, coefficients, depth, nearest)
-    on_ground = np.append(faces[:, GROUND] > 0, False)[nearest]  # the last one for samples without a face
+    on_ground = np.append(faces[:, GROUND] > 0, False)[nearest]  # the appended value is for samples without a face
     shadows, shadow = _shadows(faces, environment.sun, view.position), np.full(view.size, -1, np.int32)
     _draw(shadows, textures, view, np.empty((len(shadows), 9)), np.where(on_ground, 0, np.inf).astype(np.float32),
           shadow)
@@ -354,24 +354,16 @@ def render(faces, textures, pose, intrinsics, size, environment):
 
 
 def _brightness(faces, environment):
-    """What each face's texture is multiplied by, (n,): ambient light, and the sun by the cosine of its angle."""
+    """Return the factor of each face's texture, (n,): ambient light plus the sun by the cosine of its angle."""
     normal = np.cross(faces[:, EDGE_S:EDGE_S + 3], faces[:, EDGE_T:EDGE_T + 3])
     cosine = -(normal * environment.sun).sum(axis=1) / np.maximum(np.sqrt((normal * normal).sum(axis=1)), 1e-12)
     direct = np.where(faces[:, LIT] > 0, np.maximum(cosine, 0.0), UNLIT)
     return faces[:, GAIN] * (environment.ambient + environment.direct * direct)
 
 
-def compile_for_all():
-    """Compile once and keep it on disk where possible, so that the processes started afterwards need not."""
-    textures = Textures(np.zeros(1, np.uint8), np.zeros((1, LEVELS, LEVELS), np.int64), np.zeros((1, 2), np.int64),
-                        np.zeros(1, np.bool_))
-    environment = Environment(np.ones(3), *[1.0] * 5)
-    render(np.zeros((0, COLUMNS)), textures, np.eye(4), np.eye(3), (1, 1), environment)
-
-
 @fast
 def _pixels(faces, brightness, textures, environment, coefficients, nearest, shadow):
-    """Image and label map, from what each sample sees."""
+    """Return image and label map from the nearest face and the shadow at each sample."""
     height, width = nearest.shape[0] // SUPERSAMPLING, nearest.shape[1] // SUPERSAMPLING
     image = np.empty((height, width), np.float32)
     label_map = np.empty((height, width), np.uint8)
@@ -381,7 +373,7 @@ def _pixels(faces, brightness, textures, environment, coefficients, nearest, sha
     for i in range(height):
         for j in range(width):
             index, shaded = nearest[2 * i, 2 * j], 0
-            whole = True  # most pixels show one face, whose texture is read once, in the middle
+            whole = True  # most pixels show one face, whose texture is read once, at the pixel's centre
             for k in range(4):
                 y, x = 2 * i + (k >> 1), 2 * j + (k & 1)
                 whole &= nearest[y, x] == index

@@ -1,7 +1,7 @@
-"""A street of the embedded world: how it looks, what stands and moves on it, and the light.
+"""A street of the embedded world: the ground, the things that stand and move on it, and the light.
 
-The ground is flat, the road at y = 0 and the sidewalks a kerb higher; cars drive on the right. A side of a road is
-1 on the right and -1 on the left, looking along its track.
+The ground is flat, the road at y = 0 and the sidewalks a kerb higher. Cars drive on the right. A `side` is 1 on the
+right and -1 on the left, looking along the track.
 """
 
 from dataclasses import dataclass, field
@@ -9,58 +9,35 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesis_repro.world import raster, things
+from thesis_repro.world.drives import ZONES, Style, Track
 from thesis_repro.world.raster import Environment, Textures
 from thesis_repro.world.textures import PERSONS, TILE
 
 KERB = 0.12
 BEYOND = 100.0  # metres of grass around all roads, up to a forest
 SKY_HEIGHT, SKY_HALF = 60.0, 5000.0  # metres; the clouds are a ceiling that fades into the haze
-ZONES = ("row", "gardens", "park", "wall")
-
-
-@dataclass(frozen=True)
-class Style:
-    """What a street looks like; widths in metres."""
-
-    half: float = 5.5  # half of the road
-    road: str = "road"  # its texture
-    sidewalk: float = 2.6  # 0: a highway, with low walls
-    parked: tuple = (0.0, 0.0)  # part of the parking places that are taken, left and right
-    zones: tuple = (0.55, 0.2, 0.15, 0.1)  # shares of ZONES
-    trees: float = 0.5  # street trees
-    persons: float = 0.05  # for each metre of sidewalk
-    traffic: float = 0.01  # oncoming cars for each metre
-    sunny: bool = True
-    sun: tuple = (0.5, 0.8)  # azimuth the light comes from, elevation (radians)
-    sky: tuple = (150.0, 205.0)  # gray of the sky between the clouds, and of the haze at the horizon
-    haze: float = 0.003
-    leaders: tuple = ()  # distances of cars that drive ahead at the camera's pace
-    crossing: float | None = None  # s of a crossing with cars that pass ahead of a waiting camera
 
 
 @dataclass
 class Mover:
-    """A car or person that moves along a track at a steady pace (metres a frame).
-
-    pace: None keeps its distance to the camera; turn: what it looks to the right of the track (radians).
-    """
+    """A car or person that moves along a track at a constant pace."""
 
     faces: np.ndarray
-    track: object  # a `drives.Track`
+    track: Track
     s: float  # at frame 0
-    pace: float | None
+    pace: float | None  # metres a frame; None keeps the distance to the camera
     d: float
-    turn: float
+    turn: float  # radians to the right of the track's direction
 
     def at(self, frame, driven):
-        """Its faces in the street at a frame; driven: metres that the camera has come by then."""
+        """Return the faces in the street at a frame; driven: metres that the camera has driven by then."""
         x, z, heading = self.track.at(self.s + (driven if self.pace is None else self.pace * frame), self.d)
         return things.place(self.faces, x, z, heading + self.turn)
 
 
 @dataclass
 class Street:
-    """A street that is ready to be rendered."""
+    """A street, ready to be rendered."""
 
     faces: np.ndarray
     movers: list
@@ -68,63 +45,62 @@ class Street:
     environment: Environment
 
     def view(self, pose, intrinsics, size, frame, driven=0.0):
-        """Image (float32, before exposure and noise) and label map (uint8), both of `size`, (height, width).
+        """Render the image (float32, before exposure and noise) and the label map (uint8), both (height, width).
 
-        pose: 4x4 camera-to-world; intrinsics: 3x3, pixels; frame, driven: when, as `Mover.at` takes them.
+        pose: 4x4 camera-to-world; intrinsics: 3x3, pixels; size: (height, width); frame, driven: as in `Mover.at`.
         """
         moved = [mover.at(frame, driven) for mover in self.movers]
         return raster.render(np.concatenate([self.faces, *moved]), self.textures, pose, intrinsics, size,
                              self.environment)
 
 
-def build(rng, bank, track, style, crossing=None):
-    """Lay out a `Street` along a `drives.Track`.
-
-    rng: NumPy generator, on which alone the street depends besides these; bank: of `textures.build`; style: `Style`;
-    crossing: the track of a road that crosses it.
-    """
-    plan = _Plan(rng, bank.names, style, track, [road for road in (track, crossing) if road is not None])
+def build(rng, bank, track, style):
+    """Lay out a `Street` of a `Style` along a `Track`; rng: NumPy generator; bank: result of `textures.build`."""
+    roads = [track]
+    if style.crossing is not None:
+        x, z, heading = track.at(style.crossing)
+        roads.append(Track((), -75.0, 75.0, (x, z), heading - np.pi / 2))
+    plan = _Plan(rng, bank.names, style, track, roads)
     _lay_ground(plan)
     _surround(plan)
     for side in (-1, 1):
         _build_up(plan, side)
         _furnish(plan, side)
-    _traffic(plan, crossing)
+    _traffic(plan)
     return Street(np.ascontiguousarray(np.concatenate(plan.parts)), plan.movers, bank.packed, environment(style))
 
 
 @dataclass
 class _Plan:
-    """A street in the making: its roads, first the one that the camera drives, and what has been put up so far."""
+    """A street in the making: its roads and the things placed so far."""
 
     rng: np.random.Generator
     names: dict  # of the textures
     style: Style
-    track: object
-    roads: list
+    track: Track  # of the camera
+    roads: list  # tracks; the camera's is the first
     parts: list = field(default_factory=list)  # matrices of faces
     movers: list = field(default_factory=list)
 
     def __post_init__(self):
         self.middle = np.concatenate([np.stack([road.x, road.z], axis=1)[::2] for road in self.roads])
         self.houses = np.empty((0, 2))  # points spread over all houses, at most 3 m apart
-        self.line = self.style.half + (self.style.sidewalk or 3.0)  # from the middle to where houses and gardens begin
+        self.line = self.style.half + (self.style.sidewalk or 3.0)  # |d| at which houses and gardens begin
 
     def off_road(self, x, z):
-        """Distance of points, (n,) each, to the nearest edge of any road; negative on a road."""
-        x, z = np.atleast_1d(x), np.atleast_1d(z)
-        return _nearest(x, z, self.middle) - self.style.half
+        """Return the distance of points, (n,) each, to the nearest edge of any road; negative on a road."""
+        return _distance(x, z, self.middle) - self.style.half
 
     def free(self, x, z, margin):
-        """Whether a point lies more than `margin` metres off all roads, and off all houses."""
-        return self.off_road(x, z)[0] > margin and not _near(x, z, self.houses, 2.4)
+        """Return whether a point is more than `margin` metres from all roads, and outside all houses."""
+        return self.off_road(x, z)[0] > margin and _distance(x, z, self.houses)[0] >= 2.4
 
     def put(self, faces, x, z, yaw, y=-KERB):
-        """Put up a thing at (x, y, z), turned by yaw (radians to the right)."""
+        """Place a thing at (x, y, z), turned by yaw (radians to the right)."""
         self.parts.append(things.place(faces, x, z, yaw, y))
 
     def extrude(self, profile, side, texture, label, span=None, margin=None, step=1.0, **options):
-        """Put up what runs along the main road between two places; margin: metres that it keeps off all roads."""
+        """Place a strip along the main road; span: (start, stop); margin: metres that it keeps from all roads."""
         start, stop = span or (self.track.s[0], self.track.s[-1])
         places = np.linspace(start, stop, max(2, round((stop - start) / step) + 1))
         off_road = None if margin is None else lambda x, z: self.off_road(x, z) > margin
@@ -132,25 +108,21 @@ class _Plan:
                                          **options))
 
     def along(self, step):
-        """Places along the main road, about `step` metres apart."""
+        """Yield places along the main road, about `step` metres apart."""
         s = self.track.s[0] + self.rng.uniform(0, step)
         while s < self.track.s[-1] - 3:
             yield s
             s += step * self.rng.uniform(0.75, 1.35)
 
 
-def _nearest(x, z, points):
-    """Distance of each place, (n,), to the nearest of some points, (m, 2)."""
-    return np.sqrt(((x[:, None] - points[:, 0]) ** 2 + (z[:, None] - points[:, 1]) ** 2).min(axis=1))
-
-
-def _near(x, z, points, distance):
-    """Whether any of some points, (m, 2), lies within a distance of any of the places."""
-    return len(points) > 0 and bool(_nearest(np.atleast_1d(x), np.atleast_1d(z), points).min() < distance)
+def _distance(x, z, points):
+    """Return the distance of each place, (n,), to the nearest of the points (m, 2); infinity without points."""
+    x, z = np.atleast_1d(x)[:, None], np.atleast_1d(z)[:, None]
+    return np.sqrt(((x - points[:, 0]) ** 2 + (z - points[:, 1]) ** 2).min(axis=1, initial=np.inf))
 
 
 def _lay_ground(plan):
-    """Roads, kerbs and sidewalks along the tracks."""
+    """Place roads, kerbs and sidewalks along the tracks."""
     half, width = plan.style.half, plan.style.sidewalk
     plan.extrude([(-half, 0), (half, 0)], 1, plan.style.road, "road", step=2.0, ground=1)
     if width:
@@ -165,7 +137,7 @@ def _lay_ground(plan):
 
 
 def _surround(plan):
-    """Grass around the roads, a forest around the grass, and the sky."""
+    """Place grass around the roads, a forest around the grass, and the sky."""
     faces, light = things.Faces(plan.names), environment(plan.style)
     low, high = plan.middle.min(axis=0) - BEYOND, plan.middle.max(axis=0) + BEYOND
     (x, z), (width, depth) = low, high - low
@@ -181,7 +153,7 @@ def _surround(plan):
 
 
 def _build_up(plan, side):
-    """Divide one side of the main road into stretches and fill each with a zone of the style."""
+    """Divide one side of the main road into stretches and fill each with a random zone."""
     rng, s, end = plan.rng, plan.track.s[0], plan.track.s[-1]
     while s < end - 5:
         span = (s, min(s + rng.uniform(24, 60), end))
@@ -203,8 +175,11 @@ def _build_up(plan, side):
 
 
 def _house_row(plan, side, span, gap, setback, floors, pitched):
-    """Houses side by side where there is room; gap, setback: metres; floors: least, one more than most; pitched: part
-    of the roofs."""
+    """Place houses side by side where there is room.
+
+    gap: metres between houses; setback: metres behind the building line; floors: lowest number and one more than the
+    highest; pitched: share of pitched roofs.
+    """
     rng, s = plan.rng, span[0]
     across, along = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.45, 0.45, 6), np.linspace(0.05, 0.95, 5)))
     while s < span[1] - 6:
@@ -213,7 +188,8 @@ def _house_row(plan, side, span, gap, setback, floors, pitched):
         yaw = heading + side * np.pi / 2
         points = np.stack([x + width * across * np.cos(yaw) + depth * along * np.sin(yaw),
                            z - width * across * np.sin(yaw) + depth * along * np.cos(yaw)], axis=1)
-        if plan.off_road(*points.T).min() > plan.style.sidewalk - 0.5 and not _near(*points.T, plan.houses, 0.8):
+        clear = _distance(*points.T, plan.houses).min() >= 0.8
+        if clear and plan.off_road(*points.T).min() > plan.style.sidewalk - 0.5:
             plan.put(things.building(plan.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched),
                      x, z, yaw)
             plan.houses = np.concatenate([plan.houses, points])
@@ -221,7 +197,7 @@ def _house_row(plan, side, span, gap, setback, floors, pitched):
 
 
 def _border(plan, side, span, kind, height):
-    """A fence, a hedge or a wall along the building line."""
+    """Place a fence, a hedge or a wall along the building line."""
     texture, label, thickness = {"fence": ("picket", "fence", 0.0), "hedge": ("leaves", "vegetation", 0.7),
                                  "wall": ("stone", "wall", 0.3)}[kind]
     near, far = plan.line + 0.15, plan.line + 0.15 + thickness
@@ -232,7 +208,7 @@ def _border(plan, side, span, kind, height):
 
 
 def _scatter(plan, side, span, near, far, density):
-    """Trees and bushes, so many for each metre, from `near` to `far` metres behind the building line."""
+    """Place trees and bushes `near` to `far` metres behind the building line; density: plants for each metre."""
     for _ in range(int((span[1] - span[0]) * density) + 1):
         x, z, _ = plan.track.at(plan.rng.uniform(*span), side * (plan.line + plan.rng.uniform(near, far)))
         if plan.free(x, z, 2.0):
@@ -241,9 +217,9 @@ def _scatter(plan, side, span, near, far, density):
 
 
 def _furnish(plan, side):
-    """What stands and walks on one side of the main road, and what parks there."""
+    """Place lamps, signs, trees, persons and parked cars on one side of the main road."""
     rng, style, track = plan.rng, plan.style, plan.track
-    ahead = 0.0 if side > 0 else np.pi  # looks the way one drives on that side
+    ahead = 0.0 if side > 0 else np.pi  # direction of the traffic on that side
     for make, step, distance in ((things.lamp, 26.0, 0.45), (things.sign, 21.0, 0.5),
                                  (things.tree, 9.0 / style.trees, 0.8)):
         if make is things.tree and not style.sidewalk:
@@ -265,12 +241,13 @@ def _furnish(plan, side):
                                      d, rng.uniform(-0.5, 0.5)))
     for s in plan.along(5.8):
         x, z, heading = track.at(s, side * (style.half - 1.0))
-        if rng.random() < style.parked[side > 0] and not _near(x, z, plan.middle[len(track.x[::2]):], style.half + 3):
+        clear = _distance(x, z, plan.middle[len(track.x[::2]):])[0] >= style.half + 3  # of a crossing
+        if rng.random() < style.parked[side > 0] and clear:
             plan.put(things.car(plan.names, rng), x, z, heading + ahead + rng.normal(0, 0.02), 0.0)
 
 
-def _traffic(plan, crossing):
-    """Cars that drive: ahead at the camera's pace, towards it, across the road, or beside it on a highway."""
+def _traffic(plan):
+    """Place moving cars: beside the camera on a highway; else ahead at its pace, towards it and on a crossing."""
     rng, style, track = plan.rng, plan.style, plan.track
 
     def drive(road, s, pace, d, turn=0.0):
@@ -285,16 +262,17 @@ def _traffic(plan, crossing):
         drive(track, distance, None, 1.9)
     for s in plan.along(1 / style.traffic):
         drive(track, s + 40, -rng.uniform(0.7, 1.1), -1.8, np.pi)
-    for k in range(14 if crossing else 0):
-        side = 1 if k % 2 else -1
-        drive(crossing, -side * (12.0 + 13.0 * k + rng.uniform(-3, 3)), side * rng.uniform(0.6, 0.75), 1.7 * side,
-              0.0 if side > 0 else np.pi)
+    for crossing in plan.roads[1:]:
+        for k in range(14):
+            side = 1 if k % 2 else -1
+            drive(crossing, -side * (12.0 + 13.0 * k + rng.uniform(-3, 3)), side * rng.uniform(0.6, 0.75), 1.7 * side,
+                  0.0 if side > 0 else np.pi)
 
 
 def environment(style):
-    """The light of a style, a `raster.Environment`."""
+    """Return the light of a style as a `raster.Environment`."""
     azimuth, elevation = style.sun if style.sunny else (style.sun[0], 1.35)
     sun = np.array([-np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth)])
-    # Under clouds the light comes from above and shadows are faint pools under things.
+    # Under clouds the light comes from above, so shadows are faint and lie under the things.
     ambient, direct, shadow = (0.36, 0.86, 0.36) if style.sunny else (0.70, 0.30, 0.62)
     return Environment(sun, ambient, direct, shadow, float(style.sky[1]), style.haze)

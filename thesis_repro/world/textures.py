@@ -1,8 +1,8 @@
 """The textures of the embedded world, painted once for a seed and packed for the rasteriser.
 
-Painters return gray float32 (rows, columns), albedo 0 to 255; those of cut-outs also an alpha (0 to 255) of that shape.
-Surfaces mix noise of many scales with structure, so that there are corners on them from near and from far. Nothing
-repeats itself closely: in a turn, rows of equal windows or pickets are tracked to their neighbours.
+A painter returns a gray image (rows, columns), albedo 0 to 255. The painter of a cut-out also returns an alpha image
+(0 to 255) of the same shape. Surfaces mix noise of many scales with structure, so corners are found on them from near
+and from far. Windows and pickets differ from each other: the tracker confuses equal ones with their neighbours.
 """
 
 from functools import lru_cache
@@ -13,34 +13,34 @@ import numpy as np
 
 from thesis_repro.world.raster import ALPHA_LEVELS, LEVELS, OPAQUE, Textures
 
-# Metres that one repeat covers (along u, along v); None: the whole width of what it lies on.
+# Metres that one repeat covers (along u, along v); None: one repeat covers the whole width of the surface.
 TILE = {"road": (28.0, None), "highway": (30.0, None), "asphalt": (12.0, 12.0), "sidewalk": (8.0, None),
         "grass": (12.0, 12.0), "roof": (6.0, 6.0), "stone": (6.0, 3.0), "leaves": (6.0, 6.0), "picket": (6.0, None),
         "facade": (12.0, 6.0), "metal": (2.0, 2.0), "forest": (110.0, None), "sky": (600.0, 600.0)}
 FACADES, TREES, PERSONS, SIGNS = 4, 3, 3, 2
-# Side view of a car: metres from its rear and above the ground, from the front over the roof to the rear.
+# Outline of a car in side view: (metres from the rear, metres above the ground), from the front over the roof.
 CAR_PROFILE = np.array([(4.3, 0.3), (4.3, 0.62), (4.1, 0.82), (3.15, 0.97), (2.45, 1.44), (0.6, 1.46), (0.1, 1.0),
                         (0.0, 0.62), (0.02, 0.3)])
-CAR_HEIGHT = 1.5  # of the picture of its side
+CAR_HEIGHT = 1.5  # metres that the texture of the side covers
 
 
 class Bank(NamedTuple):
-    """The textures of a world: names to indices, and the arrays for `raster.render`."""
+    """The textures of a world."""
 
-    names: dict
-    packed: Textures
+    names: dict  # name to index
+    packed: Textures  # for `raster.render`
 
 
 @lru_cache(maxsize=1)
 def build(seed):
-    """All textures of the world with this seed, a `Bank`."""
+    """Return all textures of the world with this seed as a `Bank`."""
     painted = _painted(np.random.default_rng(np.random.SeedSequence([seed, 7001])))
     chunks, start, length = [], np.zeros((len(painted), LEVELS, LEVELS), np.int64), 0
     for index, layers in enumerate(painted.values()):
         for j in range(layers[0].shape[0].bit_length()):
             for i in range(layers[0].shape[1].bit_length()):
                 start[index, j, i] = length
-                # Only gray is needed where cut-outs no longer are.
+                # Coarser levels of the alpha are never read.
                 for number in range(len(layers) if max(i, j) < ALPHA_LEVELS else 1):
                     chunks.append(_reduced(layers[number], j, i, is_alpha=number == 1))
                     length += chunks[-1].size
@@ -51,26 +51,26 @@ def build(seed):
 
 
 def _reduced(layer, row_level, column_level, is_alpha):
-    """One level of a gray or an alpha, as bytes in a row.
+    """Return one level of a gray or alpha image as a flat array of bytes.
 
-    The levels of rows and columns are separate, which keeps a road that is seen at a flat angle sharp across its
-    markings without aliasing along them.
+    Rows and columns are reduced separately, so a road seen at a flat angle stays sharp in one direction without
+    aliasing in the other.
     """
     rows, columns = layer.shape[0] >> row_level, layer.shape[1] >> column_level
     level = cv2.resize(layer, (columns, rows), interpolation=cv2.INTER_AREA)
     if is_alpha:
-        # Averaged leaves would fall below the opacity threshold and far trees would thin out.
+        # Averaging would push leaves below the opacity threshold, and distant trees would look thin.
         level = level * (OPAQUE / max(np.quantile(level, 1 - np.mean(layer >= OPAQUE)), 1.0))
     return np.clip(np.rint(level), 0, 255).astype(np.uint8).ravel()
 
 
 def _painted(rng):
-    """All textures by name: (gray,), or (gray, alpha) of cut-outs; their sides are powers of two."""
+    """Return all textures by name: (gray,), or (gray, alpha) for cut-outs. Their sides are powers of two."""
     big, middle, small = (512, 512), (256, 256), (64, 64)
     sidewalk = 148 + _slabs(rng, (256, 512), 8, 16, 2) + 9 * noise(rng, (256, 512), 64, 1.2)
     sidewalk[-28:] = 168 + 8 * noise(rng, (28, 512), 16)  # the kerb, nearest to the road
     sidewalk[-28:, ::64], sidewalk[-30:-28] = 90, 100
-    leaves = _leaves(rng, big)
+    leaves = _leaves(rng)
     ridge = 90 + 90 * noise(rng, (1, 512), 64)
     painted = {
         "road": _carriageway(rng, ((0.04, 0.008, 0), (0.5, 0.008, 3), (0.96, 0.008, 0))),
@@ -100,9 +100,9 @@ def _painted(rng):
 
 
 def noise(rng, shape, cell, slope=1.7):
-    """Periodic noise with unit deviation: structures of up to about `cell` pixels, float32.
+    """Return periodic noise, float32, standard deviation 1, with structures of up to about `cell` pixels.
 
-    slope: how fast the smaller ones fade; at 1 all sizes are equally strong.
+    slope: how fast smaller structures fade; at 1 all sizes are equally strong.
     """
     frequency = np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1]))
     spectrum = np.fft.rfft2(rng.standard_normal(shape)) / np.maximum(frequency, 0.5 / cell) ** slope
@@ -112,9 +112,8 @@ def noise(rng, shape, cell, slope=1.7):
 
 
 def _asphalt(rng, shape, patches):
-    """Asphalt with so many repaired squares and cracks."""
-    rows, columns = shape
-    base = 100.0
+    """Paint asphalt; patches: number of repaired squares and of cracks."""
+    (rows, columns), base = shape, 100.0
     image = base + 9 * noise(rng, shape, 128, 0.9)
     for _ in range(patches):
         x, y = int(rng.integers(0, columns - 150)), int(rng.integers(0, rows - 120))
@@ -127,7 +126,10 @@ def _asphalt(rng, shape, patches):
 
 
 def _carriageway(rng, lines):
-    """A road with its markings, (512, 2048), u along it; lines: (place, half width) in parts of its width, dashes."""
+    """Paint a road with its markings, (512, 2048), u along the road.
+
+    lines: (position, half width, number of dashes), the first two as shares of the road's width; 0 dashes: solid.
+    """
     image = _asphalt(rng, (512, 2048), 22)
     rows, columns = image.shape
     worn = noise(rng, image.shape, 16) > 1.5
@@ -141,9 +143,9 @@ def _carriageway(rng, lines):
 
 
 def _slabs(rng, shape, rows, columns, joint, spread=9.0):
-    """Slabs or bricks, to be added to a surface: a random tone for each (deviation `spread`), dark joints.
+    """Paint slabs or bricks with dark joints, to be added to a surface; each has a random tone (deviation `spread`).
 
-    rows, columns: of slabs in the shape; joint: pixels; every other row is shifted by half a slab.
+    rows, columns: number of slabs; joint: pixels. Every second row is shifted by half a slab.
     """
     height, width = shape
     y, x = np.mgrid[0:height, 0:width]
@@ -156,7 +158,7 @@ def _slabs(rng, shape, rows, columns, joint, spread=9.0):
 
 
 def _facade(rng, kind):
-    """Two floors of four bays of a house, (512, 1024); kind: below FACADES."""
+    """Paint two floors of a house with four windows each, (512, 1024); kind: 0 to FACADES - 1."""
     shape = (512, 1024)
     base = (172.0, 128.0, 200.0, 112.0)[kind]
     image = base + 17 * noise(rng, shape, 128, 1.2)
@@ -180,8 +182,8 @@ def _facade(rng, kind):
 
 
 def _outline(shape, polygons, ellipses=()):
-    """Antialiased alpha of polygons and ellipses given in parts of the size."""
-    rows, columns = shape[0] * 2, shape[1] * 2
+    """Return an antialiased alpha image of polygons and ellipses, whose coordinates are shares of the size."""
+    rows, columns = shape[0] * 2, shape[1] * 2  # reduced to `shape` at the end, which smooths the edges
     mask = np.zeros((rows, columns), np.uint8)
     for polygon in polygons:
         cv2.fillPoly(mask, [np.rint(np.asarray(polygon, float) * (columns, rows)).astype(np.int32)], 255)
@@ -191,22 +193,20 @@ def _outline(shape, polygons, ellipses=()):
     return cv2.resize(mask, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
 
 
-def _leaves(rng, shape, dark=38, light=118, leaf=4):
-    """Foliage in clumps: dark to light gray, leaves of that many pixels."""
-    image = np.full(shape, float(dark), np.float32)
-    clumps = noise(rng, shape, 64, 1.4)
-    rows, columns = shape
-    count = rows * columns // (leaf * leaf * 2)
-    x, y = rng.integers(0, columns, count), rng.integers(0, rows, count)
+def _leaves(rng):
+    """Paint foliage in clumps, (512, 512), the dark leaves first and the light ones over them."""
+    image, count = np.full((512, 512), 38, np.float32), 8192
+    clumps = noise(rng, image.shape, 64, 1.4)
+    x, y = rng.integers(0, 512, (2, count))
     angle, tone = rng.uniform(0, 180, count), np.sort(rng.random(count))
     for k in range(count):
-        value = dark + (light - dark) * float(np.clip(0.6 * tone[k] + 0.22 * clumps[y[k], x[k]], 0, 1))
-        cv2.ellipse(image, (int(x[k]), int(y[k])), (leaf, leaf // 2), angle[k], 0, 360, value, -1)
+        value = 38 + 80 * float(np.clip(0.6 * tone[k] + 0.22 * clumps[y[k], x[k]], 0, 1))
+        cv2.ellipse(image, (int(x[k]), int(y[k])), (4, 2), angle[k], 0, 360, value, -1)
     return image + 10 * clumps
 
 
 def _tree(rng, leaves):
-    """A tree in side view, (512, 512); leaves: what its crown shows."""
+    """Paint a tree in side view, (512, 512); leaves: texture of its crown."""
     shape = (512, 512)
     y, x = np.mgrid[0:512, 0:512]
     crown = 1.15 - ((x - 256) / 95) ** 2 - ((y - 205) / 120) ** 2  # around the trunk
@@ -222,7 +222,7 @@ def _tree(rng, leaves):
 
 
 def _person(rng):
-    """A standing or walking person, (256, 128) for 1.8 m by 0.9 m."""
+    """Paint a standing or walking person, (256, 128)."""
     shape = (256, 128)
     stride, shoulder, hip = rng.uniform(0.03, 0.14), rng.uniform(0.17, 0.23), rng.uniform(0.11, 0.14)
     torso = [(0.47, 0.15), (0.53, 0.15), (0.5 + shoulder, 0.2), (0.5 + shoulder, 0.5), (0.5 + hip, 0.55),
@@ -238,7 +238,7 @@ def _person(rng):
 
 
 def _picket(rng):
-    """A stretch of a picket fence, (128, 512), the pickets of unequal width, height and tone."""
+    """Paint a picket fence, (128, 512), with pickets of unequal width, height and tone."""
     image, alpha = 120 + 8 * noise(rng, (128, 512), 32, 1.2), np.zeros((128, 512))
     alpha[34:46], alpha[96:108] = 255, 255
     left = 0
@@ -251,7 +251,7 @@ def _picket(rng):
 
 
 def _sign(kind):
-    """A traffic sign, (128, 128), the same mirrored, so that it may be seen from behind: no entry, or a board."""
+    """Paint a traffic sign, (128, 128): "no entry" (kind 0) or a board. Both look the same from behind."""
     image = np.full((128, 128), 95.0)
     if kind == 0:
         cv2.rectangle(image, (26, 52), (101, 75), 232.0, -1)
@@ -264,7 +264,7 @@ def _sign(kind):
 
 
 def _car_side(rng):
-    """A car of middle gray from the side, looking right, (256, 512)."""
+    """Paint the right side of a car in middle gray, (256, 512)."""
     shape, length = (256, 512), CAR_PROFILE[:, 0].max()
 
     def parts(points):
@@ -274,7 +274,7 @@ def _car_side(rng):
         return [(x / length, 1 - 0.31 / CAR_HEIGHT, share * 0.31 / length, share * 0.31 / CAR_HEIGHT)
                 for x in (0.85, 3.45)]
 
-    # Doors bulge: above the crease they mirror the sky, below it the street.
+    # A curved door reflects the sky above its crease and the street below it.
     up = CAR_HEIGHT * (1 - np.arange(256)[:, None] / 256)
     image = 128 + 1.5 * noise(rng, shape, 128)
     image *= np.interp(up, (0.2, 0.5, 0.62, 0.66, 1.5), (0.6, 0.8, 0.85, 1.1, 1.1)).astype(np.float32)
@@ -289,7 +289,7 @@ def _car_side(rng):
 
 
 def _car_end(rng):
-    """Front or rear of a car of middle gray, (128, 256)."""
+    """Paint the front or rear of a car in middle gray, (128, 256)."""
     image = 128 + 1.5 * noise(rng, (128, 256), 64) + np.linspace(20, -40, 128, dtype=np.float32)[:, None]
     for middle in (34, 222):
         cv2.ellipse(image, (middle, 44), (32, 15), 0, 0, 360, 60.0, -1)

@@ -1,7 +1,7 @@
-"""What a street is built from, as rows of the rasteriser's face matrix: ground, walls, houses, cars, trees and signs.
+"""The things of a street, as rows of the rasteriser's face matrix: ground, walls, houses, cars, trees and signs.
 
-Things have coordinates of their own: metres, y = 0 on the ground, x and z around the foot. `place` puts them in the
-street. `names` maps textures to their indices.
+A thing is built in local coordinates: metres, y = 0 on the ground, x and z around its foot. `place` moves it into the
+street. `names` maps the names of textures to their indices.
 """
 
 import numpy as np
@@ -14,25 +14,22 @@ CAR_HALF = 0.86  # half of a car's width
 
 
 class Faces:
-    """Rows of the face matrix in the making.
-
-    Faces are rectangles that are seen from outside, edge_s to the right and edge_t up, where nothing else is said.
-    """
+    """A list of faces under construction: rectangles seen from outside, usually edge_s to the right and edge_t up."""
 
     def __init__(self, names):
         self.names, self._rows = names, []
 
     def add(self, corner, edge_s, edge_t, texture, label, repeats=(1.0, 1.0), uv=None, gain=1.0, triangle=0, ground=0,
             lit=1):
-        """Add one face; corner and edges in metres. The rest are the matrix' columns, as `raster` describes them.
+        """Add one face; corner and edges in metres. The other arguments are columns that `raster` describes.
 
-        repeats: of the texture along edge_s and edge_t, upright; or uv: the six numbers of u and v.
+        repeats: repeats of the upright texture along edge_s and edge_t; uv: the six numbers of u and v instead.
         """
         uv = uv or (0.0, repeats[0], 0.0, 1.0, 0.0, -repeats[1])
         self._rows.append((*corner, *edge_s, *edge_t, *uv, self.names[texture], ID[label], gain, triangle, ground, lit))
 
     def box(self, x, y, z, texture, label, gain=1.0):
-        """Add an upright box without a bottom between (low, high) of each axis; y low is the top."""
+        """Add an upright box without a bottom; x, y, z: (low, high) on each axis; low y is the top."""
         (x0, x1), (top, bottom), (z0, z1) = x, y, z
         width, height, length = x1 - x0, bottom - top, z1 - z0
         tile = TILE[texture]
@@ -44,12 +41,12 @@ class Faces:
                  gain=gain)
 
     def matrix(self):
-        """The faces added so far, (n, COLUMNS)."""
+        """Return the faces added so far, (n, COLUMNS)."""
         return np.array(self._rows, np.float64).reshape(-1, COLUMNS)
 
 
 def place(faces, x, z, yaw, y=0.0):
-    """Local faces (n, COLUMNS) turned by yaw (radians, right positive) and moved to (x, y, z)."""
+    """Return local faces (n, COLUMNS) turned by yaw (radians to the right) and moved to (x, y, z)."""
     placed = faces.copy()
     cosine, sine = np.cos(yaw), np.sin(yaw)
     for start in (CORNER, EDGE_S, EDGE_T):
@@ -63,18 +60,19 @@ def place(faces, x, z, yaw, y=0.0):
 
 
 def extrude(names, track, s, side, profile, texture, label, off_road=None, ground=0, lit=1):
-    """Faces of what runs along a track with one profile, (n, COLUMNS): a road, a sidewalk, a fence, a wall.
+    """Return the faces of a strip along a track, (n, COLUMNS): a road, a sidewalk, a fence or a wall.
 
-    s: (k,) places along the track, evenly spaced; side: 1 on its right, -1 mirrored on its left; profile: (distance
-    from the track, y) of its points from the inner edge outwards; off_road: (x, z) to whether a cell may lie there.
+    s: (k,) evenly spaced places along the track; side: 1 right of it, -1 mirrored to its left; profile: cross-section,
+    (distance from the track, y) of points from the inner edge outwards; off_road: function of (x, z) that returns
+    whether a face may lie there.
     """
     points, (tile_u, tile_v) = np.array(profile, float), TILE[texture]
     v = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     v = -v / (tile_v or v[-1])
-    if side < 0:  # the normals look outside where the points run to the right
+    if side < 0:  # points must run to the right, or the normals would look inwards
         points, v = points[::-1] * (-1, 1), v[::-1]
     u, u_step = s[:-1] / tile_u, (s[1] - s[0]) / tile_u
-    # Where a street meets itself its later part lies a little lower, or the two would flicker.
+    # Where a street meets itself, its later part lies a little lower. Otherwise the two would flicker.
     lower = 1e-5 * (s - track.s[0])
     bends = np.abs(np.interp(track.along(s), track.s, track.curvature)) > 1e-6
     x_middle, z_middle, heading = track.at((s[:-1] + s[1:]) / 2, points[:, 0].mean())
@@ -89,24 +87,17 @@ def extrude(names, track, s, side, profile, texture, label, off_road=None, groun
             shown &= step[:, X] * np.sin(heading) + step[:, Z] * np.cos(heading) > 0.02
         bent = (bends[:-1] | bends[1:]) & (d0 != d1)  # two triangles instead of a parallelogram
         columns = (names[texture], ID[label], 1.0, bent, ground, lit)
-        near = _rows(first[:-1], second[:-1] - first[:-1], first[1:] - first[:-1],
-                     (u, 0, u_step, v0, v1 - v0, 0), columns)
-        far = _rows(second[1:], first[1:] - second[1:], second[:-1] - second[1:],
-                    (u + u_step, 0, -u_step, v1, v0 - v1, 0), columns)
-        parts += [near[shown], far[shown & bent]]
+        near = (*first[:-1].T, *(second - first)[:-1].T, *(first[1:] - first[:-1]).T,
+                u, 0, u_step, v0, v1 - v0, 0, *columns)
+        far = (*second[1:].T, *(first - second)[1:].T, *(second[:-1] - second[1:]).T,
+               u + u_step, 0, -u_step, v1, v0 - v1, 0, *columns)
+        for face, kept in ((near, shown), (far, shown & bent)):
+            parts.append(np.stack(np.broadcast_arrays(*face), axis=1)[kept])
     return np.concatenate(parts)
 
 
-def _rows(corner, edge_s, edge_t, uv, columns):
-    """Many faces at once, (n, COLUMNS): three (n, 3), the six of uv and the other columns, (n,) or single."""
-    matrix = np.empty((len(corner), COLUMNS))
-    for k, column in enumerate([*corner.T, *edge_s.T, *edge_t.T, *uv, *columns]):
-        matrix[:, k] = column
-    return matrix
-
-
 def car(names, rng):
-    """A car that looks along z, its middle at the origin; paint and size are drawn."""
+    """Build a car of random colour and size that looks along z, its middle at the origin."""
     faces = Faces(names)
     gain = float(rng.choice([1.55, 1.15, 0.7, 0.42, 0.32, 1.4]))
     size = rng.uniform(0.95, 1.12)
@@ -116,37 +107,37 @@ def car(names, rng):
     for side in (1, -1):
         faces.add((side * half, 0, z.min()), (0, 0, length), (0, -height, 0), "car side", "car", gain=gain)
     materials = (("car end", 0.5, 1.0), ("car end", 0.0, 0.5), ("paint", 0, 1), ("glass", 0, 1), ("paint", 0, 1),
-                 ("glass", 0, 1), ("car end", 0.0, 0.5), ("car end", 0.5, 1.0))  # from front to rear: texture, its rows
+                 ("glass", 0, 1), ("car end", 0.0, 0.5), ("car end", 0.5, 1.0))  # front to rear: texture, top, bottom
     for k, (texture, top, bottom) in enumerate(materials):
         low, high = (k, k + 1) if up[k] < up[k + 1] else (k + 1, k)
-        right = half if low < high else -half  # of who looks at this part
+        right = half if low < high else -half  # as seen by somebody who looks at this part
         faces.add((right, -up[low], z[low]), (-2 * right, 0, 0), (0, up[low] - up[high], z[high] - z[low]), texture,
                   "car", uv=(0, 1, 0, bottom, 0, top - bottom), gain=1.0 if texture == "glass" else gain)
     return faces.matrix()
 
 
 def cut_out(names, texture, label, width, height, gain=1.0):
-    """Two upright pictures that cross."""
+    """Build two upright pictures that cross each other."""
     faces = Faces(names)
-    faces.add((-width / 2, 0, 0), (width, 0, 0), (0, -height, 0), texture, label, lit=0, gain=gain)
-    faces.add((0, 0, -width / 2), (0, 0, width), (0, -height, 0), texture, label, lit=0, gain=gain)
+    for x, z in ((width, 0), (0, width)):
+        faces.add((-x / 2, 0, -z / 2), (x, 0, z), (0, -height, 0), texture, label, lit=0, gain=gain)
     return faces.matrix()
 
 
 def tree(names, rng, lowest=5.0, highest=9.5):
-    """A tree between two heights, metres."""
+    """Build a tree; lowest, highest: metres."""
     height = rng.uniform(lowest, highest)
     return cut_out(names, f"tree{rng.integers(0, TREES)}", "vegetation", height * rng.uniform(0.85, 1.05), height,
                    rng.uniform(0.85, 1.2))
 
 
 def bush(names, rng):
-    """A bush: a small tree whose trunk is in the ground."""
+    """Build a bush: a small tree whose trunk is below the ground."""
     return place(tree(names, rng, 2.2, 4.0), 0, 0, 0, 1.2)
 
 
 def lamp(names, rng):
-    """A street lamp whose arm reaches to the left."""
+    """Build a street lamp whose arm reaches to the left."""
     faces, height = Faces(names), rng.uniform(5, 7)
     faces.box((-0.07, 0.07), (-height, 0), (-0.07, 0.07), "metal", "pole")
     faces.box((-1.4, 0), (-height, -height + 0.09), (-0.05, 0.05), "metal", "pole")
@@ -155,7 +146,7 @@ def lamp(names, rng):
 
 
 def sign(names, rng):
-    """A traffic sign that looks at z and -z."""
+    """Build a traffic sign that is seen from z and from -z."""
     faces, kind = Faces(names), int(rng.integers(0, SIGNS))
     height, size = rng.uniform(1.9, 2.4), rng.uniform(0.65, 0.9) * (1.4 if kind == 1 else 1)
     faces.box((-0.04, 0.04), (-height - size / 2, 0), (0.01, 0.09), "metal", "pole")
@@ -164,12 +155,12 @@ def sign(names, rng):
 
 
 def building(names, rng, width, depth, floors, pitched):
-    """A house whose front stands at z = 0 and looks at -z; pitched: a roof with a ridge instead of a flat one."""
+    """Build a house whose front stands at z = 0 and looks to -z; pitched: a roof with a ridge instead of a flat one."""
     faces, facade, height = Faces(names), f"facade{rng.integers(0, FACADES)}", 3.0 * floors
     gain, start = rng.uniform(0.85, 1.12), rng.integers(0, 4) / 4.0
     for corner, edge in (((-width / 2, 0), (width, 0)), ((width / 2, depth), (-width, 0)), ((width / 2, 0), (0, depth)),
                          ((-width / 2, depth), (0, -depth))):
-        bays = max(1, round(4 * abs(edge[0] + edge[1]) / TILE["facade"][0])) / 4  # whole ones
+        bays = max(1, round(4 * abs(edge[0] + edge[1]) / TILE["facade"][0])) / 4  # no window is cut
         faces.add((corner[0], 0, corner[1]), (edge[0], 0, edge[1]), (0, -height, 0), facade, "building",
                   uv=(start, bays, 0, 1, 0, -height / TILE["facade"][1]), gain=gain)
     if not pitched:
