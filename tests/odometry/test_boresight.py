@@ -1,4 +1,4 @@
-"""The rotation between camera and truth is estimated where it shows, and taken out of a finished run."""
+"""The boresight is estimated from finished runs and removed from them."""
 
 import json
 
@@ -16,7 +16,7 @@ KNOWN = np.array([0.4, -0.6, 0.3])  # pitch, yaw, roll in degrees
 
 
 def drive(steps=200, turning=0.02, start=None, seed=3):
-    """A camera on a car that turns to both sides and looks down a little, and its noisy estimate: (estimated, true)."""
+    """Paths (estimated, ground truth) of a car that turns to both sides; the estimate is noisy."""
     random = np.random.default_rng(seed)
     paths = [[np.eye(4) if start is None else start] for _ in range(2)]
     for index in range(steps):
@@ -35,7 +35,7 @@ def test_a_corrected_path_has_each_of_its_motions_turned():
     poses, _ = drive(20, start=start)
     b = rotation(KNOWN)
     ahead, right = b @ [0, 0, 1], rotation((0, 0, 1.0)) @ [1, 0, 0]
-    assert ahead[0] < 0 and ahead[1] < 0 < right[1]  # to the left and up; right goes down
+    assert ahead[0] < 0 and ahead[1] < 0 < right[1]  # forward turns left and up, right turns down
     after = corrected(poses, KNOWN)
     assert after[0] == pytest.approx(start)
     before, motion = (np.linalg.inv(path[:-1]) @ path[1:] for path in (poses, after))
@@ -56,7 +56,7 @@ def test_a_known_rotation_is_recovered_within_its_intervals(seed):
 def test_failed_steps_do_not_count_much():
     estimated, true = drive()
     broken = estimated.copy()
-    for index in (30, 90, 91, 150):  # a motion to the side, and one that turned wrong
+    for index in (30, 90, 91, 150):  # a motion to the side with a wrong turn
         wrong = np.eye(4)
         wrong[:3, :3], wrong[:3, 3] = rotation((0, 5.0, 0)), (0.3, 0, 0)
         broken[index:] = broken[index - 1] @ wrong @ np.linalg.inv(estimated[index - 1]) @ estimated[index:]
@@ -64,14 +64,14 @@ def test_failed_steps_do_not_count_much():
     assert result.angles == pytest.approx(KNOWN, abs=0.15)
 
 
-def test_what_does_not_show_is_not_determined():
+def test_too_little_motion_leaves_angles_undetermined():
     straight = boresight.estimate([drive(turning=0)])
     assert np.isnan(straight.angles[2]) and np.isnan(straight.low[2]) and np.isfinite(straight.angles[:2]).all()
     assert straight.usable[2] == 0
     assert np.isnan(boresight.estimate([drive(5)]).angles).all()
 
 
-def test_the_table_says_what_the_rotation_explains_of_each_sequence():
+def test_the_table_compares_errors_with_and_without_the_boresight():
     paths = {}
     for seed, name in enumerate(("04", "05", "00")):
         estimated, true = drive(seed=seed)

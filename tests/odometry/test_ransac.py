@@ -1,4 +1,4 @@
-"""RANSAC gives the bits of cv2.findEssentialMat."""
+"""RANSAC returns the same bits as cv2.findEssentialMat."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -18,7 +18,7 @@ def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBA
 
 
 def scene(random, count, outliers=0.3, noise=2e-4, motion=1.0, depth=(4, 40), turn=0.02):
-    """Correspondences of a camera that moves forward by `motion`; the first of them, a share `outliers`, are wrong."""
+    """Correspondences (current, previous) of a camera that moves forward by `motion`; the first ones are outliers."""
     points = random.uniform([-10, -3, depth[0]], [10, 3, depth[1]], (count, 3))
     rotation = cv2.Rodrigues(random.normal(0, turn, 3))[0]
     moved = points @ rotation.T - motion * (np.array([0, 0, 1]) + random.normal(0, 0.05, 3))
@@ -83,16 +83,16 @@ def test_other_thresholds_and_probabilities():
 
 
 def test_few_samples_are_solved_by_opencv(monkeypatch):
-    """What makes it fast: OpenCV is asked about a few samples of five, and never about everything."""
-    real, asked = cv2.findEssentialMat, []
+    """This makes the search fast: OpenCV solves a few samples of five and never does the whole search."""
+    real, sizes = cv2.findEssentialMat, []
     current, previous = scene(np.random.default_rng(1), 1000, outliers=0.5)
     monkeypatch.setattr(cv2, "findEssentialMat", lambda points, *arguments, **options: (
-        asked.append(len(points)), real(points, *arguments, **options))[1])
+        sizes.append(len(points)), real(points, *arguments, **options))[1])
     ransac.find_essential_matrix(current, previous, THESIS.threshold, pose.PROBABILITY)
-    assert 0 < len(asked) < 60 and set(asked) == {5}  # of some 200 samples
+    assert 0 < len(sizes) < 60 and set(sizes) == {5}  # of about 200 samples
 
 
-def test_a_wrong_forecast_leaves_everything_to_opencv(monkeypatch):
+def test_opencv_does_the_whole_search_if_the_bounds_were_wrong(monkeypatch):
     monkeypatch.setattr(ransac, "_opencv_solution", lambda *arguments: (1, None, None))
     assert assert_same_bits(*scene(np.random.default_rng(2), 500))
 
@@ -109,9 +109,9 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
             unsure += 1
             continue
         stack, _ = opencv(current, previous, 1e-3)
-        theirs = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
-        assert len(theirs) == len(solutions)
-        for matrix in theirs:
+        matrices = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
+        assert len(matrices) == len(solutions)
+        for matrix in matrices:
             distances = np.minimum(np.linalg.norm(solutions - matrix, axis=1),
                                    np.linalg.norm(solutions + matrix, axis=1))
             shares.append((distances / margins).min())
@@ -126,7 +126,7 @@ def test_real_roots_of_a_known_polynomial():
     np.testing.assert_allclose(computed, roots, rtol=1e-9)
     double = np.poly([1.0, 1.0, 3.0, -2.0, 1j, -1j, 2j, -2j, 3j, -3j]).real
     extrema = five_point.real_roots(double)[2]
-    assert np.abs(extrema - 1).min() < 1e-6  # where it is 0, so that the caller sees that a root may be double or none
+    assert np.abs(extrema - 1).min() < 1e-6  # the double root, where the polynomial is 0
 
 
 def test_same_bits_in_threads():
@@ -137,7 +137,7 @@ def test_same_bits_in_threads():
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["00", "05", "06"])
 def test_same_bits_on_real_frames(kitti_real, name, monkeypatch):
-    odometry.odometry.warm_up(False)  # by place, as `Odometry` does, or it is not the same call
+    odometry.odometry.warm_up(False)  # now, so that it adds no pair; lru_cache knows only the positional call
     pairs, real = [], ransac.find_essential_matrix
     monkeypatch.setattr(ransac, "find_essential_matrix", lambda *arguments: (
         pairs.append(arguments[:2]), real(*arguments))[1])

@@ -1,4 +1,4 @@
-"""What makes the refined estimator reliable: the fit, the sign of slow steps, and the consistency of motions."""
+"""The refined estimator: the fit, the sign of slow steps and the consistency with the motion prior."""
 
 from dataclasses import replace
 
@@ -21,12 +21,12 @@ REFINED = replace(THESIS, estimator="refined")
 
 
 def turn(degrees):
-    """A rotation about the vertical."""
+    """Rotation about the vertical axis."""
     return Rotation.from_euler("Y", degrees, degrees=True).as_matrix()
 
 
 def seen(world, rotation, translation, noise=0.0, seed=0):
-    """Correspondences (current, previous) of points (N, 3) in the current camera under a motion to the previous one."""
+    """Correspondences (current, previous) of points (N, 3) in the current camera and its motion to the previous one."""
     moved = world @ rotation.T + translation
     current, previous = (points[:, :2] / points[:, 2:] for points in (world, moved))
     return current, previous + np.random.default_rng(seed).normal(0, noise, previous.shape)
@@ -38,13 +38,13 @@ def street(count=300, seed=0):
 
 
 def hedge():
-    """Correspondences of points along one line, under 1 degree of turn and a step ahead."""
+    """Correspondences of points along one line: 1 degree of turn and a step ahead."""
     points = np.array([-3.0, 0.5, 5.0]) + np.linspace(0, 1, 200)[:, None] * [0.5, -0.2, 25.0]
     return seen(points, turn(1), AHEAD, noise=1e-4)
 
 
 def two_motions(*motions, counts):
-    """Correspondences of which some have one motion and some another."""
+    """Correspondences of several motions, `counts` of each."""
     sides = [seen(street(count, seed), *motion, noise=5e-5, seed=seed)
              for seed, (count, motion) in enumerate(zip(counts, motions, strict=True))]
     return tuple(np.concatenate(side) for side in zip(*sides, strict=True))
@@ -78,7 +78,7 @@ def test_of_the_twisted_pair_the_smaller_rotation_is_taken():
 
 
 def test_the_sign_survives_a_slow_step():
-    # All points lie beyond 50 translations, so under PySLAM's rule none of them may vote.
+    # All points lie beyond 50 translations, so OpenCV's recoverPose lets none of them vote.
     current, previous = seen(street() + [0, 0, 20], turn(0.2), 0.3 * AHEAD, noise=5e-5)
     votes, _, _ = pose.recover_pose(essential(turn(0.2), AHEAD), current, previous)
     assert votes < 20
@@ -86,19 +86,19 @@ def test_the_sign_survives_a_slow_step():
         motion = fitted(turn(0.2), start, current, previous)
         assert motion.translation @ AHEAD > 0.999
         assert motion.pose_inliers > 150
-    # no ray meets another at such an angle
+    # no two rays meet at so large an angle
     assert refine.cheirality_votes(turn(0.2), AHEAD, current, previous, 1.0) == (0, 0)
 
 
-def test_the_normal_equations_of_all_points_are_the_sums_of_those_of_each():
+def test_normal_equations_are_sums_over_single_points():
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (2 * refine.POINTS_PER_BLOCK + 7, 4))
     rotation, ahead, scale = Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(), np.array([0.0, 0.6, 0.8]), 0.1
     current, previous = points[:, :2].copy(), points[:, 2:].copy()
-    whole = refine._normal_equations(rotation, ahead, current, previous, scale)
+    totals = refine._normal_equations(rotation, ahead, current, previous, scale)
     parts = [refine._normal_equations(rotation, ahead, current[k:k + 1], previous[k:k + 1], scale)
              for k in range(len(points))]
-    for total, of_each in zip(whole, zip(*parts, strict=True), strict=True):
-        np.testing.assert_allclose(total, sum(of_each), rtol=1e-12, atol=1e-12)
+    for total, terms in zip(totals, zip(*parts, strict=True), strict=True):
+        np.testing.assert_allclose(total, sum(terms), rtol=1e-12, atol=1e-12)
 
 
 def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
@@ -118,10 +118,10 @@ def test_points_on_one_line_do_not_determine_the_motion():
     assert np.isinf(fitted(turn(1), AHEAD, *seen(street(4), turn(1), AHEAD)).rotation_std_deg)
 
 
-# One step after others
+# A step and its prior
 
 
-def test_the_search_near_an_expected_motion_finds_it_in_a_minority():
+def test_the_search_near_an_expected_motion_finds_it_among_fewer_points():
     true, other = (turn(2), AHEAD), (turn(-1), np.array([0.8, 0.0, 0.6]))
     points = two_motions(true, other, counts=(120, 180))
     for rotation, translation in (true, other):
@@ -139,10 +139,10 @@ def test_a_consistent_motion_is_used_as_it_is():
     np.testing.assert_array_equal(prior.rotation, used.rotation)
 
 
-def test_shuffles_that_end_in_several_minima_meet_again():
+def test_different_minima_end_in_the_same_motion():
     points = seen(street(60), turn(1), 0.15 * AHEAD, noise=1e-4)
     start = fitted(turn(1), AHEAD, *points)
-    for off in (0.1, -0.1):  # as if RANSAC had led elsewhere
+    for off in (0.1, -0.1):  # as if RANSAC had led to another minimum
         motion = replace(start, rotation=turn(off) @ start.rotation, support=start.support - 2)
         used, _, flag = checked(motion, *points, 0.15, MotionPrior(turn(1), AHEAD, 0.15))
         assert flag == "" and degrees_apart(start.rotation, used.rotation) < 0.01
@@ -161,7 +161,7 @@ def test_of_two_motions_the_consistent_one_is_used_and_flagged():
 
 @pytest.mark.parametrize("motion", [(turn(8), AHEAD), (turn(0.5), -AHEAD), (turn(-4), np.array([0.8, 0, 0.6]))])
 def test_an_inconsistent_motion_that_nothing_else_explains_is_used_and_flagged_once(motion):
-    """A sharp turn at a low rate of frames, and reversing after a stop."""
+    """A sharp turn at a low frame rate, and reversing after a stop."""
     points = seen(street() + [0, 0, 5], *motion, noise=5e-5)
     estimated, prior, flags = fitted(*motion, *points), MotionPrior(turn(1), AHEAD, 0.5), []
     for _ in range(3):
@@ -177,11 +177,11 @@ def test_a_motion_that_no_point_determines_repeats_the_prior():
     motion = fitted(turn(7), np.array([1.0, 0.0, 0.0]), *hedge())
     used, after, flag = checked(motion, *hedge(), 0.5, prior)
     assert flag == NOT_DETERMINED and after is prior
-    np.testing.assert_allclose(used.rotation, turn(0.5), atol=1e-12)  # the same curve over half the way
+    np.testing.assert_allclose(used.rotation, turn(0.5), atol=1e-12)  # the same curve over half the distance
     np.testing.assert_array_equal(used.translation, AHEAD)
 
 
-def test_the_first_step_is_used_where_the_camera_looks_elsewhere():
+def test_the_first_step_is_used_if_the_camera_looks_sideways():
     sideways = np.array([1.0, 0.0, 0.0])
     points = seen(street(), turn(0.5), sideways)
     motion = fitted(turn(0.5), sideways, *points)
@@ -194,7 +194,7 @@ def test_the_first_step_is_used_where_the_camera_looks_elsewhere():
 
 
 def column_at(drive, index):
-    """Masks of a drive that leave everything, but in one frame nothing but a column of points."""
+    """Masks of a drive that allow all keypoints, but in frame `index` only a narrow column."""
     masks = np.full((len(drive), *drive.frame(0).shape), 255, np.uint8)
     masks[index] = 0
     masks[index, :, 100:102] = 255
@@ -210,7 +210,7 @@ def test_a_line_beside_the_road_costs_one_flagged_step(seed):
     assert metrics.rmse(result.poses, drive.poses) < 0.05
 
 
-def test_a_plain_drive_is_not_flagged_and_the_fit_is_closer_to_the_truth_and_varies_less():
+def test_on_a_plain_drive_the_fit_has_no_flags_and_its_errors_are_smaller_and_vary_less():
     drive, errors = Street(5), {}
     for estimator in ("thesis", "inliers", "refined"):
         results = [odometry.run(drive, replace(THESIS, estimator=estimator, shuffle_seed=seed)) for seed in range(3)]
@@ -222,12 +222,12 @@ def test_a_plain_drive_is_not_flagged_and_the_fit_is_closer_to_the_truth_and_var
 
 @pytest.mark.real
 @pytest.mark.parametrize("seed", [None, 2, 4])
-def test_few_keypoints_keep_their_way_through_a_turn(kitti_real, seed):
-    """05, frames 128 to 149: a turn seen in points far away, where a shift to the side explains 500 points as well."""
+def test_a_turn_is_estimated_from_few_keypoints(kitti_real, seed):
+    """05, frames 128 to 149: the points are far away, so a shift to the side explains them as well as the turn."""
     sequence = Sequence(kitti_real, "05")
     settings = replace(REFINED, max_keypoints=500, shuffle_seed=seed)
     follower = Odometry(sequence.intrinsics, settings, sequence.poses[128])
-    follower.count = 128  # the frame's number is part of the order's seed
+    follower.count = 128  # the shuffle's seed includes the frame number
     metres = odometry.scales(sequence)
     flags = set()
     for index in range(128, 150):
@@ -241,7 +241,7 @@ def test_few_keypoints_keep_their_way_through_a_turn(kitti_real, seed):
 
 @pytest.mark.real
 def test_a_second_start_leaves_a_poor_minimum(kitti_real):
-    """05, frames 0 and 1: fitted once, six orders of 300 points end in directions up to 11 degrees apart."""
+    """05, frames 0 and 1: without a second start, six shuffles of 300 points give headings up to 11 degrees apart."""
     sequence = Sequence(kitti_real, "05")
     directions = []
     for seed in range(6):
@@ -251,11 +251,11 @@ def test_a_second_start_leaves_a_poor_minimum(kitti_real):
     assert np.degrees(np.arccos(np.min(np.array(directions) @ np.transpose(directions)))) < 4
 
 
-# All keypoints where masked ones do not determine the motion
+# Fallback on all keypoints
 
 
 @pytest.mark.parametrize("estimator", ["thesis", "refined"])
-def test_the_fallback_uses_all_keypoints_where_masks_leave_too_few(small_world, estimator):
+def test_the_fallback_uses_all_keypoints_if_masks_leave_too_few(small_world, estimator):
     drive = Sequence(small_world / "kitti", "00")
     plain = replace(THESIS, estimator=estimator)
     settings = replace(plain, fallback=True)
@@ -268,7 +268,7 @@ def test_the_fallback_uses_all_keypoints_where_masks_leave_too_few(small_world, 
     every = odometry.run(drive, plain)
     assert np.array_equal(results["few"].poses, every.poses) and np.array_equal(results["no mask"].poses, every.poses)
     assert results["few"].flagged[ALL_KEYPOINTS] == len(drive) - 1 and ALL_KEYPOINTS not in results["no mask"].flagged
-    assert results["last"].flagged[ALL_KEYPOINTS] == 1  # only the last step starts from a frame with such a mask
+    assert results["last"].flagged[ALL_KEYPOINTS] == 1  # only the last step starts from a frame with few keypoints
     assert np.array_equal(results["last"].poses, every.poses)
     assert ALL_KEYPOINTS not in results["without"].flagged
     assert not np.array_equal(results["without"].poses[-1], every.poses[-1])
