@@ -19,7 +19,7 @@ import numpy as np
 from thesis_repro.compiled import fast, inner
 
 SAMPLE_SIZE = 5
-MIN_INDEPENDENCE = 1e-8  # of five epipolar constraints: with less, no solution is trusted
+MIN_INDEPENDENCE = 1e-8  # of five epipolar constraints; with less, no solution is trusted
 
 
 def _signs() -> np.ndarray:
@@ -58,8 +58,9 @@ TO_QUADRATIC, TO_CUBIC = _products()
 def null_space(five):
     """Step 1: independence of five epipolar constraints (0 to 1) and the basis X, Y, Z, W (4, 9; matrices row by row).
 
-    A constraint is (u, v, 1) E (x, y, 1)^T = 0. Nister uses a QR factorisation. This is Gram-Schmidt, run twice against
-    rounding. It gives OpenCV's basis: in another basis, rounding would change the solutions by other amounts.
+    A constraint is (u, v, 1) E (x, y, 1)^T = 0. An independence below MIN_INDEPENDENCE is returned as 0. Nister uses a
+    QR factorisation. This is Gram-Schmidt, run twice against rounding. It gives OpenCV's basis: in another basis,
+    rounding would change the solutions by other amounts.
     """
     rows, independence = np.empty((9, 9)), 1.0
     for k in range(9):

@@ -8,17 +8,7 @@ units of ROUNDING, times SAFETY_FACTOR.
 import numpy as np
 
 from thesis_repro.compiled import fast, inner
-from thesis_repro.odometry.opencv_exact.five_point import (
-    MIN_INDEPENDENCE,
-    constraints,
-    determinant,
-    eliminate,
-    essential,
-    null_space,
-    real_roots,
-    row_values,
-    value,
-)
+from thesis_repro.odometry.opencv_exact import five_point
 
 ROUNDING = 2.0**-52  # of a number of size 1
 # Among 200,000 solutions of real and degenerate scenes, no difference was larger than 1.4 times the estimate.
@@ -37,29 +27,29 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     """
     solutions, margins, b, b_sizes = np.empty((10, 9)), np.empty(10), np.zeros((3, 13)), np.empty((3, 13))
     unsure = False, solutions[:0], margins[:0]
-    independence, basis = null_space(five)  # step 1
-    if not independence > MIN_INDEPENDENCE:
+    independence, basis = five_point.null_space(five)  # step 1
+    if independence == 0:
         return unsure
-    equations = constraints(basis)  # step 2
-    if not eliminate(equations, b):  # step 3
+    equations = five_point.constraints(basis)  # step 2
+    if not five_point.eliminate(equations, b):  # step 3
         return unsure
     for i in range(3):
         for j in range(13):
             b_sizes[i, j] = abs(b[i, j])
     errors = _elimination_errors(equations)
-    polynomial = determinant(b)  # step 4
-    solved, roots, extrema = real_roots(polynomial)  # step 5
+    polynomial = five_point.determinant(b)  # step 4
+    solved, roots, extrema = five_point.real_roots(polynomial)  # step 5
     if not solved:
         return unsure
     work, degree = np.empty((4, 3, 3)), len(polynomial) - 1
     for k in range(len(extrema)):  # a value as small as rounding: a double root or none
         error = _determinant_error(b, b_sizes, errors, extrema[k], work)
-        if not abs(value(polynomial, degree, extrema[k])) > SAFETY_FACTOR * ROUNDING * error:
+        if not abs(five_point.value(polynomial, degree, extrema[k])) > SAFETY_FACTOR * ROUNDING * error:
             return unsure
     for k in range(len(roots)):
         error = _determinant_error(b, b_sizes, errors, roots[k], work)
         best = _best_row(work[3])
-        essential(work[3, best], basis, roots[k], solutions[k])  # step 6
+        five_point.essential(work[3, best], basis, roots[k], solutions[k])  # step 6
         change = 1 / independence + _solution_error(b, best, roots[k], error, polynomial, work)
         margins[k] = MIN_MARGIN + SAFETY_FACTOR * ROUNDING * change
         if not margins[k] < MAX_MARGIN:
@@ -106,8 +96,8 @@ def _determinant_error(b, b_sizes, errors, z, work):
     size = abs(z)
     powers = 1 + size + size * size
     for i in range(3):
-        values[i, 0], values[i, 1], values[i, 2] = row_values(b[i], z)
-        sizes[i, 0], sizes[i, 1], sizes[i, 2] = row_values(b_sizes[i], size)
+        values[i, 0], values[i, 1], values[i, 2] = five_point.row_values(b[i], z)
+        sizes[i, 0], sizes[i, 1], sizes[i, 2] = five_point.row_values(b_sizes[i], size)
         error = errors[2 * i] + size * errors[2 * i + 1]
         wrong[i, 0], wrong[i, 1] = error * powers + sizes[i, 0], error * powers + sizes[i, 1]
         wrong[i, 2] = error * (1 + size * powers) + sizes[i, 2]
