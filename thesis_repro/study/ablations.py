@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import joblib
 import numpy as np
 import pandas as pd
 
-from thesis_repro import longrun, masks, odometry, stages
+from thesis_repro import masks, odometry, stages
 from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
@@ -22,6 +21,7 @@ from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.odometry.pose import normalise
+from thesis_repro.study import cluster
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.controls import CORRECTED
 from thesis_repro.study.jobs import CONTROL_WIDTH
@@ -29,7 +29,7 @@ from thesis_repro.study.runner import measures
 
 Runs = dict[tuple[str, str, int], tuple[OdometrySettings, Masks | None]]  # by method, estimator, repetition
 ESTIMATORS = ("thesis", "inliers", "refined")
-REPETITIONS, BASELINE_REPETITIONS = 3, 8  # the second: all keypoints under the thesis's estimator
+REPETITIONS, BASELINE_REPETITIONS = 3, 8  # the second is for all keypoints with the thesis's estimator
 VEGETATION = (ID["vegetation"], ID["terrain"])
 FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesis's 2000
 
@@ -68,13 +68,14 @@ def measure(kitti: Path, names: Iterable[str], labels: Path, folder: Path, *, fr
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in metres after an
     alignment with scale).
     """
-    calls = [joblib.delayed(_measure)(kitti, name, labels / name, folder / name, frames, options) for name in names]
-    work = joblib.Parallel(n_jobs=processes, return_as="generator", initializer=longrun.end_with_parent)(calls)
-    paths = list(progress(work, "ablations", total=len(calls), unit="sequence"))
-    return pd.concat([pd.read_csv(path, dtype={"sequence": str}) for path in paths], ignore_index=True)
+    calls = [(kitti, name, labels / name, folder / name, frames, options) for name in names]
+    with cluster.open_pool(processes) as pool:
+        tables = dict(progress(pool.run(_measure, calls), "ablations", total=len(calls), unit="sequence"))
+    return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
 
 
-def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | None, options: dict[str, Any]) -> Path:
+def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | None, options: dict[str, Any]
+             ) -> pd.DataFrame:
     sequence = Sequence(kitti, name).subset(frames)
     stages.stage(folder, options=options, code=stages.code("study/ablations"),
                  **stages.made_with("opencv-python-headless", "numpy", "numba"),
@@ -91,7 +92,7 @@ def _measure(kitti: Path, name: str, labels: Path, folder: Path, frames: int | N
                 | {"sim3": metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]}
                 for (method, estimator, repetition), result in zip(runs, results.values(), strict=True)]
         write_text(path, pd.DataFrame(rows).assign(sequence=name).to_csv(index=False))
-    return path
+    return pd.read_csv(path, dtype={"sequence": str})
 
 
 def runs_of(sequence: Sequence, labels: Path, *, repetitions: int = REPETITIONS,

@@ -4,7 +4,6 @@ If the odometry gains as much from a control, the segmentation is not what helps
 in `masks`.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -38,7 +37,7 @@ class OtherFrame:
     """The mask of the frame half a sequence away: similar boundaries in the wrong place."""
 
     def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
-        self.masks = source.masks(sequence, dilation_width)
+        self.sequence, self.masks = sequence, source.masks(sequence, dilation_width)
         self.paths = self.masks.paths
         self.line_width = dilation_width or LINE_WIDTH
 
@@ -88,10 +87,6 @@ class RandomLines(OtherFrame):
 class ImageEdges(OtherFrame):
     """The strongest Canny edges of the frame, dilated, that cover as many pixels as its mask. They need no network."""
 
-    def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
-        super().__init__(source, sequence, dilation_width)
-        self.sequence = sequence
-
     def __getitem__(self, index: int) -> np.ndarray:
         frame, target = self.sequence.frame(index), np.count_nonzero(self.masks[index])
         across, down = cv2.spatialGradient(frame)
@@ -114,21 +109,21 @@ class ImageEdges(OtherFrame):
 
 
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-OF_MASKS: dict[str, Callable[[Source, Sequence, int | None], ControlMasks]] = {
-    "fallback": Source.masks,  # the same masks; the odometry falls back to all keypoints (OdometrySettings)
-    "other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges}
+OF_MASKS = {"other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges}
 LITERATURE = ("static", "inverse", "static-boundaries")  # as SLAM systems use a segmentation, see masks.KEEP
 OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
-MASKS = (*OF_MASKS, *OF_LABEL_MAPS)
+MASKS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)  # "fallback" is a setting of the odometry, with the same masks
 
 
 def masks(method: str, source: Source, sequence: Sequence, dilation_width: int | None) -> ControlMasks:
-    """Return the masks of one of MASKS for a sequence, as a control of the masks of `source`.
+    """Return the masks of a sequence for a method: "masked" or one of MASKS, a control of the masks of `source`.
 
     dilation_width: pixels, for masks from label maps.
     """
     if method in OF_MASKS:
         return OF_MASKS[method](source, sequence, dilation_width)
+    if method in ("masked", "fallback"):
+        return source.masks(sequence, dilation_width)
     folder, settings = source.folder, source.settings
     if method == "true-labels":
         folder, settings = true_labels(sequence.root, sequence.name), replace(settings, ids="labels")

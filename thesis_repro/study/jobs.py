@@ -70,10 +70,7 @@ class Job:
         """Return the job's masks, or None for a job without masks. sources: by name."""
         if self.method in UNMASKED:
             return None
-        source = sources[self.source]
-        if self.method == "masked":
-            return source.masks(sequence, self.dilation_width)
-        return controls.masks(self.method, source, sequence, self.dilation_width)
+        return controls.masks(self.method, sources[self.source], sequence, self.dilation_width)
 
 
 def first_jobs(kitti: Path, names: Iterable[str], widths: Mapping[str, Iterable[int]], *, tested: int | None = None,
@@ -114,7 +111,7 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
 
     best: the table of `thesis_tables.best_widths`.
     """
-    return _repeated([Job(name, "reduced", max_keypoints=_whole(number))
+    return _repeated([Job(name, "reduced", max_keypoints=max(1, round(number)))  # OpenCV takes 0 as "no limit"
                       for name, number in best["mean_keypoints"].items()], ["thesis"], repetitions)
 
 
@@ -129,13 +126,9 @@ def keypoint_control_jobs(keypoints: Mapping[str, float], kitti: Path, frames: i
     jobs: list[Job] = []
     for name, number in keypoints.items():
         distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
-        jobs += _repeated([Job(name, "fewer", width, max_keypoints=_whole(number), source=source),
+        jobs += _repeated([Job(name, "fewer", width, max_keypoints=max(1, round(number)), source=source),
                            Job(name, "spread", width, min_distance=distance, source=source)], estimators, repetitions)
     return jobs
-
-
-def _whole(number: float) -> int:
-    return max(1, round(number))  # OpenCV takes 0 as "no limit"
 
 
 def in_passes(jobs: Iterable[Job], sequences: Mapping[str, Sequence], workers: int) -> list[list[Job]]:
@@ -147,10 +140,10 @@ def in_passes(jobs: Iterable[Job], sequences: Mapping[str, Sequence], workers: i
     groups: dict[str, dict[Job, list[Job]]] = {}
     for job in jobs:
         groups.setdefault(job.sequence, {}).setdefault(replace(job, estimator="", repetition=0), []).append(job)
-    total = sum(len(alike) * len(sequences[name]) for name, alike in groups.items())
+    total = sum(len(job_lists) * len(sequences[name]) for name, job_lists in groups.items())
     passes = []
-    for name, alike in groups.items():
-        job_lists = list(alike.values())
+    for name, by_keypoints in groups.items():
+        job_lists = list(by_keypoints.values())
         size = max(1, round(total / (PIECES * workers) / len(sequences[name]))) if workers > 1 else len(job_lists)
         passes += [sum(job_lists[start:start + size], []) for start in range(0, len(job_lists), size)]
     return passes

@@ -24,18 +24,12 @@ from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
 
-CHECKPOINTS = f"pass-{'[0-9a-f]' * 12}.npz"  # pattern of the file names of `_checkpoint`
+CHECKPOINTS = f"pass-{'[0-9a-f]' * 12}.npz"  # pattern of the file names, one for each unfinished pass
 
 
 def _result(folder: Path, job: Job) -> Path:
     """Return the result file of a job, which is written when the job is done."""
     return folder / job.sequence / f"{job.name}.csv"
-
-
-def _checkpoint(folder: Path, jobs: list[Job]) -> Path:
-    """Return the checkpoint file of the jobs of one pass."""
-    digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
-    return folder / jobs[0].sequence / f"pass-{digest}.npz"
 
 
 def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *,
@@ -198,7 +192,8 @@ def _run_pass(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], f
               ) -> dict[Job, str]:
     """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason} for the failed ones."""
     cv2.setNumThreads(1)  # the processes already use every core
-    checkpoint = _checkpoint(folder, jobs)
+    digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
+    checkpoint = folder / sequence.name / f"pass-{digest}.npz"
     failures: dict[Job, str] = {}
     try:
         stages.check_worker(folder / sequence.name, record, **_versions())

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import joblib
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, longrun, masks, odometry, stages
+from thesis_repro import InputError, masks, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
+from thesis_repro.study import cluster
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import by_name, masks_of
 from thesis_repro.study.sources import Source
@@ -48,10 +48,11 @@ def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source],
     """
     jobs, sources = list(jobs), by_name(labels)
     names = sorted({job.sequence for job in jobs})
-    work = joblib.Parallel(n_jobs=processes, return_as="generator", initializer=longrun.end_with_parent)(
-        joblib.delayed(_time_jobs)([job for job in jobs if job.sequence == name], Sequence(kitti, name).subset(frames),
-                                   sources, folder / name / f"seconds-{frames}.csv") for name in names)
-    return pd.concat(progress(work, "timing", total=len(names), unit="sequence"), ignore_index=True)
+    calls = [([job for job in jobs if job.sequence == name], Sequence(kitti, name).subset(frames), sources,
+              folder / name / f"seconds-{frames}.csv") for name in names]
+    with cluster.open_pool(processes) as pool:
+        tables = dict(progress(pool.run(_time_jobs, calls), "timing", total=len(calls), unit="sequence"))
+    return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
 
 
 def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path) -> pd.DataFrame:
