@@ -374,14 +374,14 @@ MASKS = {
     "--keep": dict(metavar="boundaries|static|inverse|static-boundaries", default="boundaries",
                    help="keypoints on boundaries, on all but movable things, on all but boundaries, or on boundaries "
                         "between static classes (boundaries)"),
-    "--ids": dict(metavar="labels|train", default="labels", help="Cityscapes label ids or train ids (labels)"),
+    "--ids": dict(metavar="labels|train", default="labels", help="label maps hold label ids or train ids (labels)"),
     "--margin": dict(type=int, default=0, metavar="PIXELS", help="no keypoints near the frame's border (0)"),
 }
 
 
 def build_parser():
     parser = _Parser(prog="thesis-repro", description="Keypoint masks from semantic segmentation for monocular visual "
-                     "odometry. thesis-repro COMMAND --help shows options and examples.")
+                     "odometry. thesis-repro COMMAND --help shows options, with defaults in parentheses, and examples.")
     parser.add_argument("--version", action="version", version=f"thesis-repro {version('thesis-repro')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     examples = (Path(__file__).parent / "report/templates/examples.txt").read_text(encoding="utf-8").splitlines()
@@ -416,7 +416,7 @@ def build_parser():
 
     add = command(masks, *SEQUENCE, *MASKS, "--output").add_argument
     add("--labels", type=Path, required=True, metavar="DIR", help="a label map for each frame")
-    add("--dilation", **WIDTHS, required=True, help="in pixels: 10, 5,10 or 1-15; several get a subfolder each")
+    add("--dilation", **WIDTHS, required=True, help="in pixels, such as 5,10 or 1-15; several get a subfolder each")
 
     sub = command(odometry, *SEQUENCE, *MASKS, "--invert", "--plot", "--json")
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
@@ -444,8 +444,8 @@ def build_parser():
         add(f"--{kind}", dest="sources", action="append", metavar="DIR",
             type=lambda text, kind=kind: (kind, _path(text)),
             help=f"folder with a subfolder NN for each sequence ({content}); can be repeated")
-    add("--name", action="append", default=[], metavar="NAME", help="of a --labels or --masks folder (folder's name)")
-    add("--widths", **WIDTHS, help="dilation widths, in pixels, of masks from label maps: 10, 5,10 or 1-15 (1-15)")
+    add("--name", action="append", default=[], metavar="NAME", help="name of a --labels or --masks folder (its name)")
+    add("--widths", **WIDTHS, help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)")
     add("--controls", type=int, nargs="?", const=10, metavar="W", help="run controls, too, for masks of width W (10)")
     add("--repetitions", type=int, default=5, metavar="N", help="shuffles of the matched points for each run (5)")
     add("--estimator", nargs="+", choices=("thesis", "refined"), default=["thesis"], help="one or both (thesis)")

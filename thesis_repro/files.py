@@ -166,8 +166,7 @@ def atomic(path):
         number, name = longrun.number_of(error), getattr(error, "filename", None)
         if number is None or name not in (None, str(temporary), temporary):
             raise
-        # libraries name no file, or the temporary one
-        raise OSError(number, os.strerror(number), str(path)) from error
+        raise OSError(number, os.strerror(number), str(path)) from error  # instead of the temporary name or none
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -193,8 +192,7 @@ def is_stdout(path):
 
 
 def check_output(path):
-    """Raise InputError if an output file cannot be written to `path`, or if `path` is in a folder of results, with
-    which it could be deleted later."""
+    """Raise InputError if a file cannot be written to `path`, or could be deleted later with results around it."""
     if is_stream(path):
         return
     path = path.resolve() if path.is_symlink() else path.absolute()

@@ -143,19 +143,18 @@ def store(path, job, arrays):
         np.savez(file, job=json.dumps(job), **{f"array {name}": array for name, array in arrays.items()})
 
 
-def resume(path, arrays=True):
+def resume(path):
     """Return (job, arrays) of a checkpoint that `store` wrote, or None if there is no file.
 
-    `arrays` False leaves the arrays out, which is faster. Raises InputError for a damaged file.
+    Raises InputError for a damaged file.
     """
     path = Path(path)
     if not path.is_file():
         return None
     try:
         with np.load(path, allow_pickle=False) as checkpoint:
-            names = [name for name in checkpoint.files if name != "job"] if arrays else []
-            return (json.loads(str(checkpoint["job"])),
-                    {name.removeprefix("array "): checkpoint[name] for name in names})
+            arrays = {name.removeprefix("array "): checkpoint[name] for name in checkpoint.files if name != "job"}
+            return json.loads(str(checkpoint["job"])), arrays
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         raise InputError(f"{path}: is damaged; delete it to start from the beginning") from None
 

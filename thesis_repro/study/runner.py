@@ -144,7 +144,7 @@ def _passes(jobs: list[Job], sequences: Mapping[str, Sequence], folder: Path, wo
         waiting = {key: job for key, job in sequence_jobs.items() if not _result(folder, job).is_file()}
         for path in sorted((folder / name).glob(CHECKPOINTS)):
             try:
-                keys = stages.resume(path, arrays=False)[0]["job"]["runs"]
+                keys = stages.resume(path)[0]["job"]["runs"]
             except InputError:  # a damaged checkpoint is deleted below
                 keys = []
             if not sequence_jobs.keys() >= set(keys):
