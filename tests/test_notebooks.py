@@ -147,7 +147,6 @@ def test_bad_data_stops_before_the_notebooks(tmp_path, tiny_kitti):
     failed = make_figures(tmp_path, f"KITTI={tiny_kitti}")
     assert failed.returncode != 0 and "poses/00.txt" in failed.stderr
     assert not list((tmp_path / "build").rglob("*.ipynb"))
-    assert "PROFILE=huge" in make_figures(tmp_path, "PROFILE=huge").stderr
     assert "PROFIL: unknown setting" in make_figures(tmp_path, "PROFIL=smoke").stderr
 
 

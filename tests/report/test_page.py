@@ -93,15 +93,6 @@ def test_the_answer_comes_first_and_41_artefacts_in_the_order_of_the_thesis(run)
     assert "41 of 41" in shown.text and shown.text.count("What it shows") == 1
 
 
-def test_chapter_2_long_tables_and_details_of_the_findings_are_folded(run):
-    (run.settings.figures / "table_4_1.csv").write_text("sequence,frames\n" + "00,77\n" * 21)
-    (run.settings.figures / "findings.md").write_text("Masks do not help.\n\n## How\n\nBy odometry.\n")
-    assert not read(run).values("details", "open")
-    folded = "".join(re.findall("</summary>(.*?)</details>", run.page.read_text(), re.DOTALL))
-    texts = 'id="figure_2_01"', 'id="figure_2_12"', "By odometry", "77", 'id="table_3_1"', "Masks do not"
-    assert [text in folded for text in texts] == [True] * 4 + [False] * 2
-
-
 PROBE = """<iframe src="index.html" style="width: 400px; border: 0"></iframe>
 <iframe src="index.html" style="width: 1400px; border: 0"></iframe><pre></pre><script>onload = () => {
 const faults = [];

@@ -42,15 +42,6 @@ def test_random_keypoints_are_a_subset_of_the_asked_size(small_world, amount, lo
     assert np.array_equal(drawn, ablations.random_keypoints(sequence, amount, 0))
 
 
-def test_finished_ablations_are_not_run_again(small_world, small_labels, tmp_path, monkeypatch):
-    arguments = (small_world / "kitti", ["00"], small_labels, tmp_path)
-    options = {"repetitions": 1, "baseline_repetitions": 2, "frames": 5}
-    runs = ablations.measure(*arguments, **options)
-    assert set(runs["sequence"]) == {"00"} and runs["rmse"].notna().all() and (runs["frames"] == 5).all()
-    monkeypatch.setattr(ablations.odometry, "run_many", None)  # would fail
-    assert ablations.measure(*arguments, **options).equals(runs)
-
-
 REPORTED = pd.Series([0.0] * 11)
 
 

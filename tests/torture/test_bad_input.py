@@ -108,11 +108,9 @@ REFUSED = [line.split(" -> ") for line in f"""
 {ODOMETRY} --tum out/path.txt -> --tum out/path.txt
 {ODOMETRY} --tum path.txt/path.tum -> path.txt
 {ODOMETRY} --tum {POSES} -> --tum {POSES}
-{ODOMETRY} --plot {FRAMES}/path.png -> --plot
 odometry --kitti kitti --sequence 77 -> sequences/77
 odometry --kitti kitti --sequence ../00 -> '../00'
 {MASKS[:-3]}labels -> --output labels
-{MASKS[:-3]}mine -> mine
 {STUDY} --widths 900 -> 900
 check-data -> --kitti
 check-data --kitti nowhere -> nowhere

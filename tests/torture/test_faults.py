@@ -1,6 +1,5 @@
 """Faults of the machine: full and read-only disks, a second run, dead workers, too little memory."""
 
-import fcntl
 import os
 import resource
 import shlex
@@ -56,16 +55,6 @@ def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes)
 def test_limits_of_memory_and_of_file_size(words, tmp_path, name, limit, megabytes, named):
     set_limit = partial(resource.setrlimit, limit, (int(megabytes * 2**20),) * 2)
     refused(run(words(name), tmp_path, before=set_limit), named, left=["out", "out/*"])
-
-
-@pytest.mark.torture
-@pytest.mark.parametrize("name", ["synthesize", "training", "predict", "study"])
-def test_a_folder_locked_by_another_run(words, tmp_path, name):
-    (tmp_path / "out").mkdir()
-    descriptor = os.open(tmp_path / "out", os.O_RDONLY)
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    refused(run(words(name), tmp_path), "out")
-    os.close(descriptor)
 
 
 @pytest.mark.torture

@@ -67,11 +67,11 @@ def test_the_page(tmp_path):
         executed = settings.build / "notebooks"
         executed.mkdir(parents=True)
         (tmp_path / "figures").mkdir(exist_ok=True)
+        output = nbformat.v4.new_output("stream", text="1\n" * 2000)
+        cell = nbformat.v4.new_code_cell("1", id="one", outputs=[output])
+        notebook = nbformat.v4.new_notebook(cells=[cell], metadata={"language_info": {"name": "python"}})
         for number in range(12):
-            output = nbformat.v4.new_output("stream", text=f"{number}\n" * 2000)
-            cell = nbformat.v4.new_code_cell("1", id="one", outputs=[output])
-            nbformat.write(nbformat.v4.new_notebook(cells=[cell], metadata={"language_info": {"name": "python"}}),
-                           executed / f"{number:02d}_some.ipynb")
+            nbformat.write(notebook, executed / f"{number:02d}_some.ipynb")
         for path in (ROOT / "figures").glob("*.csv"):
             shutil.copy(path, settings.figures)
 

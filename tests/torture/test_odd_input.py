@@ -60,15 +60,14 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
     assert not any(tag in page for tag in ("<script", "<b>", "<i>"))
 
 
-def make(*words):
-    """Run make without its target `setup`."""
-    return subprocess.run(["make", "-C", trials.ROOT, "-o", ".venv/ready", *words], capture_output=True, text=True,
-                          env=trials.environment())
-
-
 def test_make_takes_odd_folders_and_refuses_unknown_settings(tiny_kitti, tmp_path):
     odd = tmp_path / ODD.replace("$x$_", "").replace("\n", " ")  # make expands $ and ends at a line break
     tiny_kitti.rename(odd)
+
+    def make(*words):
+        return subprocess.run(["make", "-C", trials.ROOT, "-o", ".venv/ready", *words], capture_output=True, text=True,
+                              env=trials.environment())
+
     assert make("check-data", f"KITTI={odd}").returncode == 0
     planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={odd}", f"BUILD={tmp_path / 'build'}")
     assert planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout, planned
@@ -83,7 +82,7 @@ def test_caches_that_cannot_be_written(tmp_path, tiny_kitti):
     package, home = tmp_path / "package" / "thesis_repro", tmp_path / "home"
     shutil.copytree(trials.ROOT / "thesis_repro", package, ignore=shutil.ignore_patterns("__pycache__"))
     home.mkdir()
-    folders = [home, package.parent, package, *(path for path in package.rglob("*") if path.is_dir())]
+    folders = [home, package.parent, package, *package.rglob("*/")]
     for folder in folders:
         folder.chmod(0o555)
     no_caches = dict.fromkeys(("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "NUMBA_CACHE_DIR", "KERAS_HOME"))
