@@ -9,9 +9,9 @@ from typing import TypeAlias
 
 from thesis_repro import InputError, stages
 from thesis_repro.cityscapes import read_label_map
-from thesis_repro.files import listed
+from thesis_repro.files import glance, listed
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
+from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, check_mask_size, read_mask
 
 KINDS = {"labels": "label maps", "masks": "masks"}
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both have `paths`, the files that they read
@@ -87,8 +87,8 @@ def named(folders: Iterable[tuple[str, Path]], names: Iterable[str], settings: M
 def check(sources: Iterable[Source], sequences: Collection[Sequence], widths: Collection[int]) -> None:
     """Raise InputError, before anything runs, if a source lacks a file for a frame or has files of the wrong kind.
 
-    widths: pixels, for masks from label maps. Only the first file of each sequence is read here. The runner reads all
-    files, and a bad one stops only the runs that need it.
+    widths: pixels, for masks from label maps. Only the size of every mask and the first file of each sequence are
+    checked here. The runner reads all files, and a bad one stops only the runs that need it.
     """
     for source in sources:
         kind = KINDS[source.kind]
@@ -101,4 +101,6 @@ def check(sources: Iterable[Source], sequences: Collection[Sequence], widths: Co
                                  "name one with --sequences")
             for width in widths or (1,):  # raises InputError for a width that is too large for the frames
                 paths = source.masks(sequence, width).paths
+            for path in paths if source.kind == "masks" else ():
+                check_mask_size(path, glance(path), sequence.size)
             source.check_file(paths[0], sequence.size)
