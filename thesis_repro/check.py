@@ -1,6 +1,6 @@
-"""What is missing, wrong or odd in the user's KITTI and Cityscapes folders, and what can be run with them.
+"""Checks of the user's KITTI and Cityscapes folders: what is missing, wrong or odd, and which commands can be run.
 
-What is odd can be read, but is hardly what it is taken for. It is a warning: somebody may mean it.
+Odd input is readable but probably not what the user believes it to be. It causes a warning, not an error.
 """
 
 import sys
@@ -17,10 +17,10 @@ from thesis_repro.settings import read_settings
 
 
 class _Problems(list):
-    """Lines that say what is wrong."""
+    """A list of problems, one line each."""
 
     def of(self, function, *arguments):
-        """What a function returns; None where it raises InputError, which is entered."""
+        """Result of a function; None if it raises InputError, whose message is added to the list."""
         try:
             return function(*arguments)
         except InputError as error:
@@ -28,7 +28,7 @@ class _Problems(list):
             return None
 
     def of_each(self, function, items, description):
-        """The same for every item, in threads, for reading and decoding release the interpreter."""
+        """Call a function for every item, in threads, because reading and decoding release Python's lock."""
         calls = (joblib.delayed(self.of)(function, item) for item in items)
         results = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(calls)
         for _ in files.progress(results, description, total=len(items), unit="file"):
@@ -36,10 +36,10 @@ class _Problems(list):
 
 
 def check_kitti(root, deep=False):
-    """Check every sequence below an odometry root; returns (lines that describe, problems).
+    """Check every sequence below an odometry root; returns (lines that describe it, problems).
 
-    Names, numbers, both ends of every file, calibration, times and poses are looked at, and the first and last frame
-    decoded; deep: all frames are, on all cores.
+    Names, numbers, beginning and end of every file, calibration, times and poses are checked, and the first and last
+    frame are decoded. deep: all frames are decoded, on all cores.
     """
     facts, problems, sound = [], _Problems(), []
     every = kitti.with_frames(root)
@@ -56,7 +56,7 @@ def check_kitti(root, deep=False):
 
 
 def _check_sequence(root, name, needs_truth, deep):
-    """(what a sequence holds in one line, its problems)"""
+    """(one line that describes a sequence, its problems)"""
     folder, problems = Path(root) / "sequences" / name, _Problems()
     where = kitti.images_of(folder)
     paths = problems.of(files.images, where)
@@ -95,9 +95,9 @@ def _check_sequence(root, name, needs_truth, deep):
 
 
 def check_cityscapes(root, deep=False, splits=("train", "val")):
-    """Check the training and validation split; returns (lines that describe, problems).
+    """Check the training and validation split; returns (lines that describe them, problems).
 
-    Names and both ends of every file are looked at, and the first and last pair decoded; deep: all pairs are.
+    Names, and beginning and end of every file are checked, and the first and last pair are decoded. deep: all are.
     """
     facts, problems = [], _Problems()
     for split in splits:
@@ -124,9 +124,9 @@ def check_cityscapes(root, deep=False, splits=("train", "val")):
 
 
 def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=False):
-    """Print what is in the folders, what is wrong and what is odd; returns whether nothing is wrong."""
+    """Print the content of the folders, problems and warnings; returns whether there are no problems."""
     wrong = False
-    check_semantic = partial(check_cityscapes, splits=("train",))  # KITTI's street scenes have no other
+    check_semantic = partial(check_cityscapes, splits=("train",))  # KITTI's street scenes have one split
     for option, root, check in (("KITTI", kitti_root, check_kitti), ("CITYSCAPES", cityscapes_root, check_cityscapes),
                                 ("KITTI_SEMANTIC", kitti_semantic, check_semantic)):
         if not root:
@@ -143,23 +143,23 @@ def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=Fals
     return not wrong
 
 
-# What is odd
+# Odd input
 
-FRAME_SECONDS = 0.005, 2  # between frames: less or more are hardly seconds
-MAX_SPEED = 60  # metres a second; KITTI's cars drive up to 27
-AHEAD = 0.5  # of a step, along the camera's axis; KITTI's have 0.97 and more
-OFF_CENTRE = 0.1, 0.15  # of the frame's width and height; KITTI's principal points are within 0.04
-SAMPLE = 6  # frames whose masks are looked at
+FRAME_SECONDS = 0.005, 2  # between frames; other values are probably not in seconds
+MAX_SPEED = 60  # metres a second; the cars of KITTI drive at most 27
+AHEAD = 0.5  # share of a step along the camera's axis; KITTI has 0.97 or more
+OFF_CENTRE = 0.1, 0.15  # offset of the principal point, in frame widths and heights; KITTI has at most 0.04
+SAMPLE = 6  # frames whose masks are checked
 MIN_COVERAGE, MAX_COVERAGE = 0.005, 0.99
-# Of the mean gradient where a mask keeps to that where it does not. The thesis's masks keep less than half of a frame
-# and have 0.98 to 1.6; turned round, they keep more and have 0.64 to 1.02.
+# Ratio of the mean gradient inside a mask to that outside. The thesis's masks cover less than half of a frame and have
+# 0.98 to 1.6. Inverted, they cover more and have 0.64 to 1.02.
 MIN_CONTRAST, MIN_CONTRAST_OF_MOST = 0.7, 0.9
-TURNING = 0.3  # degrees a frame to either side, from which turns can be compared
-MIN_CORRELATION, MAX_TURN_DIFFERENCE = 0.4, 0.5  # of the turns; degrees. Right ones have 0.79 and more, at most 0.04
+TURNING = 0.3  # degrees a frame; smaller turns cannot be compared
+MIN_CORRELATION, MAX_TURN_DIFFERENCE = 0.4, 0.5  # degrees; correct paths have >= 0.79 and <= 0.04
 
 
 def oddities(sequence):
-    """Lines that say why a sequence's times, poses, camera or frames are hardly its own."""
+    """Warnings about a sequence whose times, poses, camera or frames are probably not its own, one line each."""
     lines, where = [], f"sequence {sequence.name}: "
     seconds = np.diff(sequence.times)
     if len(seconds) and not FRAME_SECONDS[0] <= np.median(seconds) <= FRAME_SECONDS[1]:
@@ -185,7 +185,7 @@ def oddities(sequence):
         lines.append(f"{where}calib.txt has the centre {u:g}, {v:g}, frames have {width}x{height} pixels; it must be "
                      "that of these frames, at their size")
     sizes = pd.Series({path: path.stat().st_size for path in sequence.frame_paths})
-    alike = sizes.index[sizes.duplicated(keep=False)]  # few, where frames are compressed
+    alike = sizes.index[sizes.duplicated(keep=False)]  # compressed frames seldom have equal sizes
     copies = alike[pd.Series(stages.contents(alike), dtype=object).duplicated()]
     if len(copies):
         lines.append(f"{where}{len(copies)} frames are copies of others, the first {copies[0].name}; each must be "
@@ -194,7 +194,7 @@ def oddities(sequence):
 
 
 def path_oddities(name, estimated, true):
-    """Lines that say why estimated and true poses, (n, 4, 4) each, are hardly those of one drive."""
+    """Warnings if estimated and true poses, (n, 4, 4) each, are probably not of the same drive, one line each."""
     turns = pd.DataFrame({key: [np.degrees(np.arctan2(step[0, 2], step[2, 2]))
                                 for step in np.linalg.inv(poses[:-1]) @ poses[1:]]
                           for key, poses in (("estimated", estimated), ("true", true))})
@@ -210,7 +210,7 @@ def path_oddities(name, estimated, true):
 
 
 def of_masks(source, sequence):
-    """What `masks.LabelMasks` or a `masks.MaskFolder` of a sequence hold, on SAMPLE frames: (a line, [what is odd])."""
+    """Check the masks of SAMPLE frames of a sequence (LabelMasks or MaskFolder); returns (description, [warnings])."""
     chosen = np.unique(np.linspace(0, len(source) - 1, SAMPLE).round().astype(int))
     made = [source[index] for index in chosen]
     coverage = np.array([masks.coverage(mask) for mask in made])
@@ -259,11 +259,11 @@ def _contrast(frame, mask):
 
 
 def main(path):
-    """Check the data of the settings in the environment, unless `path` says that just these bytes were checked."""
+    """Check the data of the settings in the environment, unless `path` holds the digest of the same data."""
     settings, used, digest = read_settings(), [], None
     kitti_root = None if settings.kitti_is_embedded else settings.kitti
     cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes
-    with suppress(InputError):  # the report says more
+    with suppress(InputError):  # `report` names all problems
         for name in kitti.sequences(kitti_root) if kitti_root else ():
             used += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
         for root, split in ((cityscapes_root, "train"), (cityscapes_root, "val"), (settings.kitti_semantic, "train")):

@@ -1,4 +1,4 @@
-"""Cityscapes: its label table, and image and label map pairs from the official or the thesis's flat layout."""
+"""Cityscapes: the table of labels, and pairs of images and label maps in the official or the thesis's flat layout."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -19,8 +19,8 @@ class Label(NamedTuple):
     color: tuple
 
 
-# Tables 3.1 and 3.2; colours as the Cityscapes scripts draw them. "background" exists in the tables only:
-# the network has 35 outputs, and no label map holds 35 (audit: the tables list one category too many).
+# Tables 3.1 and 3.2; colours as in the Cityscapes scripts. "background" exists in the tables only: the network has 35
+# outputs, and no label map holds 35 (audit row 9).
 LABELS = tuple(Label(*row) for row in [
     ("unlabeled", 0, 1.0, (0, 0, 0)),
     ("ego vehicle", 1, 1.0, (0, 0, 0)),
@@ -63,7 +63,7 @@ N_CLASSES = 35  # Figure A.1: ids 0 to 34
 CLASS_WEIGHTS = np.array([label.weight for label in LABELS[:N_CLASSES]], np.float32)
 COLORS = np.array([label.color for label in LABELS], np.uint8)
 ID = {label.name: label.id for label in LABELS}
-# Cityscapes' train ids, 0 to 18 in this order and 255 for all else, which many networks are trained with
+# Many networks are trained with Cityscapes' train ids: 0 to 18 in this order, and 255 for all other labels.
 TRAINED = ("road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation",
            "terrain", "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")
 LABEL_OF_TRAIN_ID = np.full(256, 255, np.uint8)
@@ -72,7 +72,7 @@ LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
 
 
 class Pair(NamedTuple):
-    """One image and its label map, of which one may be missing (None); `name` is what their file names share."""
+    """An image and its label map, one of which may be missing (None); `name` is the common part of their file names."""
 
     name: str
     image: Path
@@ -80,16 +80,16 @@ class Pair(NamedTuple):
 
 
 def colorize(label_map):
-    """Colours of a label map: (height, width) ids to (height, width, 3) red, green, blue."""
+    """Colours of a label map (height, width): (height, width, 3), red, green, blue."""
     return COLORS[np.minimum(label_map, len(COLORS) - 1)]
 
 
 def pairs(root, split, limit=None):
     """The image and label map pairs of one split ("train" or "val"), sorted by name.
 
-    limit: at most so many of them, spread evenly over the split (its images are sorted by city); None for all.
+    limit: largest number of pairs, spread evenly over the split, whose images are sorted by city; None for all.
     The appendix pairs two unsorted directory listings by position (A.2); here the names decide.
-    Raises InputError for a missing folder, an empty split or an image without its label map.
+    Raises InputError for a missing folder, an empty split, and an image without its label map.
     """
     every = listing(root, split)
     for pair in every:
@@ -100,7 +100,7 @@ def pairs(root, split, limit=None):
 
 
 def listing(root, split):
-    """The pairs of a split, sorted by name, incomplete ones among them. Raises InputError where there are no images.
+    """The pairs of a split, sorted by name, including incomplete ones. Raises InputError if there are no images.
 
     Both layouts are read: the official one (leftImg8bit, gtFine) and the appendix's flat one (train, trainannot).
     """
@@ -129,9 +129,9 @@ def check_complete(pair):
 
 
 def read_image(path, height, width, channels=1):
-    """One image stretched to height x width (A.2.1: bilinear), uint8 (height, width, channels).
+    """One image resized to height x width (bilinear, A.2.1), uint8 (height, width, channels).
 
-    channels: 1 for gray, as the thesis has it, 3 for red, green, blue.
+    channels: 1 for gray, as in the thesis, 3 for red, green, blue.
     """
     image = read_gray(path) if channels == 1 else read_color(path)
     return cv2.resize(image, (width, height)).reshape(height, width, channels)
@@ -140,7 +140,7 @@ def read_image(path, height, width, channels=1):
 def read_label_map(path, train_ids=False):
     """One label map of Cityscapes label ids, uint8. train_ids: the file holds train ids, which are translated.
 
-    Raises InputError for a number that is no such id, and what `read_ids` does.
+    Raises InputError for a number that is not such an id, and as `read_ids` does.
     """
     ids = read_ids(path)
     label_map = LABEL_OF_TRAIN_ID[ids] if train_ids else ids
@@ -155,7 +155,7 @@ def read_label_map(path, train_ids=False):
 def load(image_pairs, size, channels=1):
     """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size), both uint8 (A.2).
 
-    Label maps are resized with nearest neighbour, so that no id is invented.
+    Label maps are resized by nearest neighbour, which invents no ids.
     """
     images = np.empty((len(image_pairs), size, size, channels), np.uint8)
     labels = np.empty((len(image_pairs), size, size), np.uint8)
