@@ -1,31 +1,31 @@
-"""The augmentation of appendix A.3, on integer label maps."""
+"""The augmentation of appendix A.3, applied to integer label maps."""
 
 import os
 import warnings
 
-os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # its look-up for a newer release needs a network
+os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # the search for a newer release needs a network
 
 import albumentations as A
 import numpy as np
 
 from thesis_repro.files import progress
 
-NOTHING = 255  # a label that one-hot encoding turns into zeros everywhere, as the appendix's border fill is
+NOTHING = 255  # a pixel without a class: one-hot encoding gives zeros, like the border in the appendix
 
-# The thesis leaves the noise at its library's defaults of that time: a variance of 10 to 50 grey levels squared.
+# The library's default noise at the time of the thesis: a variance of 10 to 50 grey levels squared.
 # Today's default is about ten times as strong.
 NOISE_STD = (10**0.5 / 255, 50**0.5 / 255)
 
 
 def transform_list(size, fill_mask=NOTHING):
-    """The transforms of A.3 for images of size x size, for `albumentations.Compose`.
+    """Return the transforms of A.3 for images of size x size, for `albumentations.Compose`.
 
-    The appendix transforms one-hot masks of 35 float channels. Every transform here resamples masks with nearest
-    neighbour, so integer label maps give the same labels at one byte a pixel instead of 140, provided that what comes
-    from outside of the image is no label at all; `fill_mask` is that value (0 where the masks are one-hot).
+    The appendix transforms one-hot masks of 35 float channels. All transforms resample masks by nearest neighbour, so
+    integer label maps give the same labels with one byte a pixel instead of 140. `fill_mask` is the value of pixels
+    from outside the image: NOTHING in label maps, 0 in one-hot masks.
     """
     with warnings.catch_warnings(action="ignore", category=UserWarning):
-        # the thesis's own name for the transform; the library would rather have it called Affine
+        # the library warns that this transform, which the thesis uses, is now called Affine
         shift_and_scale = A.ShiftScaleRotate(scale_limit=0.5, rotate_limit=0, shift_limit=0.1, p=1, border_mode=0,
                                              fill=0, fill_mask=fill_mask)
     return [
@@ -49,17 +49,14 @@ def transform_list(size, fill_mask=NOTHING):
 
 
 class Augmenter:
-    """Transforms that give the same result for the same seed, whatever was augmented before.
-
-    Holds the library's random state: one Augmenter a thread.
-    """
+    """Transforms whose result depends only on the image and the seed. Use one Augmenter a thread."""
 
     def __init__(self, transforms):
-        """transforms: a list of them, or an `albumentations.Compose`."""
+        """transforms: a list of transforms or an `albumentations.Compose`."""
         self._compose = transforms if isinstance(transforms, A.Compose) else A.Compose(transforms)
 
     def to_dict(self):
-        """The transforms and their settings as Albumentations writes them (JSON values)."""
+        """Return the transforms and their settings in Albumentations' format (JSON values)."""
         return A.to_dict(self._compose)
 
     def __call__(self, image, label, seed):
@@ -67,18 +64,18 @@ class Augmenter:
         self._compose.set_random_seed(int(seed))
         result = self._compose(image=image, mask=label)
         label = result["mask"]
-        return result["image"].reshape(label.shape[:2] + image.shape[2:]), label  # some transforms drop a lone channel
+        return result["image"].reshape(label.shape[:2] + image.shape[2:]), label  # some drop a single channel
 
 
 def training_augmenter(size):
-    """The appendix's transform list, for the training set."""
+    """Return the augmenter of the training set, with the appendix's transform list."""
     return Augmenter(transform_list(size))
 
 
 def validation_augmenter():
-    """What the validation set is augmented with: by a slip of the appendix, a blur and nothing else.
+    """Return the augmenter of the validation set: only a blur, by a mistake in the appendix.
 
-    A.3 draws Figure 3.1 between the two sets and leaves `transform` bound to the last thing drawn, the blur.
+    Between the two sets, A.3 draws Figure 3.1, which leaves `transform` set to the last one drawn, the blur.
     Section 3.5.1 means `training_augmenter`.
     """
     return Augmenter([A.Blur(blur_limit=3, p=1)])
@@ -87,7 +84,7 @@ def validation_augmenter():
 def augment_set(images, labels, augmenter, seed):
     """Augment every image of a set once (A.3): images (n, size, size, channels) and labels (n, size, size), uint8.
 
-    Returns new arrays of the same shapes. Image i depends on the seed and on i only.
+    Returns new arrays of the same shapes. Each image has a seed that depends only on `seed` and its index.
     """
     augmented_images, augmented_labels = np.empty_like(images), np.empty_like(labels)
     for index in progress(range(len(images)), "augmenting", unit="image"):
@@ -97,10 +94,10 @@ def augment_set(images, labels, augmenter, seed):
 
 
 def image_seed(seed, index, epoch=0):
-    """A seed for one image, independent of the order in which images are augmented."""
+    """Return the seed of one image, independent of the order in which images are augmented."""
     return int(np.random.SeedSequence((seed, epoch, index)).generate_state(1)[0])
 
 
 def one_hot(label_maps, n_classes):
-    """One-hot encode label maps (..., height, width) to float32 (..., n_classes); NOTHING becomes all zeros."""
+    """Return label maps (..., height, width) one-hot encoded, float32 (..., n_classes); NOTHING becomes zeros."""
     return (label_maps[..., None] == np.arange(n_classes, dtype=np.uint8)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The gap between domains (Section 4.1): label maps measured by class, in shadows and from frame to frame."""
+"""The gap between domains (Section 4.1): errors of label maps by class and in shadows, and their flicker."""
 
 from typing import NamedTuple
 
@@ -10,29 +10,29 @@ from thesis_repro import cityscapes, files
 from thesis_repro.segmentation import prediction, quality
 
 GROUND = tuple(cityscapes.ID[name] for name in ("road", "sidewalk", "terrain"))  # where shadows fall
-DARK = 0.6  # of the median gray of its class in its image; ground below that counts as shadow
-AWAY = 4 / 320  # of an image; nearer to a true boundary errors have other causes
-CONSISTENT = 1.0  # pixels; forward and backward flow must cancel to this, or the pixel is not compared
+DARK = 0.6  # ground darker than this share of the median gray of its class in its image counts as shadow
+AWAY = 4 / 320  # share of the image height; errors this near to a true boundary have other causes
+CONSISTENT = 1.0  # pixels; only pixels whose forward and backward flow add up to at most this are compared
 
-IMAGES = 100  # of a domain at most, spread evenly
-DRIVES, FRAMES = 3, 12  # how much of the odometry's data the flicker is measured on
-EXACT = "exact label maps"  # whose flicker is the floor of that measure
+IMAGES = 100  # most images of a domain
+DRIVES, FRAMES = 3, 12  # number of sequences, and of frames of each, for measuring the flicker
+EXACT = "exact label maps"  # their flicker shows what the measure gives without any real flicker
 
 
 class Gap(NamedTuple):
-    """What `measure` returns."""
+    """The result of `measure`."""
 
     scores: pd.DataFrame  # a row for each model and domain; shares and IoU from 0 to 1
-    classes: pd.DataFrame  # a row for each of these and each class present: model, domain, class, id, share, iou
-    flicker: pd.Series  # by model: the share of pixels that change their class between frames; of EXACT too
+    classes: pd.DataFrame  # a row for each model, domain and class present: model, domain, class, id, share, iou
+    flicker: pd.Series  # by model, and for EXACT: share of pixels that change their class between frames
 
 
 def measure(models, domains, drives):
-    """Measure models on domains, and their flicker on the first frames of drives; returns a Gap.
+    """Measure models on domains, and their flicker on the first frames of drives; return a Gap.
 
-    models: Keras models by name; domains: lists of `cityscapes.Pair` by name; drives: `kitti.Sequence`s. Each model is
-    measured at its own size. A mean IoU is that of one confusion matrix over the domain (`quality.cityscapes_scores`);
-    `classes` and `images` say over how many of each.
+    models: Keras models by name; domains: lists of `cityscapes.Pair` by name; drives: list of `kitti.Sequence`. The
+    images are resized to the model's input. The mean IoU comes from one confusion matrix over the domain
+    (`quality.cityscapes_scores`); the columns `classes` and `images` hold the number of classes and images.
     """
     scores, classes = [], []
     for model_name, model in models.items():
@@ -40,12 +40,12 @@ def measure(models, domains, drives):
             images, true = cityscapes.load(pairs, *model.input_shape[2:])
             predicted = prediction.predict(model, images)
             mean_iou, accuracy, table = quality.cityscapes_scores(quality.confusion_matrix(true, predicted))
-            where = {"model": model_name, "domain": domain}
-            scores.append({**where, "images": len(pairs), "classes": len(table), "mean_iou": mean_iou,
+            names = {"model": model_name, "domain": domain}
+            scores.append({**names, "images": len(pairs), "classes": len(table), "mean_iou": mean_iou,
                            "accuracy": accuracy, "sky_recall": table["recall"].get("sky", np.nan),
                            **shadow_errors(images, true, predicted)})
             share = (table["pixels"] / table["pixels"].sum()).to_numpy()
-            classes.append(table.reset_index().assign(**where, share=share))
+            classes.append(table.reset_index().assign(**names, share=share))
     shares = []
     for drive in (drive.subset(FRAMES) for drive in drives[:DRIVES]):
         label_maps = {name: prediction.predict(model, np.stack([
@@ -59,7 +59,7 @@ def measure(models, domains, drives):
 
 
 def labelled_frames(drives):
-    """Frames of `kitti.Sequence`s with their exact label maps (labels_0), spread evenly; none on real data."""
+    """Return evenly spread frames of `kitti.Sequence`s with their exact label maps (labels_0); none for real data."""
     pairs = []
     for drive in drives:
         if (drive.folder / "labels_0").is_dir():
@@ -71,14 +71,14 @@ def labelled_frames(drives):
 
 
 def shadow_errors(images, true, predicted):
-    """Whether ground in shadow is taken for another class more often than ground in light (Section 4.1).
+    """Return how often ground in shadow and ground in light are given a wrong class (Section 4.1).
 
-    images: (n, h, w, channels) uint8; true, predicted: (n, h, w) uint8. No data set marks its shadows. So a pixel of
-    GROUND (by the true label map) counts as dark where its gray is below DARK times the median of its class in its
-    image, and as lit elsewhere. Pixels near a true boundary are left out.
+    images: (n, h, w, channels) uint8; true, predicted: (n, h, w) uint8. No data set marks its shadows, so they are
+    estimated: a pixel whose true class is in GROUND counts as dark if its gray is below DARK times the median of its
+    class in its image, otherwise as lit. Pixels near a true boundary are ignored.
 
-    Returns `dark`, the share of these pixels that are dark, and `dark_wrong` and `lit_wrong`, the shares of dark and
-    of lit ones that are given another class (NaN where there are none).
+    The keys are `dark`, the share of ground pixels that are dark, and `dark_wrong` and `lit_wrong`, the shares of dark
+    and of lit pixels with a wrong class (NaN without such pixels).
     """
     away = np.ones((2 * max(1, round(AWAY * true.shape[1])) + 1,) * 2, np.uint8)
     pixels, wrong = np.zeros(2), np.zeros(2)  # lit, dark
@@ -96,11 +96,11 @@ def shadow_errors(images, true, predicted):
 
 
 def flicker(label_maps, frames):
-    """The share of pixels whose class changes between consecutive frames, motion taken out: (n - 1,), from 0 to 1.
+    """Return the share of pixels whose class changes between consecutive frames, without motion: (n - 1,), 0 to 1.
 
     label_maps: n of (h, w) uint8, any size; frames: n of (height, width) uint8. The motion is measured by dense optical
-    flow in both directions. Only pixels whose two flows cancel are compared, which leaves out what is occluded, enters
-    or leaves. Exact label maps show the floor of the measure: flow that is off by a pixel at a boundary.
+    flow in both directions. Only pixels whose two flows cancel are compared, so pixels that are occluded, enter or
+    leave are ignored. Even exact label maps flicker a little, because the flow is not exact at boundaries.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     frames = [np.ascontiguousarray(frame) for frame in frames]
@@ -112,10 +112,10 @@ def flicker(label_maps, frames):
     for index in files.progress(range(1, len(frames)), "flicker"):
         forward = flow.calc(frames[index - 1], frames[index], None)
         backward = flow.calc(frames[index], frames[index - 1], None)
-        origin = columns + backward[..., 0], rows + backward[..., 1]  # where each pixel was in the frame before
-        there = cv2.remap(forward, *origin, cv2.INTER_LINEAR, borderValue=(np.inf, np.inf))
+        origin = columns + backward[..., 0], rows + backward[..., 1]  # each pixel's position in the frame before
+        forward = cv2.remap(forward, *origin, cv2.INTER_LINEAR, borderValue=(np.inf, np.inf))
         with np.errstate(invalid="ignore"):
-            compared = np.linalg.norm(there + backward, axis=-1) <= CONSISTENT
+            compared = np.linalg.norm(forward + backward, axis=-1) <= CONSISTENT
         changed = (cv2.remap(label_maps[index - 1], *origin, cv2.INTER_NEAREST) != label_maps[index]) & compared
         shares.append(changed.sum() / max(compared.sum(), 1))
     return np.array(shares)

@@ -1,4 +1,4 @@
-"""How good a model is on a set of images: by the library's scores, and by the Cityscapes benchmark's."""
+"""Quality of a model on a set of images: the scores of segmentation-models and those of the Cityscapes benchmark."""
 
 import os
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from thesis_repro import InputError, files
 from thesis_repro.cityscapes import LABELS, N_CLASSES
 from thesis_repro.segmentation import training
 
-# The ids that the Cityscapes benchmark evaluates; pixels of all others are left out of its confusion matrix.
+# The ids that the Cityscapes benchmark evaluates; pixels of all other ids are ignored.
 EVALUATED = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 32, 33)
 
 
 @dataclass(frozen=True)
 class Quality:
-    """How good a model is on a set, by the library's measure and by that of the Cityscapes benchmark."""
+    """Scores of a model on a set of images."""
 
-    iou_score: float  # segmentation-models: mean over 35 classes, absent ones scoring 1, then over batches as in Keras
-    f1_score: float
-    mean_iou: float  # Cityscapes: one confusion matrix over the set, mean over the classes present (len(classes))
-    accuracy: float  # share of evaluated pixels that are right
+    iou_score: float  # segmentation-models: mean over 35 classes (absent ones score 1), then over batches as in Keras
+    f1_score: float  # the same for F1
+    mean_iou: float  # Cityscapes: from one confusion matrix over the set, mean over the classes present
+    accuracy: float  # share of evaluated pixels with the right class
     classes: pd.DataFrame  # a row for each class present: id, pixels, iou, precision, recall
     confusion: np.ndarray  # (35, 35) pixels: true class, predicted class
 
@@ -32,8 +32,8 @@ class Quality:
 def quality(model, images, labels, batch_size=16):
     """Measure a model on images (n, size, size, channels) and true label maps (n, size, size), both uint8.
 
-    The library's scores depend on the batch size, the others do not (Sections 3.3 and 4.1).
-    Raises InputError for an empty set or one of another shape than the model's.
+    Only the scores of segmentation-models depend on the batch size (Sections 3.3 and 4.1).
+    Raises InputError for an empty set, and for shapes that do not fit the model.
     """
     if len(images) == 0:
         raise InputError("quality: an empty set; it needs at least one image with its label map")
@@ -60,17 +60,18 @@ def quality(model, images, labels, batch_size=16):
 
 
 def confusion_matrix(true, predicted):
-    """Pixels by true class (rows) and predicted class (columns); pixels without a true class are not counted."""
+    """Return pixel counts by true class (rows) and predicted class (columns); pixels without a class do not count."""
     known = true < N_CLASSES
     pairs = true[known].astype(np.int64) * N_CLASSES + predicted[known]
     return np.bincount(pairs, minlength=N_CLASSES**2).reshape(N_CLASSES, N_CLASSES)
 
 
 def cityscapes_scores(confusion):
-    """Mean IoU, pixel accuracy and per-class table as the Cityscapes benchmark defines them.
+    """Return mean IoU, pixel accuracy and a table by class, as the Cityscapes benchmark defines them.
 
-    Pixels whose true class it does not evaluate are left out. The mean is over the evaluated classes that are present
-    in the true label maps; a prediction of any other class counts against the class it should have been.
+    Pixels whose true class is not evaluated are ignored. The mean is over the evaluated classes in the true label maps.
+    A pixel that is wrongly given a class that is not evaluated is an error of its true class.
+    Raises InputError if no pixel is evaluated.
     """
     evaluated = np.zeros_like(confusion)
     evaluated[EVALUATED, :] = confusion[EVALUATED, :]

@@ -12,16 +12,13 @@ DEPTH = 4  # encoder blocks; each halves the image
 
 
 def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
-    """The U-Net for images of input_shape (height, width, channels), with a softmax over n_classes (A.4).
+    """Build the U-Net with a softmax over n_classes (A.4); its layer names are those of Figure A.1.
 
-    A height or width of None leaves the size open: the network is convolutions from end to end.
-
-    `base_filters` is the width of the first block: 64 in the thesis, doubled by each of the four encoder blocks.
-
-    In the thesis both convolutions of a block read the block's input, so the first one leads nowhere and Figure A.1
-    counts every second convolution only. `corrected_blocks` puts the two in a row, as they were meant.
-
-    Layer names are those of Figure A.1. Raises InputError where height or width is not a multiple of 16.
+    input_shape: (height, width, channels); a height or width of None accepts any size.
+    base_filters: filters of the first block, 64 in the thesis; each further encoder block has twice as many.
+    corrected_blocks: put the two convolutions of a block in a row, as intended. In the thesis both read the block's
+    input, so the output of the first one is never used and Figure A.1 lists only every second convolution.
+    Raises InputError if height or width is not a multiple of 16.
     """
     height, width, _ = input_shape
     if (height or 0) % 2**DEPTH or (width or 0) % 2**DEPTH:
@@ -47,7 +44,7 @@ def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
 def _conv_block(inputs, filters, number, corrected):
     x = inputs
     for index in (number, number + 1):
-        source = x if corrected else inputs  # the thesis's slip: the second convolution starts at the input again
+        source = x if corrected else inputs  # the thesis's mistake: the second convolution reads the block's input
         x = layers.Conv2D(filters, 3, padding="same", name=_numbered("conv2d", index))(source)
         x = layers.BatchNormalization(name=_numbered("batch_normalization", index))(x)
         x = layers.Activation("relu", name=_numbered("activation", index))(x)
@@ -59,10 +56,7 @@ def _numbered(name, number):
 
 
 def summary_rows(model):
-    """The rows of Figure A.1 for a model: dicts of layer, output_shape, params and connected_to.
-
-    Class and shape are written the way Figure A.1 has them, so the two can be compared word by word.
-    """
+    """Return a model's rows in the format of Figure A.1: dicts of layer, output_shape, params and connected_to."""
     rows = []
     for layer in model.layers:
         kind = type(layer).__name__
