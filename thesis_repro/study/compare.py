@@ -99,9 +99,9 @@ def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
 
 
 def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Series:
-    """Return the ratio, by sequence, of a metric in some rows of a table of runs to the metric in the reference rows.
+    """Return, for each sequence, the error of some runs divided by the error of the reference runs.
 
-    Sequences that are in only one of the two, and sequences whose error is zero or missing, are left out.
+    metric: the column of the error. Sequences without a positive error in both tables are left out.
     """
     def logarithms(runs: pd.DataFrame) -> pd.Series:
         positive = runs.loc[runs[metric] > 0]
@@ -148,7 +148,7 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _variants(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    """Split the runs by source, method and width; returns ({source, method, ...}, runs) pairs in METHODS' order."""
+    """Split the runs by method, source and width. Returns pairs of (the first columns of `comparisons`, runs)."""
     variants = []
     for method in METHODS:
         by_width = runs[runs["method"] == method].groupby(["source", "dilation_width"], dropna=False, sort=False)
@@ -161,7 +161,7 @@ def _variants(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
 
 
 def _is_compared(variant: dict[str, Any], reference: dict[str, Any]) -> bool:
-    """Return whether `comparisons` has a row for two variants."""
+    """Return whether `comparisons` compares a variant with a reference, which is another variant or the same."""
     if reference["method"] == "baseline":
         return True
     if variant is reference or variant["method"] != "masked" or not (variant["tested"] and reference["tested"]):
@@ -201,10 +201,9 @@ def judging_estimator(table: pd.DataFrame) -> str:
 def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
     """Measure how much shuffling the matched points before RANSAC changes the RMSE, with all keypoints.
 
-    Returns one row for each estimator and sequence: repetitions, lowest, highest, factor (highest over lowest).
+    Returns one row for each estimator and sequence: mean, lowest, highest, factor (highest over lowest).
     """
-    rows = runs[runs["method"] == "baseline"].groupby(["estimator", "sequence"])["rmse"]
-    table = rows.agg(repetitions="size", lowest="min", highest="max").reset_index()
+    table = spread(runs[runs["method"] == "baseline"], "rmse", by=["estimator", "sequence"]).reset_index()
     return table.assign(factor=table["highest"] / table["lowest"])
 
 
@@ -246,14 +245,12 @@ def tested_width(runs: pd.DataFrame) -> int | None:
 
 def keypoints_left(runs: pd.DataFrame) -> pd.Series:
     """Return the mean number of keypoints that masks of the `tested_width` leave, by sequence."""
-    width = tested_width(runs)
     rows = runs[runs["method"] == "masked"]
-    if width is not None:
-        rows = rows[rows["dilation_width"] == width]
+    rows = rows[rows["dilation_width"].isna() | (rows["dilation_width"] == tested_width(runs))]
     return rows.groupby("sequence")["mean_keypoints"].mean()
 
 
-def spread(rows: pd.DataFrame, column: str, by: str = "sequence") -> pd.DataFrame:
+def spread(rows: pd.DataFrame, column: str, by: str | list[str] = "sequence") -> pd.DataFrame:
     """Return mean, lowest and highest of a column over the repetitions: one row for each value of `by`."""
     table = rows.groupby(by)[column].agg(mean="mean", lowest="min", highest="max")
     # rounding may put the mean of equal values outside their range, which gives an error bar of negative length
