@@ -1,4 +1,4 @@
-"""Faults of the machine: full and read-only disks, a second run, dead workers, too little memory."""
+"""Faults of the machine: full and read-only disks, killed workers, too little memory."""
 
 import os
 import resource
@@ -14,9 +14,8 @@ from trials import finish, no_temporary_files, refused, resumes, run, start
 from waiting import wait_for
 
 
-def quick_and_long(quick, *cases):
-    """The first case runs in `make test`, the others in `make torture`."""
-    return [quick, *(pytest.param(*case, marks=pytest.mark.torture) for case in cases)]
+def long(*case):
+    return pytest.param(*case, marks=pytest.mark.torture)  # not in `make test`
 
 
 @pytest.fixture
@@ -35,8 +34,9 @@ def disk(tmp_path):
     subprocess.run(["umount", "-l", folder], capture_output=True)
 
 
-@pytest.mark.parametrize("name, kilobytes", quick_and_long(
-    ("odometry.txt", 0), ("odometry.mp4", 0), ("synthesize", 300), ("training", 40), ("predict", 24), ("study", 40)))
+@pytest.mark.parametrize("name, kilobytes", [
+    ("odometry.txt", 0), long("odometry.mp4", 0), long("synthesize", 300), long("training", 40), long("predict", 24),
+    long("study", 40)])
 def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes):
     """The error names the output; with room made, the same command resumes."""
     disk(1000, "ro")
@@ -48,10 +48,10 @@ def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes)
     resumes(words, name, tmp_path, "disk/out")
 
 
-@pytest.mark.parametrize("name, limit, megabytes, named", quick_and_long(
-    ("odometry.txt", resource.RLIMIT_AS, 300, "memory"), ("synthesize", resource.RLIMIT_AS, 700, "memory"),
-    ("predict", resource.RLIMIT_AS, 3080, "memory"), ("study", resource.RLIMIT_AS, 2000, "memory"),
-    ("odometry.png", resource.RLIMIT_FSIZE, 1 / 256, "out.png")))
+@pytest.mark.parametrize("name, limit, megabytes, named", [
+    ("odometry.txt", resource.RLIMIT_AS, 300, "memory"), long("synthesize", resource.RLIMIT_AS, 700, "memory"),
+    long("predict", resource.RLIMIT_AS, 3080, "memory"), long("study", resource.RLIMIT_AS, 2000, "memory"),
+    long("odometry.png", resource.RLIMIT_FSIZE, 1 / 256, "out.png")])
 def test_limits_of_memory_and_of_file_size(words, tmp_path, name, limit, megabytes, named):
     set_limit = partial(resource.setrlimit, limit, (int(megabytes * 2**20),) * 2)
     refused(run(words(name), tmp_path, before=set_limit), named, left=["out", "out/*"])

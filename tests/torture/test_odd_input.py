@@ -12,13 +12,12 @@ pytestmark = pytest.mark.torture
 
 ODD = "it's \"50%\" <script>&$x$_ é漢\n{b} #[1]*"
 SEQUENCE = "<b>&\"'$_$ %s é"
-CLONE_NEWNET = 0x40000000  # Linux's flag for a new network namespace
 
 
 def without_network():
     """Take the network from a process, which only root may do."""
     if os.geteuid() == 0:
-        ctypes.CDLL(None).unshare(CLONE_NEWNET)
+        ctypes.CDLL(None).unshare(0x40000000)  # CLONE_NEWNET
 
 
 def without_root_privileges():
