@@ -162,3 +162,12 @@ def test_bad_input_is_one_line_before_anything_runs(small_world, small_labels, m
     assert main(["study", "--kitti", str(small_world / "kitti"), *given, "--output", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err.strip()
     assert error.startswith("error: ") and named in error and "\n" not in error and not (tmp_path / "out").exists()
+
+
+def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_labels, tmp_path):
+    shutil.copytree(small_labels / "00", tmp_path / "labels" / "00")
+    damaged = tmp_path / "labels" / "00" / "000002.png"
+    damaged.write_bytes(damaged.read_bytes()[:-20])
+    study = series.Study(small_world / "kitti", ("00",), (Source(tmp_path / "labels", name="net"),), (5,), frames=5)
+    with pytest.raises(series.InputError, match="every run with masks failed"):
+        study.run(tmp_path / "out")

@@ -98,6 +98,8 @@ class Study:
             if runs["mean_keypoints"].isna().all():
                 raise InputError(f"{self.kitti}: no frame has any structure (all are black, white or of one gray); "
                                  "check how they were written")
+            if not (runs["method"] == "masked").any():
+                raise InputError("every run with masks failed (see above), so there is nothing to compare")
             if self.tested:
                 made = runs.attrs["made"]
                 for source in self.sources:
