@@ -1,6 +1,8 @@
 """Faults of a drawn figure: raw TeX, missing glyphs and texts that overlap."""
 
+import functools
 import itertools
+import sys
 import warnings
 
 from matplotlib.text import Text
@@ -34,3 +36,22 @@ def _visible_texts(figure):
     # slanted texts are left out, since their boxes are much larger than they are
     return [text for text in figure.findobj(Text) if text not in hidden and text.get_visible()
             and text.get_text().strip() and text.get_rotation() % 90 == 0]
+
+
+def watch(shell, path):
+    """Append the faults of every figure that the notebook of an IPython shell saves to a file."""
+    def wrap_save_figure(_):
+        style = sys.modules.get("thesis_repro.report.style")
+        if style is None or hasattr(style.save_figure, "__wrapped__"):
+            return
+        save_figure = style.save_figure
+
+        @functools.wraps(save_figure)
+        def checked(figure, folder, name, note):
+            with open(path, "a", encoding="utf-8") as file:
+                file.writelines(f"{name}: {fault}\n" for fault in ["saved", *problems(figure)])
+            save_figure(figure, folder, name, note)
+
+        style.save_figure = checked
+
+    shell.events.register("post_run_cell", wrap_save_figure)

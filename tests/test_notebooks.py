@@ -30,7 +30,7 @@ def execute(name, build, output):
     """Execute a notebook by nbconvert with no setting of the Makefile but the profile and the folders."""
     environment = {key: os.environ[key] for key in ("PATH", "HOME", "LANG") if key in os.environ}
     environment |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROFILE": "smoke", "THESIS_REPRO_BUILD": str(build),
-                    "THESIS_REPRO_FIGURES": str(build.parent / "figures")}
+                    "THESIS_REPRO_FIGURES": str(build.parent / "figures"), "IPYTHONDIR": str(build.parent / "ipython")}
     return subprocess.run([JUPYTER, "--to", "notebook", "--execute", "--ExecutePreprocessor.kernel_name=python3",
                            "--output-dir", output, ROOT / "notebooks" / name],
                           env=environment, capture_output=True, text=True)
@@ -52,6 +52,10 @@ def executed(tmp_path_factory):
     run = folder / "build" / "embedded-smoke"
     run.mkdir(parents=True)
     (run / "checked").touch()  # as if make had checked the data
+    startup = folder / "ipython" / "profile_default" / "startup" / "watch.py"  # executed by every kernel
+    startup.parent.mkdir(parents=True)
+    startup.write_text(f"import sys\nsys.path.append({str(ROOT / 'tests')!r})\nfrom drawn import watch\n"
+                       f"watch(get_ipython(), {str(folder / 'faults.txt')!r})\n")
     for name in NOTEBOOKS:
         done = execute(name, folder / "build", run / "notebooks")
         assert done.returncode == 0, done.stderr[-3000:]
@@ -69,6 +73,13 @@ def test_every_artefact_is_written_and_names_its_data(executed):
     texts = [written[name] for name in FIGURES if name not in WITHOUT_DATA]
     texts += [figures / f"{name}.md" for name in TABLES[2:]]
     assert [path.name for path in texts if b"embedded world" not in path.read_bytes()] == []
+
+
+@pytest.mark.notebooks
+def test_figures_have_no_raw_tex_and_no_texts_that_overlap(executed):
+    faults = (executed / "faults.txt").read_text().splitlines()
+    assert {f"{name}: saved" for name in FIGURES} <= set(faults)
+    assert [fault for fault in faults if not fault.endswith(": saved")] == []
 
 
 @pytest.mark.notebooks
