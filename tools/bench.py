@@ -1,7 +1,7 @@
-"""What odometry and segmentation cost on this machine, as ratios: python tools/bench.py --kitti ROOT (make bench).
+"""Measure what odometry and segmentation cost on this machine, as ratios: python tools/bench.py --kitti ROOT.
 
-Machines differ and are busy, so what counts is the ratio of two things measured in turn in one process. Prints a table
-and writes it as JSON. Nothing fails for being slow.
+Machines differ and are busy, so only the ratio of two measurements taken in turn in one process counts. Prints a table
+and writes it as JSON. A slow machine is no error.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry
+from thesis_repro import InputError, longrun, masks, odometry
 from thesis_repro.files import write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
@@ -33,20 +33,21 @@ from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.sources import Source
 
 REPEATS = 3
-WIDTHS = range(1, 17)  # pixels; with all keypoints, 17 runs
-CORES = 2  # of the whole chain
-CAMERA = 10.0  # frames a second of KITTI
+WIDTHS = range(1, 17)  # dilation widths in pixels; with all keypoints, 17 runs
+CORES = 2  # for `chain_rate`
+CAMERA = 10.0  # frames a second of KITTI's camera
 FIRST_USE = "from thesis_repro.odometry import odometry; odometry.warm_up(refined=True)"
 
 
 def seconds(work, clock=time.perf_counter):
+    """Return the seconds that a call takes."""
     started = clock()
     work()
     return clock() - started
 
 
 def bare_calls(previous, frame, points, intrinsics):
-    """The OpenCV calls of one step of the thesis's odometry, each as a function on what the step gives it."""
+    """Return the OpenCV calls of one step of the thesis's odometry, as functions without arguments."""
     tracked, followed = keypoints.track(previous, frame, points)
     old, new = (pose.normalise(corners[followed], intrinsics) for corners in (points, tracked))
     camera = {"focal": 1.0, "pp": (0.0, 0.0)}
@@ -61,17 +62,17 @@ def bare_calls(previous, frame, points, intrinsics):
 
 
 def step_cost(sequence):
-    """Milliseconds of a step, of a refined one and of the thesis's bare OpenCV calls: medians of the least of 3."""
+    """Return the milliseconds of a thesis step, a refined step and the bare OpenCV calls: medians of the best of 3."""
     followers = [Odometry(sequence.intrinsics, replace(THESIS, estimator=name)) for name in ("thesis", "refined")]
     metres, costs = odometry.scales(sequence), []
-    clock = time.thread_time  # of a single thread, which does not see what else the machine is doing
+    clock = time.thread_time  # does not count other processes
     previous = sequence.frame(0)
     for follower in followers:
         follower.step(previous)
     for index, frame in enumerate(list(sequence.frames())[1:], 1):
         calls = bare_calls(previous, frame, followers[0].points, sequence.intrinsics)
         before, least = followers, np.full(3, np.inf)
-        for _ in range(REPEATS):  # in turn, so that what else the machine does falls on all of them
+        for _ in range(REPEATS):  # in turn, so that all three share the machine's load
             followers = [copy(follower) for follower in before]
             row = [seconds(partial(follower.step, frame, metres[index]), clock) for follower in followers]
             least = np.minimum(least, [*row, sum(seconds(call, clock) for call in calls)])
@@ -81,8 +82,8 @@ def step_cost(sequence):
 
 
 def shared_cost(sequence):
-    """CPU milliseconds a frame of runs in one pass and of the same runs one by one; whether their poses are equal."""
-    # boundaries of the frames' own contours, for where there are no label maps
+    """Return CPU milliseconds a frame of runs in one pass and one by one, and whether their poses are equal."""
+    # edges of the frames stand in for label maps
     contours = [cv2.Canny(cv2.GaussianBlur(frame, (0, 0), 4), 20, 60) for frame in sequence.frames()]
     runs = {"": (THESIS, None)} | {f"{width}": (THESIS, [masks.dilate(edges, width) for edges in contours])
                                    for width in WIDTHS}
@@ -95,7 +96,7 @@ def shared_cost(sequence):
 
 
 def mask_cost(sequence, labels):
-    """CPU milliseconds a mask of all widths and controls of a frame, made together and each by itself."""
+    """Return CPU milliseconds a mask, for the masks of all widths and controls made together and one by one."""
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
         controls.masks(method, source, sequence, controls.LINE_WIDTH) for method in controls.MASKS
@@ -110,20 +111,19 @@ def mask_cost(sequence, labels):
 
 
 def compile_cost():
-    """CPU seconds until a process may use the refined odometry, with nothing compiled and once more."""
+    """Return the CPU seconds until the refined odometry is ready, with an empty and with a full Numba cache."""
+    def clock():
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return usage.ru_utime + usage.ru_stime
+
     with tempfile.TemporaryDirectory() as cache:
         work = partial(subprocess.run, [sys.executable, "-c", FIRST_USE], check=True,
                        env={**os.environ, "NUMBA_CACHE_DIR": cache})
-        return [seconds(work, _children) for _ in range(2)]
-
-
-def _children():
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
+        return [seconds(work, clock) for _ in range(2)]
 
 
 def chain_rate(sequence):
-    """Frames a second from the frame's file to the masked pose on CORES cores, in a process of its own."""
+    """Return the frames a second from image file to masked pose on CORES cores, measured in a new process."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(_chain, sequence).result()
 
@@ -146,12 +146,12 @@ def _chain(sequence):
             for index, (frame, mask) in enumerate(pool.map(prepare, range(frames))):
                 follower.step(frame, metres[index], mask)
 
-    drive(3)  # loads compiled code
+    drive(3)  # loads the compiled code
     return len(sequence) / seconds(partial(drive, len(sequence)))
 
 
 def measure(sequence):
-    """A table: what is measured, its unit, the measure, what it is set against, and their ratio."""
+    """Return a table with a row for each measurement, its reference and their ratio."""
     from thesis_repro.segmentation import prediction
 
     rows = []
@@ -161,7 +161,7 @@ def measure(sequence):
         rows.append({"what": what, "unit": unit, "measured": measured, "against": against, "reference": reference,
                      "ratio": measured / reference})
 
-    odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})  # compiles and loads
+    odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})  # loads compiled code
     with timing.opencv_threads(1):
         step, refined, bare = step_cost(sequence)
         add("a step of the odometry", "ms", (step, bare), "its bare OpenCV calls")
@@ -181,14 +181,13 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kitti", required=True, type=Path, help="KITTI odometry folder (sequences, poses)")
     parser.add_argument("--sequence", default="00")
-    parser.add_argument("--frames", default=40, type=int, help="taken from its start (40)")
+    parser.add_argument("--frames", default=40, type=int, help="frames from its start (40)")
     parser.add_argument("--output", type=Path, default=Path("bench.json"))
     options = parser.parse_args(arguments)
     try:
         table = measure(Sequence(options.kitti, options.sequence).subset(options.frames))
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+        return longrun.report_error(error)
     write_text(options.output, table.to_json(orient="records", indent=1) + "\n")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, OpenCV {cv2.__version__}")
     print(table.to_string(index=False, float_format="{:.3g}".format))

@@ -1,8 +1,8 @@
-"""Section 5.2.1's networks, each trained for the same time: python tools/proposals.py --cityscapes ROOT [ROOT ...].
+"""Train the networks of Section 5.2.1 for equal times: python tools/proposals.py --cityscapes ROOT [ROOT ...].
 
-The thesis's network in gray and in colour, a U-Net around a published backbone (random weights: the published ones need
-a download) and an ensemble. ROOT is a folder in one of Cityscapes' layouts. Prints one Markdown table a folder: means
-over the seeds, and the mean IoU of each. Milliseconds are processor time of one image, all cores together.
+They are the thesis's network in gray and in colour, a U-Net with a published backbone (random weights, because the
+published ones need a download) and an ensemble. ROOT is a folder in one of Cityscapes' layouts. Prints a Markdown table
+for each folder: means over the seeds, and the mean IoU of each seed. Milliseconds are processor time on all cores.
 """
 
 import argparse
@@ -20,16 +20,16 @@ import numpy as np
 import pandas as pd
 import segmentation_models as sm
 
-from thesis_repro import InputError, cityscapes
+from thesis_repro import InputError, cityscapes, longrun
 from thesis_repro.report.style import markdown
 from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.settings import PROFILES
 
 SIZES = PROFILES["demo"]
-IMAGES, SEEDS = 64, (0, 1)  # for training at most, and a quarter of them for validation
-BACKBONE, MEMBERS = "resnet18", 2  # each member of the ensemble has its part of the time
-# For trainings of minutes: the steps are few, and batch normalisation's averages must keep up with them.
+IMAGES, SEEDS = 64, (0, 1)  # most images for training; a quarter as many for validation
+BACKBONE, MEMBERS = "resnet18", 2  # the members of the ensemble share the time
+# A training of minutes has few steps, so the averages of batch normalisation must adapt fast.
 LEARNING_RATE, MOMENTUM = 0.003, 0.9
 
 
@@ -38,7 +38,7 @@ def unet(input_shape):
 
 
 def backbone_unet(input_shape):
-    """A U-Net of segmentation-models around BACKBONE; grey levels are scaled to 0 to 1, as it was made for."""
+    """Return the U-Net of segmentation-models with BACKBONE, which expects grey levels from 0 to 1."""
     network = sm.Unet(BACKBONE, input_shape=input_shape, classes=cityscapes.N_CLASSES, activation="softmax",
                       encoder_weights=None)
     inputs = keras.Input(input_shape)
@@ -46,7 +46,7 @@ def backbone_unet(input_shape):
 
 
 class TimeLimit(keras.callbacks.Callback):
-    """Ends a training after so many seconds of processor time; the first batch, which compiles, does not count."""
+    """Ends a training after some seconds of processor time; the first batch, which compiles, does not count."""
 
     def __init__(self, seconds):
         super().__init__()
@@ -59,7 +59,7 @@ class TimeLimit(keras.callbacks.Callback):
 
 
 def train(build, images, labels, seconds, seed):
-    """A network trained with the thesis's loss and augmentation for some processor time, and its batches."""
+    """Train a network with the thesis's loss and augmentation; return it and the number of batches."""
     keras.utils.set_random_seed(seed)
     model = build(images.shape[1:])
     augmented = augmentation.augment_set(images, labels, augmentation.training_augmenter(images.shape[1]), seed)
@@ -76,9 +76,9 @@ def train(build, images, labels, seconds, seed):
 
 
 def milliseconds(model, repeats=25):
-    """Processor time of one image alone on all cores, from uint8 to label map: the median."""
+    """Return the median processor time of predicting one image, on all cores together."""
     image, times = np.zeros((1, *model.input_shape[1:]), np.uint8), []
-    for _ in range(repeats + 1):  # the first one compiles
+    for _ in range(repeats + 1):  # the first repeat compiles
         started = time.process_time()
         prediction.predict(model, image)
         times.append(time.process_time() - started)
@@ -86,7 +86,7 @@ def milliseconds(model, repeats=25):
 
 
 def compare(root, seconds, seeds=SEEDS, images=IMAGES):
-    """A table with a row for each network, from a folder of colour or gray images with label maps."""
+    """Return a table with a row for each network, trained on a folder of colour or gray images with label maps."""
     sets = [cityscapes.load(cityscapes.pairs(root, split, limit=limit), SIZES.image_size, 3)
             for split, limit in (("train", images), ("val", images // 4))]
     (train_images, train_labels), (shown, shown_labels) = sets
@@ -120,15 +120,14 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cityscapes", type=Path, nargs="+", metavar="ROOT", required=True,
                         help="folders of images and label maps")
-    parser.add_argument("--seconds", type=float, default=60, help="of processor time for each network (60)")
+    parser.add_argument("--seconds", type=float, default=60, help="processor time for each network (60)")
     options = parser.parse_args(arguments)
     memory.keep_freed()
     try:
         for root in options.cityscapes:
             print(f"{root.name}, {options.seconds:g} s a network\n\n{markdown(compare(root, options.seconds))}")
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+        return longrun.report_error(error)
     return 0
 
 

@@ -1,9 +1,9 @@
-"""How reliable the refined estimator is: runs of every method with the matched points shuffled, and what failed.
+"""Count the failures of the refined estimator, in runs of every method with the matched points shuffled.
 
 python tools/reliability.py --kitti ROOT --labels DIR --output FOLDER prints a row for each sequence, method and number
-of keypoints. A run fails where its RMSE is more than SPREAD times the median over its shuffles. A step of more than
-MOVING metres fails where its rotation is wrong by more than WRONG degrees without a flag. Each sequence and method is
-one file, so a stopped series resumes. reliability.md beside this file has the list of the real frames.
+of keypoints. A run fails if its RMSE is more than SPREAD times the median over its shuffles. A step of more than MOVING
+metres fails if its rotation is wrong by more than WRONG degrees without a flag. Each sequence and method has a file, so
+a stopped series resumes. The results on real frames are in reliability.md beside this file.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, odometry, stages
+from thesis_repro import InputError, longrun, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, MaskSettings
@@ -24,15 +24,15 @@ from thesis_repro.study import controls
 from thesis_repro.study.sources import Source
 from thesis_repro.study.timing import opencv_threads
 
-SPREAD, MOVING, WRONG = 1.5, 0.25, 2.0
+SPREAD, MOVING, WRONG = 1.5, 0.25, 2.0  # ratio, metres, degrees
 KEYPOINTS, SHUFFLES = (300, 500, 1000, 2000, 4000), 20
 WIDTHS = (5, 10)
-SPREAD_OUT = 12  # pixels between keypoints
+SPREAD_OUT = 12  # least distance between keypoints, pixels
 CONTROLS = ("corrected", "other-frame", "mirrored", "random-lines", "image-edges")
 
 
 def methods(sequence, labels=None):
-    """{name: (settings, masks)}: all keypoints, all of them spread out, and with label maps the masks and controls."""
+    """Return {name: (settings, masks)}: all keypoints, spread-out keypoints, and with label maps masks and controls."""
     spread = replace(THESIS, min_distance=SPREAD_OUT)
     by_name = {"all": (THESIS, None), "spread": (spread, None)}
     if labels is not None:
@@ -45,7 +45,7 @@ def methods(sequence, labels=None):
 
 
 def trial(sequence, settings, masks, keypoints=KEYPOINTS, shuffles=SHUFFLES):
-    """One method's runs, a DataFrame with a row each: RMSE (m), the largest wrong turn (degrees), steps by kind."""
+    """Run one method; return a DataFrame with a row for each run: RMSE (m) and the counts of `count_steps`."""
     runs = {(count, shuffle): (replace(settings, estimator="refined", max_keypoints=count,
                                        shuffle_seed=shuffle or None), masks)
             for count in keypoints for shuffle in range(shuffles)}
@@ -56,7 +56,7 @@ def trial(sequence, settings, masks, keypoints=KEYPOINTS, shuffles=SHUFFLES):
 
 
 def count_steps(result, sequence, moving):
-    """How many moving steps of a run there are, turn wrong, do so without a flag, are ambiguous or not determined."""
+    """Return the largest error of a rotation (degrees), and how many moving steps have which kind of failure."""
     true, turns = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (sequence.poses, result.poses))
     wrong = np.where(moving, np.concatenate([[0.0], metrics.angles(np.linalg.inv(true) @ turns)]), 0)
     flags = result.frames["flag"]
@@ -67,7 +67,7 @@ def count_steps(result, sequence, moving):
 
 
 def failures(trials):
-    """The list of failures, a row for each sequence, method and number of keypoints, from all trials."""
+    """Return the list of failures: a row for each sequence, method and number of keypoints."""
     cell = ["sequence", "method", "keypoints"]
     times = trials["rmse"] / trials.groupby(cell, sort=False)["rmse"].transform("median")
     cells = trials.assign(times=times, over=times > SPREAD).groupby(cell, sort=False)
@@ -77,7 +77,7 @@ def failures(trials):
 
 
 def measure(options):
-    """All trials as one DataFrame; those that the output folder holds already are not made again."""
+    """Return all trials as one DataFrame; trials whose file is already in the output folder are not run again."""
     folder = stages.stage(options.output, code=stages.code("odometry"), tool=stages.content(Path(__file__)),
                           kitti=str(options.kitti), labels=str(options.labels), keypoints=options.keypoints,
                           shuffles=options.shuffles, frames=options.frames)
@@ -86,7 +86,7 @@ def measure(options):
             for name, method in methods(sequence, options.labels and options.labels / sequence.name).items()
             if options.methods is None or name in options.methods]
     if not jobs:
-        raise InputError(f"methods {' '.join(options.methods)}: none is known here; masks and controls need --labels")
+        raise InputError(f"--methods {' '.join(options.methods)}: unknown; masks and controls need --labels")
     tables = []
     for sequence, name, method in progress(jobs, "reliability", unit="method"):
         path = folder / f"{sequence.name}-{name}.csv"
@@ -103,18 +103,17 @@ def main(arguments=None):
     parser.add_argument("--kitti", required=True, type=Path, metavar="ROOT", help="folder of sequences and poses")
     parser.add_argument("--sequences", nargs="+", default=["00"], metavar="NN")
     parser.add_argument("--labels", type=Path, metavar="DIR",
-                        help="folder with one folder of label maps a sequence; without it, no masks and controls")
-    parser.add_argument("--methods", nargs="+", metavar="NAME", help="some of the methods (all)")
+                        help="folder with a folder of label maps for each sequence; needed for masks and controls")
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help="names of methods (all)")
     parser.add_argument("--keypoints", nargs="+", type=int, default=list(KEYPOINTS), metavar="N")
-    parser.add_argument("--shuffles", type=int, default=SHUFFLES, metavar="N", help=f"of each run ({SHUFFLES})")
-    parser.add_argument("--frames", type=int, metavar="N", help="taken from each sequence's start (all)")
+    parser.add_argument("--shuffles", type=int, default=SHUFFLES, metavar="N", help=f"shuffles a method ({SHUFFLES})")
+    parser.add_argument("--frames", type=int, metavar="N", help="frames from each sequence's start (all)")
     parser.add_argument("--output", type=Path, default=Path("reliability"), metavar="DIR")
     options = parser.parse_args(arguments)
     try:
         table = failures(measure(options))
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+        return longrun.report_error(error)
     write_text(options.output / "failures.csv", table.to_csv(index=False))
     print(table.round(2).to_string(index=False))
     print(table[["runs", "steps", "over", "wrong", "unflagged"]].sum().to_string())

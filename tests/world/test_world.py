@@ -1,4 +1,6 @@
-"""The embedded world: exact poses and label maps, the same bytes for a seed, both layouts, faults and resuming."""
+"""The embedded world: exact poses and label maps, equal bytes for equal seeds, both layouts, errors and resuming."""
+
+import shutil
 
 import cv2
 import numpy as np
@@ -23,7 +25,7 @@ def out(tmp_path_factory):
 
 def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*"))
-            if path.is_file() and path.name != longrun.LIST}  # files are listed there in the order they were made
+            if path.is_file() and path.name != longrun.LIST}  # the list's order depends on the run
 
 
 def test_layouts_are_read_by_the_readers_of_real_data(out):
@@ -72,7 +74,7 @@ def test_drives_are_realistic(name, frames):
     assert turns.max() < 4.5
     standing = int((steps == 0).sum())
     assert standing >= 4 if name == "07" else standing == 0
-    # Forwards along z and level: a camera that looks elsewhere would give another shape of path.
+    # The camera moves forwards along z, on a level road.
     assert (np.diff(poses[:3, 2, 3]) > 0.1).all()
     assert np.abs(poses[:, 1, 3]).max() < 0.03 + 0.002 * steps.sum()
 
@@ -86,7 +88,7 @@ def test_drives_are_unequal_and_one_is_closed():
 
 
 def epipolar_errors(before, after, relative, intrinsics, keep):
-    """Distances (pixels) of Lucas-Kanade tracks from the epipolar lines of a relative pose."""
+    """Return the distances (pixels) of Lucas-Kanade tracks from the epipolar lines of a relative pose."""
     settings = {"winSize": (21, 21), "maxLevel": 3, "criteria": (3, 30, 0.01)}
     mask = np.where(keep, 255, 0).astype(np.uint8)
     points = cv2.goodFeaturesToTrack(before, 2000, 0.01, 3, mask=mask, blockSize=5)
@@ -101,15 +103,13 @@ def epipolar_errors(before, after, relative, intrinsics, keep):
     return np.abs((lines * np.c_[y, np.ones(len(y))]).sum(axis=1)) / np.hypot(lines[:, 0], lines[:, 1])
 
 
-def test_tracked_points_keep_to_the_true_poses():
+def test_tracked_points_agree_with_the_poses():
     frames = 30
-    _, scene_poses, _ = drives.way("05", frames, seed=0)
-    poses = drives.relative_to_first(scene_poses)
+    _, poses, _ = drives.way("05", frames, seed=0)
     _, intrinsics = drives.scaled_camera("05", 0.5)
     true, turned = [], []
     wrong = np.eye(4)
-    angle = np.radians(0.3)
-    wrong[:3, :3] = [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+    wrong[:3, :3] = cv2.Rodrigues(np.radians([0.3, 0, 0]))[0]
     for index in (3, 8, 20, 26):
         before, labels = dataset.render_frame("05", index, frames)
         after, _ = dataset.render_frame("05", index + 1, frames)
@@ -119,7 +119,7 @@ def test_tracked_points_keep_to_the_true_poses():
         turned.extend(epipolar_errors(before, after, wrong @ relative, intrinsics, still))
     assert len(true) > 500
     assert np.median(true) < 0.16
-    assert np.median(turned) > 0.3  # 0.3 degrees are seen at once
+    assert np.median(turned) > 0.3  # a rotation of 0.3 degrees is noticed
 
 
 def test_every_class_occurs_in_each_part_of_the_world():
@@ -152,7 +152,7 @@ def test_label_of_a_pixel_is_that_of_most_of_its_samples(half):
         samples = np.arange(count)[:, None] + np.array([-0.25, 0.25])
         inside.append(np.abs(samples - middle) <= 10 * half + 1e-6)
     covered = inside[0][:, None, :, None] & inside[1][None, :, None, :]
-    # Two of four: the nearer surface, which is the square before the sky.
+    # If two of four samples are inside, the nearer surface counts: the square, not the sky.
     assert np.array_equal(labels == ID["wall"], covered.sum(axis=(2, 3)) >= 2)
 
 
@@ -182,19 +182,18 @@ def test_same_seed_gives_the_same_bytes_for_any_number_of_processes(out, tmp_pat
     assert not np.array_equal(first, kitti.Sequence(out / "kitti", "00").frame(3))
 
 
-def test_stopped_run_goes_on_and_touches_nothing_that_is_there(out, tmp_path):
-    folder = tmp_path / "stopped"
-    dataset.write(folder, **SMALL)
-    before = contents(folder)
-    lost = [folder / "kitti/sequences/07/image_0/000004.png", folder / "kitti/sequences/00/labels_0/000011.png",
-            folder / "kitti/poses/00.txt", sorted((folder / "cityscapes").rglob("*.png"))[0]]
-    for path in lost:
+def test_a_stopped_run_resumes_and_keeps_complete_files(out, tmp_path):
+    folder = shutil.copytree(out, tmp_path / "stopped")
+    missing = [folder / "kitti/sequences/07/image_0/000004.png", folder / "kitti/sequences/00/labels_0/000011.png",
+               folder / "kitti/poses/00.txt", sorted((folder / "cityscapes").rglob("*.png"))[0]]
+    for path in missing:
         path.unlink()
-    (folder / "kitti/sequences/07/image_0/.000004.thesis-repro-00004711.png").write_bytes(b"half")  # of a killed run
+    # a temporary file of a killed run
+    (folder / "kitti/sequences/07/image_0/.000004.thesis-repro-00004711.png").write_bytes(b"half")
     untouched = folder / "kitti/sequences/07/image_0/000005.png"
     age = untouched.stat().st_mtime_ns
     dataset.write(folder, **SMALL)
-    assert contents(folder) == before
+    assert contents(folder) == contents(out)
     assert untouched.stat().st_mtime_ns == age
 
 
@@ -215,7 +214,7 @@ def test_bad_parameters_write_nothing(tmp_path, bad):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_folder_of_something_else_is_left_as_it_is(out, tmp_path):
+def test_a_folder_with_other_files_is_not_changed(out, tmp_path):
     before = contents(out)
     with pytest.raises(InputError):  # other parameters
         dataset.write(out, **{**SMALL, "frames": 13})

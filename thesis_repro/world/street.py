@@ -10,8 +10,8 @@ import numpy as np
 
 from thesis_repro.world import raster, things
 from thesis_repro.world.drives import ZONES, Style, Track
-from thesis_repro.world.raster import Environment, Textures
-from thesis_repro.world.textures import PERSONS, TILE
+from thesis_repro.world.raster import Environment
+from thesis_repro.world.textures import PERSONS, TILE, Bank
 
 KERB = 0.12
 BEYOND = 100.0  # metres of grass around all roads, up to a forest
@@ -37,12 +37,25 @@ class Mover:
 
 @dataclass
 class Street:
-    """A street, ready to be rendered."""
+    """A street along the camera's track, and the things on it."""
 
-    faces: np.ndarray
-    movers: list
-    textures: Textures
-    environment: Environment
+    rng: np.random.Generator
+    bank: Bank
+    style: Style
+    track: Track
+    parts: list = field(default_factory=list)  # matrices of faces
+    movers: list = field(default_factory=list)
+
+    def __post_init__(self):
+        self.names, self.environment = self.bank.names, environment(self.style)
+        self.crossings = []  # tracks of the roads that cross this one
+        if self.style.crossing is not None:
+            x, z, heading = self.track.at(self.style.crossing)
+            self.crossings.append(Track((), -75.0, 75.0, (x, z), heading - np.pi / 2))
+        roads = [self.track, *self.crossings]
+        self.middle = np.concatenate([np.stack([road.x, road.z], axis=1)[::2] for road in roads])
+        self.houses = np.empty((0, 2))  # points spread over all houses, at most 3 m apart
+        self.line = self.style.half + (self.style.sidewalk or 3.0)  # |d| at which houses and gardens begin
 
     def view(self, pose, intrinsics, size, frame, driven=0.0):
         """Render the image (float32, before exposure and noise) and the label map (uint8), both (height, width).
@@ -50,42 +63,8 @@ class Street:
         pose: 4x4 camera-to-world; intrinsics: 3x3, pixels; size: (height, width); frame, driven: as in `Mover.at`.
         """
         moved = [mover.at(frame, driven) for mover in self.movers]
-        return raster.render(np.concatenate([self.faces, *moved]), self.textures, pose, intrinsics, size,
+        return raster.render(np.concatenate([*self.parts, *moved]), self.bank.packed, pose, intrinsics, size,
                              self.environment)
-
-
-def build(rng, bank, track, style):
-    """Lay out a `Street` of a `Style` along a `Track`; rng: NumPy generator; bank: result of `textures.build`."""
-    roads = [track]
-    if style.crossing is not None:
-        x, z, heading = track.at(style.crossing)
-        roads.append(Track((), -75.0, 75.0, (x, z), heading - np.pi / 2))
-    plan = _Plan(rng, bank.names, style, track, roads)
-    _lay_ground(plan)
-    _surround(plan)
-    for side in (-1, 1):
-        _build_up(plan, side)
-        _furnish(plan, side)
-    _traffic(plan)
-    return Street(np.ascontiguousarray(np.concatenate(plan.parts)), plan.movers, bank.packed, environment(style))
-
-
-@dataclass
-class _Plan:
-    """A street in the making: its roads and the things placed so far."""
-
-    rng: np.random.Generator
-    names: dict  # of the textures
-    style: Style
-    track: Track  # of the camera
-    roads: list  # tracks; the camera's is the first
-    parts: list = field(default_factory=list)  # matrices of faces
-    movers: list = field(default_factory=list)
-
-    def __post_init__(self):
-        self.middle = np.concatenate([np.stack([road.x, road.z], axis=1)[::2] for road in self.roads])
-        self.houses = np.empty((0, 2))  # points spread over all houses, at most 3 m apart
-        self.line = self.style.half + (self.style.sidewalk or 3.0)  # |d| at which houses and gardens begin
 
     def off_road(self, x, z):
         """Return the distance of points, (n,) each, to the nearest edge of any road; negative on a road."""
@@ -115,31 +94,43 @@ class _Plan:
             s += step * self.rng.uniform(0.75, 1.35)
 
 
+def build(rng, bank, track, style):
+    """Lay out a `Street` of a `Style` along a `Track`; rng: NumPy generator; bank: result of `textures.build`."""
+    street = Street(rng, bank, style, track)
+    _lay_ground(street)
+    _surround(street)
+    for side in (-1, 1):
+        _build_up(street, side)
+        _furnish(street, side)
+    _traffic(street)
+    return street
+
+
 def _distance(x, z, points):
     """Return the distance of each place, (n,), to the nearest of the points (m, 2); infinity without points."""
     x, z = np.atleast_1d(x)[:, None], np.atleast_1d(z)[:, None]
     return np.sqrt(((x - points[:, 0]) ** 2 + (z - points[:, 1]) ** 2).min(axis=1, initial=np.inf))
 
 
-def _lay_ground(plan):
+def _lay_ground(street):
     """Place roads, kerbs and sidewalks along the tracks."""
-    half, width = plan.style.half, plan.style.sidewalk
-    plan.extrude([(-half, 0), (half, 0)], 1, plan.style.road, "road", step=2.0, ground=1)
+    half, width = street.style.half, street.style.sidewalk
+    street.extrude([(-half, 0), (half, 0)], 1, street.style.road, "road", step=2.0, ground=1)
     if width:
         for side in (-1, 1):
-            plan.extrude([(half, 0.05), (half, -KERB), (half + width, -KERB)], side, "sidewalk", "sidewalk",
-                         margin=0.2, ground=1)
-            plan.extrude([(half - 0.02, 0.01), (half + width, 0.01)], side, "asphalt", "road", ground=1)
-    for crossing in plan.roads[1:]:
+            street.extrude([(half, 0.05), (half, -KERB), (half + width, -KERB)], side, "sidewalk", "sidewalk",
+                           margin=0.2, ground=1)
+            street.extrude([(half - 0.02, 0.01), (half + width, 0.01)], side, "asphalt", "road", ground=1)
+    for crossing in street.crossings:
         places = np.arange(crossing.s[0], crossing.s[-1], 2.0)
-        plan.parts.append(things.extrude(plan.names, crossing, places, 1, [(-half, 0.005), (half, 0.005)], "asphalt",
-                                         "road", ground=1))
+        street.parts.append(things.extrude(street.names, crossing, places, 1, [(-half, 0.005), (half, 0.005)],
+                                           "asphalt", "road", ground=1))
 
 
-def _surround(plan):
+def _surround(street):
     """Place grass around the roads, a forest around the grass, and the sky."""
-    faces, light = things.Faces(plan.names), environment(plan.style)
-    low, high = plan.middle.min(axis=0) - BEYOND, plan.middle.max(axis=0) + BEYOND
+    faces, light = things.Faces(street.names), street.environment
+    low, high = street.middle.min(axis=0) - BEYOND, street.middle.max(axis=0) + BEYOND
     (x, z), (width, depth) = low, high - low
     faces.add((x, 0.06, z), (width, 0, 0), (0, 0, depth), "grass", "terrain",
               (width / TILE["grass"][0], depth / TILE["grass"][1]), ground=1)
@@ -148,110 +139,112 @@ def _surround(plan):
                   (np.abs(edge).max() / TILE["forest"][0], 1), lit=0)
     faces.add((-SKY_HALF, -SKY_HEIGHT, -SKY_HALF), (2 * SKY_HALF, 0, 0), (0, 0, 2 * SKY_HALF), "sky", "sky",
               (2 * SKY_HALF / TILE["sky"][0],) * 2, lit=0,
-              gain=plan.style.sky[0] / 128 / (light.ambient + raster.UNLIT * light.direct))
-    plan.parts.append(faces.matrix())
+              gain=street.style.sky[0] / 128 / (light.ambient + raster.UNLIT * light.direct))
+    street.parts.append(faces.matrix())
 
 
-def _build_up(plan, side):
+def _build_up(street, side):
     """Divide one side of the main road into stretches and fill each with a random zone."""
-    rng, s, end = plan.rng, plan.track.s[0], plan.track.s[-1]
+    rng, s, end = street.rng, street.track.s[0], street.track.s[-1]
     while s < end - 5:
         span = (s, min(s + rng.uniform(24, 60), end))
-        zone = str(rng.choice(ZONES, p=plan.style.zones))
+        zone = str(rng.choice(ZONES, p=street.style.zones))
         if zone == "row":
-            _house_row(plan, side, span, 0.02, 0.05, (2, 6), 0.5)
+            _house_row(street, side, span, 0.02, 0.05, (2, 6), 0.5)
         elif zone == "gardens":
-            _house_row(plan, side, span, rng.uniform(2, 6), 4.0, (1, 4), 0.85)
-            _border(plan, side, span, str(rng.choice(["fence", "hedge", "wall"])), rng.uniform(0.9, 1.6))
-            _scatter(plan, side, span, 1.0, 12.0, 0.1)
+            _house_row(street, side, span, rng.uniform(2, 6), 4.0, (1, 4), 0.85)
+            _border(street, side, span, str(rng.choice(["fence", "hedge", "wall"])), rng.uniform(0.9, 1.6))
+            _scatter(street, side, span, 1.0, 12.0, 0.1)
         elif zone == "park":
-            _scatter(plan, side, span, 1.0, 26.0, 0.5)
+            _scatter(street, side, span, 1.0, 26.0, 0.5)
             if rng.random() < 0.5:
-                _border(plan, side, span, "fence", 1.2)
+                _border(street, side, span, "fence", 1.2)
         else:
-            _border(plan, side, span, "wall", rng.uniform(1.8, 2.6))
-            _scatter(plan, side, span, 2.0, 12.0, 0.15)
+            _border(street, side, span, "wall", rng.uniform(1.8, 2.6))
+            _scatter(street, side, span, 2.0, 12.0, 0.15)
         s = span[1]
 
 
-def _house_row(plan, side, span, gap, setback, floors, pitched):
+def _house_row(street, side, span, gap, setback, floors, pitched):
     """Place houses side by side where there is room.
 
     gap: metres between houses; setback: metres behind the building line; floors: lowest number and one more than the
     highest; pitched: share of pitched roofs.
     """
-    rng, s = plan.rng, span[0]
+    rng, s = street.rng, span[0]
     across, along = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.45, 0.45, 6), np.linspace(0.05, 0.95, 5)))
     while s < span[1] - 6:
         width, depth = min(rng.uniform(9, 17), span[1] - s), rng.uniform(8, 12)
-        x, z, heading = plan.track.at(s + width / 2, side * (plan.line + setback + rng.uniform(0, 2)))
+        x, z, heading = street.track.at(s + width / 2, side * (street.line + setback + rng.uniform(0, 2)))
         yaw = heading + side * np.pi / 2
         points = np.stack([x + width * across * np.cos(yaw) + depth * along * np.sin(yaw),
                            z - width * across * np.sin(yaw) + depth * along * np.cos(yaw)], axis=1)
-        clear = _distance(*points.T, plan.houses).min() >= 0.8
-        if clear and plan.off_road(*points.T).min() > plan.style.sidewalk - 0.5:
-            plan.put(things.building(plan.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched),
-                     x, z, yaw)
-            plan.houses = np.concatenate([plan.houses, points])
+        clear = _distance(*points.T, street.houses).min() >= 0.8
+        if clear and street.off_road(*points.T).min() > street.style.sidewalk - 0.5:
+            house = things.building(street.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched)
+            street.put(house, x, z, yaw)
+            street.houses = np.concatenate([street.houses, points])
         s += width + gap
 
 
-def _border(plan, side, span, kind, height):
+def _border(street, side, span, kind, height):
     """Place a fence, a hedge or a wall along the building line."""
     texture, label, thickness = {"fence": ("picket", "fence", 0.0), "hedge": ("leaves", "vegetation", 0.7),
                                  "wall": ("stone", "wall", 0.3)}[kind]
-    near, far = plan.line + 0.15, plan.line + 0.15 + thickness
+    near, far = street.line + 0.15, street.line + 0.15 + thickness
     profile = [(near, -KERB), (near, -KERB - height)]
     if thickness:
         profile += [(far, -KERB - height), (far, -KERB)]
-    plan.extrude(profile, side, texture, label, (span[0], span[1] - 3), margin=1.0, step=2.0, lit=int(kind != "hedge"))
+    street.extrude(profile, side, texture, label, (span[0], span[1] - 3), margin=1.0, step=2.0,
+                   lit=int(kind != "hedge"))
 
 
-def _scatter(plan, side, span, near, far, density):
+def _scatter(street, side, span, near, far, density):
     """Place trees and bushes `near` to `far` metres behind the building line; density: plants for each metre."""
     for _ in range(int((span[1] - span[0]) * density) + 1):
-        x, z, _ = plan.track.at(plan.rng.uniform(*span), side * (plan.line + plan.rng.uniform(near, far)))
-        if plan.free(x, z, 2.0):
-            plant = things.tree if plan.rng.random() < 0.65 else things.bush
-            plan.put(plant(plan.names, plan.rng), x, z, plan.rng.uniform(0, np.pi))
+        x, z, _ = street.track.at(street.rng.uniform(*span), side * (street.line + street.rng.uniform(near, far)))
+        if street.free(x, z, 2.0):
+            plant = things.tree if street.rng.random() < 0.65 else things.bush
+            street.put(plant(street.names, street.rng), x, z, street.rng.uniform(0, np.pi))
 
 
-def _furnish(plan, side):
+def _furnish(street, side):
     """Place lamps, signs, trees, persons and parked cars on one side of the main road."""
-    rng, style, track = plan.rng, plan.style, plan.track
+    rng, style, track = street.rng, street.style, street.track
     ahead = 0.0 if side > 0 else np.pi  # direction of the traffic on that side
     for make, step, distance in ((things.lamp, 26.0, 0.45), (things.sign, 21.0, 0.5),
                                  (things.tree, 9.0 / style.trees, 0.8)):
         if make is things.tree and not style.sidewalk:
             continue
-        for s in plan.along(step):
+        for s in street.along(step):
             x, z, heading = track.at(s, side * (style.half + distance + (0 if style.sidewalk else 1.2)))
-            if plan.free(x, z, 0.3):
-                plan.put(make(plan.names, rng), x, z, heading + ahead + rng.uniform(-0.15, 0.15))
+            if street.free(x, z, 0.3):
+                street.put(make(street.names, rng), x, z, heading + ahead + rng.uniform(-0.15, 0.15))
     if not style.sidewalk:
         near = style.half + 0.7
-        plan.extrude([(near, 0), (near, -0.8), (near + 0.3, -0.8), (near + 0.3, 0.06)], side, "stone", "wall", step=4.0)
+        profile = [(near, 0), (near, -0.8), (near + 0.3, -0.8), (near + 0.3, 0.06)]
+        street.extrude(profile, side, "stone", "wall", step=4.0)
         return
     for _ in range(int((track.s[-1] - track.s[0]) * style.persons)):
         s, d = rng.uniform(track.s[0], track.s[-1]), side * (style.half + rng.uniform(0.6, style.sidewalk - 0.3))
-        if plan.free(*track.at(s, d)[:2], 0.4):
+        if street.free(*track.at(s, d)[:2], 0.4):
             height = rng.uniform(1.6, 1.9)
-            faces = things.cut_out(plan.names, f"person{rng.integers(0, PERSONS)}", "person", height / 2, height)
-            plan.movers.append(Mover(things.place(faces, 0, 0, 0, -KERB), track, s, float(rng.choice([0, 0.12, -0.12])),
-                                     d, rng.uniform(-0.5, 0.5)))
-    for s in plan.along(5.8):
+            faces = things.cut_out(street.names, f"person{rng.integers(0, PERSONS)}", "person", height / 2, height)
+            street.movers.append(Mover(things.place(faces, 0, 0, 0, -KERB), track, s,
+                                       float(rng.choice([0, 0.12, -0.12])), d, rng.uniform(-0.5, 0.5)))
+    for s in street.along(5.8):
         x, z, heading = track.at(s, side * (style.half - 1.0))
-        clear = _distance(x, z, plan.middle[len(track.x[::2]):])[0] >= style.half + 3  # of a crossing
+        clear = _distance(x, z, street.middle[len(track.x[::2]):])[0] >= style.half + 3  # of a crossing
         if rng.random() < style.parked[side > 0] and clear:
-            plan.put(things.car(plan.names, rng), x, z, heading + ahead + rng.normal(0, 0.02), 0.0)
+            street.put(things.car(street.names, rng), x, z, heading + ahead + rng.normal(0, 0.02), 0.0)
 
 
-def _traffic(plan):
+def _traffic(street):
     """Place moving cars: beside the camera on a highway; else ahead at its pace, towards it and on a crossing."""
-    rng, style, track = plan.rng, plan.style, plan.track
+    rng, style, track = street.rng, street.style, street.track
 
     def drive(road, s, pace, d, turn=0.0):
-        plan.movers.append(Mover(things.car(plan.names, rng), road, s, pace, d, turn))
+        street.movers.append(Mover(things.car(street.names, rng), road, s, pace, d, turn))
 
     if not style.sidewalk:
         for k in range(int((track.s[-1] - track.s[0]) / 28)):
@@ -260,9 +253,9 @@ def _traffic(plan):
         return
     for distance in style.leaders:
         drive(track, distance, None, 1.9)
-    for s in plan.along(1 / style.traffic):
+    for s in street.along(1 / style.traffic):
         drive(track, s + 40, -rng.uniform(0.7, 1.1), -1.8, np.pi)
-    for crossing in plan.roads[1:]:
+    for crossing in street.crossings:
         for k in range(14):
             side = 1 if k % 2 else -1
             drive(crossing, -side * (12.0 + 13.0 * k + rng.uniform(-3, 3)), side * rng.uniform(0.6, 0.75), 1.7 * side,
