@@ -1,8 +1,8 @@
-"""What every table, figure and text shows (captions.json), and the numbers that the thesis reports (reported.json).
+"""The captions of all tables, figures and texts (captions.json), and the numbers of the thesis (reported.json).
 
-An artefact is a dict: kind ("figure", "table", "text"), name (of its files), title, caption; constant, where it is the
-same for all data; needs, the variable without which a run on real frames cannot make it; thesis, what the thesis
-reports in words: data, text, and a template for this run's numbers, here. Both texts are Jinja templates.
+An artefact is a dict with kind ("figure", "table", "text"), name (of its files), title and caption. Optional keys:
+constant: true if it shows no data. needs: the variable that a run on real frames must set to make it.
+thesis: what the thesis reports, a dict of data and two Jinja templates, text and here (for this run's numbers).
 """
 
 import json
@@ -13,8 +13,8 @@ REPORTED = json.loads((_HERE / "reported.json").read_text(encoding="utf-8"))
 _CAPTIONS = json.loads((_HERE / "captions.json").read_text(encoding="utf-8"))
 CHAPTERS = _CAPTIONS["chapters"]  # the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
 ADDED = _CAPTIONS["added"]  # artefacts that are not in the thesis
-OF_STUDIES = _CAPTIONS["of_studies"]  # what studies alone show
-OF_EVIDENCE = _CAPTIONS["of_evidence"]  # what the evidence on real frames alone shows
+OF_STUDIES = _CAPTIONS["of_studies"]  # artefacts that only a study has
+OF_EVIDENCE = _CAPTIONS["of_evidence"]  # the artefact that only the evidence on real frames has
 CONSTANT = [artefact["name"] for artefacts in CHAPTERS.values() for artefact in artefacts if artefact.get("constant")]
 THESIS = [artefact["name"] for artefacts in CHAPTERS.values() for artefact in artefacts]
-CARD = "thesis_repro/segmentation/weights/README.md"  # of the model in the package
+CARD = "thesis_repro/segmentation/weights/README.md"  # describes the model in the package

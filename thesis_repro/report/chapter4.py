@@ -1,7 +1,7 @@
-"""Figures 4.6, 4.7 and 4.9 to 4.16: errors in metres, and keypoints.
+"""Figures 4.6, 4.7 and 4.9 to 4.16: errors in metres, and keypoints. comparison.py shows ratios of errors.
 
-`runs` is the table of `runner.run`. Lines and bars stand at the mean over repetitions; bands and error bars go from the
-lowest to the highest of them. What compares methods by ratios is in comparison.py.
+`runs` is the table of `runner.run`. Lines and bars show the mean over repetitions. Bands and error bars go from the
+lowest to the highest repetition.
 """
 
 import matplotlib.pyplot as plt
@@ -18,17 +18,17 @@ BAND = "lowest to highest of the repetitions"
 
 
 def figure_paths(truths, rows, paths, method):
-    """Figures 4.6, 4.11, 4.12: paths from above, and below each the distance to the true path along the way.
+    """Figures 4.6, 4.11, 4.12: the paths from above, and below each path its distance to the ground truth.
 
-    truths: {sequence: true positions (n, 3)}. rows: the runs to draw, of one method; repetition 0 is drawn bold, the
-    others faint. paths: {(sequence, run): estimated positions (n, 3)}.
+    truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method; repetition 0 is bold, the
+    other repetitions are faint. paths: {(sequence, run): estimated positions (n, 3)}.
     """
     groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
     columns = min(4, len(groups))
     count = -(-len(groups) // columns)
     figure, axes = style.new_figure(2 * count, columns, height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
                                     squeeze=False, height_ratios=[2, 1] * count)
-    pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))  # the path, and its error below
+    pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))  # panels of a path and of its error
     for panel in np.ravel(pairs[len(groups):]):
         panel.remove()
     errors = compare.spread(rows, "rmse")
@@ -36,11 +36,11 @@ def figure_paths(truths, rows, paths, method):
         true = truths[name]
         along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
         above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
-        for order, run in enumerate(runs["run"]):
+        for repetition, run in enumerate(runs["run"]):
             line = {"color": METHODS[method][1], "linewidth": 0.6, "alpha": 0.45, "label": "matched points shuffled"}
-            if order == 0:
+            if repetition == 0:
                 line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
-            estimated = paths[name, run] + (true[1] - paths[name, run][1])  # agree at frame 1, as for the RMSE
+            estimated = paths[name, run] + (true[1] - paths[name, run][1])  # paths meet at frame 1, as for the RMSE
             above.plot(estimated[:, 0], estimated[:, 2], **line)
             below.plot(along, np.linalg.norm(estimated - true, axis=1), **line)
         row = errors.loc[name]
@@ -61,7 +61,7 @@ def figure_paths(truths, rows, paths, method):
 
 
 def figure_4_07(runs):
-    """Keypoints that masks leave, as a part of the thesis's 2000, against dilation width."""
+    """Figure 4.7: the keypoints that masks keep, as a part of the thesis's 2000, against dilation width."""
     masked = compare.of_method(runs, "masked")
     kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack() / THESIS.max_keypoints
     figure, axes = style.new_figure(height=4.0)
@@ -72,8 +72,10 @@ def figure_4_07(runs):
 
 
 def figure_against_width(runs, metric):
-    """Figures 4.9, 4.10: the metric against dilation width, one line a sequence; below, one panel a sequence with the
-    band of its repetitions and that of all keypoints."""
+    """Figures 4.9, 4.10: the metric against dilation width, one line a sequence.
+
+    Below, one panel a sequence has the bands of the repetitions with masks and with all keypoints.
+    """
     masked = compare.of_method(runs, "masked")
     baseline = compare.spread(compare.of_method(runs, "baseline"), metric)
     names = sorted(masked["sequence"].unique())
@@ -103,8 +105,8 @@ def figure_against_width(runs, metric):
 
 
 def figure_of_methods(runs, metric):
-    """Figures 4.13, 4.15: the metric of baseline, best mask and plainly reduced, all sequences."""
-    names, tables = _of_methods(runs, metric)
+    """Figures 4.13, 4.15: the metric with all keypoints, the best mask and plainly reduced keypoints, all sequences."""
+    names, tables = _spread_by_method(runs, metric)
     figure, axes = style.new_figure(height=3.2)
     for offset, (method, table) in enumerate(tables.items()):
         _bar(axes, np.arange(len(names)) + (offset - 1) * 0.27, table, 0.25, method)
@@ -116,8 +118,8 @@ def figure_of_methods(runs, metric):
 
 
 def figure_of_sequences(runs, metric):
-    """Figures 4.14, 4.16: the same, one panel a sequence with its own scale."""
-    names, tables = _of_methods(runs, metric)
+    """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel with a scale of its own for each sequence."""
+    names, tables = _spread_by_method(runs, metric)
     figure, panels = style.small_panels(names)
     for panel, name in zip(panels, names, strict=True):
         for offset, (method, table) in enumerate(tables.items()):
@@ -130,24 +132,27 @@ def figure_of_sequences(runs, metric):
 
 
 def _lines(axes, table):
-    """One line a row of a table with one column a dilation width."""
+    """Draw one line for each row of a table with one column for each dilation width."""
     for index, (name, row) in enumerate(table.iterrows()):
         axes.plot(row.index, row, marker="o", markersize=2.5, label=name, **style.line_style(index))
     axes.set_xticks(table.columns.astype(int))
     axes.legend(title="sequence", loc="center left", bbox_to_anchor=(1, 0.5))
 
 
-def _of_methods(runs, metric):
-    """(sequences, {method: mean, lowest, highest, one row a sequence}) of the three methods of the thesis."""
-    rows = {method: compare.of_method(runs, method) for method in ("baseline", "masked", "reduced")}
-    rows["masked"] = thesis_tables.of_chosen_width(rows["masked"])
-    names = sorted(rows["baseline"]["sequence"].unique())
-    return names, {method: compare.spread(own, metric).reindex(names) for method, own in rows.items()}
+def _spread_by_method(runs, metric):
+    """Return the sequences and, for each method of the thesis, a table (mean, lowest, highest) with one row each."""
+    tables = {}
+    for method in METHODS:
+        rows = compare.of_method(runs, method)
+        rows = thesis_tables.of_chosen_width(rows) if method == "masked" else rows
+        tables[method] = compare.spread(rows, metric)
+    names = sorted(tables["baseline"].index)
+    return names, {method: table.reindex(names) for method, table in tables.items()}
 
 
 def _bar(axes, positions, table, width, method):
-    """Bars at the means of some rows of a table, with error bars that end at lowest and highest."""
-    text, color, hatch = METHODS[method]
-    axes.bar(positions, table["mean"], width, label=text, color=color, hatch=hatch, edgecolor="white", linewidth=0)
+    """Draw bars at the means of a table, with error bars from lowest to highest."""
+    label, color, hatch = METHODS[method]
+    axes.bar(positions, table["mean"], width, label=label, color=color, hatch=hatch, edgecolor="white", linewidth=0)
     errors = [table["mean"] - table["lowest"], table["highest"] - table["mean"]]
     axes.errorbar(positions, table["mean"], yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2)

@@ -1,8 +1,4 @@
-"""Masks against all keypoints, controls and other sources, in figures and tables: `compare.comparisons`, for reading.
-
-A figure has one row of panels an estimator and one column an error: those that judge, and the RMSE as the thesis
-measures it. Several sources of masks are further rows.
-"""
+"""Figures and tables of `compare.comparisons`: masks against all keypoints, controls and masks from other sources."""
 
 import textwrap
 from itertools import product
@@ -17,11 +13,13 @@ from thesis_repro.study.jobs import ESTIMATORS
 
 SHOWN = (*compare.JUDGING_METRICS, "rmse")
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
-KEYS = ["source", "method", "dilation_width", "estimator"]
 
 
 def figure_comparison(table):
-    """Every method's ratio to all keypoints, a row each: sequences in grey, geometric mean, bootstrap interval."""
+    """Draw each method's ratio to all keypoints: its sequences in grey, geometric mean and bootstrap interval.
+
+    The figure has one row of panels for each estimator. Its columns are the judging metrics and the thesis's RMSE.
+    """
     rows = _tested(_over_all_keypoints(table))
     labels = _labels(rows)
     order = list(labels.unique())
@@ -57,13 +55,13 @@ def _over_all_keypoints(table):
 
 
 def _tested(rows):
-    """Rows at the tested width, or at every one where masks of their source have none of that width."""
+    """Return the rows of the tested width. A source without masks of that width keeps all its rows."""
     masked = rows[(rows["method"] == "masked") & rows["tested"]]
     return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
 
 
 def _labels(rows):
-    """What each row is called: source where there are several, method, width of masks."""
+    """Label each row with its method, the width of its masks and, if there are several sources, its source."""
     source = rows["source"] + ": " if rows["source"].nunique() > 1 else ""
     width = rows["dilation_width"].where(rows["method"] == "masked")
     width = width.map(", width {:g}".format, na_action="ignore").fillna("")
@@ -71,24 +69,25 @@ def _labels(rows):
 
 
 def _sequences(table):
-    """The columns with the ratio of each sequence."""
+    """Return the names of the columns with the ratio of each sequence."""
     return list(table.columns[table.columns.get_loc("verdict") + 1:])
 
 
 def table_comparison(table):
-    """Every method over all keypoints and masks over every control, a column an error: "1.09 (0.98-1.32)".
+    """Return the ratios of each method to all keypoints, and of masks to each control, one column a metric.
 
-    The last columns are the verdict of the errors that judge together (`compare.overall`), and each sequence's ratio of
-    the first error.
+    A ratio is a text, "1.09 (0.98-1.32)". The last columns are the verdict on all judging metrics (`compare.overall`)
+    and each sequence's ratio of the first metric.
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
-    rows = rows.assign(what=_labels(rows))
+    rows = rows.assign(label=_labels(rows))
     shown = []
-    for _, pair in rows.groupby(["estimator", *KEYS[:3], "reference_source", "reference"], dropna=False, sort=False):
+    keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
+    for _, pair in rows.groupby(keys, dropna=False, sort=False):
         first, judging = pair.iloc[0], pair[pair["metric"].isin(compare.JUDGING_METRICS)]
         other_source = "" if first["reference_source"] in ("", first["source"]) else f"{first['reference_source']}: "
         shown.append({
-            "estimator": ESTIMATORS[first["estimator"]], "keypoints": first["what"],
+            "estimator": ESTIMATORS[first["estimator"]], "keypoints": first["label"],
             "number": round(first["keypoints"]), "over": other_source + compare.METHODS[first["reference"]],
             "sequences": pair["n"].max(), **{compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()},
             "verdict": compare.overall(judging["verdict"]) if len(judging) else pd.NA,
@@ -103,31 +102,34 @@ def _short(row):
 
 
 def table_widths(runs):
-    """What the best, the left-out and the fixed width give: ratios of errors to all keypoints, one row a sequence.
+    """Return the ratios of errors to all keypoints with the best, the left-out and the fixed width, by sequence.
 
-    Below each source's sequences their geometric mean with its bootstrap interval, and in how many the error is lower.
+    The last two rows of each source have the geometric mean with its bootstrap interval, and the number of sequences
+    with a lower error.
     """
     tables = {}
     for source in compare.sources(runs) or [""]:
-        own = compare.of_source(runs, source)
-        if own["dilation_width"][own["method"] == "masked"].nunique() > 1:
-            tables[source] = _widths(own)
+        masked, baseline = (compare.of_method(compare.of_source(runs, source), name) for name in ("masked", "baseline"))
+        if masked["dilation_width"].nunique() > 1:
+            tables[source] = _widths(masked, baseline)
     if len(compare.sources(runs)) > 1 and tables:
         return pd.concat(tables, names=["masks"]).reset_index("masks")
     return next(iter(tables.values()), pd.DataFrame())
 
 
-def _widths(runs):
-    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
-    chosen, again = thesis_tables.chosen_widths(masked, baseline), thesis_tables.stability(masked, baseline)
-    ratios = {f"{words}: {compare.METRICS[metric]}": compare.ratios(
-        thesis_tables.of_chosen_width(masked, chosen[choice]), baseline, metric)
-        for choice, words in CHOICES.items() for metric in ("rmse", "rmse_boresight_corrected") if metric in masked}
-    ratios["best width of one repetition, in the others: RMSE"] = again["elsewhere"]
+def _widths(masked, baseline):
+    chosen, stability = thesis_tables.chosen_widths(masked, baseline), thesis_tables.stability(masked, baseline)
+    ratios = {}
+    for choice, label in CHOICES.items():
+        rows = thesis_tables.of_chosen_width(masked, chosen[choice])
+        for metric in ("rmse", "rmse_boresight_corrected"):
+            if metric in masked:
+                ratios[f"{label}: {compare.METRICS[metric]}"] = compare.ratios(rows, baseline, metric)
+    ratios["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]
     table = pd.DataFrame(ratios, index=chosen.index).dropna(axis=1, how="all")
     shown = table.map(texts.number, na_action="ignore").astype(object)
     shown.loc["geometric mean"] = {name: _short(compare.geometric_mean(table[name])) for name in table}
     shown.loc["lower in"] = {name: f"{(table[name] < 1).sum()} of {table[name].count()}" for name in table}
     numbers = chosen[list(CHOICES)].rename(columns=CHOICES).assign(
-        **{"same best width in two repetitions (%)": again["same_best"].round()}).dropna(axis=1, how="all")
+        **{"same best width in two repetitions (%)": stability["same_best"].round()}).dropna(axis=1, how="all")
     return numbers.convert_dtypes().join(shown, how="right").rename_axis("sequence").reset_index()

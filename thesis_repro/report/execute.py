@@ -1,6 +1,6 @@
-"""How `make figures` executes a notebook: with progress, one line on failure, and what libraries log in a file.
+"""Execution of notebooks by `make figures`: with progress bars, one line on failure, and a log file.
 
-The Makefile calls `jupyter nbconvert --to notebook --execute` and names `Execution` as the preprocessor that does it.
+The Makefile calls `jupyter nbconvert --to notebook --execute` with `Execution` as its preprocessor.
 """
 
 import logging
@@ -21,14 +21,14 @@ from thesis_repro.settings import PREFIX
 
 
 class Execution(ExecutePreprocessor):
-    """Executes all cells of a notebook; ends the program with status 1 where one fails, 130 where it is interrupted."""
+    """Executes all cells of a notebook. Exits with status 1 if a cell fails and with 130 if it is interrupted."""
 
-    kernel_name = Unicode("python3").tag(config=True)  # not what the last editor of the notebook called it
-    log_file = Unicode("execution.log").tag(config=True)  # what is said outside of cells, and a failure's whole report
+    kernel_name = Unicode("python3").tag(config=True)  # the notebook may name a kernel that is not installed here
+    log_file = Unicode("execution.log").tag(config=True)  # for the output of libraries and the traceback of a failure
 
     def preprocess(self, nb, resources=None, km=None):
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
-        sys.excepthook = _say_why  # where nbconvert cannot write the result
+        sys.excepthook = _print_error  # nbconvert may fail to write the executed notebook
         name, path, started = resources["metadata"]["name"], Path(self.log_file), time.monotonic()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,27 +45,27 @@ class Execution(ExecutePreprocessor):
                     failure = f"{name} failed: {_reason(error)}"
                     longrun.note(failure)
         except KeyboardInterrupt:
-            logging.getLogger("asyncio").disabled = True  # would report the cell that nobody waits for now
-            print(f"{name} was interrupted; the same command goes on from here", file=sys.stderr)
+            logging.getLogger("asyncio").disabled = True  # would report the interrupted cell
+            print(f"{name} was interrupted; the same command resumes it", file=sys.stderr)
             sys.exit(130)
-        sys.exit(f"{failure}\nthe whole report: {os.path.relpath(path)}; the same command goes on from here")
+        sys.exit(f"{failure}\nthe traceback is in {os.path.relpath(path)}; the same command resumes")
 
     def setup_kernel(self, **options):
-        # what compiled libraries log goes to the log file instead of into the cells' outputs
+        # compiled libraries log into the log file, not into the outputs of cells
         self.extra_arguments = ["--IPKernelApp.capture_fd_output=False"]
-        # bars of progress (`files.progress`) go to this program's own standard error
+        # progress bars (`files.progress`) go to the standard error of this program
         environment = os.environ | {f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2"}
         return super().setup_kernel(env=environment, stdout=self._log, stderr=self._log, **options)
 
 
-def _say_why(kind, error, _trace):
+def _print_error(kind, error, _traceback):
     print(longrun.explain(error) or f"{kind.__name__}: {error}", file=sys.stderr)
 
 
 def _reason(error):
-    """Why a notebook failed, in one line."""
+    """Return in one line why a notebook failed."""
     if isinstance(error, DeadKernelError):
-        return "the kernel died, as it does where there is not enough memory"
+        return "the kernel died, probably for lack of memory"
     name, text = type(error).__name__, str(error)
     if isinstance(error, CellExecutionError):
         name, text = error.ename, error.evalue
