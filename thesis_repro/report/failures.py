@@ -1,4 +1,4 @@
-"""Where masks fail, step by step: how many keypoints they leave a step, and how well these determine its motion."""
+"""The steps on which masks fail: how many keypoints the masks keep, and how well these determine the motion."""
 
 from dataclasses import replace
 
@@ -13,21 +13,21 @@ from thesis_repro.report import style
 
 SETTINGS = replace(THESIS, estimator="refined")
 KINDS = {"all": ("all keypoints", style.BASELINE), "masks": ("masks", style.MASKED)}
-CELLS = 4  # of a frame, across and down
-CLEARLY = 0.15  # degrees by which one of two rotations of a step is more wrong
-BINS = (0, 100, 200, 300, 500, 10**6)  # of keypoints that agree with the motion
+CELLS = 4  # columns and rows into which a frame is divided
+CLEAR_DIFFERENCE = 0.15  # degrees between the rotation errors of a step with masks and with all keypoints
+BINS = (0, 100, 200, 300, 500, 10**6)  # edges for the number of keypoints that agree with the motion
 PANELS = {"agreeing": "agreeing\nkeypoints", "direction_std": "uncertainty of\ndirection (degrees)",
           "rotation_error": "rotation error\n(degrees)"}
 
 
 def measure(sequence, masks):
-    """One row a step and kind of keypoints, "all" or "masks", of the refined estimator over a kitti.Sequence.
+    """Return one row for each step of a kitti.Sequence and kind of keypoints ("all" or "masks"), refined estimator.
 
-    tracked, agreeing: keypoints, and those near the motion that all keypoints give (the best that is known of it).
-    Of the tracked ones cells, the share of 4x4 cells that hold one, and spread_u, spread_v, standard deviations in
-    pixels. Of the agreeing ones depth_spread, the ratio of upper to lower quartile; condition, of the normal equations,
-    and direction_std, how well they determine the direction of motion, degrees. Of the estimate rotation_error,
-    degrees, and flag.
+    tracked: number of keypoints. agreeing: number of keypoints that agree with the motion from all keypoints (the best
+    known motion). cells: share of 4x4 cells that contain a tracked keypoint. spread_u, spread_v: standard deviations
+    of the tracked keypoints, pixels. depth_spread: upper over lower quartile of the depths of the agreeing keypoints.
+    condition, direction_std: condition of their normal equations, and uncertainty of the direction of motion, degrees.
+    rotation_error: of the estimate, degrees. flag: texts of its flags.
     """
     rows, scale = [], scales(sequence)
     for index, steps in _steps(sequence, masks, range(len(sequence))):
@@ -37,21 +37,21 @@ def measure(sequence, masks):
         true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
         for kind, step in steps.items():
             current, previous, agreeing = _agreeing(step, reference, sequence)
-            of_agreeing = measured(reference.rotation, reference.translation, current[agreeing], previous[agreeing],
-                                   agreeing, SETTINGS.threshold)
+            fit = measured(reference.rotation, reference.translation, current[agreeing], previous[agreeing],
+                           agreeing, SETTINGS.threshold)
             cells = (step.previous // [sequence.size[1] / CELLS, sequence.size[0] / CELLS]).astype(int)
             rows.append({
                 "sequence": sequence.name, "frame": index, "kind": kind, "tracked": len(current),
                 "agreeing": int(agreeing.sum()), "cells": len(np.unique(cells, axis=0)) / CELLS**2,
                 "spread_u": step.previous[:, 0].std(), "spread_v": step.previous[:, 1].std(),
                 "depth_spread": _depth_spread(current[agreeing], previous[agreeing], reference),
-                "condition": of_agreeing.condition, "direction_std": of_agreeing.heading_std_deg,
+                "condition": fit.condition, "direction_std": fit.heading_std_deg,
                 "rotation_error": metrics.angles(true[:3, :3].T @ step.motion.rotation), "flag": "; ".join(step.flags)})
     return pd.DataFrame(rows)
 
 
 def _steps(sequence, masks, indices):
-    """The steps of both kinds over some consecutive frames of a sequence, as (frame, {kind: step})."""
+    """Yield (frame index, {kind: step}) for consecutive frames of a sequence."""
     odometries, scale = {kind: Odometry(sequence.intrinsics, SETTINGS) for kind in KINDS}, scales(sequence)
     for index in indices:
         frame = sequence.frame(index)
@@ -60,14 +60,14 @@ def _steps(sequence, masks, indices):
 
 
 def _agreeing(step, motion, sequence):
-    """A step's normalised correspondences, current and previous, and which of them are near a motion."""
+    """Return a step's normalised matched points, current and previous, and which of them agree with a motion."""
     current, previous = (pose.normalise(points, sequence.intrinsics) for points in (step.current, step.previous))
     limit = SUPPORT_THRESHOLDS * SETTINGS.threshold
     return current, previous, near(motion.rotation, motion.translation, current, previous, limit)
 
 
 def _depth_spread(current, previous, motion):
-    """Upper over lower quartile of the depths of correspondences, as far as these lie in front of the camera."""
+    """Return upper over lower quartile of the depths of the matched points in front of the camera."""
     projection = np.column_stack([motion.rotation, motion.translation])
     points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T, previous.T)
     ahead = points[2] * points[3] > 0
@@ -75,7 +75,7 @@ def _depth_spread(current, previous, motion):
 
 
 def table(steps):
-    """Medians of each sequence, all keypoints beside masks, then the steps by how many keypoints agree with masks."""
+    """Return the medians with all keypoints and with masks, by sequence and by number of agreeing keypoints."""
     wide = steps.pivot(index=["sequence", "frame"], columns="kind").reset_index(level="sequence")
     by_number = pd.cut(wide["agreeing", "masks"], BINS, right=False).map(
         lambda bin: f"{bin.left} to {bin.right - 1} agreeing" if bin.right < BINS[-1] else f"{bin.left} or more")
@@ -85,33 +85,33 @@ def table(steps):
                    for column in steps.columns[3:-1] for kind in KINDS}
         worse = group["rotation_error", "masks"] - group["rotation_error", "all"]
         rows.append({"steps": name, "number": len(group), **medians,
-                     f"masks worse by {CLEARLY} degrees": int((worse > CLEARLY).sum()),
-                     f"masks better by {CLEARLY} degrees": int((worse < -CLEARLY).sum()),
+                     f"masks worse by {CLEAR_DIFFERENCE} degrees": int((worse > CLEAR_DIFFERENCE).sum()),
+                     f"masks better by {CLEAR_DIFFERENCE} degrees": int((worse < -CLEAR_DIFFERENCE).sum()),
                      "flagged, masks": int((group["flag", "masks"] != "").sum())})
     return pd.DataFrame(rows)
 
 
 def figure(steps, sequences, masks):
-    """The worst step as a drawing, and below it what masks leave the worst two sequences, frame by frame.
+    """Draw the worst step, and below it, frame by frame, the measures of the two worst sequences.
 
-    sequences, masks: lists; the steps are theirs. Worst is where masks raise the rotation error the most: the
-    sequences by its mean, and the step among those of the first.
+    sequences, masks: lists of equal length. The worst sequences are those whose mean rotation error masks raise most.
+    The worst step is the one of the first of these sequences whose rotation error masks raise most.
     """
     error = steps.pivot(index=["sequence", "frame"], columns="kind", values="rotation_error")
     means = error.groupby("sequence").mean()
     names = list((means["masks"] / means["all"]).sort_values(ascending=False).index[:2])
     index = (error["masks"] - error["all"])[names[0]].idxmax()
-    place = [sequence.name for sequence in sequences].index(names[0])
+    worst = [sequence.name for sequence in sequences].index(names[0])
     axes = plt.figure(figsize=(style.PAGE_WIDTH, 7), layout="constrained").subplot_mosaic(
         [["drawing"] * len(names), *([f"{column} {name}" for name in names] for column in PANELS)],
         height_ratios=[2.0, 1, 1, 1])
-    _draw(axes["drawing"], sequences[place], masks[place], index)
+    _draw(axes["drawing"], sequences[worst], masks[worst], index)
     for name in names:
         for column, label in PANELS.items():
             panel = axes[f"{column} {name}"]
-            for kind, (words, color) in KINDS.items():
+            for kind, (text, color) in KINDS.items():
                 rows = steps[(steps["sequence"] == name) & (steps["kind"] == kind)]
-                panel.plot(rows["frame"], rows[column].where(rows[column] > 0), color=color, label=words, linewidth=1)
+                panel.plot(rows["frame"], rows[column].where(rows[column] > 0), color=color, label=text, linewidth=1)
             for frame in rows.loc[rows["flag"] != "", "frame"]:
                 panel.axvspan(frame - 0.5, frame + 0.5, color=style.ORANGE, alpha=0.3, linewidth=0,
                               label="flag: ambiguous motion")
@@ -125,7 +125,7 @@ def figure(steps, sequences, masks):
 
 
 def _draw(panel, sequence, masks, index):
-    """The keypoints of the frame before a step, without the frame: kept by the mask or not, near the motion or not."""
+    """Draw the keypoints before a step: dropped by the mask, or kept, and whether they agree with the motion."""
     _, (_, steps) = _steps(sequence, masks, (index - 1, index))
     motion, mask = steps["all"].motion, masks[index - 1]
     _, _, agreeing = _agreeing(steps["masks"], motion, sequence)

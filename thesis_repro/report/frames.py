@@ -1,4 +1,4 @@
-"""Figures of single frames in chapters 3 and 4: label maps, masks, and the keypoints that masks leave."""
+"""Figures of single frames in chapters 3 and 4: label maps, masks, and the keypoints that masks keep."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -13,7 +13,7 @@ from thesis_repro.report.style import BLUE, EDGE_COLOR, KEYPOINT, ORANGE, PAGE_W
 def figure_3_03(image, label_map, prediction, label):
     """Figure 3.3: intersection and union of a prediction and its label map for one class (Equation 3.1).
 
-    image: (h, w) gray or (h, w, 3) colours.
+    image: (h, w) gray or (h, w, 3) RGB.
     """
     true, predicted = label_map == label.id, prediction == label.id
     intersection, union = (true & predicted).sum(), (true | predicted).sum()
@@ -44,38 +44,35 @@ def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
 
 
 def figure_masks(frame, masks, keypoints, true_edges=None):
-    """Masks of one frame side by side, {title: (h, w)}, with their keypoints, {title: (n, 2)}, and the true boundaries.
+    """Figure "masks": one frame with several masks. The kept area is light; true boundaries are drawn on it.
 
-    What a mask keeps is light. true_edges: (h, w), 255 on them, or None where they are not known.
+    masks: {title: (h, w)}. keypoints: {title: (n, 2)}. true_edges: (h, w), 255 on boundaries, or None if unknown.
     """
-    light = {title: np.where(mask > 0, frame // 2 + 127, frame // 3) for title, mask in masks.items()}
-    true_edges = np.zeros_like(frame) if true_edges is None else true_edges
-    return _pictures(frame, {title: _with_edges(picture, true_edges) for title, picture in light.items()}, keypoints,
-                     columns=2)
+    edges = np.zeros_like(frame) if true_edges is None else true_edges
+    pictures = {title: _with_edges(np.where(mask > 0, frame // 2 + 127, frame // 3), edges)
+                for title, mask in masks.items()}
+    return _pictures(frame, pictures, keypoints, columns=2)
 
 
-def figure_4_02(image, label_map, prediction, whose):
-    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction (Section 4.1).
-
-    whose: the model's name, as "the model of this run".
-    """
+def figure_4_02(image, label_map, prediction, model_name):
+    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction (Section 4.1)."""
     figure, axes = style.new_figure(1, 3, height=2.5)
     style.show_image(axes[0], image, "image")
     style.show_image(axes[1], colorize(label_map), "label map")
-    style.show_image(axes[2], colorize(prediction), f"prediction of\n{whose}")
+    style.show_image(axes[2], colorize(prediction), f"prediction of\n{model_name}")
     style.class_legend(figure, label_map, prediction)
     return figure
 
 
 def figure_4_03(frame, prediction, title, label_map=None):
-    """Figure 4.3: a KITTI frame, its predicted label map at the network's size, and its true one where there is any."""
+    """Figure 4.3: a KITTI frame, its predicted label map at the network's size, and its true label map if known."""
     label_maps = {"prediction": prediction} | ({} if label_map is None else {"true label map": label_map})
-    in_colors = {text: style.label_colors(shown, frame) for text, shown in label_maps.items()}
-    return _pictures(frame, {title: frame} | in_colors, label_maps=label_maps.values())
+    pictures = {text: style.label_colors(label_map, frame) for text, label_map in label_maps.items()}
+    return _pictures(frame, {title: frame} | pictures, label_maps=label_maps.values())
 
 
 def figure_4_04(frame, edge_image, keypoints, title):
-    """Figure 4.4: keypoints, (n, 2) pixels, that the mask left along the predicted boundaries."""
+    """Figure 4.4: the keypoints, (n, 2) pixels, that the mask keeps along the predicted boundaries."""
     figure, (axes,) = style.frame_panels(frame)
     brighter = np.clip(230 * (frame / max(np.percentile(frame, 98), 1)) ** 0.6, 0, 255).astype(np.uint8)
     style.show_image(axes, _with_edges(brighter, edge_image), title)
@@ -85,17 +82,17 @@ def figure_4_04(frame, edge_image, keypoints, title):
 
 def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation_width, title):
     """Figure 4.5: the procedure in five panels: frame, all keypoints, prediction, dilated edges, kept keypoints."""
-    everywhere = f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints"
-    on_mask = f"(e) the {len(kept_keypoints)} keypoints that the mask keeps"
+    all_title = f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints"
+    kept_title = f"(e) the {len(kept_keypoints)} keypoints that the mask keeps"
     return _pictures(frame, {
-        f"(a) {title}": frame, everywhere: frame, "(c) prediction": style.label_colors(prediction, frame),
-        f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask, on_mask: frame},
-        {everywhere: all_keypoints, on_mask: kept_keypoints}, columns=3, label_maps=[prediction],
+        f"(a) {title}": frame, all_title: frame, "(c) prediction": style.label_colors(prediction, frame),
+        f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask, kept_title: frame},
+        {all_title: all_keypoints, kept_title: kept_keypoints}, columns=3, label_maps=[prediction],
         width=1.4 * PAGE_WIDTH)
 
 
 def figure_4_08(views, title):
-    """Figure 4.8: one place in consecutive frames and how its keypoints jump: views of `flicker.follow`."""
+    """Figure 4.8: one place in consecutive frames, where keypoints jump. views: from `flicker.follow`."""
     figure, axes = style.new_figure(1, len(views), height=3.4)
     for panel, view in zip(axes, views, strict=True):
         height, width = view.crop.shape
@@ -105,19 +102,19 @@ def figure_4_08(views, title):
             panel.scatter(*view.expected.T, s=34, facecolors="none", edgecolors=PINK, linewidths=1.1)
         style.show_image(panel, _with_edges(view.crop, view.edges), text)
         panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
-        panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))  # a ring at the rim must not stretch the panel
-    points = {"linestyle": "none", "marker": "o"}
+        panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))  # a circle at the border would widen the panel
+    marker = {"linestyle": "none", "marker": "o"}
     figure.legend(handles=[
         Patch(color=np.array(EDGE_COLOR) / 255, label="edges of the predicted label map"),
-        Line2D([], [], **points, markersize=4, color=KEYPOINT["color"], label="keypoints"),
-        Line2D([], [], **points, markersize=6, markerfacecolor="none", color=PINK,
+        Line2D([], [], **marker, markersize=4, color=KEYPOINT["color"], label="keypoints"),
+        Line2D([], [], **marker, markersize=6, markerfacecolor="none", color=PINK,
                label="keypoints of the frame before, tracked to here")], loc="outside lower center", ncols=3)
     figure.suptitle(title, fontsize=9)
     return figure
 
 
 def _pictures(frame, pictures, keypoints=(), columns=1, label_maps=(), width=PAGE_WIDTH):
-    """Pictures of a frame's shape by title, keypoints (n, 2) on those that have some, and the classes of label maps."""
+    """Show pictures {title: picture} of a frame's shape, with keypoints {title: (n, 2)} and a legend of label maps."""
     figure, axes = style.frame_panels(frame, -(-len(pictures) // columns), columns, width)
     for panel, (title, picture) in zip(axes, pictures.items()):
         style.show_image(panel, picture, title)

@@ -1,46 +1,42 @@
-"""The gap between domains (Section 4.1) as a table and a figure, and how good the label maps of a run are.
-
-What is shown is a `segmentation.domain_gap.Gap`.
-"""
+"""The domain gap (Section 4.1), a `segmentation.domain_gap.Gap`, as a table and a figure; the label maps' quality."""
 
 import pandas as pd
 
 from thesis_repro.report.style import BLUE, GREEN, ORANGE, new_figure
 
-FRAMES = "the odometry's frames"  # the domain that masks are made on
-# where the model in the package has seen some of the images: its card says how good it is on others
+FRAMES = "the odometry's frames"  # the domain for which masks are made
+# a model and a domain with images that are in the model's training data
 SEEN = ("the model in the package", "KITTI's street scenes")
-RECORD = "quality"  # a table in the build folder: the scores, and which model's label maps the odometry uses
+RECORD = "quality"  # name of the table in the build folder with the scores of all models
 COLOURS = (BLUE, ORANGE, GREEN)  # of the domains
-FLICKER = "pixels that flicker (%)"
-MEASURES = {  # column: what the table calls it, factor, digits
+MEASURES = {  # column: name in the table, factor, digits
     "images": ("images", 1, 0), "classes": ("classes present", 1, 0), "mean_iou": ("mean IoU over these", 1, 3),
     "accuracy": ("pixel accuracy", 1, 3), "sky_recall": ("sky found (%)", 100, 1),
     "dark": ("ground that is dark (%)", 100, 1), "dark_wrong": ("dark ground taken for something else (%)", 100, 1),
     "lit_wrong": ("lit ground taken for something else (%)", 100, 1),
 }
-RARE = 0.0005  # of a domain's pixels; classes below that everywhere are left out of the figure
+MIN_SHARE = 0.0005  # of a domain's pixels; the figure leaves out classes with a smaller share in all domains
 
 
 def table(gap):
-    """A row for each measure and class, a column for each model and domain; empty where a class is not there.
+    """Return one row for each measure and class, one column for each model and domain; empty if the class is absent.
 
-    Flicker needs no true label maps. It is measured on the odometry's frames, and stands in a model's first column.
+    Flicker is measured on the odometry's frames without label maps. It is in the first column of each model.
     """
     scores, classes = (rows.assign(column=rows["model"] + ": " + rows["domain"]) for rows in (gap.scores, gap.classes))
     measures = pd.DataFrame({name: (factor * scores[key]).round(digits)
                              for key, (name, factor, digits) in MEASURES.items()}).set_axis(scores["column"]).T
     ious = classes.pivot(index=["id", "class"], columns="column", values="iou").droplevel("id").round(3)
     first_columns = dict(zip(scores["model"][::-1], scores["column"][::-1]))
-    flicker = (100 * gap.flicker).round(2).rename(first_columns).to_frame(FLICKER).T
+    flicker = (100 * gap.flicker).round(2).rename(first_columns).to_frame("pixels that flicker (%)").T
     table = pd.concat([measures, ious.rename("IoU: {}".format), flicker])
     return table.rename_axis(index="measure", columns=None).reset_index()
 
 
 def figure(gap):
-    """IoU of each class, a panel a model and a bar a domain; lines stand at the means over classes."""
+    """Draw the IoU of each class, one panel a model and one bar a domain. Lines show the means over classes."""
     models, domains = gap.scores["model"].unique(), list(gap.scores["domain"].unique())
-    common = gap.classes[gap.classes.groupby("class")["share"].transform("max") >= RARE]
+    common = gap.classes[gap.classes.groupby("class")["share"].transform("max") >= MIN_SHARE]
     ious = common.pivot(index=["id", "class"], columns=["model", "domain"], values="iou").droplevel("id")
     drawn, axes = new_figure(len(models), 1, height=2.1 * len(models) + 0.6, squeeze=False, sharex=True, sharey=True)
     for panel, model in zip(axes[:, 0], models):
@@ -56,10 +52,10 @@ def figure(gap):
 
 
 def label_map_quality(build):
-    """How good the label maps of a run are, from RECORD in its build folder: a list of dicts, one a domain.
+    """Return the scores of the model that the odometry uses, one dict a domain, or [] if notebook 05 measured none.
 
-    `used`: by the model that the odometry uses. `seen`: some of the images were in the model's training.
-    The domain that masks are made on comes first where it has true label maps. Empty where nothing was measured.
+    They are read from RECORD in the build folder. The odometry's frames come first if they have true label maps.
+    `seen`: whether some of the domain's images are in the model's training data.
     """
     path = build / f"{RECORD}.csv"
     if not path.is_file():
