@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from thesis_repro import InputError, check, files, stages
-from thesis_repro.check import check_cityscapes, check_kitti, oddities, of_masks, path_oddities
+from thesis_repro.check import check_cityscapes, check_kitti, mask_oddities, oddities, path_oddities
 from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
@@ -142,7 +142,7 @@ def test_implausible_masks_are_one_line_with_the_option(tiny_kitti, tmp_path, ki
         cv2.imwrite(str(path), image)
     sequence = Sequence(tiny_kitti, "00")
     made = MaskFolder(folder, sequence) if kind == "masks" else LabelMasks(folder, sequence, 3, MaskSettings(**options))
-    line, odd = of_masks(made, sequence)
+    line, odd = mask_oddities(made, sequence)
     assert "%" in line and [seen in text for text in odd] == ([True] if seen else [])
 
 
@@ -152,11 +152,11 @@ def test_masks_of_other_frames_and_other_names_of_files(tiny_kitti, tmp_path):
     for path in sequence.frame_paths:
         files.write_png(folder / f"{path.name}.png", HALF)
     made = MaskFolder(folder, sequence)
-    assert of_masks(made, sequence)[1] == []
+    assert mask_oddities(made, sequence)[1] == []
     assert np.array_equal(MaskFolder(folder, sequence, invert=True)[2], 255 - HALF)
     assert np.array_equal(MaskFolder(made.paths[0], sequence)[3], read_mask(made.paths[0], sequence.size))
     cv2.imwrite(str(sequence.frame_paths[0]), np.zeros((48, 64), np.uint8))
-    assert len(of_masks(made, sequence)[1]) == 1
+    assert len(mask_oddities(made, sequence)[1]) == 1
     files.write_png(tmp_path / "unfinished" / "000000.png", HALF)  # the mask of one frame is not one for all frames
     with pytest.raises(InputError, match="000001.png"):
         MaskFolder(tmp_path / "unfinished", sequence)

@@ -1,6 +1,6 @@
-"""Checks of the user's KITTI and Cityscapes folders: what is missing, wrong or odd, and which commands can be run.
+"""Check the user's KITTI and Cityscapes folders: report missing, wrong and odd files, and which commands can be run.
 
-Odd input is readable but probably not what the user believes it to be. It causes a warning, not an error.
+Odd input can be read, but is probably not what the user intended. It causes a warning, not an error.
 """
 
 import sys
@@ -19,89 +19,91 @@ from thesis_repro.settings import read_settings
 class _Problems(list):
     """A list of problems, one line each."""
 
-    def of(self, function, *arguments):
-        """Result of a function; None if it raises InputError, whose message is added to the list."""
+    def call(self, function, *arguments):
+        """Return the result of a function. If it raises InputError, add the message to the list and return None."""
         try:
             return function(*arguments)
         except InputError as error:
             self.append(str(error))
             return None
 
-    def of_each(self, function, items, description):
-        """Call a function for every item, in threads, because reading and decoding release Python's lock."""
-        calls = (joblib.delayed(self.of)(function, item) for item in items)
+    def call_for_each(self, function, items, description):
+        """Call a function for every item in threads; reading and decoding release Python's lock."""
+        calls = (joblib.delayed(self.call)(function, item) for item in items)
         results = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(calls)
         for _ in files.progress(results, description, total=len(items), unit="file"):
             pass
 
 
 def check_kitti(root, deep=False):
-    """Check every sequence below an odometry root; returns (lines that describe it, problems).
+    """Check all sequences below an odometry root. Returns (lines that describe the sequences, problems).
 
-    Names, numbers, beginning and end of every file, calibration, times and poses are checked, and the first and last
-    frame are decoded. deep: all frames are decoded, on all cores.
+    Checks file names and numbers, calibration, times and poses, and the start and end of every frame's file. Decodes
+    the first and the last frame. deep: decodes all frames, on all cores.
     """
-    facts, problems, sound = [], _Problems(), []
-    every = kitti.with_frames(root)
-    with_truth = problems.of(kitti.sequences, root) or []
-    for name in every:
-        fact, of_sequence = _check_sequence(root, name, name in with_truth, deep)
+    facts, problems, usable = [], _Problems(), []
+    with_truth = problems.call(kitti.sequences, root) or []
+    for name in kitti.with_frames(root):
+        fact, sequence_problems = _check_sequence(root, name, name in with_truth, deep)
         facts.append(fact)
-        problems += of_sequence
-        sound += [] if of_sequence else [name]
-    for commands, names in (("odometry, predict and masks", sound),
-                            ("evaluate, boresight, study and plan", [name for name in sound if name in with_truth])):
+        problems += sequence_problems
+        usable += [] if sequence_problems else [name]
+    for commands, names in (("odometry, predict and masks", usable),
+                            ("evaluate, boresight, study and plan", [name for name in usable if name in with_truth])):
         facts.append(f"can be run: {commands} with {', '.join(names)}" if names else f"cannot be run: {commands}")
     return facts, sorted(problems)
 
 
 def _check_sequence(root, name, needs_truth, deep):
-    """(one line that describes a sequence, its problems)"""
+    """Check one sequence. Returns (one line that describes it, problems).
+
+    Unlike kitti.Sequence, this lists all problems, not only the first.
+    """
     folder, problems = Path(root) / "sequences" / name, _Problems()
-    where = kitti.images_of(folder)
-    paths = problems.of(files.images, where)
+    frame_folder = kitti.images_of(folder)
+    paths = problems.call(files.images, frame_folder)
     if not paths:
-        return f"sequence {name}: no frames", problems or [f"{where}: holds no PNG or JPEG frames"]
-    matrix = problems.of(kitti.read_intrinsics, folder / "calib.txt", where.name)
+        return f"sequence {name}: no frames", problems or [f"{frame_folder}: holds no PNG or JPEG frames"]
+    matrix = problems.call(kitti.read_intrinsics, folder / "calib.txt", frame_folder.name)
     poses, times, rows = Path(root) / "poses" / f"{name}.txt", folder / "times.txt", {}
     if needs_truth:
-        rows[poses] = problems.of(kitti.read_poses, poses)
+        rows[poses] = problems.call(kitti.read_poses, poses)
     if times.is_file():
-        rows[times] = problems.of(kitti.read_times, times)
+        rows[times] = problems.call(kitti.read_times, times)
     counts = {path: len(values) for path, values in rows.items() if values is not None}
     missing = kitti.missing_frames(paths, max([count for count in counts.values() if count > len(paths)], default=None))
     problems += [f"{path}: is missing" for path in missing]
     if not missing:
-        problems.of(kitti.check_numbering, paths)
+        problems.call(kitti.check_numbering, paths)
         for path, count in counts.items():
-            problems.of(kitti.check_count, path, count, paths)
-    size = problems.of(files.glance, paths[0])
+            problems.call(kitti.check_count, path, count, paths)
+    size = problems.call(files.glance, paths[0])
     if size and matrix is not None:
-        problems.of(kitti.check_camera, folder / "calib.txt", matrix, paths[0], size)
+        problems.call(kitti.check_camera, folder / "calib.txt", matrix, paths[0], size)
 
     def check_frame(path):
-        its_size = files.read_gray(path).shape if deep or path in (paths[0], paths[-1]) else files.glance(path)
-        kitti.check_size(path, its_size, size)
+        decode = deep or path in (paths[0], paths[-1])
+        kitti.check_size(path, files.read_gray(path).shape if decode else files.glance(path), size)
 
-    problems.of_each(check_frame, paths if size else paths[1:], f"sequence {name}")
+    problems.call_for_each(check_frame, paths if size else paths[1:], f"sequence {name}")
     complete = kitti.FRAME_COUNTS.get(name, len(paths))
     notes = {f"{len(paths)} of {len(paths) + len(missing)} frames": bool(missing),
              f"{len(paths)} frames{f' of {size[1]}x{size[0]}' if size else ''}": not missing,
-             f"in {where.name}": where.name != kitti.IMAGE_FOLDERS[0],
+             f"in {frame_folder.name}": frame_folder.name != kitti.IMAGE_FOLDERS[0],
              f"an excerpt of {complete}": complete != len(paths),
-             "no true poses, so steps are those of --speed or 1 m": not needs_truth,
+             "no ground truth, so step lengths follow from --speed, or are 1 m": not needs_truth,
              f"no times.txt, so {1 / kitti.FRAME_TIME:g} frames a second": not times.is_file()}
     return f"sequence {name}: {'; '.join(note for note, holds in notes.items() if holds)}", problems
 
 
 def check_cityscapes(root, deep=False, splits=("train", "val")):
-    """Check the training and validation split; returns (lines that describe them, problems).
+    """Check the training and validation split. Returns (lines that describe the splits, problems).
 
-    Names, and beginning and end of every file are checked, and the first and last pair are decoded. deep: all are.
+    Checks file names, and the start and end of every file. Decodes the first and the last pair. deep: decodes all.
     """
     facts, problems = [], _Problems()
     for split in splits:
-        pairs = problems.of(cityscapes.listing, root, split)
+        pairs = problems.call(cityscapes.listing, root, split)
         if pairs is None:
             continue
         ids, ends = set(), (pairs[0], pairs[-1])
@@ -116,7 +118,7 @@ def check_cityscapes(root, deep=False, splits=("train", "val")):
                 size, label_size = files.glance(pair.image), files.glance(pair.label)
             kitti.check_size(pair.label, label_size, size, "its image")
 
-        problems.of_each(check_pair, pairs, f"split {split}")
+        problems.call_for_each(check_pair, pairs, f"split {split}")
         names = ", ".join(f"{label.name} {label.id}" for label in cityscapes.LABELS if label.id in ids)
         facts.append(f"split {split}: {sum(None not in pair for pair in pairs)} images with label maps; "
                      f"{'labels' if deep else 'labels in the first and last'}: {names}")
@@ -124,8 +126,8 @@ def check_cityscapes(root, deep=False, splits=("train", "val")):
 
 
 def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=False):
-    """Print the content of the folders, problems and warnings; returns whether there are no problems."""
-    wrong = False
+    """Print the content of the folders, problems and warnings. Returns True if there are no problems."""
+    has_problems = False
     check_semantic = partial(check_cityscapes, splits=("train",))  # KITTI's street scenes have one split
     for option, root, check in (("KITTI", kitti_root, check_kitti), ("CITYSCAPES", cityscapes_root, check_cityscapes),
                                 ("KITTI_SEMANTIC", kitti_semantic, check_semantic)):
@@ -136,121 +138,122 @@ def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=Fals
         print("\n  ".join([str(root), *facts]))
         for problem in problems:
             print(f"wrong: {one_line(problem)}", file=sys.stderr)
-        wrong = wrong or bool(problems)
-    for name in kitti.with_frames(kitti_root) if kitti_root and not wrong else ():
+        has_problems = has_problems or bool(problems)
+    for name in kitti.with_frames(kitti_root) if kitti_root and not has_problems else ():
         for line in oddities(kitti.Sequence(kitti_root, name)):
             print(f"warning: {one_line(line)}", file=sys.stderr)
-    return not wrong
+    return not has_problems
 
 
 # Odd input
 
-FRAME_SECONDS = 0.005, 2  # between frames; other values are probably not in seconds
-MAX_SPEED = 60  # metres a second; the cars of KITTI drive at most 27
-AHEAD = 0.5  # share of a step along the camera's axis; KITTI has 0.97 or more
-OFF_CENTRE = 0.1, 0.15  # offset of the principal point, in frame widths and heights; KITTI has at most 0.04
-SAMPLE = 6  # frames whose masks are checked
+FRAME_SECONDS = 0.005, 2  # least and greatest time between frames; times outside are probably not in seconds
+MAX_CAR_SPEED = 60  # metres a second; the cars of KITTI drive at most 27
+MIN_FORWARD_SHARE = 0.5  # of a step, along the camera's axis; KITTI has 0.97 or more
+MAX_CENTRE_OFFSET = 0.1, 0.15  # of the principal point, in frame widths and heights; KITTI has at most 0.04
+MASK_SAMPLES = 6  # number of frames whose masks are checked
 MIN_COVERAGE, MAX_COVERAGE = 0.005, 0.99
-# Ratio of the mean gradient inside a mask to that outside. The thesis's masks cover less than half of a frame and have
-# 0.98 to 1.6. Inverted, they cover more and have 0.64 to 1.02.
-MIN_CONTRAST, MIN_CONTRAST_OF_MOST = 0.7, 0.9
-TURNING = 0.3  # degrees a frame; smaller turns cannot be compared
+# Mean gradient inside a mask divided by the mean gradient outside. The thesis's masks cover less than half of a frame
+# and have 0.98 to 1.6. Inverted, they cover more than half and have 0.64 to 1.02.
+MIN_CONTRAST, MIN_CONTRAST_OF_LARGE_MASK = 0.7, 0.9
+MIN_TURN_SPREAD = 0.3  # degrees a frame; smaller turns cannot be compared
 MIN_CORRELATION, MAX_TURN_DIFFERENCE = 0.4, 0.5  # degrees; correct paths have >= 0.79 and <= 0.04
 
 
 def oddities(sequence):
-    """Warnings about a sequence whose times, poses, camera or frames are probably not its own, one line each."""
-    lines, where = [], f"sequence {sequence.name}: "
+    """Warnings, one line each, if a sequence's times, poses, camera matrix or frames are implausible."""
+    lines, prefix = [], f"sequence {sequence.name}: "
     seconds = np.diff(sequence.times)
     if len(seconds) and not FRAME_SECONDS[0] <= np.median(seconds) <= FRAME_SECONDS[1]:
-        lines.append(f"{where}frames are {np.median(seconds):g} s apart; times.txt must be in seconds")
+        lines.append(f"{prefix}frames are {np.median(seconds):g} s apart; times.txt must be in seconds")
     elif sequence.has_truth and len(seconds):
         motion = np.linalg.inv(sequence.poses[:-1]) @ sequence.poses[1:]
         metres = np.linalg.norm(motion[:, :3, 3], axis=1)
-        speed, ahead = metres / seconds, motion[metres > 0.1, 2, 3] / metres[metres > 0.1]
-        if speed.max() > MAX_SPEED:
-            lines.append(f"{where}at frame {speed.argmax() + 1} the car drives {speed.max():.0f} m/s, "
-                         f"{np.median(speed):.3g} in the middle of all; positions must be in metres, one line a frame")
-        if len(ahead) and np.median(ahead) < AHEAD:
-            lines.append(f"{where}{np.median(ahead):.2f} of a step lies along the camera's axis; poses must be camera "
-                         "to world (inverted?), x right, y down, z ahead")
+        speed, forward = metres / seconds, motion[metres > 0.1, 2, 3] / metres[metres > 0.1]
+        if speed.max() > MAX_CAR_SPEED:
+            lines.append(f"{prefix}at frame {speed.argmax() + 1} the car drives {speed.max():.0f} m/s "
+                         f"(median: {np.median(speed):.3g}); positions must be in metres, one line a frame")
+        if len(forward) and np.median(forward) < MIN_FORWARD_SHARE:
+            lines.append(f"{prefix}{np.median(forward):.2f} of a step lies along the camera's axis; poses must be "
+                         "camera to world (inverted?), x right, y down, z ahead")
     height, width = sequence.size
     (fx, _, u), (_, fy, v), _ = sequence.intrinsics
     camera = kitti.CAMERAS.get(sequence.name)
     if camera and (height, width) == (camera.height, camera.width):
         if not np.allclose((fx, fy, u, v), (camera.fx, camera.fy, camera.cx, camera.cy), rtol=0, atol=1e-3):
-            lines.append(f"{where}calib.txt has the focal length {fx:g} and centre {u:g}, {v:g}; KITTI's camera has "
+            lines.append(f"{prefix}calib.txt has the focal length {fx:g} and centre {u:g}, {v:g}; KITTI's camera has "
                          f"{camera.fx:g} and {camera.cx:g}, {camera.cy:g}")
-    elif abs(u / width - 0.5) > OFF_CENTRE[0] or abs(v / height - 0.5) > OFF_CENTRE[1]:
-        lines.append(f"{where}calib.txt has the centre {u:g}, {v:g}, frames have {width}x{height} pixels; it must be "
-                     "that of these frames, at their size")
+    elif abs(u / width - 0.5) > MAX_CENTRE_OFFSET[0] or abs(v / height - 0.5) > MAX_CENTRE_OFFSET[1]:
+        lines.append(f"{prefix}calib.txt has the centre {u:g}, {v:g}, but frames have {width}x{height} pixels; it must "
+                     "belong to frames of this size")
     sizes = pd.Series({path: path.stat().st_size for path in sequence.frame_paths})
-    alike = sizes.index[sizes.duplicated(keep=False)]  # compressed frames seldom have equal sizes
-    copies = alike[pd.Series(stages.contents(alike), dtype=object).duplicated()]
+    candidates = sizes.index[sizes.duplicated(keep=False)]  # compressed frames seldom have equal sizes
+    copies = candidates[pd.Series(stages.contents(candidates), dtype=object).duplicated()]
     if len(copies):
-        lines.append(f"{where}{len(copies)} frames are copies of others, the first {copies[0].name}; each must be "
-                     "there once")
+        lines.append(f"{prefix}{len(copies)} frames are copies of other frames, first {copies[0].name}; remove them")
     return lines
 
 
 def path_oddities(name, estimated, true):
-    """Warnings if estimated and true poses, (n, 4, 4) each, are probably not of the same drive, one line each."""
+    """Warnings, one line each, if estimated and true poses, (n, 4, 4), probably belong to different drives."""
     turns = pd.DataFrame({key: [np.degrees(np.arctan2(step[0, 2], step[2, 2]))
                                 for step in np.linalg.inv(poses[:-1]) @ poses[1:]]
                           for key, poses in (("estimated", estimated), ("true", true))})
     spread = (turns.quantile(0.95) - turns.quantile(0.05)) / 2
     if len(turns) < 20 or not spread["estimated"]:
         return []
-    correlation = turns.corr("spearman").iloc[0, 1] if spread.max() > TURNING and spread["true"] else 1
+    correlation = turns.corr("spearman").iloc[0, 1] if spread.max() > MIN_TURN_SPREAD and spread["true"] else 1
     difference = (turns["estimated"] - turns["true"]).abs().median()
     if correlation >= MIN_CORRELATION and difference <= MAX_TURN_DIFFERENCE:
         return []
-    return [f"sequence {name}: turns from frame to frame differ by {difference:.2g} degrees (median) from the true "
-            f"poses', correlation {correlation:.2f}; are frames, their order and poses those of one drive?"]
+    return [f"sequence {name}: turns from frame to frame differ from the ground truth by {difference:.2g} degrees "
+            f"(median), correlation {correlation:.2f}; do frames and poses belong to one drive, in the same order?"]
 
 
-def of_masks(source, sequence):
-    """Check the masks of SAMPLE frames of a sequence (LabelMasks or MaskFolder); returns (description, [warnings])."""
-    chosen = np.unique(np.linspace(0, len(source) - 1, SAMPLE).round().astype(int))
-    made = [source[index] for index in chosen]
-    coverage = np.array([masks.coverage(mask) for mask in made])
-    line, lines = f"masks keep {coverage.mean():.1%} of sequence {sequence.name}", []
+def mask_oddities(source, sequence):
+    """Check MASK_SAMPLES masks (LabelMasks or MaskFolder) of a sequence. Returns (description, [warning] or [])."""
+    indices = np.unique(np.linspace(0, len(source) - 1, MASK_SAMPLES).round().astype(int))
+    sampled_masks = [source[index] for index in indices]
+    coverage = np.array([masks.coverage(mask) for mask in sampled_masks])
+    description, faults = f"masks keep {coverage.mean():.1%} of sequence {sequence.name}", []
     folder, has_labels = source.paths[0].parent, isinstance(source, masks.LabelMasks)
     if has_labels:
-        label_maps = [masks.label_map_of(source, index) for index in chosen]
-        shares = np.mean([np.bincount(each.ravel(), minlength=cityscapes.N_CLASSES) / each.size for each in label_maps],
-                         axis=0)
+        label_maps = [masks.label_map_of(source, index) for index in indices]
+        shares = np.mean([np.bincount(label_map.ravel(), minlength=cityscapes.N_CLASSES) / label_map.size
+                          for label_map in label_maps], axis=0)
         largest = [index for index in np.argsort(-shares, kind="stable") if shares[index] >= 0.005]
-        line += f" (width {source.dilation_width}); label maps hold " + ", ".join(
+        description += f" (width {source.dilation_width}); label maps hold " + ", ".join(
             f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest)
-        lines = _label_oddities(label_maps, np.flatnonzero(shares), sequence, source.settings)
+        faults = _label_faults(label_maps, np.flatnonzero(shares), sequence, source.settings)
     record = stages.record(folder) or {}
-    present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)  # a study may take a part
-    known = [stages.listing(each) for each in (sequence.frame_paths, frames, frames[:present])]
-    if record.get("frames", known[0]) not in known:
-        lines.append("were made from other frames than these")
+    present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)
+    # A study may use only the first frames.
+    digests = [stages.listing(paths) for paths in (sequence.frame_paths, frames, frames[:present])]
+    if record.get("frames", digests[0]) not in digests:
+        faults.append("were made from other frames")
     elif "frames" not in record and present not in (1, len(sequence), len(frames)):
-        lines.append(f"are {present} files for {len(frames)} frames")
-    option = "" if has_labels else "; --invert takes masks the other way round"
+        faults.append(f"are {present} files for {len(frames)} frames")
+    option = "" if has_labels else "; --invert inverts masks"
     if coverage.min() < MIN_COVERAGE or coverage.mean() > MAX_COVERAGE:
-        lines.append(f"leave {coverage.min():.1%} to {coverage.max():.1%} of the frames{option}")
+        faults.append(f"leave {coverage.min():.1%} to {coverage.max():.1%} of the frames{option}")
     elif not has_labels:
-        contrast = np.median([_contrast(sequence.frame(index), mask) for index, mask in zip(chosen, made, strict=True)])
-        if contrast < (MIN_CONTRAST_OF_MOST if coverage.mean() > 0.5 else MIN_CONTRAST):
-            lines.append(f"keep what has {contrast:.2f} times the contrast of what they leave out{option}")
-    return line, [f"{folder}: label maps {lines[0]}" if has_labels else f"{folder}: masks {lines[0]}"] if lines else []
+        contrast = np.median([_contrast(sequence.frame(index), mask)
+                              for index, mask in zip(indices, sampled_masks, strict=True)])
+        if contrast < (MIN_CONTRAST_OF_LARGE_MASK if coverage.mean() > 0.5 else MIN_CONTRAST):
+            faults.append(f"keep regions with {contrast:.2f} times the contrast of the rest{option}")
+    return description, [f"{folder}: {'label maps' if has_labels else 'masks'} {faults[0]}"] if faults else []
 
 
-def _label_oddities(label_maps, ids, sequence, settings):
+def _label_faults(label_maps, ids, sequence, settings):
     height, width = label_maps[0].shape
-    lines = []
+    faults = []
     if len(ids) == 1:
-        lines.append(f"hold nothing but {cityscapes.LABELS[ids[0]].name} {ids[0]}")
+        faults.append(f"hold only {cityscapes.LABELS[ids[0]].name} {ids[0]}")
     elif settings.ids == "labels" and ids.max() < len(cityscapes.TRAINED):
-        lines.append(f"hold no id above {ids.max()}, so no sky, vegetation or cars; --ids train reads train ids")
+        faults.append(f"hold no id above {ids.max()}, so no sky, vegetation or cars; --ids train reads train ids")
     if (height - width) * (sequence.size[0] - sequence.size[1]) < 0:
-        lines.append(f"have {width}x{height} pixels, the frames {sequence.size[1]}x{sequence.size[0]}; turned?")
-    return lines
+        faults.append(f"have {width}x{height} pixels, the frames {sequence.size[1]}x{sequence.size[0]}; rotated?")
+    return faults
 
 
 def _contrast(frame, mask):
@@ -259,16 +262,19 @@ def _contrast(frame, mask):
 
 
 def main(path):
-    """Check the data of the settings in the environment, unless `path` holds the digest of the same data."""
-    settings, used, digest = read_settings(), [], None
+    """Check the data that the environment's settings name, unless `path` holds the digest of the same files.
+
+    Returns the exit code. After a check without problems, the digest is written to `path`.
+    """
+    settings, used_files, digest = read_settings(), [], None
     kitti_root = None if settings.kitti_is_embedded else settings.kitti
     cityscapes_root = None if settings.cityscapes_is_embedded else settings.cityscapes
-    with suppress(InputError):  # `report` names all problems
+    with suppress(InputError):  # `report` below names all problems
         for name in kitti.sequences(kitti_root) if kitti_root else ():
-            used += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
+            used_files += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
         for root, split in ((cityscapes_root, "train"), (cityscapes_root, "val"), (settings.kitti_semantic, "train")):
-            used += [file for pair in cityscapes.pairs(root, split) for file in pair[1:]] if root else []
-        digest = stages.listing(used)
+            used_files += [file for pair in cityscapes.pairs(root, split) for file in pair[1:]] if root else []
+        digest = stages.listing(used_files)
     if digest and path.is_file() and path.read_text(encoding="utf-8") == digest:
         return 0
     if not report(kitti_root, cityscapes_root, settings.kitti_semantic):

@@ -11,7 +11,7 @@ from thesis_repro.files import listed, progress, read_color, read_gray, read_ids
 
 
 class Label(NamedTuple):
-    """A row of Tables 3.1 and 3.2: name, id, Dice weight, and its colour (red, green, blue)."""
+    """A row of Tables 3.1 and 3.2: name, id, weight in the Dice loss, and colour (red, green, blue)."""
 
     name: str
     id: int
@@ -19,8 +19,8 @@ class Label(NamedTuple):
     color: tuple
 
 
-# Tables 3.1 and 3.2; colours as in the Cityscapes scripts. "background" exists in the tables only: the network has 35
-# outputs, and no label map holds 35 (audit row 9).
+# Tables 3.1 and 3.2, with the colours of the Cityscapes scripts. "background" is in the tables only: the network has 35
+# outputs, and no label map holds id 35 (audit row 9).
 LABELS = tuple(Label(*row) for row in [
     ("unlabeled", 0, 1.0, (0, 0, 0)),
     ("ego vehicle", 1, 1.0, (0, 0, 0)),
@@ -72,7 +72,7 @@ LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
 
 
 class Pair(NamedTuple):
-    """An image and its label map, one of which may be missing (None); `name` is the common part of their file names."""
+    """An image and its label map; a missing file is None. `name` is the common part of both file names."""
 
     name: str
     image: Path
@@ -80,48 +80,48 @@ class Pair(NamedTuple):
 
 
 def colorize(label_map):
-    """Colours of a label map (height, width): (height, width, 3), red, green, blue."""
+    """Colour image (height, width, 3), red, green, blue, of a label map (height, width)."""
     return COLORS[np.minimum(label_map, len(COLORS) - 1)]
 
 
 def pairs(root, split, limit=None):
-    """The image and label map pairs of one split ("train" or "val"), sorted by name.
+    """Pairs of image and label map of one split ("train" or "val"), sorted by name.
 
-    limit: largest number of pairs, spread evenly over the split, whose images are sorted by city; None for all.
-    The appendix pairs two unsorted directory listings by position (A.2); here the names decide.
-    Raises InputError for a missing folder, an empty split, and an image without its label map.
+    limit: largest number of pairs; None for all. They are spread evenly over the split, because it is sorted by city.
+    The appendix pairs two unsorted directory listings by position (A.2); this function pairs equal names.
+    Raises InputError if a folder is missing, a split is empty, or an image has no label map.
     """
-    every = listing(root, split)
-    for pair in every:
+    split_pairs = listing(root, split)
+    for pair in split_pairs:
         check_complete(pair)
-    if limit is not None and limit < len(every):
-        every = [every[index * len(every) // limit] for index in range(limit)]
-    return every
+    if limit is not None and limit < len(split_pairs):
+        split_pairs = [split_pairs[index * len(split_pairs) // limit] for index in range(limit)]
+    return split_pairs
 
 
 def listing(root, split):
-    """The pairs of a split, sorted by name, including incomplete ones. Raises InputError if there are no images.
+    """Pairs of one split, sorted by name, including incomplete pairs. Raises InputError if there are no images.
 
-    Both layouts are read: the official one (leftImg8bit, gtFine) and the appendix's flat one (train, trainannot).
+    Reads the official layout (leftImg8bit, gtFine) and the appendix's flat layout (train, trainannot).
     """
     root = Path(root)
     if (root / "leftImg8bit").is_dir():
-        image_folder, label_folder, within = root / "leftImg8bit" / split, root / "gtFine" / split, "*/*"
+        image_folder, label_folder, pattern = root / "leftImg8bit" / split, root / "gtFine" / split, "*/*"
         image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
     elif (root / split).is_dir():
-        image_folder, label_folder, within = root / split, root / f"{split}annot", "*"
+        image_folder, label_folder, pattern = root / split, root / f"{split}annot", "*"
         image_end = label_end = ".png"
     else:
         raise InputError(f"{root}: must be a folder that holds leftImg8bit and gtFine, or {split} and {split}annot")
-    images = {path.name.removesuffix(image_end): path for path in listed(image_folder, within + image_end)}
-    labels = {path.name.removesuffix(label_end): path for path in listed(label_folder, within + label_end)}
+    images = {path.name.removesuffix(image_end): path for path in listed(image_folder, pattern + image_end)}
+    labels = {path.name.removesuffix(label_end): path for path in listed(label_folder, pattern + label_end)}
     if not images:
         raise InputError(f"{image_folder}: no PNG images")
     return [Pair(name, images.get(name), labels.get(name)) for name in sorted(images | labels)]
 
 
 def check_complete(pair):
-    """Raise InputError for an image without its label map, or a label map without its image."""
+    """Raise InputError if the image or the label map is missing."""
     if pair.label is None:
         raise InputError(f"{pair.image}: has no label map")
     if pair.image is None:
@@ -129,33 +129,33 @@ def check_complete(pair):
 
 
 def read_image(path, height, width, channels=1):
-    """One image resized to height x width (bilinear, A.2.1), uint8 (height, width, channels).
+    """Read an image and resize it bilinearly (A.2.1): uint8 (height, width, channels).
 
-    channels: 1 for gray, as in the thesis, 3 for red, green, blue.
+    channels: 1 for gray, as in the thesis; 3 for red, green, blue.
     """
     image = read_gray(path) if channels == 1 else read_color(path)
     return cv2.resize(image, (width, height)).reshape(height, width, channels)
 
 
 def read_label_map(path, train_ids=False):
-    """One label map of Cityscapes label ids, uint8. train_ids: the file holds train ids, which are translated.
+    """Read a label map (height, width) of Cityscapes label ids, uint8. train_ids: translate train ids to label ids.
 
-    Raises InputError for a number that is not such an id, and as `read_ids` does.
+    Raises InputError if a number is no valid id, and as `read_ids` does.
     """
     ids = read_ids(path)
     label_map = LABEL_OF_TRAIN_ID[ids] if train_ids else ids
     if label_map.max() < N_CLASSES:
         return label_map
-    wrong = ids[label_map >= N_CLASSES].max()
-    raise InputError(f"{path}: holds {wrong}, which is no train id (0 to 18, 255); leave out --ids train" if train_ids
-                     else f"{path}: label id {wrong} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
+    invalid = ids[label_map >= N_CLASSES].max()
+    raise InputError(f"{path}: holds {invalid}, which is no train id (0 to 18, 255); leave out --ids train" if train_ids
+                     else f"{path}: label id {invalid} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
                           "--ids train for train ids (0 to 18, 255)")
 
 
 def load(image_pairs, size, channels=1):
     """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size), both uint8 (A.2).
 
-    Label maps are resized by nearest neighbour, which invents no ids.
+    Label maps are resized by nearest neighbour, so that no new ids appear.
     """
     images = np.empty((len(image_pairs), size, size, channels), np.uint8)
     labels = np.empty((len(image_pairs), size, size), np.uint8)

@@ -236,7 +236,7 @@ def _print_oddities(sequence, mask_sets):
     warnings = check.oddities(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
-            line, mask_warnings = check.of_masks(masks, sequence)
+            line, mask_warnings = check.mask_oddities(masks, sequence)
             longrun.remark(line)
             warnings += mask_warnings
     return longrun.warn(warnings)
