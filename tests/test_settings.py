@@ -28,9 +28,9 @@ def test_runs_of_different_data_or_profiles_have_different_folders(tmp_path):
 
 
 def test_changed_sizes_are_part_of_the_name():
-    given = {"EPOCHS": "3", "FRAMES": "all", "WIDTHS": "5,10", "IMAGE_SIZE": "64",
-             "REPETITIONS": str(PROFILES["demo"].repetitions)}
-    settings = read_settings({f"THESIS_REPRO_{name}": value for name, value in given.items()})
+    changes = {"EPOCHS": "3", "FRAMES": "all", "WIDTHS": "5,10", "IMAGE_SIZE": "64",
+               "REPETITIONS": str(PROFILES["demo"].repetitions)}
+    settings = read_settings({f"THESIS_REPRO_{name}": value for name, value in changes.items()})
     sizes = settings.sizes
     assert (sizes.epochs, sizes.frames, sizes.widths, sizes.image_size) == (3, None, (5, 10), 64)
     # a size equal to the profile's is not in the name

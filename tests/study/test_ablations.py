@@ -36,9 +36,9 @@ def test_random_keypoints_are_a_subset_of_the_asked_size(small_world, amount, lo
     sequence = Sequence(small_world / "kitti", "00").subset(2)
     drawn = ablations.random_keypoints(sequence, amount, 0)
     points = keypoints.detect(sequence.frame(0), THESIS, drawn)
-    every = {tuple(point) for point in keypoints.detect(sequence.frame(0), THESIS).astype(int)}
-    count = len(points) if isinstance(amount, int) else len(points) / len(every)
-    assert low <= count <= high and {tuple(point) for point in points.astype(int)} <= every
+    detected = {tuple(point) for point in keypoints.detect(sequence.frame(0), THESIS).astype(int)}
+    count = len(points) if isinstance(amount, int) else len(points) / len(detected)
+    assert low <= count <= high and {tuple(point) for point in points.astype(int)} <= detected
     assert np.array_equal(drawn, ablations.random_keypoints(sequence, amount, 0))
 
 

@@ -138,11 +138,11 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(small_world, smal
     jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
     record = runner.stages.record(tmp_path / "00")
-    given = Sequence(kitti, "00"), runner.by_name(small_labels)
-    elsewhere = runner._run_pass(jobs, *given, tmp_path / "elsewhere", record, 1)
+    inputs = Sequence(kitti, "00"), runner.by_name(small_labels)
+    elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record, 1)
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
-    older = runner._run_pass(jobs, *given, tmp_path, record, 1)
+    older = runner._run_pass(jobs, *inputs, tmp_path, record, 1)
     assert elsewhere[jobs[0]] != older[jobs[0]] and not (tmp_path / "00" / "baseline-0.csv").exists()
 
 

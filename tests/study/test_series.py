@@ -139,27 +139,25 @@ def test_results_of_another_length_are_kept(done, study):
     assert files(done[0]) == before
 
 
-@pytest.mark.parametrize("given, named", [
-    ([], "--labels"),
-    (["--labels", "nowhere"], "nowhere: "),
-    (["--labels", "LABELS", "--labels", "LABELS"], "small_labels"),
-    (["--labels", "LABELS", "--name", "a", "--name", "b"], "--name b: 2 names for 1"),
-    (["--labels", "LABELS", "--name", "a/b"], "--name a/b: "),
-    (["--masks", "MASKS", "--widths", "5"], "--widths: "),
-    (["--masks", "MASKS", "--symmetric"], "--labels"),
-    (["--masks", "LABELS"], "320x320"),
-    (["--labels", "LABELS/00"], "2 are asked for"),
-    (["--labels", "LESS", "--sequences", "00"], "2 of 12 frames of sequence 00"),
-    (["--labels", "LABELS", "--repetitions", "0"], "--repetitions 0: ")])
-def test_bad_input_is_one_line_before_anything_runs(small_world, small_labels, masks, tmp_path, capsys, given, named):
-    less = tmp_path / "LESS" / "00"
-    shutil.copytree(small_labels / "00", less)
+@pytest.mark.parametrize("options, named", [
+    ("", "--labels"),
+    ("--labels nowhere", "nowhere: "),
+    ("--labels {labels} --labels {labels}", "small_labels"),
+    ("--labels {labels} --name a --name b", "--name b: 2 names for 1"),
+    ("--labels {labels} --name a/b", "--name a/b: "),
+    ("--masks {masks} --widths 5", "--widths: "),
+    ("--masks {masks} --symmetric", "--labels"),
+    ("--masks {labels}", "320x320"),
+    ("--labels {labels}/00", "2 are asked for"),
+    ("--labels {less} --sequences 00", "2 of 12 frames of sequence 00"),
+    ("--labels {labels} --repetitions 0", "--repetitions 0: ")])
+def test_bad_input_is_one_line_before_anything_runs(small_world, small_labels, masks, tmp_path, capsys, options, named):
+    less = tmp_path / "less"
+    shutil.copytree(small_labels / "00", less / "00")
     for index in (3, 4):
-        (less / f"{index:06d}.png").unlink()
-    places = {"LABELS": small_labels, "MASKS": masks, "LESS": less.parent}
-    given = [str(places[word.split("/")[0]] / word.partition("/")[2]) if word.split("/")[0] in places else word
-             for word in given]
-    assert main(["study", "--kitti", str(small_world / "kitti"), *given, "--output", str(tmp_path / "out")]) == 1
+        (less / "00" / f"{index:06d}.png").unlink()
+    words = options.format(labels=small_labels, masks=masks, less=less).split()
+    assert main(["study", "--kitti", str(small_world / "kitti"), *words, "--output", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err.strip()
     assert error.startswith("error: ") and named in error and "\n" not in error and not (tmp_path / "out").exists()
 
