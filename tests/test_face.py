@@ -39,8 +39,8 @@ def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, caps
     labels = small_world / "kitti/sequences/00/labels_0"
     names = {"label_map_of": lambda index: read_label_map(labels / f"{index:06d}.png")}
     exec(example, names)
-    assert len(names["every"].poses) == len(names["masked"].poses) == 12
-    assert names["masked"].frames["detected"].mean() < names["every"].frames["detected"].mean()
+    assert len(names["baseline"].poses) == len(names["masked"].poses) == 12
+    assert names["masked"].frames["detected"].mean() < names["baseline"].frames["detected"].mean()
     assert len(example.splitlines()) <= 14 and capsys.readouterr().out
 
 
