@@ -4,10 +4,17 @@ import os
 import sys
 from contextlib import contextmanager
 
-# TensorFlow splits sums among its threads, so the rounding depends on their number. A fixed number gives the same bits
-# on any number of cores. It must be set before the first operation. More threads than cores cost little; fewer would
-# leave cores of large machines idle.
-os.environ.setdefault("TF_NUM_INTRAOP_THREADS", "8")
+# Variables that libraries read when they are imported, or at TensorFlow's first operation. Values of the user are kept.
+for _name, _value in {
+    # TensorFlow splits sums among its threads, so the rounding depends on their number. A fixed number gives the same
+    # bits on any number of cores. More threads than cores cost little; fewer would leave cores of large machines idle.
+    "TF_NUM_INTRAOP_THREADS": "8",
+    "TF_CPP_MIN_LOG_LEVEL": "3",  # errors of TensorFlow are Python exceptions as well
+    "TF_FORCE_GPU_ALLOW_GROWTH": "true",  # do not take all memory of a GPU at the start
+    "SM_FRAMEWORK": "tf.keras",  # of segmentation-models
+    "NO_ALBUMENTATIONS_UPDATE": "1",  # the search for a newer release needs a network
+}.items():
+    os.environ.setdefault(_name, _value)
 
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
 

@@ -1,9 +1,6 @@
 """The augmentation of appendix A.3, applied to integer label maps."""
 
-import os
 import warnings
-
-os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")  # the search for a newer release needs a network
 
 import albumentations as A
 import numpy as np

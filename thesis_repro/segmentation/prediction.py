@@ -1,14 +1,10 @@
 """Label maps for images and whole sequences (A.7)."""
 
-import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import lru_cache, partial
 from pathlib import Path
-
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-os.environ.setdefault("TF_FORCE_GPU_ALLOW_GROWTH", "true")  # do not take all memory of a GPU at the start
 
 import cv2
 import keras

@@ -1,9 +1,6 @@
 """Quality of a model on a set of images: the scores of segmentation-models and those of the Cityscapes benchmark."""
 
-import os
 from dataclasses import dataclass
-
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 import numpy as np
 import pandas as pd

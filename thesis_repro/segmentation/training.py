@@ -1,17 +1,12 @@
 """Loss, metrics and input batches of the training (A.5), and the checkpoints that let a stopped training resume."""
 
 import json
-import os
 import zipfile
 import zlib
 from contextlib import ExitStack
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-os.environ.setdefault("TF_FORCE_GPU_ALLOW_GROWTH", "true")  # do not take all memory of a GPU at the start
-os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
 
 import keras
 import numpy as np

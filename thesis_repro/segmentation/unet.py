@@ -1,9 +1,5 @@
 """The U-Net of appendix A.4, as Figure A.1 prints it."""
 
-import os
-
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-
 from keras import Model, layers
 
 from thesis_repro import InputError
