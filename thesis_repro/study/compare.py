@@ -14,7 +14,8 @@ A ratio is formed in three steps:
 3. Its interval is a bootstrap over whole sequences with DRAWS draws. It estimates how far the ratio could be off if
    other sequences of the same kind had been recorded. With few sequences it is too narrow.
 
-The verdict is that the ratio is lower than 1, higher than 1, or that there is no clear difference.
+The verdict is "lower" or "higher" if the interval excludes 1 and there are at least MIN_SEQUENCES sequences.
+Otherwise it is "no clear difference". `primary_comparison` selects the rows that answer the main question.
 """
 
 from collections.abc import Iterable
