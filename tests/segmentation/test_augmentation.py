@@ -16,7 +16,7 @@ def pair():
     return image, label
 
 
-def test_integer_label_maps_give_what_one_hot_masks_give(pair):
+def test_integer_label_maps_give_the_same_as_one_hot_masks(pair):
     image, label = pair
     integer = augmentation.training_augmenter(SIZE)
     one_hot = augmentation.Augmenter(augmentation.transform_list(SIZE, fill_mask=0))
@@ -28,7 +28,7 @@ def test_integer_label_maps_give_what_one_hot_masks_give(pair):
         assert np.array_equal(augmentation.one_hot(label_a, 35), mask_b.round().clip(0, 1)), f"seed {seed}"
         assert np.array_equal(image_a, image_b), f"seed {seed}"
         outside += (label_a == augmentation.NOTHING).any()
-    assert outside > len(SEEDS) / 4  # else the border fill was not put to the test
+    assert outside > len(SEEDS) / 4  # otherwise the border fill is not tested
 
 
 def test_noise_is_as_strong_as_in_the_thesis():

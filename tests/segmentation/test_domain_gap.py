@@ -1,4 +1,4 @@
-"""Where label maps are wrong: on pictures whose answer is known."""
+"""Errors in shadow and flicker, on pictures whose result is known."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ ROAD, BUILDING, SKY, CAR = 7, 11, 23, 26
 
 
 def halves(column):
-    """Sky to the left of a column, road to the right."""
+    """Return a label map with sky to the left of a column and road to the right."""
     label_map = np.full((1, 320, 320), SKY, np.uint8)
     label_map[:, :, column:] = ROAD
     return label_map
@@ -30,17 +30,17 @@ def test_errors_in_shadow_are_told_from_errors_in_light():
     assert domain_gap.shadow_errors(images, true, predicted) == pytest.approx(expected)
 
 
-def test_dark_is_relative_to_the_class_and_other_things_do_not_count():
+def test_dark_is_relative_to_the_class_and_only_ground_counts():
     images, true = np.full((1, 100, 100, 1), 100, np.uint8), np.full((1, 100, 100), ROAD, np.uint8)
     true[:, :, 50:] = CAR
-    images[:, :, 50:] = 10  # a black car makes no road dark
+    images[:, :, 50:] = 10  # a black car does not make the road dark
     errors = domain_gap.shadow_errors(images, true, np.full_like(true, SKY))
     assert errors["dark"] == 0 and errors["lit_wrong"] == 1 and np.isnan(errors["dark_wrong"])
-    images[:, :, :50] = 61  # all of it dark, so nothing is
+    images[:, :, :50] = 61  # equally dark everywhere, so no pixel counts as dark
     assert domain_gap.shadow_errors(images, true, true)["dark"] == 0
 
 
-def test_what_lies_near_a_boundary_is_left_out_of_shadows():
+def test_pixels_near_a_boundary_are_ignored():
     images, true = np.full((1, 320, 320, 1), 100, np.uint8), halves(160)
     assert domain_gap.shadow_errors(images, true, halves(164))["lit_wrong"] == 0
     assert domain_gap.shadow_errors(images, true, halves(168))["lit_wrong"] > 0
@@ -59,7 +59,7 @@ def test_flicker_of_a_moving_picture_with_and_without_noise():
     steady = domain_gap.flicker(true, frames)
     assert len(steady) == 2 and (steady < 0.01).all()
     assert domain_gap.flicker(wrong, frames).tolist() == pytest.approx([0.2, 0.2], abs=0.02)
-    # without taking the motion out, the boundaries alone would change more
+    # without compensation of the motion, the boundaries alone would change more
     assert (true[1] != true[0]).mean() > 3 * steady.max()
 
 

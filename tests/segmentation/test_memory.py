@@ -15,7 +15,7 @@ def test_a_batch_that_cannot_fit_is_refused(monkeypatch):
         memory.require(model, 3)
 
 
-def test_the_limit_of_the_container_counts(monkeypatch, tmp_path):
+def test_a_containers_limit_is_read(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "CGROUP", tmp_path)
     free = memory.available()
     (tmp_path / "memory.current").write_text(f"{2**20}\n")
@@ -26,6 +26,6 @@ def test_the_limit_of_the_container_counts(monkeypatch, tmp_path):
 
 
 def test_memory_needed_by_the_thesiss_batch():
-    # 600 channels at full size alone are kept for the way back
+    # 600 channels at full size are kept for the gradients
     row = 16 * 320 * 320 * 4  # bytes of one channel at full size in a batch of 16
     assert 600 * row < memory.needed(build_unet((320, 320, 1), 35), 16) < 20e9

@@ -17,7 +17,7 @@ IMAGES = np.random.default_rng(0).integers(0, 256, (7, SIZE, SIZE, 1), np.uint8)
 
 
 def untrained(seed, size=SIZE, channels=1):
-    """A U-Net with weights as varied as after a training, batch statistics included."""
+    """Return a U-Net with random weights and batch statistics, as varied as after a training."""
     keras.utils.set_random_seed(seed)
     model = build_unet((size, size, channels), 35, 4)
     values = np.random.default_rng(seed)
@@ -34,7 +34,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    """Frames of KITTI's shape, smoothed noise of different brightness."""
+    """Return paths of frames of KITTI's shape: smoothed noise of different contrast."""
     folder = tmp_path_factory.mktemp("frames")
     for index in range(11):
         noise = np.random.default_rng(index).integers(0, 256, (94, 310), np.uint8)
@@ -55,7 +55,7 @@ def test_predict_gives_the_most_probable_class(model):
         prediction.predict(model, IMAGES[:, :32, :32])
 
 
-def test_written_label_maps_are_the_predictions_at_320_and_replace_another_models(model, frames, tmp_path):
+def test_written_label_maps_are_the_predictions_and_replace_those_of_another_model(model, frames, tmp_path):
     prediction.write_label_maps(untrained(2), frames[:3], tmp_path)
     prediction.write_label_maps(model, frames, tmp_path, batch_size=4)
     images = np.stack([cv2.resize(files.read_gray(path), (SIZE, SIZE)) for path in frames])[..., None]
@@ -67,7 +67,7 @@ def test_written_label_maps_are_the_predictions_at_320_and_replace_another_model
         assert written.shape == (320, 320) and np.array_equal(written, np.kron(label_map, np.ones((5, 5), np.uint8)))
 
 
-def test_a_killed_prediction_goes_on_and_ends_with_the_same_bytes(model, frames, tmp_path, kill_when):
+def test_a_killed_prediction_resumes_and_ends_with_the_same_bytes(model, frames, tmp_path, kill_when):
     model.save(tmp_path / "model.keras")
     code = ("import time, sys; from thesis_repro import files; from thesis_repro.segmentation import prediction, "
             "training; "
@@ -76,24 +76,24 @@ def test_a_killed_prediction_goes_on_and_ends_with_the_same_bytes(model, frames,
     output = tmp_path / "killed"
     kill_when([sys.executable, "-c", code, tmp_path / "model.keras", output, *frames],
               lambda: len(contents(output)) >= 3)
-    left = {name: (output / name).stat().st_mtime_ns for name in contents(output)}
-    assert 0 < len(left) < len(frames)
+    written = {name: (output / name).stat().st_mtime_ns for name in contents(output)}
+    assert 0 < len(written) < len(frames)
 
     prediction.write_label_maps(model, frames, output, batch_size=2)
     prediction.write_label_maps(model, frames, tmp_path / "undisturbed", batch_size=2)
 
     assert contents(output) == contents(tmp_path / "undisturbed")
-    assert any((output / name).stat().st_mtime_ns == when for name, when in left.items())
+    assert any((output / name).stat().st_mtime_ns == time for name, time in written.items())
 
 
-def test_label_maps_spread_over_workers_are_those_of_one_and_are_not_made_again(model, frames, tmp_path, monkeypatch):
+def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(model, frames, tmp_path, monkeypatch):
     model.save(tmp_path / "model.keras")
     prediction.load.cache_clear()
     monkeypatch.setattr(prediction, "PART", 4)
     sequences = [(frames, tmp_path / "spread" / "00"), (frames[:5], tmp_path / "spread" / "01")]
     made = []
 
-    def run(function, calls):  # the last first, as a cluster might
+    def run(function, calls):  # in another order, like a cluster
         for index in reversed(range(len(calls))):
             made.append(len(calls[index][-1]))
             yield index, function(*calls[index])
@@ -110,8 +110,8 @@ def test_label_maps_spread_over_workers_are_those_of_one_and_are_not_made_again(
     written = {path: path.stat().st_mtime_ns for path in files.listed(sequences[0][1])}
     made.clear()
     prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences, batch_size=2)
-    again = [path.name for path, when in written.items() if path.stat().st_mtime_ns != when]
-    assert made == [1] and removed.is_file() and again == []  # the other one of its batch may have been corrected
+    assert made == [1] and removed.is_file()
+    assert written == {path: path.stat().st_mtime_ns for path in written}  # files of the same batch are kept
 
 
 def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_path):
@@ -134,7 +134,7 @@ def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_pa
         assert contents(tmp_path / "out") == {}
 
 
-def test_bad_images_leave_whole_files_only(model, frames, tmp_path):
+def test_an_unreadable_image_leaves_no_partial_files(model, frames, tmp_path):
     broken = tmp_path / "000004.png"
     broken.write_bytes(frames[4].read_bytes()[:500])
     with pytest.raises(InputError, match="000004.png"):
@@ -142,7 +142,7 @@ def test_bad_images_leave_whole_files_only(model, frames, tmp_path):
     assert not (tmp_path / "out" / "000004.png").exists()
     for path in (tmp_path / "out").glob("*.png"):
         assert cityscapes.read_label_map(path).shape == (320, 320)
-    with pytest.raises(InputError):  # two images of one name
+    with pytest.raises(InputError):  # two images with one name
         prediction.write_label_maps(model, [frames[0], frames[0]], tmp_path / "twice")
 
 
@@ -170,16 +170,16 @@ def test_an_ensemble_predicts_from_the_mean_probability(model, tmp_path):
         prediction.load((tmp_path / "a.keras", tmp_path / "b.keras"))
 
 
-def test_the_shipped_model_is_the_thesiss_network_and_knows_streets(kitti_real, tmp_path):
+def test_the_shipped_model_is_the_thesiss_network_and_recognises_streets(kitti_real, tmp_path):
     model = prediction.load_shipped()
     assert model.input_shape == (None, 320, 320, 1) and model.output_shape == (None, 320, 320, 35)
-    assert "conv2d" not in {layer.name for layer in model.layers}  # the dead convolutions are dead here too
+    assert "conv2d" not in {layer.name for layer in model.layers}  # no unused convolutions
     assert sum(os.path.getsize(path) for path in prediction.SHIPPED.parent.iterdir()) <= 8e6
     for sequence in ("00", "06"):
         frames = sorted((kitti_real / "sequences" / sequence / "image_0").glob("*.png"))[:200:10]
         prediction.write_label_maps(model, frames, tmp_path / sequence)
         maps = np.stack([cityscapes.read_label_map(tmp_path / sequence / path.name) for path in frames])
-        # road is what lies in front of the car, and sky, trees or houses are what is at the top
+        # the road lies in front of the car; sky, trees or houses are at the top
         assert (maps[:, 250:310, 120:200] == 7).mean() > 0.7
         assert np.isin(maps[:, :40], [11, 21, 23]).mean() > 0.8
 

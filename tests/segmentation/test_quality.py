@@ -33,7 +33,7 @@ def test_quality_agrees_with_keras_and_with_a_plain_count():
     assert measured.accuracy == pytest.approx((predicted == labels).mean())
     road = ((predicted == 7) & (labels == 7)).sum() / ((predicted == 7) | (labels == 7)).sum()
     assert measured.classes.loc["road", "iou"] == pytest.approx(road)
-    # the library counts the 31 classes that are not there, and mostly not predicted, as perfect
+    # the library counts the 31 absent classes, which are hardly predicted, as perfect
     assert measured.iou_score > measured.mean_iou + 0.3
     with pytest.raises(InputError):
         quality.quality(model, IMAGES[:0], labels[:0])

@@ -15,7 +15,7 @@ from thesis_repro.segmentation.unet import build_unet
 
 
 def digest():
-    """Of the weights of a training of two epochs, and of what it predicts."""
+    """Return a digest of the weights after two epochs and of the predictions."""
     random = np.random.default_rng(0)
     images = random.integers(0, 256, (6, 96, 96, 1), np.uint8)
     labels = random.integers(0, 35, (6, 12, 12), np.uint8).repeat(8, 1).repeat(8, 2)
@@ -29,7 +29,7 @@ def digest():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
-                    reason="two cores are needed, and a system that can take one away")
+                    reason="needs two cores and a system that can restrict a process to one")
 def test_one_core_and_all_give_the_same_bits():
     code = ("import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
             "import test_same_bits; print(test_same_bits.digest())")

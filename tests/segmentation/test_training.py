@@ -33,7 +33,7 @@ SETS = (*street(9, 0), *street(4, 1))
 
 
 def network(filters):
-    """A small one with the kinds of layers of the U-Net, which takes ten times as long to compile."""
+    """Return a small network with the U-Net's kinds of layers; the U-Net takes ten times as long to compile."""
     layers = [keras.Input((SIZE, SIZE, 1), name="image"),
               keras.layers.Conv2D(4 * filters, 3, padding="same", activation="relu", name="features"),
               keras.layers.BatchNormalization(name="normalized"),
@@ -42,7 +42,7 @@ def network(filters):
 
 
 def prepared(sets=SETS, filters=2, rate=0.01, strategy=None):
-    """A compiled model and its batches, as notebook 4 prepares them."""
+    """Return a compiled model and its batches, as notebook 4 prepares them."""
     keras.utils.set_random_seed(0)
     with (strategy or training.strategy()).scope():
         model = network(filters)
@@ -54,7 +54,7 @@ def prepared(sets=SETS, filters=2, rate=0.01, strategy=None):
 
 
 def train(folder, epochs=3, patience=5, pause=0, **options):
-    """The fit of notebook 4; pause: seconds after each batch, so that it can be killed in time."""
+    """Run the fit of notebook 4; pause: seconds after each batch, which leave time to kill the process."""
     model, batches, validation = prepared(**options)
     stop = keras.callbacks.EarlyStopping(patience=patience)
     best = keras.callbacks.ModelCheckpoint(folder / training.MODEL, save_best_only=True)
@@ -85,7 +85,7 @@ def test_history_and_best_model(trained):
     assert model.evaluate(validation.dataset(), verbose=0) == pytest.approx(history["val_loss"].min(), abs=1e-5)
 
 
-def test_loss_is_the_sum_of_the_librarys_two():
+def test_loss_is_the_sum_of_dice_and_focal_loss():
     random = np.random.default_rng(0)
     true = augmentation.one_hot(random.integers(0, 35, (2, 8, 8)).astype(np.uint8), 35)
     predicted = random.dirichlet(np.ones(35), (2, 8, 8)).astype(np.float32)
@@ -117,7 +117,7 @@ def test_fused_loss_is_the_same_loss_with_the_same_gradient():
     assert training.fused_loss(loss).__name__ == loss.name
 
 
-def test_each_epoch_shows_each_image_once_in_an_order_of_its_own():
+def test_each_epoch_shows_each_image_once_in_another_order():
     second = (SETS[0][:5] // 2, SETS[1][:5])
     batches, seen = training.Batches([SETS[:2], second], 4, seed=3), []
     for batches.epoch in (0, 1, 1):
@@ -145,7 +145,7 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
     assert fresh.tobytes() in changed[1]
 
 
-def test_a_killed_training_goes_on_and_ends_the_same(trained, tmp_path, kill_when):
+def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_when):
     code = (f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
             f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)")
     kill_when([sys.executable, "-c", code], (tmp_path / "state.npz").exists)
@@ -170,7 +170,7 @@ def test_several_devices_share_each_batch(tmp_path):
     assert history["epoch"].tolist() == [1, 2] and history["loss"].iloc[1] < history["loss"].iloc[0]
 
 
-def test_states_of_another_network_and_damaged_ones_are_refused(trained, tmp_path):
+def test_checkpoints_that_are_damaged_or_of_another_network_are_refused(trained, tmp_path):
     model, batches, _ = prepared(filters=4)
     (tmp_path / "state.npz").write_bytes((trained / "state.npz").read_bytes()[:1000])
     for folder in (trained, tmp_path):
@@ -190,12 +190,12 @@ def test_early_stopping_keeps_the_best_and_stays_stopped(tmp_path):
     sets = (*SETS[:3], np.where(SETS[3] == 7, 11, 7).astype(np.uint8))
     losses = train(tmp_path, 40, 2, sets=sets, rate=0.03).history["val_loss"]
     assert len(losses) < 40 and losses.idxmin() == len(losses) - 3
-    for patience, first in ((2, 40), (3, len(losses))):  # with more patience it goes on
+    for patience, first in ((2, 40), (3, len(losses))):  # with more patience, the training resumes
         stop = [keras.callbacks.EarlyStopping(patience=patience)]
         assert training.ResumableTraining(tmp_path, *prepared()[:2], stop).first_epoch(40) == first
 
 
-def test_what_a_training_depends_on_is_noticed():
+def test_every_change_of_a_training_changes_its_record():
     model, batches, validation = prepared()
     records = [training.made_from(model, batches, validation)]
     for name, value in (("seed", 1), ("batch_size", 5), ("augmenter", augmentation.training_augmenter(SIZE)),
@@ -218,7 +218,7 @@ def test_the_appendixs_hdf5_loads(trained, tmp_path):
     model.save(tmp_path / "model.hdf5")
     x, y = SETS[2].astype(np.float32), augmentation.one_hot(SETS[3], 35)
 
-    # as in the appendix, loss and metrics included, and as everywhere else
+    # with loss and metrics, as in the appendix
     with_loss = keras.models.load_model(tmp_path / "model.hdf5", custom_objects={
         loss.name: loss, **{score.name: score for score in scores}})
     assert with_loss.evaluate(x, y, verbose=0) == pytest.approx(model.evaluate(x, y, verbose=0))

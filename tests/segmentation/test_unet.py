@@ -21,20 +21,15 @@ def test_every_row_of_figure_a1():
     assert sum(w.numpy().size for w in model.non_trainable_weights) == FIGURE["non_trainable"]
 
 
-def test_corrected_blocks_have_both_convolutions_in_a_row():
-    rows = {row["layer"].split()[0]: row for row in summary_rows(build_unet((32, 32, 1), 35, 4, corrected_blocks=True))}
+def test_corrected_blocks_and_base_filters():
+    rows = {row["layer"].split()[0]: row for row in summary_rows(build_unet((64, 64, 3), 5, 8, corrected_blocks=True))}
 
     assert len(rows) == 41 + 3 * 9
     assert rows["conv2d"]["connected_to"] == "input_2[0][0]"
     assert rows["conv2d_1"]["connected_to"] == "activation[0][0]"
     assert rows["conv2d_17"]["connected_to"] == "activation_16[0][0]"
-
-
-def test_base_filters_scale_every_block():
-    outputs = {row["layer"].split()[0]: row["output_shape"] for row in summary_rows(build_unet((64, 64, 3), 5, 8))}
-
-    assert outputs["conv2d_9"] == "(None, 4, 4, 128)"
-    assert outputs["conv2d_18"] == "(None, 64, 64, 5)"
+    assert rows["conv2d_9"]["output_shape"] == "(None, 4, 4, 128)"
+    assert rows["conv2d_18"]["output_shape"] == "(None, 64, 64, 5)"
 
 
 def test_a_size_that_cannot_be_halved_four_times():

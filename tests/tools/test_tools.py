@@ -1,4 +1,4 @@
-"""A smoke test of each tool on tiny input, and the numbers that its results rest on."""
+"""Each tool runs on tiny input, and the numbers behind its results are right."""
 
 import json
 import subprocess
@@ -25,7 +25,7 @@ import train_shipped  # noqa: E402
 pytestmark = pytest.mark.slow
 
 
-def test_bench_sets_each_measure_against_another(small_world, monkeypatch):
+def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypatch):
     monkeypatch.setattr(bench, "REPEATS", 1)
     monkeypatch.setattr(bench, "WIDTHS", (5,))
     table = bench.measure(Sequence(small_world / "kitti", "00").subset(5))
@@ -34,7 +34,7 @@ def test_bench_sets_each_measure_against_another(small_world, monkeypatch):
     assert len(json.loads(table.to_json(orient="records"))) == 6
 
 
-def test_a_wrong_turn_counts_once_and_as_flagged_where_it_is():
+def test_a_wrong_turn_is_counted_once():
     line = np.tile(np.eye(4), (6, 1, 1))
     line[:, 2, 3] = 0.3 * np.arange(6)
     turned = line.copy()
@@ -46,7 +46,7 @@ def test_a_wrong_turn_counts_once_and_as_flagged_where_it_is():
         assert counts["largest"] == pytest.approx(2.56, abs=0.01) and counts["not_determined"] == 1
 
 
-def test_a_run_fails_beside_its_own_shuffles_and_a_series_resumes(small_world, tmp_path):
+def test_a_run_is_compared_with_its_shuffles_and_a_series_resumes(small_world, tmp_path):
     arguments = ["--kitti", str(small_world / "kitti"), "--frames", "5", "--keypoints", "300", "--shuffles", "2",
                  "--output", str(tmp_path)]
     assert reliability.main(arguments) == 0
@@ -55,13 +55,13 @@ def test_a_run_fails_beside_its_own_shuffles_and_a_series_resumes(small_world, t
     assert len(table) == 2
     table.loc[1, "rmse"] *= 10
     table.to_csv(trials, index=False)
-    assert reliability.main(arguments) == 0  # reads it, and does not run it again
+    assert reliability.main(arguments) == 0  # reads the file instead of running again
     rows = pd.read_csv(tmp_path / "failures.csv").set_index("method")
     assert rows["over"].to_dict() == {"all": 1, "spread": 0}
     assert reliability.main([*arguments, "--methods", "masked-5"]) == 1
 
 
-def test_convolutions_are_moved_by_muon_as_matrices():
+def test_muon_treats_convolutions_as_matrices():
     kernel = keras.Variable(np.zeros((3, 3, 8, 4), np.float32))
     slope = np.random.default_rng(0).normal(size=kernel.shape)
     optimizer = train_shipped.Muon(1.0, weight_decay=None, adam_weight_decay=None)
@@ -71,7 +71,7 @@ def test_convolutions_are_moved_by_muon_as_matrices():
     assert np.linalg.svd(step, compute_uv=False) == pytest.approx(1, abs=0.35)  # nearly orthogonal
 
 
-def test_a_view_has_the_look_of_another_camera():
+def test_a_view_looks_like_that_of_another_camera():
     label = np.zeros((188, 620), np.uint8)
     label[94 - 18:94 + 18, 310 - 18:310 + 18] = 1  # a square in KITTI's frame
     for look, (across, down) in train_shipped.LOOKS.items():
@@ -85,7 +85,7 @@ def test_a_view_has_the_look_of_another_camera():
 
 
 @pytest.mark.torture
-def test_the_shipped_training_ends_with_a_model_and_its_card(camvid_real, tmp_path):
+def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path):
     kitti_semantic = camvid_real.parent / "kitti_semantic"
     arguments = [str(camvid_real), str(kitti_semantic), str(tmp_path), "--epochs", "1", "--last-epochs", "1",
                  "--steps", "1"]
@@ -101,7 +101,7 @@ def test_all_proposals_are_trained_and_measured(camvid_real):
     assert table["pixel accuracy"].between(0, 1).all() and (table["images"] == 2).all()
 
 
-def test_make_weights_wants_both_folders():
-    for given, wanted in (("CAMVID=x", "KITTI_SEMANTIC"), ("KITTI_SEMANTIC=x", "CAMVID")):
-        done = subprocess.run(["make", "weights", given, "-o", "setup"], cwd=ROOT, capture_output=True, text=True)
-        assert done.returncode and wanted in done.stderr
+def test_make_weights_requires_both_folders():
+    for setting, missing in (("CAMVID=x", "KITTI_SEMANTIC"), ("KITTI_SEMANTIC=x", "CAMVID")):
+        done = subprocess.run(["make", "weights", setting, "-o", "setup"], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode and missing in done.stderr

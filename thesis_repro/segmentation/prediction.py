@@ -3,7 +3,7 @@
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -81,9 +81,11 @@ def _arithmetic():
 
 def _write_batches(model, batches, done):
     """Predict and write batches of (image, label map) paths; done: called with the length of each written batch."""
-    run, paths = _compiled(model), [[path for path, _ in batch] for batch in batches]
+    def decode(batch):
+        return np.stack([read_image(path, *model.input_shape[1:]) for path, _ in batch])
+
     with ThreadPoolExecutor(2) as pool:
-        predicted = map(run, _ahead(pool, partial(_decode, model.input_shape), paths))
+        predicted = map(_compiled(model), _ahead(pool, decode, batches))
         for count in _ahead(pool, _write, zip(batches, predicted)):
             done(count)
 
@@ -96,10 +98,6 @@ def _ahead(pool, function, items):
         if len(waiting) > 2:
             yield waiting.popleft().result()
     yield from (future.result() for future in waiting)
-
-
-def _decode(input_shape, paths):
-    return np.stack([read_image(path, *input_shape[1:]) for path in paths])
 
 
 def _write(batch):

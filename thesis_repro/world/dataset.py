@@ -27,7 +27,7 @@ CITIES = {"train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfe
 def _drive(name, frames, seed):
     """Return a sequence's street, camera-to-world poses in it, (frames, 4, 4), and metres driven, (frames,)."""
     track, poses, driven = drives.way(name, frames, seed)
-    rng = drives.generator(seed, drives.STREET, int(name))
+    rng = np.random.default_rng((seed, drives.STREET, int(name)))
     return street.build(rng, textures.build(seed), track, drives.DRIVES[name].style), poses, driven
 
 
@@ -40,12 +40,13 @@ def render_frame(name, index, frames=None, scale=0.5, seed=0):
     scenery, poses, driven = _drive(name, frames or plan.frames, seed)
     size, intrinsics = drives.scaled_camera(name, scale)
     image, labels = scenery.view(poses[index], intrinsics, size, index, driven[index])
-    return _expose(drives.generator(seed, drives.SENSOR, int(name), index), image, plan.level, plan.noise), labels
+    rng = np.random.default_rng((seed, drives.SENSOR, int(name), index))
+    return _expose(rng, image, plan.level, plan.noise), labels
 
 
 def render_image(split, index, scale=0.5, seed=0):
     """Render training or validation image `index` ("train", "val"): image and label map, both uint8 (height, width)."""
-    rng = drives.generator(seed, drives.IMAGE, ("train", "val").index(split), index)
+    rng = np.random.default_rng((seed, drives.IMAGE, ("train", "val").index(split), index))
     plan = drives.DRIVES[SEQUENCES[int(rng.integers(0, len(SEQUENCES)))]]
     bend = rng.uniform(-70, 70)
     pieces = ((float(rng.uniform(8, 40)), 0.0), (float(rng.uniform(15, 40)), bend if rng.random() < 0.6 else 0.0),

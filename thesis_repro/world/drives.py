@@ -148,13 +148,8 @@ DRIVES = {
 }
 
 
-# Purposes of random numbers; each purpose has separate generators.
-SWAY, SENSOR, IMAGE, STREET = 1, 2, 3, 4
-
-
-def generator(seed, purpose, *key):
-    """Return a random generator that depends only on the seed, the purpose and further whole numbers."""
-    return np.random.default_rng(np.random.SeedSequence((seed, purpose, *key)))
+# Purposes of random numbers. A generator's seed is (seed of the world, purpose, further whole numbers).
+SWAY, SENSOR, IMAGE, STREET, TEXTURES = 1, 2, 3, 4, 7001
 
 
 def scaled_camera(name, scale):
@@ -207,7 +202,7 @@ def way(name, frames, seed):
         track = Track(drive.pieces, 0.0, sum(length for length, _ in drive.pieces), closed=True)
     else:
         track = Track(drive.pieces, -BEHIND, frames * drive.pace * 1.15 + AHEAD)
-    phase = generator(seed, SWAY, int(name)).uniform(0, 2 * np.pi, 6)
+    phase = np.random.default_rng((seed, SWAY, int(name))).uniform(0, 2 * np.pi, 6)
     driven = _driven(drive, track, frames, phase[0])
     # The sway depends on the metres driven, so the camera does not move while the car waits.
     x, z, heading = track.at(driven, drive.lane + 0.06 * np.sin(driven / 6 + phase[1]))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thesis_repro.world.drives import TEXTURES
 from thesis_repro.world.raster import ALPHA_LEVELS, LEVELS, OPAQUE, Textures
 
 # Metres that one repeat covers (along u, along v); None: one repeat covers the whole width of the surface.
@@ -34,7 +35,7 @@ class Bank(NamedTuple):
 @lru_cache(maxsize=1)
 def build(seed):
     """Return all textures of the world with this seed as a `Bank`."""
-    painted = _painted(np.random.default_rng(np.random.SeedSequence([seed, 7001])))
+    painted = _painted(np.random.default_rng((seed, TEXTURES)))
     chunks, start, length = [], np.zeros((len(painted), LEVELS, LEVELS), np.int64), 0
     for index, layers in enumerate(painted.values()):
         for j in range(layers[0].shape[0].bit_length()):
