@@ -94,7 +94,7 @@ def odometry(options):
     from thesis_repro.kitti import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
     from thesis_repro.odometry.refined import boresight
-    from thesis_repro.report import terminal
+    from thesis_repro.report import texts
 
     changes = {field.name: vars(options)[field.name] for field in fields(odometry.OdometrySettings)
                if vars(options).get(field.name) is not None}
@@ -113,18 +113,18 @@ def odometry(options):
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
         longrun.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
-    record = terminal.run(result, sequence, settings.alignment)
+    record = texts.run_record(result, sequence, settings.alignment)
     if options.video:
         from thesis_repro.report import video
 
         video.write_video(options.video, sequence, settings, masks)
     if options.plot:
-        from thesis_repro.report import trajectories
+        from thesis_repro.report import style, trajectories
 
         truth = sequence.poses if sequence.has_truth else None
         poses = result.poses if truth is None else metrics.shifted(result.poses, truth, settings.alignment)
         drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
-        trajectories.write(options.plot, drawing)
+        style.write_figure(drawing, options.plot)
     _print(options, record, "run.txt.j2", sequence=sequence, speed=options.speed, length=metrics.RELATIVE_LENGTH)
 
 
@@ -132,7 +132,7 @@ def boresight(options):
     """estimate the constant rotation between camera and ground truth, in degrees, for odometry --boresight"""
     from thesis_repro import kitti, odometry
     from thesis_repro.odometry.refined import boresight
-    from thesis_repro.report import terminal
+    from thesis_repro.report import texts
 
     paths = {}
     names = options.sequences or kitti.sequences(options.kitti)
@@ -142,7 +142,7 @@ def boresight(options):
         result = odometry.run(sequence, replace(odometry.THESIS, estimator="refined"), description=f"sequence {name}")
         paths[name] = result.poses, sequence.poses
     rotation, table = boresight.estimate(list(paths.values())), boresight.explained(paths)
-    _print(options, terminal.angles(rotation, table), "angles.txt.j2", table=table)
+    _print(options, texts.angles_record(rotation, table), "angles.txt.j2", table=table)
 
 
 def study(options):
@@ -186,7 +186,7 @@ def evaluate(options):
     """compare trajectories with the ground truth: the thesis's RMSE and MAE, ATE, RPE, KITTI's t_rel and r_rel"""
     from thesis_repro import check
     from thesis_repro.kitti import true_path
-    from thesis_repro.report import trajectories
+    from thesis_repro.report import style, trajectories
 
     sequences = trajectories.by_sequence(options.poses, options.kitti, options.sequence)
     if options.plot and len(sequences) > 1:
@@ -202,7 +202,7 @@ def evaluate(options):
     if options.plot:
         drawing = trajectories.figure(trajectories.aligned(paths, truth, options.align), truth, f"sequence {sequence}",
                                       {name: matched for name, (matched, _) in paths.items()})
-        trajectories.write(options.plot, drawing)
+        style.write_figure(drawing, options.plot)
     rows += list(trajectories.means(rows))
     _print(options, rows, "evaluate.txt.j2", alignment=options.align, table=trajectories.table(rows, options.align))
 

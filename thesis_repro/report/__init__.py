@@ -1,1 +1,1 @@
-"""Tables, figures, words, videos and the page: what is shown of results that are there."""
+"""Tables, figures, texts, videos and pages of the results."""

@@ -1,8 +1,6 @@
-"""One page with every table and figure of a run or a study: index.html beside them, to be opened from disk.
+"""The page with all tables and figures of a run or a study: index.html beside them. It needs no network or server.
 
-`python -m thesis_repro.report.page` writes the page, and turns executed notebooks that are newer than their HTML into
-HTML. Neither needs a network, a server or scripts to be read. This module says what is shown, templates/page.html.j2
-says how.
+`python -m thesis_repro.report.page` writes the page, and converts executed notebooks to HTML.
 """
 
 import importlib.metadata
@@ -19,25 +17,28 @@ from datetime import UTC, datetime
 from markupsafe import Markup
 
 from thesis_repro import longrun
-from thesis_repro.files import write_text
+from thesis_repro.files import listed, write_text
 from thesis_repro.report import captions, tables, texts
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
 EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
-OPENING = ("figure_4_05", "findings", "figure-comparison")  # what a page starts with, by id
-PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # what numbers depend on most
+OPENING = ("figure_4_05", "findings", "figure-comparison")  # ids of the artefacts at the top of a page
+PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # packages that affect the numbers most
 
 
 def update(settings):
-    """Write the page of a run, and the HTML of each executed notebook that has changed since.
+    """Write the page of a run, and the HTML of each executed notebook that is newer than its HTML.
 
-    What killed runs left half written in the run's folders is deleted. Raises InputError where another run is at work.
+    Deletes temporary files of killed runs. Raises InputError if another run uses the folder.
     """
     with longrun.claimed(settings.build / "notebooks"):
         longrun.sweep(settings.build)
-        _bring_constants(settings.figures)
+        for name in captions.CONSTANT:  # copied from the default run if their notebooks were not executed
+            for path in (ROOT / "figures").glob(f"{name}.*"):
+                if not (settings.figures / path.name).exists():
+                    write_text(settings.figures / path.name, path.read_text(encoding="utf-8"))
         if settings.figures.is_dir():
             longrun.sweep(settings.figures)
         page = settings.figures / PAGE
@@ -48,24 +49,15 @@ def update(settings):
         write_text(page, build(settings))
 
 
-def _bring_constants(figures):
-    """Copy what shows no data from the default run, where the notebooks that make it were not run."""
-    for name in captions.CONSTANT:
-        for path in (ROOT / "figures").glob(f"{name}.*"):
-            if not (figures / path.name).exists():
-                write_text(figures / path.name, path.read_text(encoding="utf-8"))
-
-
 def _executed(settings):
-    """The executed notebooks in their order; a half-written one has a name that starts with a dot."""
-    return sorted((settings.build / "notebooks").glob("[!.]*.ipynb"))
+    return listed(settings.build / "notebooks", "*.ipynb")
 
 
 def notebook_html(path, page):
-    """An executed notebook as HTML, with a link to the page."""
+    """Convert an executed notebook to HTML with a link to the page."""
     from nbconvert import HTMLExporter  # slow to import, and seldom needed
 
-    # nbconvert's whole pages load scripts from the network; the bare content needs none
+    # nbconvert's complete pages load scripts from the network, but the basic template does not
     content, resources = HTMLExporter(
         template_name="basic", embed_images=True, exclude_input_prompt=True, exclude_output_prompt=True,
         exclude_anchor_links=True).from_filename(str(path))
@@ -74,9 +66,9 @@ def notebook_html(path, page):
 
 
 def build(settings):
-    """The page of a run as HTML, from the files in its folders."""
+    """Return the page of a run as HTML, made from the files in its folders."""
     makers, numbers = _makers(), tables.beside_the_thesis(settings)
-    chapters = {title: [_shown(settings.figures, artefact, makers, settings, numbers) for artefact in artefacts]
+    chapters = {title: [_describe(settings.figures, artefact, makers, settings, numbers) for artefact in artefacts]
                 for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()}
     executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
     return texts.render(
@@ -93,22 +85,23 @@ def build(settings):
 
 
 def build_study(folder, names, **facts):
-    """The page of a study as HTML, from the files in its folder. names: of what the study left. facts: for the page."""
-    shown = []
+    """Return the page of a study as HTML. names: (kind, name) of its files. facts: further values of the template."""
+    artefacts = []
     for artefact, (kind, name) in itertools.product([*captions.OF_STUDIES, *captions.ADDED], names):
-        base, _, sequence = name.partition("-")  # one artefact stands for the figures of all sequences
+        base, _, sequence = name.partition("-")  # one artefact describes the figures of all sequences
         if (kind, base) == (artefact["kind"], artefact["name"]):
             title = f"{artefact['title']} {sequence}".strip()
-            shown.append(_shown(folder, artefact | {"name": name, "title": title}, {}))
-    return texts.render("study.html.j2", title="A study of masks", artefacts=shown, notebooks={}, made=_made(), **facts)
+            artefacts.append(_describe(folder, artefact | {"name": name, "title": title}, {}))
+    return texts.render("study.html.j2", title="A study of masks", artefacts=artefacts, notebooks={}, made=_made(),
+                        **facts)
 
 
-def _shown(folder, artefact, makers, settings=None, numbers=None):
-    """What the template needs to show a table, a figure or a text of a folder, or to say that it is missing."""
+def _describe(folder, artefact, makers, settings=None, numbers=None):
+    """Return the values that the template needs to show a table, figure or text, or to report it as missing."""
     kind, name = artefact["kind"], artefact["name"]
     files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
     content, details, rows = None, None, 0
-    if files and kind == "text":  # what stands before its first heading is for everybody
+    if files and kind == "text":  # the page folds the part after the first heading
         content, _, details = files[0].read_text(encoding="utf-8").partition("\n## ")
         content, details = texts.html(content), texts.html(f"## {details}") if details else None
     elif kind == "table" and files and files[0].suffix == ".csv":
@@ -136,7 +129,7 @@ def _shown(folder, artefact, makers, settings=None, numbers=None):
 
 
 def _makers():
-    """The notebooks in whose code a table or figure is named, {name: [notebooks]}."""
+    """Return {name: [notebooks]}, the notebooks whose code contains the name of a table or figure."""
     makers = {}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
@@ -147,13 +140,13 @@ def _makers():
 
 
 def _made(executed=(), in_git=False):
-    """Packages, machine, commit and day of the results; a page in git is that of its commit, made anywhere, any day."""
+    """Return the packages and, for a page outside git, the machine, commit and day of the results."""
     made = {"packages": {name: importlib.metadata.version(name) for name in PACKAGES}}
     if in_git:
         return made
     made |= {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
     with suppress(OSError, subprocess.CalledProcessError):
-        made["commit"] = subprocess.run(  # not that of a checkout around this folder
+        made["commit"] = subprocess.run(  # --git-dir excludes a repository in a parent folder
             ["git", f"--git-dir={ROOT / '.git'}", f"--work-tree={ROOT}", "describe", "--always", "--dirty",
              "--exclude=*", "--abbrev=12"], capture_output=True, text=True, check=True).stdout.strip()
     if executed:

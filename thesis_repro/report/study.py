@@ -1,15 +1,13 @@
-"""What a study with masks of one's own leaves: findings, figures and tables, the paths of its runs, and one page.
-
-Everything that a paper takes is there in its form: tables as LaTeX, figures as PDF, paths in KITTI's and TUM's form.
+"""The results of a study with the user's masks: findings, figures, tables and a page. Tables are also written as
+LaTeX and figures as PDF, for use in a paper.
 """
 
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 
 from thesis_repro import InputError, stages
-from thesis_repro.files import atomic, write_text
+from thesis_repro.files import write_text
 from thesis_repro.kitti import Sequence, read_poses
 from thesis_repro.masks import label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
@@ -18,58 +16,55 @@ from thesis_repro.study import compare, controls, runner, series
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS
 
-DIGITS = 6  # of the table of runs
-
 
 def write(study, runs, folder, warnings=()):
-    """Write everything that the runs of a `series.Study` show into a folder; returns the page's path.
+    """Write the findings, figures, tables and page of a `series.Study` into a folder, and return the page's path.
 
-    warnings: lines that the page opens with.
+    warnings: lines for the top of the page.
     """
+    # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
+    embedded = "train_images" in (stages.record(study.kitti.absolute().parent) or {})
+    data = "embedded world (rendered)" if embedded else f"KITTI folder {study.kitti.name}"
+    changed = {source.name: _changed(source) for source in study.sources}
+    masks = ", ".join(f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources)
+    note = f"odometry: {data}; masks: {masks}"
     runs = runner.with_boresight_correction(runs, study.kitti, folder / "runs", study.frames)
-    table, note = compare.comparisons(runs), data_note(study)
+    table = compare.comparisons(runs)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
     figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
+    for name, figure in figures.items():
+        style.write_figure(figure, folder / f"{name}.pdf", metadata={"CreationDate": None})
     numbers = {"comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
-               "errors": tables.table_errors(runs), "runs": runs.round(DIGITS)}
-    names = save(figures, numbers, folder, note)
+               "errors": tables.table_errors(runs), "runs": runs.round(6)}
+    for name, rows in numbers.items():
+        latex = rows.to_latex(index=False, escape=True, na_rep="", float_format="{:g}".format)
+        write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
+    names = style.save_all(figures, numbers, folder, note)
     write_text(folder / page.PAGE, page.build_study(
-        folder, [("text", "findings"), *names], study=study, warnings=warnings,
-        embedded=is_embedded(study.kitti), kinds=KINDS, estimators=ESTIMATORS, line_width=controls.LINE_WIDTH,
-        changed={source.name: _changed(source) for source in study.sources},
+        folder, [("text", "findings"), *names], study=study, warnings=warnings, embedded=embedded, kinds=KINDS,
+        estimators=ESTIMATORS, line_width=controls.LINE_WIDTH, changed=changed,
         widths=sorted(runs["dilation_width"].dropna().astype(int).unique())))
     return folder / page.PAGE
 
 
-def save(figures, tables, folder, note):
-    """`style.save_all`, and the same for a paper: figures as PDF, tables as LaTeX for the package booktabs."""
-    for name, figure in figures.items():
-        with atomic(folder / f"{name}.pdf") as temporary:
-            figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, metadata={"CreationDate": None})
-    for name, table in tables.items():
-        latex = table.to_latex(index=False, escape=True, na_rep="", float_format="{:g}".format)
-        write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
-    return style.save_all(figures, tables, folder, note)
-
-
 def figure_sources(study):
-    """The middle frame of the first sequence: each source's label map, its mask, and the keypoints in that.
+    """Draw the middle frame of the first readable sequence: each source's label map, its mask and the kept keypoints.
 
-    The frame alone stands in place of the label map where there is none.
+    The plain frame replaces a label map that is missing.
     """
-    for sequence, own in study.masks():
+    for sequence, sequence_masks in study.masks():
         index = len(sequence) // 2
-        with suppress(InputError):  # a frame that cannot be read costs the runs of its sequence alone
-            frame, of_sources = sequence.frame(index), own
+        with suppress(InputError):  # if a frame cannot be read, only the runs of its sequence fail
+            frame, masks_by_source = sequence.frame(index), sequence_masks
             break
     label_maps = []
-    figure, axes = style.frame_panels(frame, len(of_sources), 3, 1.5 * style.PAGE_WIDTH)
-    for (first, second, third), source, masks in zip(np.reshape(axes, (-1, 3)), study.sources, of_sources):
+    figure, axes = style.frame_panels(frame, len(masks_by_source), 3, 1.5 * style.PAGE_WIDTH)
+    for (first, second, third), source, masks in zip(np.reshape(axes, (-1, 3)), study.sources, masks_by_source):
         style.show_image(first, frame, f"{source.name}: frame {index}")
         style.show_image(second, np.zeros_like(frame), f"{source.name}: no mask")
         style.show_image(third, frame, "")
-        with suppress(InputError):  # of a file that cannot be read: its runs say so
+        with suppress(InputError):  # the runs report a file that cannot be read
             mask = masks[index]
             if source.kind == "labels":
                 label_maps.append(label_map_of(masks, index))
@@ -84,7 +79,7 @@ def figure_sources(study):
 
 
 def figure_paths(study, name, folder):
-    """All keypoints and every source's masks over one sequence, one run each, shifted as for the RMSE."""
+    """Draw one path with all keypoints and one with each source's masks, shifted as for the RMSE."""
     true = Sequence(study.kitti, name).subset(study.frames).poses
     files = {job.source or compare.METHODS[job.method]: folder / series.PATHS / "kitti" / name / f"{job.name}.txt"
              for job in study.shown_jobs(name)}
@@ -92,20 +87,8 @@ def figure_paths(study, name, folder):
     return trajectories.figure(paths, true, f"sequence {name}")
 
 
-def is_embedded(kitti):
-    """Whether a KITTI folder is that of an embedded world, as `thesis-repro synthesize` writes it."""
-    return "train_images" in (stages.record(Path(kitti).absolute().parent) or {})
-
-
-def data_note(study):
-    """One line for captions: where the numbers come from."""
-    frames = "embedded world (rendered)" if is_embedded(study.kitti) else f"KITTI folder {study.kitti.name}"
-    masks = ", ".join(f"{source.name} ({KINDS[source.kind]}{_changed(source)})" for source in study.sources)
-    return f"odometry: {frames}; masks: {masks}"
-
-
 def _changed(source):
-    """The settings of masks from label maps that are not the thesis's, as "; margin 10"."""
+    """Return the settings of masks from label maps that differ from the thesis's, such as "; margin 10"."""
     default = vars(type(source.settings)())
     changed = [f"{name} {value}" for name, value in vars(source.settings).items() if value != default[name]]
     return f"; {', '.join(changed)}" if changed and source.kind == "labels" else ""

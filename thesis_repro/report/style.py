@@ -1,9 +1,4 @@
-"""One style for every figure and table, and the writing of both: SVG or WebP, CSV and Markdown.
-
-Each module of chapters 2 to 4 draws from arrays or a table and returns a matplotlib figure.
-"""
-
-from pathlib import Path
+"""The style of all figures and tables, and functions that write them as SVG or WebP, CSV and Markdown."""
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -27,55 +22,55 @@ matplotlib.rcParams.update({
     "lines.linewidth": 1.4,
     "image.interpolation": "nearest",
     "svg.fonttype": "none",
-    "text.parse_math": False,  # names of files and sequences may hold dollars
+    "text.parse_math": False,  # names of files and sequences may contain dollar signs
     "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
     "savefig.dpi": 160,
 })
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
-TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # what each colour stands for in all of chapter 4
-DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"  # the note where no data is shown
-KEYPOINT = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}  # how keypoints are drawn on a frame
-EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges drawn on a frame
+TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
+DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"  # note of figures that show no data
+KEYPOINT = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}  # style of keypoints on a frame
+EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges on a frame
 
 
 def line_style(index):
-    """Colour and dash of the index-th line of a figure: 28 differ, and neighbours differ without colours as well."""
+    """Return colour and dash of the index-th line of a figure. 28 styles differ; neighbours also differ in dashes."""
     colors, dashes = (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK), ("-", "--", "-.", ":")
     return {"color": colors[index % len(colors)], "linestyle": dashes[index % len(dashes)]}
 
 
 def label_colors(label_map, frame):
-    """A label map's colours at the frame's size, for looking at (the mask filter has its own enlargement)."""
+    """Return a label map in colours, enlarged to the frame's size for display. masks.py enlarges in another way."""
     rows = np.arange(frame.shape[0]) * label_map.shape[0] // frame.shape[0]
     columns = np.arange(frame.shape[1]) * label_map.shape[1] // frame.shape[1]
     return colorize(label_map[np.ix_(rows, columns)])
 
 
 def new_figure(rows=1, columns=1, height=3.2, width=PAGE_WIDTH, **options):
-    """A figure with the project's style, width and height in inches: (figure, axes)."""
+    """Return a figure and its axes. height, width: inches."""
     return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
 
 
 def frame_panels(frame, rows=1, columns=1, width=PAGE_WIDTH):
-    """A figure with panels of a frame's shape, titles above them and nothing wasted: (figure, list of axes)."""
-    height, long = frame.shape[:2]
-    figure, axes = new_figure(rows, columns, rows * (width / columns * height / long + 0.27), width, squeeze=False)
+    """Return a figure and a list of its axes, which have the shape of a frame and room for titles."""
+    height, length = frame.shape[:2]
+    figure, axes = new_figure(rows, columns, rows * (width / columns * height / length + 0.27), width, squeeze=False)
     return figure, list(axes.flat)
 
 
 def show_image(axes, image, title, **options):
-    """An image in its axes without ticks; gray where it has one channel."""
+    """Show an image without ticks; an image with one channel is gray."""
     axes.imshow(image, cmap=options.pop("cmap", "gray"), **options)
     axes.set_title(title)
     axes.set_axis_off()
 
 
 def small_panels(names, xlabel="", figure=None):
-    """A grid of panels, at most four in a row, each with a name as its title and ticks that are few: (figure, panels).
+    """Return (figure, panels), one small panel for each name, at most four in a row.
 
-    xlabel: of the lowest of each column. figure: a part of one, to put them in.
+    xlabel: label of the lowest panel of each column. figure: a subfigure for the panels, or None for a new figure.
     """
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
@@ -94,14 +89,14 @@ def small_panels(names, xlabel="", figure=None):
 
 
 def legend_below(figure, panels, columns):
-    """A legend below the figure with each label of its panels once."""
+    """Add a legend below the figure with each label of the panels once."""
     handles = {label: handle for panel in panels for handle, label in zip(*panel.get_legend_handles_labels())}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
 def class_legend(figure, *label_maps, also=()):
-    """Name the classes of label maps below a figure, which grows by the legend's height; `also`: further handles."""
-    names = {}  # Cityscapes gives several labels one colour
+    """Add a legend of the classes in label maps below a figure, and make the figure higher. also: further handles."""
+    names = {}  # some Cityscapes labels share a colour
     for index in np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps])):
         names.setdefault(LABELS[index].color, []).append(LABELS[index].name)
     handles = [Patch(color=np.array(color) / 255, label=", ".join(labels)) for color, labels in names.items()]
@@ -111,10 +106,7 @@ def class_legend(figure, *label_maps, also=()):
 
 
 def ratio_axis(axis, values):
-    """Make `axis`, as axes.yaxis, logarithmic, just wider than the positive ones of the values, with a few round ticks.
-
-    Equal values get room around them.
-    """
+    """Make an axis (such as axes.yaxis) logarithmic, with a few round ticks and limits around the positive values."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values) & (values > 0)]
     low, high = (values.min(), values.max()) if len(values) else (1, 1)
@@ -129,13 +121,11 @@ def ratio_axis(axis, values):
 
 
 def save_figure(figure, folder, name, note):
-    """Write folder/name with the data note at the foot: .webp where the figure shows pictures, else .svg.
+    """Write folder/name.webp if the figure contains images, else folder/name.svg, with the data note at the foot.
 
-    Either is what a browser shows best at the least size; the note stands in the file's text as well.
+    The note is also in the file's metadata.
     """
-    folder = Path(folder)
-    # A tight box lets legends at the figure's edge slip down onto the note, so they are pinned where the layout put
-    # them.
+    # a tight box would move legends at the figure's edge onto the note, so their places are fixed
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for legend in figure.legends:
@@ -151,20 +141,24 @@ def save_figure(figure, folder, name, note):
     else:
         ending, other = ".svg", ".webp"
         options = {"metadata": {"Date": None, "Creator": None, "Description": note}}
-    with atomic(folder / f"{name}{ending}") as temporary:
+    write_figure(figure, folder / f"{name}{ending}", **options)
+    (folder / f"{name}{other}").unlink(missing_ok=True)  # an earlier run may have written the other format
+
+
+def write_figure(figure, path, **options):
+    """Write a figure in the format that the path's ending names."""
+    with atomic(path) as temporary:
         figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
-    (folder / f"{name}{other}").unlink(missing_ok=True)  # of a run in which it was the other kind
 
 
 def save_table(table, folder, name, note):
-    """Write folder/name.csv and .md with the data note under the Markdown table."""
-    folder = Path(folder)
+    """Write folder/name.csv and folder/name.md with the data note under the Markdown table."""
     write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
     write_text(folder / f"{name}.md", f"{markdown(table)}\n{note}\n")
 
 
 def save_all(figures, tables, folder, note):
-    """Write figures and tables that have rows, {name: ...} of each; returns (kind, name) of what was written."""
+    """Write {name: figure} and {name: table}, except empty tables, and return (kind, name) of each written one."""
     tables = {name: table for name, table in tables.items() if len(table)}
     for name, figure in figures.items():
         save_figure(figure, folder, name, note)
@@ -175,7 +169,7 @@ def save_all(figures, tables, folder, note):
 
 
 def markdown(table):
-    """A pandas table as a Markdown one; numbers are aligned to the right, missing values are empty."""
+    """Return a pandas table as Markdown, with numbers aligned to the right and missing values empty."""
     numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
     rows = [list(table.columns), ["---:" if right else ":---" for right in numeric]]
     rows += [["" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value) for value in row]

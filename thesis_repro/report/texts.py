@@ -1,9 +1,9 @@
-"""Texts are templates (templates/*.j2) with numbers put in; their only conditions are what was run and the verdicts.
+"""Texts made from templates (templates/*.j2). Their conditions depend only on what was run and on the verdicts.
 
-The findings are written from the table of `compare.comparisons`; those of a run, of a study with masks of one's own and
-of the evidence on real frames come from one template.
+A run, a study with the user's masks and the evidence on real frames share one template for their findings.
 """
 
+import json
 import re
 from math import ceil, log10
 from pathlib import Path
@@ -13,29 +13,32 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from thesis_repro.odometry import metrics
+from thesis_repro.odometry.refined import boresight
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
-DIGITS = 2  # of a ratio, where no more are needed to tell it from 1
+DIGITS = 2  # of a ratio that is not close to 1
+ERRORS = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_100m")
 TEMPLATES = Environment(loader=FileSystemLoader(Path(__file__).parent / "templates"),
                         autoescape=lambda name: ".html" in (name or ""), undefined=StrictUndefined, trim_blocks=True,
                         lstrip_blocks=True)
 
 
 def render(template, **values):
-    """The text of a template in the folder templates; Markdown has one empty line at once, at most."""
+    """Return the text of a template in the folder templates. Repeated empty lines in Markdown become one."""
     text = TEMPLATES.get_template(template).render(values).strip() + "\n"
     return re.sub(r"\n{3,}", "\n\n", text) if ".md" in template else text
 
 
 def number(value):
-    """A ratio with two digits, or as many as it takes to see that it is not 1."""
+    """Return a ratio as text with two digits, or with more if it would look like 1."""
     near = 0 < abs(value - 1) < 0.5 * 10**-DIGITS
     return f"{value:.{min(6, ceil(-log10(abs(value - 1))) + 1) if near else DIGITS}f}"
 
 
 def ratio(row):
-    """"1.09 (95 % CI 0.98-1.32)" from a row with ratio, low and high; the ratio alone where there is no interval."""
+    """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high, or only the ratio if low is missing."""
     if pd.isna(row["low"]):
         return number(row["ratio"])
     return f"{number(row['ratio'])} ({compare.LEVEL} % CI {number(row['low'])}-{number(row['high'])})"
@@ -43,16 +46,16 @@ def ratio(row):
 
 class _Renderer(mistune.HTMLRenderer):
     def heading(self, text, level, **attributes):
-        return super().heading(text, max(4, level + 1), **attributes)  # below those of the page
+        return super().heading(text, max(4, level + 1), **attributes)  # lower than the headings of the page
 
 
 def html(text):
-    """Markdown as HTML; HTML in it is shown as text."""
+    """Convert Markdown to HTML. HTML tags in the Markdown are shown as text."""
     return Markup(mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])(text))
 
 
 def ratio_and_far_off(row):
-    """`ratio`, and each sequence that is far from the others: "3.85 (95 % CI 0.71-80.41), sequence 01 alone 95.20"."""
+    """Return `ratio` and the sequences far from the others: "3.85 (95 % CI 0.71-80.41), sequence 01 alone 95.20"."""
     return ratio(row) + "".join(f", sequence {name} alone {number(row[name])}" for name in row["far_off"])
 
 
@@ -61,17 +64,17 @@ TEMPLATES.filters["number"] = number
 
 
 def findings(runs, table, data, label_maps=()):
-    """What the runs show, as Markdown.
+    """Return the findings of a run, a study or the evidence as Markdown.
 
-    runs: with `compare.comparisons` of them, the table. data: one line that says where they come from.
-    label_maps: how good these are, rows of `gap.label_map_quality`.
+    table: `compare.comparisons` of the runs. data: one line with the origin of the data.
+    label_maps: the quality of the label maps, rows of `gap.label_map_quality`.
     """
-    baseline, of_masks = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
+    baseline, masked = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
     pairs = table[(table["method"] == "masked") & (table["reference"] == "masked")
                   & table["metric"].isin(compare.JUDGING_METRICS) & (table["source"] < table["reference_source"])
                   & (table["estimator"] == compare.judging_estimator(table))]  # each pair of sources once
-    sources = [_of_source(runs, table, source) for source in compare.sources(runs) or [""]
-               if (of_masks["source"] == source).any()]
+    sources = [_source_values(runs, table, source) for source in compare.sources(runs) or [""]
+               if (masked["source"] == source).any()]
     spread = compare.shuffle_spread(runs).groupby("estimator")["factor"].agg(["median", "max"])
     return render(
         "findings.md.j2", label_maps=label_maps, data=data,
@@ -82,8 +85,8 @@ def findings(runs, table, data, label_maps=()):
         sources=sources, against_each_other=pairs.to_dict("records"))
 
 
-def _of_source(runs, table, source):
-    """What the template says of one source of masks."""
+def _source_values(runs, table, source):
+    """Return the values of one source of masks for the template."""
     runs, judged = compare.of_source(runs, source), compare.primary_comparison(table, source)
     rows = table[(table["source"] == source) & (table["reference"] == "baseline") & table["tested"]]
     judging = rows["metric"].isin(compare.JUDGING_METRICS) & (rows["estimator"] == compare.judging_estimator(table))
@@ -97,3 +100,29 @@ def _of_source(runs, table, source):
             "corrected": rows[judging & (rows["method"] == "corrected")].to_dict("records"),
             "controls": controls.agg(compare.overall).to_dict(), "widths": widths,
             "same_best": None if pd.isna(same_best) else float(same_best)}
+
+
+# Records of commands, for JSON and for templates
+
+
+def run_record(result, sequence, alignment):
+    """Return the errors, keypoints, time and flags of an `odometry.Result`. An error that is not determined is None."""
+    errors = dict.fromkeys(ERRORS)
+    if sequence.has_truth:
+        values = metrics.errors(result.poses, sequence.poses, alignment).values()
+        errors = {name: None if value != value else value for name, value in zip(ERRORS, values, strict=True)}
+    detected = result.frames["detected"].dropna()  # empty if no frame has structure
+    seconds = result.frames.filter(like="_seconds").sum(axis=1)
+    return {"sequence": sequence.name, "frames": len(sequence), **errors,
+            "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
+            "ms_per_frame": 1000 * float(seconds.mean()),
+            "flagged": {flag: int(count) for flag, count in result.flagged.items()}}
+
+
+def angles_record(rotation, table):
+    """Return `boresight.estimate` (degrees) and the table of `boresight.explained` (metres, degrees) as a dict."""
+    intervals = pd.DataFrame({"degrees": rotation.angles, "low": rotation.low, "high": rotation.high}, boresight.ANGLES)
+    tables = {"angles": intervals, "sequences": table.set_index("sequence")}
+    # to_json writes null for a missing number
+    records = {name: json.loads(table.to_json(orient="index", double_precision=15)) for name, table in tables.items()}
+    return {"angles": records["angles"], "steps": rotation.steps, "sequences": records["sequences"]}

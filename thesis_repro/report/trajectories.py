@@ -1,4 +1,4 @@
-"""Trajectories against the truth: one table of errors and one picture of several of them."""
+"""Trajectories compared with the ground truth: a table of their errors and a figure of their paths."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -8,70 +8,70 @@ import pandas as pd
 from evo import EvoException
 
 from thesis_repro import InputError
-from thesis_repro.files import atomic, listed
+from thesis_repro.files import listed
 from thesis_repro.kitti import read_poses, read_tum
 from thesis_repro.odometry import metrics
-from thesis_repro.report.style import TRUTH, line_style, new_figure, plt
+from thesis_repro.report.style import TRUTH, line_style, new_figure
 
-# what a table shows of a row of `evaluate`: heads of columns
+# keys of a row of `evaluate`, and their column names in a table
 COLUMNS = {"rmse_m": "RMSE m", "mae_m": "MAE m", "ate_rmse_m": "ATE m", "ate_max_m": "largest m",
            "rpe_translation_rmse_m": "RPE m", "rpe_rotation_rmse_deg": "RPE deg", "t_rel_percent": "t_rel %",
            "r_rel_deg_per_100m": "r_rel deg/100 m", "scale": "scale"}
 
 
 def by_sequence(paths, root, sequence=None):
-    """The files of trajectories: {sequence: {trajectory: file}}; a trajectory is called as its path without the ending.
+    """Return the files of trajectories, {sequence: {trajectory: file}}. A trajectory is named by its path.
 
-    paths: files of one sequence, or folders with NN.txt or NN.tum for each sequence with true poses in a KITTI root
-    (of `sequence` alone, where it is given).
+    paths: files of one sequence, or folders with a file NN.txt or NN.tum for each sequence with ground truth in a KITTI
+    root. sequence: the only sequence to return, or None for all.
     """
     files = {}
     for path in paths:
-        of_path = {sequence: path}
+        path_files = {sequence: path}
         if path.is_dir():
-            truths = [sequence] if sequence else [true.stem for true in listed(Path(root or "", "poses"), "*.txt")]
-            of_path = {file.stem: file for file in listed(path, "*.t*") if file.stem in truths}
-        if not of_path or None in of_path:
-            raise InputError(f"{path}: name its sequence with --sequence; a folder must hold NN.txt or NN.tum of a "
-                             "sequence whose true poses --kitti holds")
-        for name, file in of_path.items():
+            names = [sequence] if sequence else [file.stem for file in listed(Path(root or "", "poses"), "*.txt")]
+            path_files = {file.stem: file for file in listed(path, "*.t*") if file.stem in names}
+        if not path_files or None in path_files:
+            raise InputError(f"{path}: name its sequence with --sequence; a folder must contain NN.txt or NN.tum for a "
+                             "sequence with ground truth in --kitti")
+        for name, file in path_files.items():
             files.setdefault(name, {})[str(path.with_suffix("") if path.is_file() else path)] = file
     return files
 
 
 def read(file, times, frames=None):
-    """A trajectory in KITTI's form, or in TUM's: (numbers of frames, their poses), (n,) and (n, 4, 4).
+    """Read a trajectory in KITTI's or TUM's format: (indices of its frames (n,), poses (n, 4, 4)).
 
-    times: of the true poses, seconds. KITTI's form has a pose for each of them; of TUM's form see `read_tum`.
-    frames: how many poses in KITTI's form to take, None for all. Raises InputError for what is neither.
+    times: of the ground truth, seconds. A file in KITTI's format needs one pose for each time; for TUM's format see
+    `read_tum`. frames: how many poses of a file in KITTI's format to use. Raises InputError for any other file.
     """
-    with suppress(OSError, ValueError), open(file, encoding="utf-8") as lines:  # which read_poses names
+    with suppress(OSError, ValueError), open(file, encoding="utf-8") as lines:  # read_poses reports these errors
         if len(next((line for line in lines if not line.startswith("#")), "").split()) == 8:
             return read_tum(file, times)
     poses = read_poses(file)[:frames]
     if len(poses) != len(times):
-        raise InputError(f"{file}: {len(poses)} poses, but the sequence has {len(times)} true ones; one a frame is "
-                         "needed in both (TUM's form has times and may leave some out)")
+        raise InputError(f"{file}: {len(poses)} poses, but the ground truth has {len(times)}; KITTI's format needs one "
+                         "for each frame (TUM's format has times and may leave frames out)")
     return np.arange(len(poses)), poses
 
 
 def evaluate(paths, true, alignment="none", sequence=""):
-    """The errors of each path, a list of dicts of numbers (None where one is not determined).
+    """Return the errors of each path, a list of dicts. An error that is not determined is None.
 
-    paths: {name: (frames, poses)} as `read` gives them; true: (n, 4, 4). RMSE and MAE are the thesis's whatever the
-    alignment is; the others are of the path as `metrics.align` leaves it. Of a path that leaves frames out, the RPE is
-    from one of its poses to the next.
+    paths: {name: (frames, poses)} from `read`; true: (n, 4, 4). RMSE and MAE follow the thesis and ignore `alignment`.
+    The other errors are of the path after `metrics.align`. The RPE is from one pose of the path to the next.
     """
-    rows, after = [], aligned(paths, true, alignment)
+    rows, aligned_paths = [], aligned(paths, true, alignment)
     for name, (frames, poses) in paths.items():
-        its_true = true[frames]
-        ate = metrics.ate(poses, its_true, alignment)
+        truth = true[frames]
+        ate = metrics.ate(poses, truth, alignment)
         row = {"trajectory": name, "sequence": sequence, "poses": len(poses), "frames": len(true),
-               "alignment": alignment, "rmse_m": metrics.rmse(poses, its_true), "mae_m": metrics.mae(poses, its_true),
+               "alignment": alignment, "rmse_m": metrics.rmse(poses, truth), "mae_m": metrics.mae(poses, truth),
                "note": ate.pop("note"), "scale": ate.pop("scale"),
                **{f"ate_{key}_m": value for key, value in ate.items()}}
-        if name in after:  # else ate's note says why it cannot be aligned
-            rpe, segments = metrics.rpe(after[name], its_true), metrics.kitti_errors(after[name], its_true)
+        if name in aligned_paths:  # else the note of the ATE says why the path cannot be aligned
+            rpe = metrics.rpe(aligned_paths[name], truth)
+            segments = metrics.kitti_errors(aligned_paths[name], truth)
             row |= {f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value for key, value in rpe.items()}
             row |= {"t_rel_percent": segments["translation_percent"], "segments": segments["segments"],
                     "r_rel_deg_per_100m": segments["rotation_deg_per_100m"], "note": row["note"] or segments["note"]}
@@ -80,35 +80,35 @@ def evaluate(paths, true, alignment="none", sequence=""):
 
 
 def means(rows):
-    """Rows of `evaluate` with the means over the sequences of a trajectory that has several, without missing values."""
-    for name, of_path in pd.DataFrame(rows).groupby("trajectory", sort=False):
-        if len(of_path) > 1:
-            errors = of_path.drop(columns=["poses", "frames", "segments"], errors="ignore").mean(numeric_only=True)
-            yield {"trajectory": name, "sequence": f"mean of {len(of_path)}", "poses": int(of_path["poses"].sum()),
-                   **errors.to_dict(), "note": ""}
+    """Yield a row like those of `evaluate` with the means of each trajectory that has several sequences."""
+    for name, errors in pd.DataFrame(rows).groupby("trajectory", sort=False):
+        if len(errors) > 1:
+            mean = errors.drop(columns=["poses", "frames", "segments"], errors="ignore").mean(numeric_only=True)
+            yield {"trajectory": name, "sequence": f"mean of {len(errors)}", "poses": int(errors["poses"].sum()),
+                   **mean.to_dict(), "note": ""}
 
 
 def aligned(paths, true, alignment):
-    """The poses of the paths as `metrics.align` leaves them; those that it cannot align are left out."""
-    after = {}
+    """Return {name: poses} after `metrics.align`, without the paths that cannot be aligned."""
+    aligned_paths = {}
     for name, (frames, poses) in paths.items():
         with suppress(EvoException):
-            after[name], _ = metrics.align(poses, true[frames], alignment)
-    return after
+            aligned_paths[name], _ = metrics.align(poses, true[frames], alignment)
+    return aligned_paths
 
 
 def table(rows, alignment="none"):
-    """The rows of `evaluate` as a table for reading."""
-    heads = {key: head for key, head in COLUMNS.items() if key != "scale" or alignment in ("sim3", "scale")}
-    table = pd.DataFrame(rows, columns=["trajectory", "sequence", "poses", *heads])
-    return table.astype(dict.fromkeys(heads, float)).rename(columns=heads)
+    """Return the rows of `evaluate` and `means` as a table for display."""
+    columns = {key: name for key, name in COLUMNS.items() if key != "scale" or alignment in ("sim3", "scale")}
+    table = pd.DataFrame(rows, columns=["trajectory", "sequence", "poses", *columns])
+    return table.astype(dict.fromkeys(columns, float)).rename(columns=columns)
 
 
 def figure(paths, true, title, frames=None):
-    """The paths from above and, where the truth is known, their distance from it along the way.
+    """Draw the paths from above and, if the ground truth is known, their distance from it.
 
-    paths: {name: (n, 4, 4) poses} as they are to be compared. true: (n, 4, 4), or None. frames: {name: numbers} where
-    paths have other frames than all of the true ones.
+    paths: {name: (n, 4, 4) aligned poses}. true: (n, 4, 4), or None. frames: {name: frame indices of its poses}, or
+    None if every path has a pose for each frame.
     """
     drawing, panels = new_figure(1, 1 if true is None else 2, height=3.4, squeeze=False)
     above, error = panels[0, 0], panels[0, -1]
@@ -126,10 +126,3 @@ def figure(paths, true, title, frames=None):
     above.set_aspect("equal", adjustable="datalim")
     drawing.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawing
-
-
-def write(path, drawing):
-    """Write a figure in the format that the file's ending names."""
-    with atomic(path) as temporary:
-        drawing.savefig(temporary, bbox_inches="tight", pad_inches=0.04)
-    plt.close(drawing)
