@@ -64,6 +64,8 @@ def test_missing_files_are_counted_and_named(tiny_kitti, tiny_cityscapes):
         (False, ("train", "val")), (True, ("train", "val")), (False, ("train",)))]
     # four images without label maps, and twelve more: ten are named, the others counted, and there is no pair
     assert counts == [4 + 12, 4 + 12, 4]
+    shutil.rmtree(tiny_cityscapes / "val")
+    assert len(check_cityscapes(tiny_cityscapes)[1]) == 4 + 1
 
 
 def test_sequences_without_ground_truth_need_no_poses(tiny_kitti):
