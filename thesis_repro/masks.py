@@ -1,6 +1,6 @@
 """The keypoint mask filter (Section 3.6, A.8): from a label map to edges to a dilated mask.
 
-A mask is uint8 of the frame's size. Keypoints are allowed where it is 255, and not where it is 0.
+A mask is a uint8 image of the frame's size. Keypoints are allowed where it is 255 and forbidden where it is 0.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -13,32 +13,33 @@ import numpy as np
 from thesis_repro import InputError, longrun, stages
 from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import is_whole, listed, progress, read_gray, write_png
-from thesis_repro.kitti import Sequence
+from thesis_repro.kitti import Sequence, check_size
 
 BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
-CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a class boundary at most two pixels away
+CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a boundary up to two pixels away
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked or not
-# Where keypoints may lie: on the thesis's boundaries, or where published SLAM systems with a segmentation allow them.
+# Where keypoints are allowed: on boundaries, as in the thesis, or as in published SLAM systems with segmentation.
 KEEP = ("boundaries", "static", "inverse", "static-boundaries")
-DYNASLAM_MARGIN = 15  # pixels around movable things that DynaSLAM excludes as well (its Frame.cc)
+DYNASLAM_MARGIN = 15  # pixels around movable objects that DynaSLAM excludes as well (in its Frame.cc)
 
 
 @dataclass(frozen=True)
 class MaskSettings:
-    """How a mask is made from a label map. The defaults are the thesis's way; each field is one change of it.
+    """Settings of the mask filter. The defaults are the thesis's.
 
-    keep: "boundaries", the dilated boundaries; "inverse", everything else; "static", everything except movable things
-    and DYNASLAM_MARGIN around them; "static-boundaries", boundaries between two classes that cannot move.
+    keep: where keypoints are allowed. "boundaries": on dilated boundaries. "inverse": everywhere else. "static":
+    everywhere except on movable objects and DYNASLAM_MARGIN around them. "static-boundaries": on boundaries between two
+    classes that cannot move.
     boundaries: "canny" finds edges in label ids, "exact" marks every change of class (see `edges`).
     canny: both thresholds (Section 3.6), with OpenCV's default 3x3 Sobel operator.
     symmetric: no shift by half a pixel, so that a mirrored label map gives the mirrored mask (see `edges`, `dilate`).
-    classes: names of labels; only boundaries of these classes, with any neighbour. Empty: of all classes.
-    movable: no keypoints on people and vehicles, nor within this many pixels of them. None: allowed (except with
-    "static").
+    classes: names of labels. Only boundaries of these classes are used, with any neighbour. Empty: all boundaries.
+    movable: no keypoints on people and vehicles, or within this many pixels of them. None: keypoints are allowed there,
+    except with "static".
     margin: no keypoints within this many pixels of the frame's border. Points there are lost in the next frame, and
     networks that pad with zeros predict false boundaries there.
     ids: ids in the files, Cityscapes' "labels" or its "train" ids (`cityscapes.TRAINED`).
-    Raises InputError for an unknown name and a negative number.
+    Raises InputError for an unknown name or a negative number.
     """
 
     boundaries: str = "canny"
@@ -51,44 +52,45 @@ class MaskSettings:
     canny: tuple[float, float] = (5, 15)
 
     def __post_init__(self) -> None:
-        for name in ("classes", "canny"):  # JSON has lists
+        for name in ("classes", "canny"):  # lists, if read from JSON
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP), ("ids", IDS)):
             if getattr(self, name) not in known:
                 raise InputError(f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(known)}")
         for name in self.classes:
             if name not in ID:
-                raise InputError(f"classes: {name!r} is no label; known are {', '.join(ID)}")
+                raise InputError(f"classes: {name!r} is no label; choose from {', '.join(ID)}")
         for name, pixels in (("movable", self.movable or 0), ("margin", self.margin)):
             if pixels < 0:
                 raise InputError(f"{name}={pixels}: must be 0 or more pixels")
 
 
 def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings = MaskSettings()) -> np.ndarray:
-    """Boundaries between classes at the frame's size.
+    """Edges between classes at the frame's size, (height, width) uint8, 255 on edges.
 
-    label_map: (h, w) uint8 class ids. size: (height, width) of the frame. Returns (height, width) uint8, 255 on edges.
+    label_map: (h, w) uint8 class ids. size: (height, width) of the frame.
 
-    boundaries "canny" is the thesis's way: enlarge bilinearly, which invents ids along every boundary, then run Canny
-    on the ids themselves, which finds a boundary only if its two ids differ enough. "exact" is the correction:
-    enlarge with nearest neighbour and mark every pixel whose right or lower neighbour has another class.
+    boundaries="canny" is the thesis's way. It enlarges the label map bilinearly, which creates wrong ids along every
+    boundary. Then it runs Canny on the ids, which finds a boundary only if the two ids differ enough.
+    boundaries="exact" is the correction. It enlarges with nearest neighbour and marks every pixel whose right or lower
+    neighbour has another class.
     symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary. OpenCV's plain nearest
-    neighbour is shifted by half a pixel, and so is a mark on one side only.
-    classes, "static-boundaries": only some boundaries. Canny does not know classes, so its edges are kept where they
-    are within two pixels of such a boundary.
+    neighbour shifts the boundary by half a pixel, and so does a mark on one side only.
+    With `classes` or keep="static-boundaries", only some boundaries are used. Canny does not know classes, so its edges
+    are kept within two pixels of these boundaries.
     """
     if settings.boundaries == "canny":
         canny = cv2.Canny(cv2.resize(label_map, size[::-1]), *settings.canny)
         if not settings.classes and settings.keep != "static-boundaries":
             return canny
-        of_classes = edges(label_map, size, replace(settings, boundaries="exact", symmetric=True))
-        return canny & dilate(of_classes, CLASS_EDGE_WINDOW)
-    enlarged = _enlarged(label_map, size, settings.symmetric)
-    chosen = np.isin(enlarged, [ID[name] for name in settings.classes]) if settings.classes else np.ones(size, bool)
+        class_edges = edges(label_map, size, replace(settings, boundaries="exact", symmetric=True))
+        return canny & dilate(class_edges, CLASS_EDGE_WINDOW)
+    enlarged = _enlarge(label_map, size, settings.symmetric)
+    selected = np.isin(enlarged, [ID[name] for name in settings.classes]) if settings.classes else np.ones(size, bool)
     allowed = ~np.isin(enlarged, MOVABLE) if settings.keep == "static-boundaries" else np.ones(size, bool)
     different = np.zeros(size, bool)
     for pixel, neighbour in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        change = (enlarged[pixel] != enlarged[neighbour]) & (chosen[pixel] | chosen[neighbour])
+        change = (enlarged[pixel] != enlarged[neighbour]) & (selected[pixel] | selected[neighbour])
         change &= allowed[pixel] & allowed[neighbour]
         different[pixel] |= change
         if settings.symmetric:
@@ -96,8 +98,8 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
     return different.astype(np.uint8) * 255
 
 
-def _enlarged(label_map, size, symmetric):
-    """The label map enlarged to the frame's size by nearest neighbour, which invents no ids."""
+def _enlarge(label_map, size, symmetric):
+    """Enlarge a label map to the frame's size by nearest neighbour, so that no new ids appear."""
     nearest = cv2.INTER_NEAREST_EXACT if symmetric else cv2.INTER_NEAREST
     return cv2.resize(label_map, size[::-1], interpolation=nearest)
 
@@ -106,8 +108,8 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
     """Widen edges with a square of ones, `dilation_width` pixels a side.
 
     A square of even width has no centre pixel, so OpenCV shifts the mask by half a pixel, as in the thesis.
-    symmetric: an even square is made one pixel smaller. The mask keeps its width, because exact boundaries are then
-    marked on both sides.
+    symmetric: a square of even width is made one pixel smaller. The mask is as wide as before, because symmetric exact
+    edges are two pixels wide.
     """
     check_width(dilation_width, edge_image.shape)
     side = dilation_width - (dilation_width % 2 == 0) if symmetric else dilation_width
@@ -115,54 +117,53 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
 
 
 def check_width(dilation_width: int, size: tuple[int, int]) -> None:
-    """Raise InputError for a dilation width that frames of (height, width) cannot have."""
-    most = 2 * max(size)  # a wider square always covers the whole frame
-    if not 1 <= dilation_width <= most:
-        raise InputError(f"dilation width {dilation_width}: must be 1 or more pixels, and at most {most} for frames of "
+    """Raise InputError if a dilation width is not possible for frames of (height, width)."""
+    limit = 2 * max(size)  # a wider square always covers the whole frame
+    if not 1 <= dilation_width <= limit:
+        raise InputError(f"dilation width {dilation_width}: must be 1 to {limit} pixels for frames of "
                          f"{size[1]}x{size[0]}")
 
 
 def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> np.ndarray:
-    """Pixels without keypoints, (height, width) booleans: movable things and the margin at the border."""
+    """Pixels where keypoints are forbidden, (height, width) booleans: movable objects and the border's margin."""
     height, width = size
-    never = np.ones(size, bool)
-    never[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
+    mask = np.ones(size, bool)
+    mask[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
     if settings.movable is not None:
-        moving = _enlarged(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
-        never |= dilate(moving, 2 * settings.movable + 1) > 0
-    return never
+        moving = _enlarge(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
+        mask |= dilate(moving, 2 * settings.movable + 1) > 0
+    return mask
 
 
 def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int,
                   settings: MaskSettings = MaskSettings()) -> np.ndarray:
-    """The mask of one frame from its label map: `dilate(edges(...))` without the `forbidden` pixels."""
-    return _widened(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
+    """Keypoint mask of one frame from its label map: `dilate(edges(...))` without the `forbidden` pixels."""
+    return _finish_mask(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
 
 
 def _edges_and_forbidden(label_map, size, settings):
-    """The parts of a mask that do not depend on its width: edges and forbidden pixels (None if there are none)."""
+    """Edges and forbidden pixels (None if there are none) of a mask; both do not depend on the dilation width."""
     if settings.keep == "static":
         movable = DYNASLAM_MARGIN if settings.movable is None else settings.movable
         return np.full(size, 255, np.uint8), forbidden(label_map, size, replace(settings, movable=movable))
-    everywhere = settings.movable is None and not settings.margin
-    return (edges(label_map, size, settings),
-            None if everywhere else forbidden(label_map, size, settings))
+    has_forbidden = settings.movable is not None or settings.margin
+    return edges(label_map, size, settings), forbidden(label_map, size, settings) if has_forbidden else None
 
 
-def _widened(parts, dilation_width, settings):
-    edge_image, never = parts
+def _finish_mask(edges_and_forbidden, dilation_width, settings):
+    edge_image, forbidden_pixels = edges_and_forbidden
     mask = dilate(edge_image, dilation_width, settings.symmetric)
     if settings.keep == "inverse":
         mask = cv2.bitwise_not(mask)
-    if never is not None:
-        mask[never] = 0
+    if forbidden_pixels is not None:
+        mask[forbidden_pixels] = 0
     return mask
 
 
 def boundaries_found(mask: np.ndarray, true_labels: np.ndarray) -> float:
-    """Share of the true boundary pixels that a mask keeps, 0 to 1. true_labels: (h, w) ids of the mask's frame.
+    """Share of the true boundary pixels that a mask keeps, 0 to 1. NaN if there are none.
 
-    True boundaries are marked on both sides (`edges`, exact and symmetric). NaN if there are none.
+    true_labels: (h, w) label ids. True boundaries are marked on both sides (`edges`, exact and symmetric).
     """
     true = edges(true_labels, mask.shape, MaskSettings("exact", symmetric=True)) > 0
     return float((mask[true] > 0).mean()) if true.any() else np.nan
@@ -174,56 +175,53 @@ def coverage(mask: np.ndarray) -> float:
 
 
 class LabelMasks:
-    """Masks of a sequence, made from its label maps on access: masks[i] for frame i.
+    """Masks of a sequence, made from label maps on access: masks[i] for frame i.
 
-    folder: one label map a frame, of any size, a PNG with the frame's name. settings: as in `keypoint_mask`.
+    folder: holds one label map a frame, of any size, as a PNG with the frame's name. settings: as in `keypoint_mask`.
     Raises InputError if the folder or a frame's label map is missing.
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int,
                  settings: MaskSettings = MaskSettings()) -> None:
-        self.paths, self.frame_paths = _files_of_frames(folder, sequence, "label map"), sequence.frame_paths
+        self.paths, self.frame_paths = _paths_by_frame(folder, sequence, "label map"), sequence.frame_paths
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
         check_width(dilation_width, self.size)
-        for name, pixels, most in (("margin", self.settings.margin, (min(self.size) - 1) // 2),
-                                   ("movable", self.settings.movable or 0, max(self.size) - 1)):
-            if pixels > most:
+        for name, pixels, limit in (("margin", self.settings.margin, (min(self.size) - 1) // 2),
+                                    ("movable", self.settings.movable or 0, max(self.size) - 1)):
+            if pixels > limit:
                 raise InputError(f"{name}={pixels}: leaves nothing of frames of {self.size[1]}x{self.size[0]}; give at "
-                                 f"most {most} pixels")
+                                 f"most {limit} pixels")
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return _widened(_parts_of_file(self.paths[index], self.size, self.settings), self.dilation_width, self.settings)
+        parts = _edges_and_forbidden_of_file(self.paths[index], self.size, self.settings)
+        return _finish_mask(parts, self.dilation_width, self.settings)
 
 
 def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
-    """The label map of a frame, in label ids."""
+    """Label map of frame `index`, in label ids."""
     return read_label_map(masks.paths[index], masks.settings.ids == "train")
 
 
-@lru_cache(maxsize=8)  # shared by masks of several widths
-def _parts_of_file(path, size, settings):
-    return _edges_and_forbidden(_read_once(path, settings.ids == "train"), size, settings)
-
-
-# shared by masks of several settings; two, because one control uses the mask of another frame
-_read_once = lru_cache(maxsize=2)(read_label_map)
+@lru_cache(maxsize=8)  # masks of several dilation widths share edges
+def _edges_and_forbidden_of_file(path, size, settings):
+    return _edges_and_forbidden(read_label_map(path, settings.ids == "train"), size, settings)
 
 
 def forget_edges() -> None:
-    """Clear the caches of LabelMasks, so that the time to make a mask can be measured."""
-    _parts_of_file.cache_clear()
-    _read_once.cache_clear()
+    """Clear the cache of LabelMasks, so that the time to make a mask can be measured."""
+    _edges_and_forbidden_of_file.cache_clear()
 
 
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:
-    """Write the mask of every frame as a PNG with the frame's name (A.8), which `MaskFolder` reads.
+    """Write the mask of every frame as a PNG with the frame's name (A.8). `MaskFolder` reads them.
 
-    The folder is a stage (see stages): a stopped run resumes; masks of other label maps or widths in it are deleted.
+    The folder is a stage (see stages): a stopped run resumes, and masks made from other label maps or settings are
+    deleted.
     """
     with longrun.claimed(folder):
         folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, **asdict(masks.settings),
@@ -237,12 +235,13 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 class MaskFolder:
     """Masks of a sequence read from images with the frames' names: masks[i] for frame i.
 
-    A folder with one image of another name, or an image file, is the mask of all frames. invert: keypoints are allowed
-    where the image is 0. Raises InputError if the folder or a frame's mask is missing, and as `read_mask` does.
+    One image is used for all frames if `folder` is a file, or holds a single file without the name of a frame.
+    invert: keypoints are allowed where the image is 0. Raises InputError if the folder or a frame's mask is missing,
+    and as `read_mask` does.
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence, invert: bool = False) -> None:
-        self.paths = _files_of_frames(folder, sequence, "mask")
+        self.paths = _paths_by_frame(folder, sequence, "mask")
         self.size = sequence.size
         self.invert = invert
 
@@ -255,40 +254,34 @@ class MaskFolder:
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """Read a mask of frames of (height, width): uint8 of two values, 0 and another one where keypoints are allowed.
+    """Read a mask for frames of (height, width): uint8, 0 where keypoints are forbidden and one other value elsewhere.
 
-    Raises InputError for another size, and for more than two values, as in a label map.
+    Raises InputError if the size differs or there are more than two values, as in a label map.
     """
     mask = read_gray(path)
-    check_mask_size(path, mask.shape, size)
+    check_size(Path(path), mask.shape, size, "its frame")
     if ((mask != 0) & (mask != mask.max())).any():
         raise InputError(f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps go "
                          "with --labels)")
     return mask
 
 
-def check_mask_size(path: str | Path, mask_size: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Raise InputError if a mask's (height, width) is not that of the frames."""
-    if mask_size != size:
-        raise InputError(f"{path}: {mask_size[1]}x{mask_size[0]} pixels, but the frames have {size[1]}x{size[0]}; "
-                         "masks must have the size of the frames")
-
-
-def _files_of_frames(folder, sequence, what):
+def _paths_by_frame(folder, sequence, kind):
+    """One path a frame to its mask or label map. Raises InputError if one is missing."""
     folder = Path(folder)
-    if what == "mask" and folder.is_file():
+    if kind == "mask" and folder.is_file():
         return [folder] * len(sequence)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; it must hold one {what} for each frame of sequence "
+        raise InputError(f"{folder}: no such folder; it must hold one {kind} for each frame of sequence "
                          f"{sequence.name}")
     present = {path.name: path for path in listed(folder)}
     # A single mask with a frame's name is the mask of that frame only.
-    if what == "mask" and len(present) == 1 and not present.keys() & set(sequence.label_names):
+    if kind == "mask" and len(present) == 1 and not present.keys() & set(sequence.label_names):
         return list(present.values()) * len(sequence)
     paths = [present.get(name) or present.get(f"{frame.name}.png")  # some tools append .png to the whole name
              for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)]
     missing = [name for name, path in zip(sequence.label_names, paths, strict=True) if path is None]
     if missing:
-        raise InputError(f"{folder / missing[0]}: no such {what} ({len(missing)} of {len(sequence)} frames of sequence "
-                         f"{sequence.name} have none); every frame needs one")
+        raise InputError(f"{folder / missing[0]}: no such {kind} ({len(missing)} of {len(sequence)} frames of sequence "
+                         f"{sequence.name} have none); each frame needs one")
     return paths

@@ -1,32 +1,32 @@
 """Monocular visual odometry as PySLAM does it (Section 3.7): Shi-Tomasi, Lucas-Kanade, essential matrix, pose.
 
-`run(sequence)` runs it once. `run_many` makes many runs over one sequence for little more than the cost of their
-estimators. THESIS agrees with PySLAM of August 2021 on every frame. Frames on which PySLAM crashes follow a rule here,
-and doubtful frames get a flag:
+`run(sequence)` runs it once. `run_many` runs it with many settings or masks and shares work between the runs. With the
+settings THESIS, the result equals that of PySLAM of August 2021 on every frame. On some frames PySLAM crashes; here a
+rule says what happens. Doubtful frames get a flag. "Kept" means that the pose does not change:
 
-| frame                                       | flag and rule (the pose is kept, but for "no keypoints")             |
+| frame                                       | flag: rule                                                           |
 |---------------------------------------------|----------------------------------------------------------------------|
-| black, blown out, no contrast               | "flat frame": skipped; the next motion is measured from the last     |
-|                                             | frame before it, over the sum of their scales                        |
-| no new keypoint (an all-zero mask, say)     | "no keypoints": the tracked points are tracked further               |
-| no point to track                           | "no points": starts again from this frame's keypoints                |
-| too few correspondences for a motion        | "fewer than five correspondences"                                    |
-| none or several essential matrices          | "no essential matrix", "several essential matrices"                  |
-| agreement no better than chance (scene cut) | "no agreement"                                                       |
-| moved less than the gate (PySLAM's rule)    | "stationary"                                                         |
-| the same picture, though the poses moved    | "still picture": moves on as PySLAM does                             |
-| turns by more than a car can                | "too large a turn": the same                                         |
+| black, overexposed or without contrast      | "flat frame": skipped. The next motion is measured from the last     |
+|                                             | frame before it, over the sum of the step lengths                    |
+| no new keypoint (mask all zero, say)        | "no keypoints": the tracked points are tracked further               |
+| no point to track                           | "no points": kept; starts again from this frame's keypoints          |
+| too few correspondences                     | "fewer than five correspondences": kept                              |
+| no essential matrix, or several             | "no essential matrix", "several essential matrices": kept            |
+| inliers no more than by chance (scene cut)  | "no agreement": kept                                                 |
+| step shorter than the gate (PySLAM's rule)  | "stationary": kept                                                   |
+| image unchanged although the car moved      | "still picture": the pose moves, as in PySLAM                        |
+| rotation larger than a car's                | "too large a turn": the pose moves, as in PySLAM                     |
 
-With settings.fallback and masks, the flag "all keypoints used" says that the masked keypoints do not determine the
-motion, or that it differs too much from the previous step's. With estimator="refined" there are two more flags, and the
-pose is always moved (see refined.motion_prior):
+With settings.fallback and masks, the flag "all keypoints used" marks steps estimated from all keypoints. The masked
+keypoints did not determine the motion, or it differed too much from the previous step's. With estimator="refined" there
+are two more flags, and the pose is always moved (see refined.motion_prior):
 
-| motion                                        | flag and rule                                                      |
-|-----------------------------------------------|--------------------------------------------------------------------|
-| not consistent with the step before           | "ambiguous motion": the best consistent motion, if nearly as many  |
-|                                               | points are near it; if not, the estimated one                      |
-| not determined by its points (all on a line)  | the same, or "motion not determined" where that is not determined  |
-|                                               | either: the motion of the step before, over this step's length     |
+| motion                                      | flag: rule                                                           |
+|---------------------------------------------|----------------------------------------------------------------------|
+| inconsistent with the previous step         | "ambiguous motion": the best consistent motion if nearly as many     |
+|                                             | points are near it, otherwise the estimated motion                   |
+| not determined (all points on a line)       | "ambiguous motion" if a consistent motion is found, otherwise        |
+|                                             | "motion not determined": the previous motion, with this step's length|
 """
 
 from thesis_repro.odometry.odometry import Odometry, Step

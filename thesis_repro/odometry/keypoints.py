@@ -1,4 +1,4 @@
-"""Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2), for one run or shared by many."""
+"""Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2), for one run or for many runs."""
 
 from collections.abc import Iterable
 from functools import lru_cache
@@ -9,7 +9,7 @@ import numpy as np
 from thesis_repro.compiled import fast
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
-QUALITY = THESIS.quality  # of the strongest corner (inside the mask)
+QUALITY = THESIS.quality  # least strength, as a share of the strongest corner (inside the mask)
 BLOCK_SIZE = THESIS.block_size
 WINDOW, LEVELS = THESIS.window, THESIS.levels
 TRACKER = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS,
@@ -18,16 +18,16 @@ TRACKER = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS,
 NO_POINTS = np.empty((0, 2), np.float32)
 
 Corners = tuple[np.ndarray, np.ndarray]  # see find_corners
-Start = tuple[np.ndarray | None, np.ndarray]  # a frame to track from, and points there (N, 2)
+Start = tuple[np.ndarray | None, np.ndarray]  # a frame to track from and its points (N, 2)
 
 
 def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None,
            corners: Corners | None = None) -> np.ndarray:
-    """Keypoints of a frame (height, width), strongest first: (N, 2) float32, N = 0 where there are none.
+    """Keypoints of a frame (height, width): (N, 2) float32 pixels, strongest first. N may be 0.
 
     `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the detector searches
     inside the mask only and returns up to max_keypoints. With "filter" it searches the whole frame, and keypoints
-    outside the mask are dropped. corners: the result of `find_corners` for this frame, if it is known already.
+    outside the mask are dropped. corners: result of `find_corners` for this frame, if known.
 
     Shi-Tomasi keypoints equal those of cv2.goodFeaturesToTrack to the bit.
     """
@@ -54,13 +54,14 @@ def _orb(max_keypoints):
 
 def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: int = WINDOW,
           levels: int = LEVELS) -> tuple[np.ndarray, np.ndarray]:
-    """Track points (N, 2) from the previous frame into the current one: (N, 2) float32, and success, (N,) booleans.
+    """Track points (N, 2) from the previous frame into the current one.
 
-    window, levels: as in OdometrySettings.
+    Returns the tracked points, (N, 2) float32, and whether tracking succeeded, (N,) booleans. window, levels: as in
+    OdometrySettings.
 
-    The result equals that of a plain call of OpenCV to the bit, in less time. Points are sorted by row, so that the
-    pixels of neighbouring points are still in the processor's cache. The matching error, which is not used, is not
-    computed. With it OpenCV would also reject points whose window left the frame, so this is done here.
+    The result equals that of OpenCV's plain call to the bit, in less time. Points are sorted by row, so that the pixels
+    of neighbouring points are still in the processor's cache. The matching error is not computed, because nothing uses
+    it. Computing it, OpenCV also rejects points whose window leaves the frame; this function does that itself.
     """
     order = np.argsort(points[:, 1])
     tracked, success = np.empty_like(points), np.empty(len(points), bool)
@@ -73,18 +74,18 @@ def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray, window:
 
 
 class SharedKeypoints:
-    """`detect` and `track` for many runs over one frame: the same results at little more than the cost of one run.
+    """`detect` and `track` for many runs over one frame, with the same results as separate calls.
 
     The corner strength does not depend on the mask, so it is computed once a frame. Lucas-Kanade tracks each point
     independently, so all points of all runs are tracked in one call.
     """
 
     def __init__(self) -> None:
-        self._tracks: tuple[np.ndarray, ...] = ()  # both frames, the sorted keys of all points, the result of `track`
+        self._tracks: tuple[np.ndarray, ...] = ()  # both frames, sorted keys of all points, result of `track`
         self._corners: tuple[np.ndarray, int, Corners] | None = None  # frame, block size, result of `find_corners`
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
-        """Track the points of all runs into `frame`, but for the few runs that start from another previous frame."""
+        """Track the points of all runs that have the same previous frame into `frame`. Few runs have another one."""
         with_points = [(previous, points) for previous, points in starts if previous is not None and len(points)]
         if with_points:
             first, _ = with_points[0]
@@ -97,8 +98,8 @@ class SharedKeypoints:
         if not is_shared or (window, levels) != (WINDOW, LEVELS):
             return track(previous, current, points, window, levels)
         _, _, keys, tracked, success = self._tracks
-        where = np.searchsorted(keys, _key(points))
-        return tracked.take(where, axis=0), success[where]
+        indices = np.searchsorted(keys, _key(points))
+        return tracked.take(indices, axis=0), success[indices]
 
     def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
         size = settings.block_size
@@ -112,19 +113,19 @@ def _key(points):
 
 
 def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
-    """Corner strength of each pixel, equal to cv2.cornerMinEigenVal to the bit, and the ranked local maxima.
+    """Corner strength of each pixel, equal to cv2.cornerMinEigenVal to the bit, and its ranked local maxima.
 
-    The maxima are indices into the flattened image, strongest first; of equal ones the last comes first. None lies on
-    the border.
+    The maxima are indices into the flattened image, strongest first. Of equal maxima, the last pixel comes first.
+    Pixels on the border are left out.
     """
-    scale = 1 / (4 * BLOCK_SIZE * 255)  # 4: the sum of a smoothing of (1, 2, 1)
+    scale = 1 / (4 * BLOCK_SIZE * 255)  # 4 is the sum of the smoothing weights 1, 2, 1
     dx, dy = (cv2.copyMakeBorder(cv2.Sobel(frame, cv2.CV_32F, *order, scale=scale), *[BLOCK_SIZE // 2] * 4,
                                  cv2.BORDER_REFLECT_101) for order in ((1, 0), (0, 1)))
     strength = _min_eigenvalues(dx, dy) if block_size == BLOCK_SIZE else cv2.cornerMinEigenVal(frame, block_size)
     is_peak = (strength == cv2.dilate(strength, None)) & (strength > 0)
     is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
     peaks = np.flatnonzero(is_peak)
-    # Positive floats sort like their bit patterns, so one integer sort ranks by strength and then by index.
+    # Positive floats sort like their bit patterns, so one sort of integers ranks by strength and then by index.
     return strength, np.sort(strength.ravel()[peaks].view(np.int32).astype(np.int64) << 32 | peaks)[::-1] & 0xFFFFFFFF
 
 
@@ -155,9 +156,9 @@ def _min_eigenvalues(dx, dy):
 
 @fast
 def _spread(strength, ranked, limit, mask, max_keypoints, min_distance):
-    """The strongest corners above `limit`, inside the mask if there is one, at least `min_distance` apart.
+    """Strongest corners above `limit`, inside the mask if it is not empty, at least `min_distance` apart.
 
-    As in OpenCV, neighbours are searched in adjacent grid cells, so a fractional distance is not kept exactly.
+    As in OpenCV, neighbours are searched in adjacent grid cells only, so a fractional distance is not kept exactly.
     """
     height, width = strength.shape
     cell = max(int(np.rint(min_distance)), 1)

@@ -1,4 +1,4 @@
-"""Errors of an estimated path: the thesis's RMSE and MAE (Section 3.4), and the measures that the field uses."""
+"""Errors of an estimated path: the thesis's RMSE and MAE (Section 3.4), and other common measures."""
 
 from typing import Any
 
@@ -15,22 +15,26 @@ from thesis_repro import InputError
 
 
 def rmse(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
-    """Root mean square error (Equation 3.5), metres, over frames 1 to n-1 of two (n, 4, 4) paths aligned at frame 1."""
+    """Root mean square error (Equation 3.5), metres, over frames 1 to n-1 of two paths, (n, 4, 4) each.
+
+    alignment: "position" shifts the estimate so that the positions of frame 1 agree, as in PySLAM of 2021. "pose" also
+    rotates it so that the rotations of frame 1 agree, as in later versions.
+    """
     return float(np.sqrt((_differences(estimated, true, alignment) ** 2).sum(axis=1).mean()))
 
 
 def mae(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
-    """Mean absolute error (Equation 3.6), metres, over x, y, z and frames, aligned as in `rmse`."""
+    """Mean absolute error (Equation 3.6), metres, over x, y, z and frames. Aligned as in `rmse`."""
     return float(np.abs(_differences(estimated, true, alignment)).mean())
 
 
 def percent_change(value: Any, benchmark: Any) -> Any:
-    """Change of a value from its benchmark in percent (Equations 4.1 and 4.2); negative if it is smaller."""
+    """Change of a value from a benchmark in percent (Equations 4.1 and 4.2). Negative if the value is smaller."""
     return (value - benchmark) / benchmark * 100
 
 
 def shifted(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> np.ndarray:
-    """The estimated path (n, 4, 4), aligned with the true one at frame 1 as in `rmse`."""
+    """Estimated path (n, 4, 4), aligned with the true path at frame 1 as in `rmse`."""
     estimated, true = checked(estimated, true)
     motion = np.eye(4)
     if alignment == "pose":
@@ -40,11 +44,7 @@ def shifted(estimated: np.ndarray, true: np.ndarray, alignment: str = "position"
 
 
 def _differences(estimated, true, alignment):
-    """Position differences from frame 1 on, (n - 1, 3).
-
-    alignment: "position" shifts the estimate so that the position of frame 1 agrees, as PySLAM did in 2021; "pose" also
-    rotates it so that the rotation of frame 1 agrees, as later versions do.
-    """
+    """Position differences of the aligned paths (see `rmse`) from frame 1 on, (n - 1, 3)."""
     estimated, true = checked(estimated, true)
     positions = estimated[1:, :3, 3] - estimated[1, :3, 3]
     if alignment == "pose":
@@ -53,17 +53,17 @@ def _differences(estimated, true, alignment):
 
 
 def checked(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both paths as arrays. Raises InputError if their lengths differ or are less than two."""
+    """Both paths as arrays. Raises InputError if their lengths differ or are below two."""
     estimated, true = np.asarray(estimated), np.asarray(true)
     if estimated.shape != true.shape:
-        raise InputError(f"the estimated path has {len(estimated)} poses and the true one {len(true)}; "
-                         "one pose a frame is needed in both")
+        raise InputError(f"the estimated path has {len(estimated)} poses and the true path {len(true)}; "
+                         "both need one pose a frame")
     if len(true) < 2:
-        raise InputError("a path of one frame has no error; at least 2 frames are needed")
+        raise InputError("a path needs at least 2 frames to have an error")
     return estimated, true
 
 
-# Measures that the field uses
+# Other common measures
 
 ALIGNMENTS = ("none", "se3", "sim3", "scale")
 STATISTICS = ("rmse", "mean", "median", "max")
@@ -72,8 +72,8 @@ STATISTICS = ("rmse", "mean", "median", "max")
 def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dict[str, Any]:
     """Absolute trajectory error, metres, over all frames: {rmse, mean, median, max, scale, note}.
 
-    estimated, true: (n, 4, 4) poses. alignment: see `align`; its scale is returned.
-    If a path is straight or does not move, an alignment is not determined; then the numbers are NaN and `note` says so.
+    estimated, true: (n, 4, 4) poses. alignment: see `align`, which also determines the scale.
+    A straight or motionless path does not determine the alignment. Then the numbers are NaN and `note` says so.
     """
     try:
         estimated, scale = align(estimated, true, alignment)
@@ -85,11 +85,11 @@ def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dic
 
 
 def align(estimated: np.ndarray, true: np.ndarray, alignment: str) -> tuple[np.ndarray, float]:
-    """Align the estimated path (n, 4, 4) with the true one; returns the aligned path and the scale.
+    """Align the estimated path (n, 4, 4) with the true path. Returns the aligned path and the scale.
 
-    alignment: "none", "se3" (the best rotation and shift, by Umeyama's method), "sim3" (also the scale) or "scale" (the
-    scale of "sim3" alone). Raises InputError for another alignment, and evo.EvoException if the path does not
-    determine the alignment, because it is straight or does not move.
+    alignment: "none", "se3" (the best rotation and shift, by Umeyama's method), "sim3" (also the best scale) or "scale"
+    (only the scale of "sim3"). Raises InputError for another alignment, and evo.EvoException if a straight or
+    motionless path does not determine the alignment.
     """
     if alignment not in ALIGNMENTS:
         raise InputError(f"alignment={alignment!r}: unknown; choose one of {', '.join(ALIGNMENTS)}")
@@ -101,8 +101,8 @@ def align(estimated: np.ndarray, true: np.ndarray, alignment: str) -> tuple[np.n
 
 
 def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Relative pose error from frame to frame: {translation_rmse, ..._mean, _median, _max} in metres, and
-    {rotation_rmse, ...} in degrees."""
+    """Relative pose error from frame to frame: translation_rmse, _mean, _median, _max in metres, and the same of
+    rotation in degrees."""
     relations = {"translation": PoseRelation.translation_part, "rotation": PoseRelation.rotation_angle_deg}
     results = {name: evo_rpe(*_evo_paths(estimated, true), relation, delta=1, delta_unit=Unit.frames, all_pairs=True)
                for name, relation in relations.items()}
@@ -120,11 +120,11 @@ RELATIVE_LENGTH = 20.0  # metres; even the short excerpts have several segments 
 def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = RELATIVE_LENGTH) -> dict[str, Any]:
     """Mean errors over segments of one length: {translation_percent, rotation_deg_per_100m, segments, note}.
 
-    A segment goes from each frame to the first frame that is `length` metres of true path away. The camera's motion M
-    over it is compared with the true motion after one rotation B, common to all segments, that fits best (B M B^T;
-    Kabsch's solution for their translations and rotation vectors). So neither a constant rotation between camera and
-    ground truth nor the start of the path changes the errors. KITTI's own measure contains that rotation.
-    NaN, with a note, if the path is shorter than `length`.
+    A segment goes from each frame to the first frame that is `length` metres of true path away. Each estimated motion M
+    is rotated to B M B^T and compared with the true motion. The rotation B is common to all segments and fits best:
+    Kabsch's solution for the translations and rotation vectors. So neither a constant rotation between camera and
+    ground truth nor the start of the path changes the errors. (The KITTI benchmark's errors contain that rotation.)
+    The errors are NaN, with a note, if the path is shorter than `length`.
     """
     estimated, true = checked(estimated, true)
     along = travelled(true)
@@ -133,23 +133,24 @@ def relative_errors(estimated: np.ndarray, true: np.ndarray, length: float = REL
     if not len(first):
         return {"translation_percent": np.nan, "rotation_deg_per_100m": np.nan, "segments": 0,
                 "note": f"too short: {along[-1]:.1f} m, segments of {length:g} m are compared"}
-    motion, given = (np.linalg.inv(poses[first]) @ poses[last[first]] for poses in (estimated, true))
-    vectors, goals = (np.concatenate([steps[:, :3, 3], length * _rotation_vectors(steps[:, :3, :3])])
-                      for steps in (motion, given))
-    moments = goals.T @ vectors
-    # A small multiple of the identity: a rotation that a straight path does not determine stays zero.
-    left, _, right = np.linalg.svd(moments + 1e-6 * np.trace(goals.T @ goals) * np.eye(3))
+    motion, true_motion = (np.linalg.inv(poses[first]) @ poses[last[first]] for poses in (estimated, true))
+    vectors, true_vectors = (
+        np.concatenate([steps[:, :3, 3], length * Rotation.from_matrix(steps[:, :3, :3]).as_rotvec()])
+        for steps in (motion, true_motion))
+    moments = true_vectors.T @ vectors
+    # The small multiple of the identity keeps a rotation zero that a straight path does not determine.
+    left, _, right = np.linalg.svd(moments + 1e-6 * np.trace(true_vectors.T @ true_vectors) * np.eye(3))
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    offsets = np.linalg.norm(given[:, :3, 3] - motion[:, :3, 3] @ turn.T, axis=1)
-    differences = given[:, :3, :3].swapaxes(1, 2) @ turn @ motion[:, :3, :3] @ turn.T
-    angle = np.linalg.norm(_rotation_vectors(differences), axis=1)
+    offsets = np.linalg.norm(true_motion[:, :3, 3] - motion[:, :3, 3] @ turn.T, axis=1)
+    differences = true_motion[:, :3, :3].swapaxes(1, 2) @ turn @ motion[:, :3, :3] @ turn.T
+    angle = np.linalg.norm(Rotation.from_matrix(differences).as_rotvec(), axis=1)
     return {"translation_percent": float(offsets.mean() / length * 100),
             "rotation_deg_per_100m": float(np.degrees(angle.mean()) / length * 100), "segments": len(first), "note": ""}
 
 
 def errors(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> dict[str, float]:
     """Errors of one run: rmse and mae (metres; alignment as in `rmse`), se3 (RMSE in metres after the best rotation
-    and shift), and both of `relative_errors`. NaN if the path is too short or too straight.
+    and shift), and the two errors of `relative_errors`. NaN if the path is too short or too straight.
     """
     relative = relative_errors(estimated, true)
     return {"rmse": rmse(estimated, true, alignment), "mae": mae(estimated, true, alignment),
@@ -163,13 +164,13 @@ TURN_RATE, STRAIGHT_RATE = 1.0, 0.3  # degrees a frame: more is a turn, less is 
 
 
 def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Errors of the single steps of (n, 4, 4) camera-to-world paths, independent of the steps before.
+    """Errors of single steps of two camera-to-world paths, (n, 4, 4) each. Earlier errors do not add up.
 
-    rotation: mean angle between estimated and true rotation, degrees a frame; in_turns, on_straights: the same of steps
-    that turn by more than TURN_RATE, and by less than STRAIGHT_RATE. The other errors are of steps of MIN_DIRECTED_STEP
-    or more. direction: median angle between estimated and true direction of motion, degrees; across, down: the median
-    differences to the right and downwards, degrees (audit row 30); failed: percent of the steps with a rotation error
-    above FAILED_ROTATION or a motion backwards.
+    rotation: mean angle between estimated and true rotation, degrees a frame. in_turns, on_straights: the same for
+    steps that turn by more than TURN_RATE, and by less than STRAIGHT_RATE.
+    The other errors are computed from steps of MIN_DIRECTED_STEP or more. direction: median angle between estimated and
+    true direction of motion, degrees. across, down: median difference to the right and downwards, degrees (audit row
+    30). failed: percent of steps with a rotation error above FAILED_ROTATION or a backward motion. steps: their number.
     """
     steps, true_steps = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (estimated, true))
     rotation_error, turn = angles(np.linalg.inv(true_steps) @ steps), angles(true_steps)
@@ -192,13 +193,8 @@ def _mean(values: np.ndarray) -> float:
 
 
 def travelled(poses: np.ndarray) -> np.ndarray:
-    """Length of a path (n, 4, 4) up to each of its poses, metres, (n,)."""
+    """Length of a path (n, 4, 4) up to each pose, (n,), metres."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
-
-
-def _rotation_vectors(rotations: np.ndarray) -> np.ndarray:
-    """Axis times angle in radians, (n, 3), of rotations (n, 3, 3)."""
-    return Rotation.from_matrix(rotations).as_rotvec()
 
 
 def angles(rotations: np.ndarray) -> np.ndarray:
@@ -212,17 +208,17 @@ KITTI_EVERY = 10  # frames between the starts of segments
 
 
 def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """The KITTI odometry benchmark's errors: {translation_percent, rotation_deg_per_100m, segments, note}.
+    """Errors of the KITTI odometry benchmark: {translation_percent, rotation_deg_per_100m, segments, note}.
 
-    Means over segments. A segment starts at every tenth frame and ends, for each of KITTI_LENGTHS, at the first frame
-    that is more than this length of true path away. NaN, with a note, if the path is too short for a segment.
+    The errors are means over segments. At every tenth frame, one segment for each of KITTI_LENGTHS starts. It ends at
+    the first frame that is more than this length of true path away. NaN, with a note, if the path is too short.
     """
     estimated, true = checked(estimated, true)
     along = travelled(true)
-    first, length = (each.ravel() for each in np.meshgrid(np.arange(0, len(true), KITTI_EVERY), KITTI_LENGTHS,
+    first, length = (grid.ravel() for grid in np.meshgrid(np.arange(0, len(true), KITTI_EVERY), KITTI_LENGTHS,
                                                           indexing="ij"))
     last = np.searchsorted(along, along[first] + length, side="right")
-    first, last, length = (each[last < len(true)] for each in (first, last, length))
+    first, last, length = (values[last < len(true)] for values in (first, last, length))
     if not len(first):
         return {"translation_percent": np.nan, "rotation_deg_per_100m": np.nan, "segments": 0,
                 "note": f"too short: {along[-1]:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m"}

@@ -1,4 +1,4 @@
-"""The odometry, frame by frame: keypoints, the motion between two frames, and the pose that follows from it."""
+"""The odometry, frame by frame: keypoints, the motion between two frames, and the new pose."""
 
 import gc
 import time
@@ -24,10 +24,10 @@ MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more t
 
 @dataclass
 class Step:
-    """Everything computed for one frame. The N correspondences: `previous`, `current` (N, 2) pixels, `inliers` (N,)."""
+    """Results for one frame. Its N correspondences are `previous` and `current`, (N, 2) pixels; `inliers` is (N,)."""
 
     frame: int
-    scale: float = 0.0  # metres moved since the previous frame used
+    scale: float = 0.0  # metres moved since the previous frame that was not skipped
     points: int | None = None  # number of points given to the tracker
     detected: int | None = None  # number of new keypoints; None if the detector did not run
     previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
@@ -35,9 +35,9 @@ class Step:
     keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)  # tracked into the next frame
     motion: Motion = Motion()
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres
-    updated: bool = False  # whether the pose was moved by this step
+    updated: bool = False  # whether this step moved the pose
     flags: list[str] = field(default_factory=list)
-    frames: tuple[np.ndarray, np.ndarray] | None = None  # previous and current, kept only while a fallback is possible
+    frames: tuple[np.ndarray, np.ndarray] | None = None  # previous and current, if a fallback is possible
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
@@ -45,7 +45,7 @@ class Step:
         return np.zeros(len(self.current), bool) if self.motion.inliers is None else self.motion.inliers
 
     def copy(self) -> "Step":
-        """A copy with the same correspondences, for another estimator."""
+        """Copy with the same correspondences, for another estimator."""
         return replace(self, flags=list(self.flags), seconds=dict(self.seconds))
 
     def row(self) -> dict[str, Any]:
@@ -66,9 +66,9 @@ FRAME_COLUMNS = tuple(Step(0).row())
 class Odometry:
     """Monocular visual odometry, frame by frame.
 
-    `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since the previous frame
-    in metres, and an optional mask of the same size (0: no keypoints there). It returns a Step. It calls the next
-    three methods in turn. Only `estimate` is expensive, and it uses no state of earlier steps.
+    `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since the previous frame in
+    metres, and an optional mask of the same size (keypoints are forbidden where it is 0). It returns a Step. It calls
+    `observe`, `estimate` and `compose`. Only `estimate` is expensive, and it uses no state of earlier steps.
     """
 
     def __init__(self, intrinsics: np.ndarray, settings: OdometrySettings = THESIS, start: np.ndarray | None = None,
@@ -82,7 +82,7 @@ class Odometry:
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
         self.points = keypoints.NO_POINTS
-        self.gap = 0.0  # metres from self.previous to the last frame, if flat frames were skipped
+        self.gap = 0.0  # metres moved during skipped (flat) frames
         warm_up(settings.estimator == "refined" or settings.fallback)
 
     def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
@@ -91,7 +91,7 @@ class Odometry:
         return self.compose(step)
 
     def observe(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
-        """Track the points into this frame and detect new keypoints. Returns a Step that has no motion yet."""
+        """Track the points into this frame and detect new keypoints. Returns a Step without a motion."""
         step = Step(frame=self.count, scale=float(scale))
         self._check(frame, scale, mask)
         self.count += 1
@@ -129,10 +129,10 @@ class Odometry:
         return step
 
     def estimate(self, step: Step, essential: "Essential | None" = None) -> "Essential | None":
-        """Estimate the motion from the step's correspondences, and return the essential matrix.
+        """Estimate the motion from the step's correspondences. Returns the essential matrix.
 
-        essential: the essential matrix of the same correspondences, if another Odometry has computed it; its settings
-        may differ in `estimator` only. Thread-safe, because it reads no state that later steps change.
+        essential: the result of another Odometry for the same correspondences. Its settings may differ in `estimator`
+        only. This method is thread-safe, because it reads no state that later steps change.
         """
         if not step.points:
             return None
@@ -146,16 +146,16 @@ class Odometry:
         current, previous, inliers = essential.current, essential.previous, essential.inliers
         if settings.estimator == "refined":
             motion = fit(*smaller_rotation(essential.matrix), current, previous, inliers, settings.threshold)
-            step.motion = replace(motion, inliers=essential.in_order())
+            step.motion = replace(motion, inliers=essential.inliers_of_step())
         else:
             voters = inliers if settings.estimator == "inliers" else slice(None)
             votes, rotation, translation = pose.recover_pose(essential.matrix, current[voters], previous[voters])
-            step.motion = Motion(rotation, translation, essential.in_order(), votes)
+            step.motion = Motion(rotation, translation, essential.inliers_of_step(), votes)
         step.seconds["pose"] = time.perf_counter() - started
         return essential
 
     def compose(self, step: Step) -> Step:
-        """Move the pose by the step's motion, unless a rule says to keep it (see the table in odometry/__init__.py)."""
+        """Move the pose by the step's motion, or keep it if a rule says so (see the table in odometry/__init__.py)."""
         settings = self.settings
         if step.frames is not None and step.scale > settings.scale_gate and self._in_doubt(step):
             self._use_all_keypoints(step)
@@ -186,16 +186,17 @@ class Odometry:
             return True
         if not isinstance(motion, RefinedMotion):
             current, previous = self._normalised(step)
-            of_points = measured(motion.rotation, motion.translation, current, previous, motion.inliers,
-                                 self.settings.threshold)
-            motion = replace(of_points, translation=motion.translation)
+            measured_motion = measured(motion.rotation, motion.translation, current, previous, motion.inliers,
+                                       self.settings.threshold)
+            motion = replace(measured_motion, translation=motion.translation)
         return not is_consistent(motion, step.scale, self.prior)
 
     def _use_all_keypoints(self, step):
-        before, frame = step.frames
-        points = keypoints.detect(before, self.settings)
+        previous_frame, frame = step.frames
+        points = keypoints.detect(previous_frame, self.settings)
         if len(points):
-            current, was_tracked = keypoints.track(before, frame, points, self.settings.window, self.settings.levels)
+            current, was_tracked = keypoints.track(previous_frame, frame, points,
+                                                   self.settings.window, self.settings.levels)
             step.points, step.previous, step.current = len(points), points[was_tracked], current[was_tracked]
             step.flags.append(ALL_KEYPOINTS)
             self.estimate(step)
@@ -224,29 +225,29 @@ class Odometry:
             raise InputError(f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
                              "the odometry needs 8-bit gray, (height, width)")
         if not np.isfinite(scale) or scale < 0:
-            raise InputError(f"frame {self.count}: the scale {scale} is no distance in metres")
+            raise InputError(f"frame {self.count}: scale {scale} is not a distance in metres")
         if mask is not None and (mask.shape != frame.shape or mask.dtype != np.uint8):
             raise InputError(f"frame {self.count}: the mask is {mask.dtype} of shape {mask.shape}, the frame uint8 of "
                              f"shape {frame.shape}; masks must be 8-bit and as large as their frames")
         if self.previous is not None and frame.shape != self.previous.shape:
-            raise InputError(f"frame {self.count}: shape {frame.shape}, the frames before {self.previous.shape}; "
-                             "all frames must have one size")
+            raise InputError(f"frame {self.count}: shape {frame.shape}, earlier frames {self.previous.shape}; "
+                             "all frames must have the same size")
 
 
 @dataclass(frozen=True)
 class Essential:
-    """An essential matrix, and the normalised correspondences (N, 2) from which it was estimated."""
+    """An essential matrix and the normalised correspondences (N, 2) from which it was estimated."""
 
     current: np.ndarray
     previous: np.ndarray
-    order: np.ndarray | slice  # of the step's points, as they were given to RANSAC
+    order: np.ndarray | slice  # indices of the step's points in the order given to RANSAC
     matrix: np.ndarray | None
-    inliers: np.ndarray  # (N,) booleans, in that order
+    inliers: np.ndarray  # (N,) booleans, in the order given to RANSAC
     problem: str
     seconds: float
 
-    def in_order(self) -> np.ndarray:
-        """The inliers in the order of the step's points."""
+    def inliers_of_step(self) -> np.ndarray:
+        """Inliers in the order of the step's points."""
         inliers = np.empty_like(self.inliers)
         inliers[self.order] = self.inliers
         return inliers
@@ -263,19 +264,19 @@ def _essential(step, settings, intrinsics):
 
 
 def _by_chance(inliers):
-    # Two unrelated frames still give 7 inliers among 20 points, 9 among 100, 12 among 300, and 1.5 to 2.7 % of 1600
-    # (with PySLAM's threshold). Consecutive real frames give 45 to 85 %.
+    # With PySLAM's threshold, two unrelated frames have 7 inliers among 20 points, 9 among 100, 12 among 300, and 24 to
+    # 43 among 1600. In consecutive real frames, 45 to 85 % of the points are inliers.
     return inliers.sum() <= 8 + 0.03 * len(inliers)
 
 
-STILL = 0.3  # pixels: in an unchanged picture, noise shifts the points by less than this on average
-MAX_TURN = 6.0  # degrees a frame; the cars of KITTI turn by at most 4.8
+MAX_NOISE_SHIFT = 0.3  # pixels; noise shifts the points of an unchanged image by less on average
+MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
 
 
 def _implausible(step):
-    """Flags of a motion that a car cannot make. The motion is used all the same."""
+    """Flags of a motion that a car cannot make. The pose is moved nevertheless."""
     turn = np.degrees(np.arccos(np.clip((np.trace(step.motion.rotation) - 1) / 2, -1, 1)))
-    return ["still picture"] * bool(_mean_shift(step) < STILL) + ["too large a turn"] * bool(turn > MAX_TURN)
+    return ["still picture"] * bool(_mean_shift(step) < MAX_NOISE_SHIFT) + ["too large a turn"] * bool(turn > MAX_TURN)
 
 
 def _mean_shift(step):
@@ -284,9 +285,9 @@ def _mean_shift(step):
 
 @lru_cache
 def warm_up(refined: bool) -> None:
-    """Load the compiled functions, or compile them if there is no cache, so that no frame's time includes it."""
+    """Load or compile the compiled functions, so that the measured time of the first frame does not include it."""
     was_collecting = gc.isenabled()
-    gc.disable()  # the compiler keeps most objects it creates; searching them for garbage takes an eighth of its time
+    gc.disable()  # garbage collection takes an eighth of the compiler's time and frees little
     try:
         keypoints.detect(np.zeros((8, 8), np.uint8), THESIS)
         points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))

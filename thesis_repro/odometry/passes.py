@@ -1,4 +1,4 @@
-"""Runs of the odometry over a sequence: one, or many in one pass at little more than the cost of their estimators."""
+"""Run the odometry over a sequence: one run, or many runs in one pass that shares detection and tracking."""
 
 import hashlib
 import time
@@ -21,18 +21,18 @@ from thesis_repro.odometry.refined.motion_prior import MotionPrior
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 CHECKPOINT = 300  # frames
-# Runs that agree in the first share their keypoints; runs that also agree in the second share the essential matrix.
+# Runs with the same KEYPOINT_SETTINGS share keypoints. If ESSENTIAL_SETTINGS agree too, they share essential matrices.
 KEYPOINT_SETTINGS = ("detector", "max_keypoints", "min_distance", "quality", "block_size", "window", "levels",
                      "mask_mode", "redetect_below", "fallback")
 ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
-SHARED_TIMES = ("detect_seconds", "track_seconds")  # of all runs of a pass together
+SHARED_TIMES = ("detect_seconds", "track_seconds")  # measured for all runs of a pass together
 DTYPES = {"frame": int, "updated": bool,
           **dict.fromkeys(("points", "detected", "tracked", "inliers", "pose_inliers"), "Int64")}
 NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "mask_seconds"]
 
 
 class Masks(Protocol):
-    """An object whose item i is the mask of frame i, (height, width) uint8; 0: no keypoints there."""
+    """An object whose item i is the mask of frame i, (height, width) uint8. Keypoints are forbidden where it is 0."""
 
     def __getitem__(self, index: int, /) -> np.ndarray: ...
 
@@ -47,18 +47,18 @@ class Result:
 
     @property
     def flagged(self) -> pd.Series:
-        """Number of frames with each flag."""
+        """Number of frames by flag."""
         return self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
 
     def with_poses(self, poses: np.ndarray) -> "Result":
-        """A copy with other poses (n, 4, 4), also in the table of frames."""
+        """Copy with other poses (n, 4, 4), also in the table of frames."""
         columns = dict(zip("xyz", poses[:, :3, 3].T, strict=True)) | dict(
             zip(ROTATION_COLUMNS, poses[:, :3, :3].reshape(-1, 9).T, strict=True))
         return replace(self, poses=poses, frames=self.frames.assign(**columns))
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:
-    """First pose of the estimate: the identity, as in PySLAM, or the first true pose if that is another one.
+    """First pose of the estimate: the identity, as in PySLAM, unless the ground truth starts at another pose.
 
     Complete KITTI sequences start at the identity (up to 1e-10); excerpts do not.
     """
@@ -69,9 +69,9 @@ def start_pose(sequence: Sequence) -> np.ndarray:
 
 
 def scales(sequence: Sequence) -> np.ndarray:
-    """Distances between the true positions of consecutive frames, metres, (n,); 0 for the first frame.
+    """Distances between the true positions of consecutive frames, (n,), metres. The first one is 0.
 
-    Without true poses, these are the sequence's `assumed_steps`.
+    Without ground truth, these are the sequence's `assumed_steps`.
     """
     if not sequence.has_truth:
         return sequence.assumed_steps
@@ -80,32 +80,32 @@ def scales(sequence: Sequence) -> np.ndarray:
 
 def run(sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None,
         description: str | None = None) -> Result:
-    """Run the odometry over a kitti.Sequence; returns a Result.
+    """Run the odometry over a kitti.Sequence. Returns a Result.
 
     masks: see Masks. description: text of the progress bar; None for no bar.
-    Raises InputError if a frame cannot be read or a mask has another size.
+    Raises InputError if a frame cannot be read, or if a mask and its frame differ in size.
     """
     return _run(sequence, {"": (settings, masks)}, None, description, None, 1)[""]
 
 
 def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
              description: str | None = None, checkpoint: Path | None = None, workers: int = 1) -> dict[str, Result]:
-    """Make many runs over one sequence, {name: (settings, masks)}; returns {name: Result}, equal to separate runs.
+    """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}, equal to separate runs.
 
-    Frames are decoded, corner strengths computed and points tracked once for all runs. So the times of detection and
-    tracking cannot be told for one run, and are blank. Runs with the same masks object share masks and keypoints if
-    their settings agree in KEYPOINT_SETTINGS. Runs that differ only in `estimator` share their essential matrices.
-    workers: threads for the estimators.
-    checkpoint: file in which the state is stored every CHECKPOINT frames. A killed pass that is started again with the
-    same file, sequence and settings resumes there. The caller deletes the file after storing the results, and uses
-    another file for other masks.
+    Frames are decoded, corner strengths computed and points tracked once for all runs. The times of detection and
+    tracking are blank, because they cannot be measured for a single run. Runs with the same masks object and the same
+    KEYPOINT_SETTINGS share masks and keypoints. Runs that differ only in `estimator` share essential matrices.
+    workers: number of threads for the estimators.
+    checkpoint: file in which the state is stored every CHECKPOINT frames. A stopped pass resumes from it if it is
+    started again with the same file, sequence and settings. The caller deletes the file after storing the results, and
+    uses another file for other masks.
     """
     return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
 
 
 @dataclass
 class _Run:
-    """One run of a pass with its results so far, one row of numbers a frame."""
+    """One run of a pass and its results so far, one row of numbers a frame."""
 
     odometry: Odometry
     masks: Masks | None
@@ -115,7 +115,7 @@ class _Run:
 
 @dataclass
 class _Estimate:
-    """Runs that share an essential matrix at one frame, their copies of the step, and the thread that estimates."""
+    """Runs that share the essential matrix of one frame, one Step for each run, and the estimating thread."""
 
     runs: list[_Run]
     steps: list[Step]
@@ -129,7 +129,7 @@ class _Estimate:
 
     def finish(self) -> None:
         if self.future is not None:
-            self.future.result()  # raises what the thread raised
+            self.future.result()  # raises an error of the thread here
         for run, step in zip(self.runs, self.steps, strict=True):
             row = run.odometry.compose(step).row()
             flag = row.pop("flag")
@@ -146,12 +146,12 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
                           np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan))
                for name, (settings, masks) in runs.items()}
     groups = _groups(members.values())
-    leaders = [group[0][0] for group in groups]  # the first run of each group detects and tracks for the others
+    leaders = [group[0][0] for group in groups]  # the first run of each group detects and tracks for its group
     step_lengths = scales(sequence)
     job = _job(sequence, members)
     done = _resume(checkpoint, job, members, leaders)
     with ThreadPoolExecutor(workers) as pool:
-        waiting: list[_Estimate] = []
+        pending: list[_Estimate] = []
         indices: Iterable[int] = range(done, len(sequence))
         if description is not None:
             indices = progress(indices, description, total=len(sequence), initial=done)
@@ -159,38 +159,38 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
             frame = sequence.frame(index)
             if shared is not None:
                 shared.expect(frame, [(leader.odometry.previous, leader.odometry.points) for leader in leaders])
-            observed = []
+            estimates = []
             for leader, group in zip(leaders, groups, strict=True):
                 started = time.perf_counter()
                 mask = None if leader.masks is None else leader.masks[index]
                 mask_seconds = time.perf_counter() - started
                 step = leader.odometry.observe(frame, step_lengths[index], mask)
-                for sharing in group:
-                    estimate = _Estimate(sharing, [step.copy() for _ in sharing], mask_seconds)
+                for runs_of_matrix in group:
+                    estimate = _Estimate(runs_of_matrix, [step.copy() for _ in runs_of_matrix], mask_seconds)
                     if workers > 1:
                         estimate.future = pool.submit(estimate.work)
                     else:
                         estimate.work()
-                    observed.append(estimate)
-            # Tracking does not depend on the pose, so the estimators may run one frame behind.
-            _finish(waiting)
-            waiting = observed
+                    estimates.append(estimate)
+            # Tracking does not depend on the motion, so the estimators may run one frame behind.
+            _finish(pending)
+            pending = estimates
             if checkpoint and (index + 1) % CHECKPOINT == 0:
-                _finish(waiting)
-                waiting = []
+                _finish(pending)
+                pending = []
                 _store(checkpoint, job, index + 1, members, leaders)
-        _finish(waiting)
+        _finish(pending)
     return {name: _result(member, SHARED_TIMES if shared else ()) for name, member in members.items()}
 
 
 def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
-    """Groups of runs with the same keypoints; each is a list of the runs of every essential matrix."""
+    """Groups of runs with the same keypoints. Each group is a list of lists of runs that share an essential matrix."""
     groups: dict[tuple, dict[tuple, list[_Run]]] = {}
     for member in members:
         settings = member.odometry.settings
-        observed = (id(member.masks), *(getattr(settings, key) for key in KEYPOINT_SETTINGS))
-        estimated = tuple(getattr(settings, key) for key in ESSENTIAL_SETTINGS)
-        groups.setdefault(observed, {}).setdefault(estimated, []).append(member)
+        keypoint_key = (id(member.masks), *(getattr(settings, key) for key in KEYPOINT_SETTINGS))
+        essential_key = tuple(getattr(settings, key) for key in ESSENTIAL_SETTINGS)
+        groups.setdefault(keypoint_key, {}).setdefault(essential_key, []).append(member)
     return [list(group.values()) for group in groups.values()]
 
 
@@ -203,7 +203,7 @@ def _finish(estimates: Iterable[_Estimate]) -> None:
 
 
 def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
-    """The inputs that must be equal for a pass to resume from a checkpoint."""
+    """Inputs of a pass. A pass resumes from a checkpoint only if they are equal."""
     arrays = (sequence.intrinsics, start_pose(sequence), scales(sequence))
     numbers = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     return {"sequence": sequence.name, "frames": len(sequence), "numbers": numbers, "opencv": cv2.__version__,
@@ -225,7 +225,7 @@ def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], 
 
 
 def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
-    """Restore the state from a checkpoint of this job; returns the number of finished frames, 0 without one."""
+    """Restore the state from a checkpoint of the same job. Returns the number of finished frames, 0 without one."""
     try:
         stored = stages.resume(checkpoint) if checkpoint else None
     except InputError:  # a damaged file: start from the first frame
@@ -258,7 +258,7 @@ def _result(member: _Run, blank: Iterable[str]) -> Result:
 
 
 def poses_of(frames: pd.DataFrame) -> np.ndarray:
-    """The poses (n, 4, 4) of a table with one row a frame."""
+    """Poses (n, 4, 4) from a table with one row a frame (Result.frames)."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = frames[ROTATION_COLUMNS].to_numpy().reshape(-1, 3, 3)
     poses[:, :3, 3] = frames[["x", "y", "z"]]

@@ -1,7 +1,7 @@
-"""Relative motion of a calibrated camera from point correspondences (Section 2.2): essential matrix and vote.
+"""Relative motion of a calibrated camera from point correspondences (Section 2.2): essential matrix, then motion.
 
-Directions as in PySLAM: points of the current frame come first, so the rotation and the unit translation take
-current camera coordinates to previous ones, and composing them onto a camera-to-world pose needs no inverse.
+As in PySLAM, points of the current frame come first. So the rotation and the unit translation take coordinates of the
+current camera to coordinates of the previous camera. A camera-to-world pose is moved by them without an inverse.
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import ransac
 
 PROBABILITY = 0.999  # of RANSAC
-MAX_DEPTH = 50.0  # in units of the translation; in recoverPose farther points do not vote
-LIMIT_MARGIN = 1e-7  # of a unit-norm homogeneous point; OpenCV decides about points nearer to a limit
+MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farther points do not vote
+LIMIT_MARGIN = 1e-7  # for homogeneous points of unit norm; points nearer to a limit are left to OpenCV
 MIN_CORRESPONDENCES = 5
 
 ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
@@ -22,7 +22,7 @@ ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsa
 
 @dataclass(frozen=True)
 class Motion:
-    """The camera's motion between two frames; `rotation` is None if it could not be estimated (see `problem`)."""
+    """Motion of the camera between two frames. If it is not known, `rotation` is None and `problem` says why."""
 
     rotation: np.ndarray | None = None  # 3x3
     translation: np.ndarray | None = None  # 3, unit length
@@ -32,10 +32,10 @@ class Motion:
 
 
 def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) to normalised image coordinates (N, 2) in double precision.
+    """Normalised image coordinates (N, 2), in double precision, of pixels (N, 2).
 
-    u * (1 / fx) + (-cx / fx) equals the inverse camera matrix times (u, v, 1) to the last bit. RANSAC amplifies a
-    difference in the last bit, so (u - cx) / fx would lead to another trajectory.
+    u * (1 / fx) + (-cx / fx) equals the product of the inverse camera matrix and (u, v, 1) to the last bit. The formula
+    (u - cx) / fx does not. RANSAC amplifies a difference in the last bit, so the trajectory would be another one.
     """
     focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
     return points * (1 / focal) + (-intrinsics[:2, 2] / focal)
@@ -43,14 +43,14 @@ def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float,
                      method: str = "ransac") -> tuple[np.ndarray | None, np.ndarray, str]:
-    """The essential matrix of normalised correspondences (N, 2): (matrix, inliers, problem).
+    """Essential matrix of normalised correspondences (N, 2). Returns (matrix, inliers, problem).
 
-    If there is no matrix or more than one, `matrix` is None and `problem` says why. (For exactly five correspondences
-    OpenCV stacks all solutions, for four it returns nothing, and for none it raises an error.)
+    If there is no matrix or more than one, `matrix` is None and `problem` says why. (From exactly five correspondences,
+    OpenCV returns all solutions in one array.)
     """
-    none = np.zeros(len(current), bool)
+    no_inliers = np.zeros(len(current), bool)
     if len(current) < MIN_CORRESPONDENCES:
-        return None, none, "fewer than five correspondences"
+        return None, no_inliers, "fewer than five correspondences"
     try:
         if method == "ransac":
             matrix, inliers = ransac.find_essential_matrix(current, previous, threshold, PROBABILITY)
@@ -61,20 +61,20 @@ def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float
     except cv2.error:  # the USAC estimators raise on degenerate points
         matrix = None
     if matrix is None or inliers is None or not np.isfinite(matrix).all():
-        return None, none, "no essential matrix"
+        return None, no_inliers, "no essential matrix"
     if matrix.shape != (3, 3):
-        return None, none, "several essential matrices"
+        return None, no_inliers, "several essential matrices"
     return matrix, inliers.ravel() > 0, ""
 
 
 def recover_pose(matrix: np.ndarray, current: np.ndarray,
                  previous: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
-    """cv2.recoverPose(matrix, current, previous) without its inlier mask, to the last bit: (votes, R, t).
+    """Motion from an essential matrix: (votes, R, t), equal to cv2.recoverPose(matrix, current, previous) to the bit.
 
-    An essential matrix allows four motions. The one that puts most points in front of both cameras, and nearer than
-    MAX_DEPTH, wins. OpenCV triangulates every point four times with a singular value decomposition. A vote depends
-    only on the side of a few limits on which a point lies. A few steps of inverse iteration decide that for nearly all
-    points, for both signs of the translation at once. OpenCV triangulates the few points close to a limit.
+    An essential matrix allows four motions. A point votes for a motion if it lies in front of both cameras and nearer
+    than MAX_DEPTH. The motion with most votes wins. OpenCV triangulates every point four times with a singular value
+    decomposition. Here a few steps of inverse iteration decide how nearly all points vote, for both signs of the
+    translation at once. OpenCV's triangulation decides only about points close to a limit.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     motions = [(rotation, sign * translation) for sign in (1.0, -1.0) for rotation in (first, second)]
@@ -83,12 +83,12 @@ def recover_pose(matrix: np.ndarray, current: np.ndarray,
     for index in (0, 1) if np.trace(first) >= np.trace(second) else (1, 0):
         votes[index], votes[index + 2], doubtful[index] = _count_in_front(
             current, previous, motions[index][0], translation.ravel(), votes.max())
-    most_sure = votes.max()
+    most_certain = votes.max()
     for index, motion in enumerate(motions):
         points = doubtful[index % 2]
-        if len(points) and votes[index] + len(points) >= most_sure:  # this motion can still win
+        if len(points) and votes[index] + len(points) >= most_certain:  # this motion can still win
             votes[index] += _triangulate_and_count(current[points], previous[points], *motion)
-    best = int(np.argmax(votes))  # the first of equal ones, as in OpenCV
+    best = int(np.argmax(votes))  # the first of equal numbers, as in OpenCV
     rotation, translation = motions[best]
     return int(votes[best]), rotation, translation.ravel()
 
@@ -105,9 +105,9 @@ def _triangulate_and_count(current, previous, rotation, translation):
 
 @fast
 def _count_in_front(current, previous, rotation, t, least):
-    """Votes for (rotation, t), for (rotation, -t), and the indices of points too close to a limit to be sure.
+    """Count the votes for (rotation, t) and (rotation, -t), and list the points that are too close to a limit.
 
-    Stops as soon as neither can reach `least` votes.
+    Stops as soon as neither motion can reach `least` votes.
     """
     forward, backward, doubts = 0, 0, 0
     doubtful = np.empty(len(current), np.int64)
@@ -116,7 +116,8 @@ def _count_in_front(current, previous, rotation, t, least):
     for index in range(len(current)):
         if max(forward, backward) + doubts + len(current) - index < least:
             break
-        # Rows x * P[2] - P[0], y * P[2] - P[1] of both cameras; the point is their singular vector of least value.
+        # Rows x * P[2] - P[0] and y * P[2] - P[1] of both cameras. The point is the right singular vector of the least
+        # singular value.
         u, v = previous[index, 0], previous[index, 1]
         a[0, 0] = -1.0
         a[0, 2] = current[index, 0]
@@ -148,7 +149,7 @@ def _count_in_front(current, previous, rotation, t, least):
 
 @inner
 def _least_eigenvector(b):
-    """Whether the iteration converged, and the unit eigenvector of the least eigenvalue of b (lower triangle)."""
+    """Unit eigenvector of the least eigenvalue of b (lower triangle), after a flag: whether the iteration converged."""
     for j in range(4):  # Cholesky
         for k in range(j):
             b[j, j] -= b[j, k] * b[j, k]

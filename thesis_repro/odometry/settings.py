@@ -1,4 +1,4 @@
-"""Settings of the odometry: the thesis's, those of a later PySLAM, and the alternatives."""
+"""Settings of the odometry: the thesis's, a later PySLAM's, and alternatives."""
 
 import math
 from dataclasses import dataclass
@@ -13,29 +13,30 @@ CHOICES = {"detector": ("shi-tomasi", "orb"), "mask_mode": ("detect", "filter"),
 
 @dataclass(frozen=True)
 class OdometrySettings:
-    """The settings of the odometry; the defaults are the thesis's.
+    """Settings of the odometry. The defaults are the thesis's.
 
     detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
-    max_keypoints: largest number of keypoints, 0 for no limit. min_distance: between keypoints, pixels (Shi-Tomasi).
-    quality: least strength of a keypoint, relative to the strongest one (Shi-Tomasi). block_size: side, in pixels, of
-    the square over which gradients are summed (Shi-Tomasi). window, levels: of the tracker; side of its window in
-    pixels, and number of times the frame is halved.
+    max_keypoints: largest number of keypoints, 0 for no limit.
+    min_distance, quality, block_size (all Shi-Tomasi): least distance between keypoints, pixels; least strength of a
+    keypoint, relative to the strongest one; side of the square over which gradients are summed, pixels.
+    window, levels: side of the tracker's window, pixels, and the number of times it halves the frame.
     mask_mode: "detect" gives the mask to the detector, which returns up to max_keypoints inside it; "filter" drops
     keypoints outside the mask.
     redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all of them.
-    essential_method: search for the essential matrix: "ransac", or OpenCV's "usac" or "usac-magsac".
-    threshold: of that search, in normalised image coordinates.
+    essential_method: how the essential matrix is estimated: "ransac", or OpenCV's "usac" or "usac-magsac".
+    threshold: largest distance of an inlier in this estimation, in normalised image coordinates.
     shuffle_seed: seed with which the matched points are shuffled before RANSAC; None: not shuffled. RANSAC's own seed
     is fixed.
-    estimator: how the motion follows from the essential matrix. "thesis": all points vote on which of its four motions
-    is the right one, as in PySLAM. "inliers": only the inliers vote (audit rows 13, 29). "refined": RANSAC's motion is
-    refitted by least squares to all points near it, the rotation is the smaller of the two possible ones, and a motion
-    that a car cannot make from one frame to the next is searched for again (refined.motion_prior).
-    fallback: a step is estimated from all keypoints if the masked ones do not determine its motion, or if the motion
+    estimator: how the motion follows from the essential matrix, which allows four motions. "thesis": all points vote
+    for one of the four, as in PySLAM. "inliers": only the inliers vote (audit rows 13, 29). "refined": the smaller of
+    the two possible rotations is taken, and the motion is refitted by least squares to all points near it. If a car
+    cannot make this motion within a frame, another one is searched for (refined.motion_prior).
+    fallback: estimate a step from all keypoints if the masked keypoints do not determine its motion, or if the motion
     differs too much from the previous step's (refined.motion_prior). Without masks it does nothing.
-    scale_gate: metres; a shorter step does not move the pose. shift_gate: pixels; the same for the points' mean shift.
+    scale_gate: metres; a shorter step does not move the pose.
+    shift_gate: pixels; a step with a smaller mean shift of its points does not move the pose.
     rotate_first: rotate the pose before moving it.
-    alignment: of both paths, for RMSE and MAE, see metrics.rmse.
+    alignment: how RMSE and MAE align the estimate with the ground truth, see metrics.rmse.
     """
 
     detector: str = "shi-tomasi"
@@ -68,8 +69,7 @@ class OdometrySettings:
                 ("shuffle_seed", 0, 2**32 - 1), ("scale_gate", 0, math.inf), ("shift_gate", 0, math.inf)):
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
-                wrong = f"is above {most}; give less" if value > most else f"is below {least}; give {least} or more"
-                raise InputError(f"odometry setting {name}: {value} {wrong}")
+                raise InputError(f"odometry setting {name}: {value} is not in the range {least} to {most}")
         if not 0 < self.threshold < math.inf:
             raise InputError(f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003")
 

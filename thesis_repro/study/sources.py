@@ -10,8 +10,8 @@ from typing import TypeAlias
 from thesis_repro import InputError, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import glance, listed
-from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, check_mask_size, read_mask
+from thesis_repro.kitti import Sequence, check_size
+from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
 
 KINDS = {"labels": "label maps", "masks": "masks"}
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both have `paths`, the files that they read
@@ -102,5 +102,5 @@ def check(sources: Iterable[Source], sequences: Collection[Sequence], widths: Co
             for width in widths or (1,):  # raises InputError for a width that is too large for the frames
                 paths = source.masks(sequence, width).paths
             for path in paths if source.kind == "masks" else ():
-                check_mask_size(path, glance(path), sequence.size)
+                check_size(path, glance(path), sequence.size, "its frame")
             source.check_file(paths[0], sequence.size)
