@@ -127,12 +127,12 @@ def check_width(dilation_width: int, size: tuple[int, int]) -> None:
 def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> np.ndarray:
     """Pixels where keypoints are forbidden, (height, width) booleans: movable objects and the border's margin."""
     height, width = size
-    mask = np.ones(size, bool)
-    mask[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
+    is_forbidden = np.ones(size, bool)
+    is_forbidden[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
     if settings.movable is not None:
         moving = _enlarge(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
-        mask |= dilate(moving, 2 * settings.movable + 1) > 0
-    return mask
+        is_forbidden |= dilate(moving, 2 * settings.movable + 1) > 0
+    return is_forbidden
 
 
 def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int,

@@ -127,17 +127,6 @@ class _Estimate:
         for run, step in zip(self.runs, self.steps, strict=True):
             essential = run.odometry.estimate(step, essential)
 
-    def finish(self) -> None:
-        if self.future is not None:
-            self.future.result()  # raises an error of the thread here
-        for run, step in zip(self.runs, self.steps, strict=True):
-            row = run.odometry.compose(step).row()
-            flag = row.pop("flag")
-            run.numbers[step.frame] = [np.nan if value is None else value
-                                       for value in (*row.values(), self.mask_seconds)]
-            if flag:
-                run.flags[step.frame] = flag
-
 
 def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
          shared: keypoints.SharedKeypoints | None, description: str | None, checkpoint: Path | None,
@@ -195,8 +184,17 @@ def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
 
 
 def _finish(estimates: Iterable[_Estimate]) -> None:
+    """Wait for the estimates, move the poses and store the rows."""
     for estimate in estimates:
-        estimate.finish()
+        if estimate.future is not None:
+            estimate.future.result()  # raises an error of the thread here
+        for run, step in zip(estimate.runs, estimate.steps, strict=True):
+            row = run.odometry.compose(step).row()
+            flag = row.pop("flag")
+            run.numbers[step.frame] = [np.nan if value is None else value
+                                       for value in (*row.values(), estimate.mask_seconds)]
+            if flag:
+                run.flags[step.frame] = flag
 
 
 # Checkpoints
