@@ -209,12 +209,17 @@ def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
 
 @lru_cache(maxsize=8)  # masks of several dilation widths share edges
 def _edges_and_forbidden_of_file(path, size, settings):
-    return _edges_and_forbidden(read_label_map(path, settings.ids == "train"), size, settings)
+    return _edges_and_forbidden(_read_once(path, settings.ids == "train"), size, settings)
+
+
+# Masks of several settings share the label map of a frame, and one control takes that of another frame: two are kept.
+_read_once = lru_cache(maxsize=2)(read_label_map)
 
 
 def forget_edges() -> None:
-    """Clear the cache of LabelMasks, so that the time to make a mask can be measured."""
+    """Clear the caches of LabelMasks, so that the time to make a mask can be measured."""
     _edges_and_forbidden_of_file.cache_clear()
+    _read_once.cache_clear()
 
 
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:
