@@ -2,6 +2,7 @@ import os
 import sys
 
 import cv2
+import h5py
 import keras
 import numpy as np
 import pytest
@@ -193,3 +194,12 @@ def test_model_files_that_cannot_be_used_are_named(suffix, model, tmp_path):
     for path in half, five, tmp_path / f"none{suffix}":
         with pytest.raises(InputError, match=path.name):
             training.load_model(path)
+
+
+def test_compressed_weights_are_refused_before_they_are_unpacked(model, tmp_path):
+    path = tmp_path / "bomb.hdf5"
+    model.save(path)
+    with h5py.File(path, "a") as file:
+        file.create_dataset("more", (200_000_000,), np.uint8, compression="gzip")
+    with pytest.raises(InputError, match=r"bomb.hdf5.*\d{3} MB"):
+        training.load_model(path)

@@ -1,5 +1,6 @@
 """Loss, metrics and input batches of the training (A.5), and the checkpoints that let a stopped training resume."""
 
+import io
 import json
 import zipfile
 import zlib
@@ -8,6 +9,7 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
+import h5py
 import keras
 import numpy as np
 import pandas as pd
@@ -213,6 +215,20 @@ def _save_atomically(model, path, **options):
         type(model).save(model, temporary, **options)
 
 
+def _check_unpacked_size(path):
+    """Raise ValueError if a model file would unpack to far more bytes than weights can be compressed to."""
+    most, sizes, weights = 10 * Path(path).stat().st_size + 100 * 2**20, [], path
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            sizes = [member.file_size for member in archive.infolist()]
+            weights = io.BytesIO(archive.read("model.weights.h5") if sum(sizes) <= most else b"")
+    if sum(sizes) <= most:
+        with h5py.File(weights, "r") as file:  # its arrays may be compressed as well
+            file.visititems(lambda _, item: sizes.append(getattr(item, "nbytes", 0)))
+    if sum(sizes) > most:
+        raise ValueError(f"it would unpack to {sum(sizes) / 1e6:,.0f} MB")
+
+
 def load_model(path):
     """Load a model saved by Keras, `.keras` or HDF5, for prediction: without loss and metrics.
 
@@ -223,11 +239,7 @@ def load_model(path):
     if not Path(path).is_file():
         raise InputError(f"{path}: no such model; train one or name another file")
     try:
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                size = sum(member.file_size for member in archive.infolist())
-            if size > 10 * Path(path).stat().st_size + 100 * 2**20:  # weights cannot be compressed that much
-                raise ValueError(f"it would unpack to {size / 1e6:,.0f} MB")
+        _check_unpacked_size(path)
         model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile raise many kinds
         reason = str(error).strip().partition("\n")[0][:200] or type(error).__name__
