@@ -19,7 +19,14 @@ from waiting import wait_for
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
 # fixtures that take seconds
-SLOW_FIXTURES = {"small_world", "small_labels", "small_model", "kitti_real", "camvid_real", "reference"}
+SLOW_FIXTURES = {
+    "small_world",
+    "small_labels",
+    "small_model",
+    "kitti_real",
+    "camvid_real",
+    "reference",
+}
 
 
 def pytest_collection_modifyitems(items):
@@ -58,9 +65,14 @@ def reference():
 
 @pytest.fixture
 def kill_when():
-    """kill_when(command, condition): start a command, and kill it and its child processes when the condition holds."""
+    """kill_when(command, condition): start a command, and kill it and its child processes when
+    the condition holds.
+    """
+
     def start(command, condition):
-        process = subprocess.Popen(list(map(str, command)), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True)
+        process = subprocess.Popen(
+            list(map(str, command)), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True
+        )
         wait_for(lambda: process.poll() is not None or condition(), 600)
         assert process.returncode is None, "it ended before it could be killed"
         os.killpg(process.pid, signal.SIGKILL)
@@ -71,7 +83,9 @@ def kill_when():
 
 @contextmanager
 def _shared_folder(tmp_path_factory, name):
-    """A folder shared by all processes of a test run (pytest -n), locked while one of them fills it."""
+    """A folder shared by all processes of a test run (pytest -n), locked while one of them
+    fills it.
+    """
     root = tmp_path_factory.getbasetemp()
     root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
     with open(root / f"{name}.lock", "w") as lock:
@@ -81,7 +95,9 @@ def _shared_folder(tmp_path_factory, name):
 
 @pytest.fixture(scope="session")
 def small_world(tmp_path_factory):
-    """A small embedded world: two sequences of 12 frames and a few street images. Tests must not change it."""
+    """A small embedded world: two sequences of 12 frames and a few street images. Tests must
+    not change it.
+    """
     from thesis_repro.settings import PROFILES
     from thesis_repro.world import dataset
 
@@ -92,15 +108,22 @@ def small_world(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def small_labels(small_world, tmp_path_factory):
-    """Exact label maps of the small world, 320x320, one folder a sequence, laid out as notebook 5 does."""
+    """Exact label maps of the small world, 320x320, one folder a sequence, laid out as notebook
+    5 does.
+    """
     from thesis_repro import stages
 
     with _shared_folder(tmp_path_factory, "small_labels") as root:
-        for path in small_world.glob("kitti/sequences/*/labels_0/*.png") if not root.exists() else ():
+        for path in (
+            small_world.glob("kitti/sequences/*/labels_0/*.png") if not root.exists() else ()
+        ):
             folder = root / path.parent.parent.name
             stages.stage(folder, model="none")
             label_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            cv2.imwrite(str(folder / path.name), cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST))
+            cv2.imwrite(
+                str(folder / path.name),
+                cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST),
+            )
     return root
 
 
@@ -117,17 +140,21 @@ def small_model(tmp_path_factory):
 
 @pytest.fixture
 def tiny_kitti(tmp_path):
-    """Sequence 00 with four 64x48 frames of noise, written by hand, for tests of reading and of faults."""
+    """Sequence 00 with four 64x48 frames of noise, written by hand, for tests of reading and of
+    faults.
+    """
     root = tmp_path / "kitti"
     images = root / "sequences" / "00" / "image_0"
     images.mkdir(parents=True)
     noise = np.random.default_rng(0).integers(0, 256, (48, 80), np.uint8)
     for index in range(4):
-        cv2.imwrite(str(images / f"{index:06d}.png"), noise[:, index:index + 64])
+        cv2.imwrite(str(images / f"{index:06d}.png"), noise[:, index : index + 64])
     (root / "sequences" / "00" / "calib.txt").write_text("P0: 50 0 32 0 0 50 24 0 0 0 1 0\n")
     (root / "sequences" / "00" / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
     (root / "poses").mkdir()
-    (root / "poses" / "00.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {index}\n" for index in range(4)))
+    (root / "poses" / "00.txt").write_text(
+        "".join(f"1 0 0 0 0 1 0 0 0 0 1 {index}\n" for index in range(4))
+    )
     return root
 
 

@@ -15,11 +15,18 @@ def problems(figure):
         figure.draw_without_rendering()
     faults = [str(warning.message) for warning in caught]
     texts = _visible_texts(figure)
-    faults += [f"raw TeX: {text.get_text()}" for text in texts
-              if "mathdefault" in text.get_text() or "$" in text.get_text() and not text.get_parse_math()]
-    boxes = {text: Text.get_window_extent(text).padded(-1) for text in texts}  # an overlap of one pixel is allowed
-    faults += [f"{text.get_text()!r} lies over {other.get_text()!r}" for text, other in itertools.combinations(texts, 2)
-              if boxes[text].overlaps(boxes[other])]
+    faults += [
+        f"raw TeX: {text.get_text()}"
+        for text in texts
+        if "mathdefault" in text.get_text() or "$" in text.get_text() and not text.get_parse_math()
+    ]
+    # an overlap of one pixel is allowed
+    boxes = {text: Text.get_window_extent(text).padded(-1) for text in texts}
+    faults += [
+        f"{text.get_text()!r} lies over {other.get_text()!r}"
+        for text, other in itertools.combinations(texts, 2)
+        if boxes[text].overlaps(boxes[other])
+    ]
     return faults
 
 
@@ -34,12 +41,19 @@ def _visible_texts(figure):
                 if not axes.axison or not low <= tick.get_loc() <= high:
                     hidden |= {tick.label1, tick.label2}
     # slanted texts are left out, since their boxes are much larger than they are
-    return [text for text in figure.findobj(Text) if text not in hidden and text.get_visible()
-            and text.get_text().strip() and text.get_rotation() % 90 == 0]
+    return [
+        text
+        for text in figure.findobj(Text)
+        if text not in hidden
+        and text.get_visible()
+        and text.get_text().strip()
+        and text.get_rotation() % 90 == 0
+    ]
 
 
 def watch(shell, path):
     """Append the faults of every figure that the notebook of an IPython shell saves to a file."""
+
     def wrap_save_figure(_):
         style = sys.modules.get("thesis_repro.report.style")
         if style is None or hasattr(style.save_figure, "__wrapped__"):

@@ -1,4 +1,6 @@
-"""A street of noise for tests of the odometry; it is rendered with exact arithmetic, the same on every machine."""
+"""A street of noise for tests of the odometry; it is rendered with exact arithmetic, the same
+on every machine.
+"""
 
 import cv2
 import numpy as np
@@ -28,8 +30,12 @@ def street(count, step=0.4, size=(160, 480), start=0.0):
         depth = np.minimum(walls, np.minimum(floor, 200.0))
         along = centre[2] + depth * z
         across = np.where(walls < floor, depth * y, centre[0] + depth * x + 11.0)
-        image = cv2.remap(texture, ((along * 40) % 2040).astype(np.float32), ((across * 40) % 2040).astype(np.float32),
-                          cv2.INTER_LINEAR)
+        image = cv2.remap(
+            texture,
+            ((along * 40) % 2040).astype(np.float32),
+            ((across * 40) % 2040).astype(np.float32),
+            cv2.INTER_LINEAR,
+        )
         frames.append((128 + (image - 128.0) / (1 + depth / 20)).astype(np.uint8))
     return frames, camera, poses
 

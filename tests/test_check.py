@@ -21,10 +21,18 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
     (tiny_kitti / "poses/00.txt").write_text("1 0 0 0 0 2 0 0 0 0 1 0\n" * 4)
     cv2.imwrite(str(tiny_cityscapes / "valannot/street_0.png"), np.full((16, 32), 200, np.uint8))
     cv2.imwrite(str(tiny_cityscapes / "valannot/street_1.png"), np.full((8, 8), 7, np.uint8))
-    assert main(["check-data", "--kitti", str(tiny_kitti), "--cityscapes", str(tiny_cityscapes)]) == 1
+    assert (
+        main(["check-data", "--kitti", str(tiny_kitti), "--cityscapes", str(tiny_cityscapes)]) == 1
+    )
     problems = sorted(capsys.readouterr().err.splitlines())
-    named = ["000001.png", "000003.png: 9x9", "00.txt, line 1", "times.txt, line 3", "street_0.png: label id 200",
-             "street_1.png: 8x8"]
+    named = [
+        "000001.png",
+        "000003.png: 9x9",
+        "00.txt, line 1",
+        "times.txt, line 3",
+        "street_0.png: label id 200",
+        "street_1.png: 8x8",
+    ]
     assert len(problems) == len(named)
     for text in named:
         assert sum(text in problem for problem in problems) == 1, text
@@ -37,11 +45,16 @@ def test_damage_within_a_file_is_found_by_a_deep_check(tiny_kitti, tiny_cityscap
     frame.write_bytes(data)
     cv2.imwrite(str(label), np.full((16, 32), 200, np.uint8))
     decoded, read = [], files._read
-    monkeypatch.setattr(files, "_read", lambda path, *rest: (decoded.append(path), read(path, *rest))[1])
+    monkeypatch.setattr(
+        files, "_read", lambda path, *rest: (decoded.append(path), read(path, *rest))[1]
+    )
     assert check_kitti(tiny_kitti)[1] == check_cityscapes(tiny_cityscapes)[1] == []
-    assert len(decoded) == 2 + 2 * 4  # the first and last frame; the first and last pair of each of two splits
-    for problems, path in ((check_kitti(tiny_kitti, deep=True)[1], frame),
-                           (check_cityscapes(tiny_cityscapes, deep=True)[1], label)):
+    # the first and last frame; the first and last pair of each of two splits
+    assert len(decoded) == 2 + 2 * 4
+    for problems, path in (
+        (check_kitti(tiny_kitti, deep=True)[1], frame),
+        (check_cityscapes(tiny_cityscapes, deep=True)[1], label),
+    ):
         assert len(problems) == 1 and problems[0].startswith(f"{path}: ")
 
 
@@ -55,14 +68,23 @@ def test_missing_files_are_counted_and_named(tiny_kitti, tiny_cityscapes):
     missing = [images / f"{index:06d}.png" for index in (0, 3, 4, 5, 9, 38, 39)]
     for path in missing:
         path.unlink()
-    assert [problem.split(":")[0] for problem in check_kitti(tiny_kitti)[1]] == list(map(str, missing))
+    assert [problem.split(":")[0] for problem in check_kitti(tiny_kitti)[1]] == list(
+        map(str, missing)
+    )
     for index in range(4):
         (tiny_cityscapes / "trainannot" / f"street_{index}.png").unlink()
     for index in range(12):
         (tiny_cityscapes / "val" / f"lonely_{index}.png").write_bytes(b"")
-    counts = [len(check_cityscapes(tiny_cityscapes, deep, splits)[1]) for deep, splits in (
-        (False, ("train", "val")), (True, ("train", "val")), (False, ("train",)))]
-    # four images without label maps, and twelve more: ten are named, the others counted, and there is no pair
+    counts = [
+        len(check_cityscapes(tiny_cityscapes, deep, splits)[1])
+        for deep, splits in (
+            (False, ("train", "val")),
+            (True, ("train", "val")),
+            (False, ("train",)),
+        )
+    ]
+    # four images without label maps, and twelve more: ten are named, the others counted, and there
+    # is no pair
     assert counts == [4 + 12, 4 + 12, 4]
     shutil.rmtree(tiny_cityscapes / "val")
     assert len(check_cityscapes(tiny_cityscapes)[1]) == 4 + 1
@@ -84,7 +106,9 @@ def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsy
     monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
     for frame, reports in ((None, True), (None, False), (0, True), (9, True)):
         if frame is not None:
-            shutil.copy(tiny_kitti / IMAGES / "000001.png", tiny_kitti / IMAGES / f"{frame:06d}.png")
+            shutil.copy(
+                tiny_kitti / IMAGES / "000001.png", tiny_kitti / IMAGES / f"{frame:06d}.png"
+            )
         assert check.main(tmp_path / "checked") == (frame == 9)  # a missing frame
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
@@ -96,12 +120,17 @@ def poses(*rows):
     return "".join(f"1 0 0 0 0 1 0 0 0 0 1 {row}\n" for row in rows)
 
 
-@pytest.mark.parametrize("path, text, seen", [
-    ("poses/00.txt", poses(0, 100, 200, 300), "1000 m/s"),
-    ("poses/00.txt", poses(0, 1, 2, 30), "280 m/s"),
-    ("poses/00.txt", poses(0, -1, -2, -3), "-1.00"), ("sequences/00/times.txt", "0\n100\n200\n300\n", "100 s"),
-    ("sequences/00/calib.txt", "P0: 50 0 20 0 0 50 24 0 0 0 1 0\n", "20, 24"),
-    (f"{IMAGES}/000002.png", None, "000002")])
+@pytest.mark.parametrize(
+    "path, text, seen",
+    [
+        ("poses/00.txt", poses(0, 100, 200, 300), "1000 m/s"),
+        ("poses/00.txt", poses(0, 1, 2, 30), "280 m/s"),
+        ("poses/00.txt", poses(0, -1, -2, -3), "-1.00"),
+        ("sequences/00/times.txt", "0\n100\n200\n300\n", "100 s"),
+        ("sequences/00/calib.txt", "P0: 50 0 20 0 0 50 24 0 0 0 1 0\n", "20, 24"),
+        (f"{IMAGES}/000002.png", None, "000002"),
+    ],
+)
 def test_implausible_data_is_one_line_with_the_number(tiny_kitti, path, text, seen):
     assert oddities(Sequence(tiny_kitti, "00")) == []
     if text:
@@ -128,22 +157,39 @@ TRAIN = np.choose(STREET // 8, [0, 2, 10]).astype(np.uint8)
 HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
 
 
-@pytest.mark.parametrize("kind, picture, count, options, seen", [
-    ("labels", STREET, 4, {}, None), ("labels", TRAIN, 4, {}, "--ids train"),
-    ("labels", TRAIN, 4, {"ids": "train"}, None), ("labels", 0 * STREET, 4, {}, "unlabeled 0"),
-    ("labels", STREET.T, 4, {}, "48x64"), ("labels", STREET, 5, {}, "5 files"),
-    ("masks", HALF, 4, {}, None), ("masks", HALF, 1, {}, None), ("masks", 0 * HALF, 4, {}, "--invert"),
-    ("masks", HALF | 255, 4, {}, "100.0%"), ("masks", HALF, 4, {"flat": True}, "--invert")])
-def test_implausible_masks_are_one_line_with_the_option(tiny_kitti, tmp_path, kind, picture, count, options, seen):
+@pytest.mark.parametrize(
+    "kind, picture, count, options, seen",
+    [
+        ("labels", STREET, 4, {}, None),
+        ("labels", TRAIN, 4, {}, "--ids train"),
+        ("labels", TRAIN, 4, {"ids": "train"}, None),
+        ("labels", 0 * STREET, 4, {}, "unlabeled 0"),
+        ("labels", STREET.T, 4, {}, "48x64"),
+        ("labels", STREET, 5, {}, "5 files"),
+        ("masks", HALF, 4, {}, None),
+        ("masks", HALF, 1, {}, None),
+        ("masks", 0 * HALF, 4, {}, "--invert"),
+        ("masks", HALF | 255, 4, {}, "100.0%"),
+        ("masks", HALF, 4, {"flat": True}, "--invert"),
+    ],
+)
+def test_implausible_masks_are_one_line_with_the_option(
+    tiny_kitti, tmp_path, kind, picture, count, options, seen
+):
     folder = tmp_path / "masks"
     for index in range(count):
         files.write_png(folder / ("bonnet.png" if count == 1 else f"{index:06d}.png"), picture)
-    for path in (tiny_kitti / IMAGES).iterdir() if options.pop("flat", False) else ():  # where the mask is 255
+    # where the mask is 255
+    for path in (tiny_kitti / IMAGES).iterdir() if options.pop("flat", False) else ():
         image = cv2.imread(str(path), 0)
         image[:, 33:] = 100
         cv2.imwrite(str(path), image)
     sequence = Sequence(tiny_kitti, "00")
-    made = MaskFolder(folder, sequence) if kind == "masks" else LabelMasks(folder, sequence, 3, MaskSettings(**options))
+    made = (
+        MaskFolder(folder, sequence)
+        if kind == "masks"
+        else LabelMasks(folder, sequence, 3, MaskSettings(**options))
+    )
     line, odd = mask_oddities(made, sequence)
     assert "%" in line and [seen in text for text in odd] == ([True] if seen else [])
 
@@ -156,9 +202,12 @@ def test_masks_of_other_frames_and_other_names_of_files(tiny_kitti, tmp_path):
     made = MaskFolder(folder, sequence)
     assert mask_oddities(made, sequence)[1] == []
     assert np.array_equal(MaskFolder(folder, sequence, invert=True)[2], 255 - HALF)
-    assert np.array_equal(MaskFolder(made.paths[0], sequence)[3], read_mask(made.paths[0], sequence.size))
+    assert np.array_equal(
+        MaskFolder(made.paths[0], sequence)[3], read_mask(made.paths[0], sequence.size)
+    )
     cv2.imwrite(str(sequence.frame_paths[0]), np.zeros((48, 64), np.uint8))
     assert len(mask_oddities(made, sequence)[1]) == 1
-    files.write_png(tmp_path / "unfinished" / "000000.png", HALF)  # the mask of one frame is not one for all frames
+    # the mask of one frame is not one for all frames
+    files.write_png(tmp_path / "unfinished" / "000000.png", HALF)
     with pytest.raises(InputError, match="000001.png"):
         MaskFolder(tmp_path / "unfinished", sequence)

@@ -16,15 +16,24 @@ def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
     flat = cityscapes.pairs(tiny_cityscapes, "train")
     official = tmp_path / "official"
     for pair in flat:
-        for source, folder, end in ((pair.image, "leftImg8bit", "leftImg8bit"),
-                                    (pair.label, "gtFine", "gtFine_labelIds")):
+        for source, folder, end in (
+            (pair.image, "leftImg8bit", "leftImg8bit"),
+            (pair.label, "gtFine", "gtFine_labelIds"),
+        ):
             target = official / folder / "train" / "town" / f"{pair.name}_{end}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(source.read_bytes())
     pairs = cityscapes.pairs(official, "train")
-    assert [pair.name for pair in pairs] == [pair.name for pair in flat] == [f"street_{i}" for i in range(4)]
+    assert (
+        [pair.name for pair in pairs]
+        == [pair.name for pair in flat]
+        == [f"street_{i}" for i in range(4)]
+    )
     np.testing.assert_equal(cityscapes.load(flat, 16), cityscapes.load(pairs, 16))
-    assert [pair.name for pair in cityscapes.pairs(official, "train", limit=2)] == ["street_0", "street_2"]
+    assert [pair.name for pair in cityscapes.pairs(official, "train", limit=2)] == [
+        "street_0",
+        "street_2",
+    ]
     assert len(cityscapes.pairs(official, "train", limit=99)) == 4
 
 
@@ -40,21 +49,30 @@ def test_images_are_read_in_colour_or_gray(tiny_cityscapes):
 
 
 def test_faults_are_named(tiny_cityscapes):
-    cv2.imwrite(str(tiny_cityscapes / "trainannot" / "street_0.png"), np.full((16, 32), 35, np.uint8))
+    cv2.imwrite(
+        str(tiny_cityscapes / "trainannot" / "street_0.png"), np.full((16, 32), 35, np.uint8)
+    )
     with pytest.raises(InputError, match="trainannot/street_0.png: label id 35"):
         cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 16)
     (tiny_cityscapes / "trainannot" / "street_2.png").unlink()
     for path in (tiny_cityscapes / "val").iterdir():
         path.unlink()
-    for root, split, named in ((tiny_cityscapes / "nowhere", "train", "nowhere"), (tiny_cityscapes, "test", "test"),
-                               (tiny_cityscapes, "train", "train/street_2.png"), (tiny_cityscapes, "val", "val")):
+    for root, split, named in (
+        (tiny_cityscapes / "nowhere", "train", "nowhere"),
+        (tiny_cityscapes, "test", "test"),
+        (tiny_cityscapes, "train", "train/street_2.png"),
+        (tiny_cityscapes, "val", "val"),
+    ):
         with pytest.raises(InputError, match=named):
             cityscapes.pairs(root, split)
 
 
 def test_train_ids_become_label_ids(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.array([[*range(19), 255]], np.uint8))
-    names = [cityscapes.LABELS[label].name for label in cityscapes.read_label_map(tmp_path / "a.png", True)[0]]
+    names = [
+        cityscapes.LABELS[label].name
+        for label in cityscapes.read_label_map(tmp_path / "a.png", True)[0]
+    ]
     assert names == [*cityscapes.TRAINED, "unlabeled"]
     for train_ids, value in ((True, 19), (False, 255)):
         cv2.imwrite(str(tmp_path / "a.png"), np.array([[value]], np.uint8))

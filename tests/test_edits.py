@@ -1,4 +1,6 @@
-"""An edit of a cell reaches the last table of notebook 8; the cells concerned run in one process."""
+"""An edit of a cell reaches the last table of notebook 8; the cells concerned run in one
+process.
+"""
 
 import json
 import os
@@ -12,18 +14,34 @@ import pytest
 from thesis_repro.settings import read_settings
 
 ROOT = Path(__file__).resolve().parent.parent
-CELLS = {"01": "02 03 09 11 13 15 25", "02": "02 03 04 06 08 17", "03": "02 03 15 17 19 27",
-         "04": "02 03 05 06 08 12 16", "05": "02 03 05 12 17", "06": "02 03 04 26", "07": "02 03 04",
-         "08": "01 02 03 32"}
-ALWAYS = {"04": {"LIVE_CURVES = True": "LIVE_CURVES = False"}, "08": {"NAMES = None": 'NAMES = ["00"]'}}
-THESIS, YOURS = ("thesis's, all keypoints", "thesis's, masked"), ("yours, all keypoints", "yours, masked")
+CELLS = {
+    "01": "02 03 09 11 13 15 25",
+    "02": "02 03 04 06 08 17",
+    "03": "02 03 15 17 19 27",
+    "04": "02 03 05 06 08 12 16",
+    "05": "02 03 05 12 17",
+    "06": "02 03 04 26",
+    "07": "02 03 04",
+    "08": "01 02 03 32",
+}
+ALWAYS = {
+    "04": {"LIVE_CURVES = True": "LIVE_CURVES = False"},
+    "08": {"NAMES = None": 'NAMES = ["00"]'},
+}
+THESIS, YOURS = (
+    ("thesis's, all keypoints", "thesis's, masked"),
+    ("yours, all keypoints", "yours, masked"),
+)
 
 
 def code(number, edits):
     """Code of the cells of a notebook, with edits {number: {old text: new text}}."""
     (path,) = (ROOT / "notebooks").glob(f"{number}_*.ipynb")
-    sources = ["".join(cell["source"]) for cell in json.loads(path.read_text())["cells"]
-               if cell["id"].removeprefix(f"{number}-") in CELLS[number].split()]
+    sources = [
+        "".join(cell["source"])
+        for cell in json.loads(path.read_text())["cells"]
+        if cell["id"].removeprefix(f"{number}-") in CELLS[number].split()
+    ]
     assert len(sources) == len(CELLS[number].split())
     text = "\n".join(sources)
     for old, new in (ALWAYS.get(number, {}) | edits.get(number, {})).items():
@@ -33,15 +51,26 @@ def code(number, edits):
 
 
 def environment(world, build):
-    return {f"THESIS_REPRO_{name}": str(value) for name, value in {
-        "PROFILE": "smoke", "KITTI": world / "kitti", "CITYSCAPES": world / "cityscapes", "BUILD": build}.items()}
+    return {
+        f"THESIS_REPRO_{name}": str(value)
+        for name, value in {
+            "PROFILE": "smoke",
+            "KITTI": world / "kitti",
+            "CITYSCAPES": world / "cityscapes",
+            "BUILD": build,
+        }.items()
+    }
 
 
 def run(world, build, *texts):
     threads = code("04", {}).split("# Knobs")[0]  # TensorFlow takes them only before its first use
     settings = environment(world, build) | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
-    return subprocess.run([sys.executable, "-c", "\n".join([threads, *texts])], env=os.environ | settings,
-                          capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, "-c", "\n".join([threads, *texts])],
+        env=os.environ | settings,
+        capture_output=True,
+        text=True,
+    )
 
 
 def tables(world, build, numbers, edits):
@@ -56,18 +85,36 @@ def tables(world, build, numbers, edits):
 
 
 def test_knobs_of_masks_and_odometry_change_their_rows(small_world, small_labels, tmp_path):
-    shutil.copytree(small_labels, read_settings(environment(small_world, tmp_path)).build / "labels")
-    none, *edited = tables(small_world, tmp_path, [], [
-        {}, {"06": {"CANNY = (5, 15)": "CANNY = (1, 3)"}}, {"06": {'"canny", ()': '"canny", ("road",)'}},
-        {"06": {"DILATION_WIDTH = 10": "DILATION_WIDTH = 5"}}, {"07": {"= 2000, 0.01": "= 500, 0.01"}},
-        {"07": {"LEVELS = 21, 3": "LEVELS = 11, 3"}}])
+    shutil.copytree(
+        small_labels, read_settings(environment(small_world, tmp_path)).build / "labels"
+    )
+    none, *edited = tables(
+        small_world,
+        tmp_path,
+        [],
+        [
+            {},
+            {"06": {"CANNY = (5, 15)": "CANNY = (1, 3)"}},
+            {"06": {'"canny", ()': '"canny", ("road",)'}},
+            {"06": {"DILATION_WIDTH = 10": "DILATION_WIDTH = 5"}},
+            {"07": {"= 2000, 0.01": "= 500, 0.01"}},
+            {"07": {"LEVELS = 21, 3": "LEVELS = 11, 3"}},
+        ],
+    )
     assert none == {}
-    assert all([table[row] for row in THESIS] == [edited[0][row] for row in THESIS] for table in edited)
+    assert all(
+        [table[row] for row in THESIS] == [edited[0][row] for row in THESIS] for table in edited
+    )
     keypoints = [[table[row]["keypoints"] for row in YOURS] for table in edited]
     everywhere, masked = (edited[0][row]["keypoints"] for row in THESIS)
     canny, classes, width, few, window = keypoints
     assert [of_all for of_all, _ in keypoints] == [everywhere] * 3 + [500, everywhere]
-    assert classes[1] < masked < canny[1] and width[1] < masked and few[1] <= 500 and window[1] == masked
+    assert (
+        classes[1] < masked < canny[1]
+        and width[1] < masked
+        and few[1] <= 500
+        and window[1] == masked
+    )
     assert all(table[YOURS[1]]["RMSE (m)"] != table[THESIS[1]]["RMSE (m)"] for table in edited)
 
 
@@ -75,16 +122,27 @@ def test_knobs_of_masks_and_odometry_change_their_rows(small_world, small_labels
 def test_network_and_loss_change_the_masked_row(small_world, tmp_path):
     assert run(small_world, tmp_path, code("01", {}), code("02", {})).returncode == 0
     width = {"06": {"DILATION_WIDTH = 10": "DILATION_WIDTH = 5"}}  # so that there is a table
-    rows = tables(small_world, tmp_path, ["03", "04", "05"], [
-        width, width | {"03": {"DEPTH = 4": "DEPTH = 3"}},
-        width | {"04": {"= dice_loss_plus_1focal_loss": "= keras.losses.CategoricalCrossentropy()"}}])
+    rows = tables(
+        small_world,
+        tmp_path,
+        ["03", "04", "05"],
+        [
+            width,
+            width | {"03": {"DEPTH = 4": "DEPTH = 3"}},
+            width
+            | {"04": {"= dice_loss_plus_1focal_loss": "= keras.losses.CategoricalCrossentropy()"}},
+        ],
+    )
     everywhere, masked = ([json.dumps(table[row]) for table in rows] for row in THESIS)
     assert len(set(everywhere)) == 1 and len(set(masked)) == 3
 
 
 @pytest.mark.torture
 def test_wrong_sizes_name_their_knobs(small_world, tmp_path):
-    for size, numbers, named in ((32, ("01", "02", "03", "04"), "SIZE in notebooks 1 and 3"), (40, ["03"], "SIZE=40")):
+    for size, numbers, named in (
+        (32, ("01", "02", "03", "04"), "SIZE in notebooks 1 and 3"),
+        (40, ["03"], "SIZE=40"),
+    ):
         edits = {"03": {"SIZE = settings.sizes.image_size": f"SIZE = {size}"}}
         done = run(small_world, tmp_path, *(code(number, edits) for number in numbers))
         assert done.returncode != 0 and named in done.stderr.splitlines()[-1]

@@ -22,9 +22,11 @@ def test_public_names():
 
 
 def test_tensorflow_is_loaded_on_first_use():
-    code = ("import sys, thesis_repro as tr; tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run; "
-            "assert 'tensorflow' not in sys.modules and 'keras' not in sys.modules; tr.build_unet; "
-            "assert 'keras' in sys.modules")
+    code = (
+        "import sys, thesis_repro as tr; tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run; "
+        "assert 'tensorflow' not in sys.modules and 'keras' not in sys.modules; tr.build_unet; "
+        "assert 'keras' in sys.modules"
+    )
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
@@ -47,9 +49,20 @@ def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, caps
 @pytest.mark.parametrize("text", ["README.md", "docs/answer.md"])
 def test_ratios_in_texts_are_in_tables(text):
     """Each "1.09 (95 % CI 0.98-1.32)" is one line of a file in figures/, rounded to two digits."""
-    ratios = re.findall(r"(\d+\.\d\d) \(95 % CI (\d+\.\d\d)-(\d+\.\d\d)\)", (ROOT / text).read_text())
-    written = [path for folder in ("figures", "figures/kitti_excerpts") for path in (ROOT / folder).iterdir()
-               if path.suffix in (".csv", ".md")]
-    rows = [{f"{float(number):.2f}" for number in re.findall(r"\d+\.\d+", line)}
-            for path in written for line in path.read_text().splitlines()]
-    assert ratios and [ratio for ratio in ratios if not any(set(ratio) <= row for row in rows)] == []
+    ratios = re.findall(
+        r"(\d+\.\d\d) \(95 % CI (\d+\.\d\d)-(\d+\.\d\d)\)", (ROOT / text).read_text()
+    )
+    written = [
+        path
+        for folder in ("figures", "figures/kitti_excerpts")
+        for path in (ROOT / folder).iterdir()
+        if path.suffix in (".csv", ".md")
+    ]
+    rows = [
+        {f"{float(number):.2f}" for number in re.findall(r"\d+\.\d+", line)}
+        for path in written
+        for line in path.read_text().splitlines()
+    ]
+    assert (
+        ratios and [ratio for ratio in ratios if not any(set(ratio) <= row for row in rows)] == []
+    )

@@ -6,7 +6,16 @@ import pytest
 from PIL import Image
 
 from thesis_repro import InputError, files, longrun
-from thesis_repro.files import atomic, check_output, glance, progress, read_color, read_gray, read_ids, write_png
+from thesis_repro.files import (
+    atomic,
+    check_output,
+    glance,
+    progress,
+    read_color,
+    read_gray,
+    read_ids,
+    write_png,
+)
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
 
@@ -17,10 +26,17 @@ def test_a_written_image_is_read_back(tmp_path):
     assert os.listdir(tmp_path / "folder") == ["a.png"]
 
 
-@pytest.mark.parametrize("damage", [
-    lambda data: data[:-1], lambda data: data[:len(data) // 2], lambda data: b"", lambda data: b"hello",
-    lambda data: data[:200] + b"????" + data[204:] if data[:1] == b"\x89" else data[:200]],
-    ids=["end", "half", "empty", "text", "middle"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[:-1],
+        lambda data: data[: len(data) // 2],
+        lambda data: b"",
+        lambda data: b"hello",
+        lambda data: data[:200] + b"????" + data[204:] if data[:1] == b"\x89" else data[:200],
+    ],
+    ids=["end", "half", "empty", "text", "middle"],
+)
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 def test_damaged_image_is_named(tmp_path, damage, ending):
     path = tmp_path / f"a.{ending}"
@@ -33,9 +49,17 @@ def test_damaged_image_is_named(tmp_path, damage, ending):
 GRAY = Image.fromarray(np.where(IMAGE > 99, np.uint8(255), np.uint8(0)))
 
 
-@pytest.mark.parametrize("image, ids", [
-    (GRAY.convert("RGB"), True), (Image.merge("LA", (GRAY, GRAY)), True),  # three equal channels; transparency
-    (GRAY.convert("P"), False), (GRAY.convert("1"), False)])  # the stored numbers are not the pixels
+@pytest.mark.parametrize(
+    "image, ids",
+    [
+        # three equal channels; transparency
+        (GRAY.convert("RGB"), True),
+        (Image.merge("LA", (GRAY, GRAY)), True),
+        # the stored numbers are not the pixels
+        (GRAY.convert("P"), False),
+        (GRAY.convert("1"), False),
+    ],
+)
 def test_other_kinds_of_gray_png_have_the_right_pixels(tmp_path, image, ids):
     path = tmp_path / "a.png"
     image.save(path)
@@ -50,7 +74,9 @@ def test_other_kinds_of_gray_png_have_the_right_pixels(tmp_path, image, ids):
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 def test_pixels_equal_opencvs(tmp_path, ending):
     path = tmp_path / f"a.{ending}"
-    colours = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (101, 67, 3), np.uint8), (0, 0), 2)
+    colours = cv2.GaussianBlur(
+        np.random.default_rng(1).integers(0, 256, (101, 67, 3), np.uint8), (0, 0), 2
+    )
     for image in (colours, colours[..., 0]):
         cv2.imwrite(str(path), image)
         assert np.array_equal(read_gray(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))

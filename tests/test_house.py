@@ -16,7 +16,9 @@ NOT_IMPORTED = {
     "study": {"report"},
 }
 PATHS = sorted(PACKAGE.rglob("*.py"))
-FOLDERS = {".".join(path.parent.relative_to(PACKAGE).parts) for path in PACKAGE.rglob("*/__init__.py")}
+FOLDERS = {
+    ".".join(path.parent.relative_to(PACKAGE).parts) for path in PACKAGE.rglob("*/__init__.py")
+}
 MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in PATHS}
 
 
@@ -35,28 +37,49 @@ def imported_names(tree):
 
 
 def imports(tree, folder=None):
-    """The package's modules that a module in a folder imports, as dotted names without `thesis_repro`."""
-    inner = {name.removeprefix("thesis_repro.") for name in imported_names(tree) if name.startswith("thesis_repro.")}
+    """The package's modules that a module in a folder imports, as dotted names without
+    `thesis_repro`.
+    """
+    inner = {
+        name.removeprefix("thesis_repro.")
+        for name in imported_names(tree)
+        if name.startswith("thesis_repro.")
+    }
     # outside a folder, its name means its __init__; inside, it is part of a neighbour's name
-    return inner & MODULES.keys() | {f"{name}.__init__" for name in inner & FOLDERS if name != folder}
+    return inner & MODULES.keys() | {
+        f"{name}.__init__" for name in inner & FOLDERS if name != folder
+    }
 
 
 def test_folders_import_only_allowed_folders():
-    wrong = [f"{name} imports {other}" for name, path in MODULES.items() for other in imports(tree_of(path))
-             if other.split(".")[0] in NOT_IMPORTED.get(name.split(".")[0], ())]
-    wrong += [f"{name} imports tools" for name, path in MODULES.items()
-              if any(other.split(".")[0] == "tools" for other in imported_names(tree_of(path)))]
+    wrong = [
+        f"{name} imports {other}"
+        for name, path in MODULES.items()
+        for other in imports(tree_of(path))
+        if other.split(".")[0] in NOT_IMPORTED.get(name.split(".")[0], ())
+    ]
+    wrong += [
+        f"{name} imports tools"
+        for name, path in MODULES.items()
+        if any(other.split(".")[0] == "tools" for other in imported_names(tree_of(path)))
+    ]
     assert wrong == []
 
 
 def test_no_circular_imports():
-    graphlib.TopologicalSorter({name: imports(tree_of(path), name.split(".")[0]) - {name}
-                                for name, path in MODULES.items()}).prepare()
+    graphlib.TopologicalSorter(
+        {
+            name: imports(tree_of(path), name.split(".")[0]) - {name}
+            for name, path in MODULES.items()
+        }
+    ).prepare()
 
 
 def test_imports_are_found():
-    tree = ast.parse("from thesis_repro.study import runner\nimport numpy\n"
-                     "from thesis_repro.report.style import BLUE\n")
+    tree = ast.parse(
+        "from thesis_repro.study import runner\nimport numpy\n"
+        "from thesis_repro.report.style import BLUE\n"
+    )
     assert imports(tree) == {"study.__init__", "study.runner", "report.style"}
     assert imports(tree, "study") == {"study.runner", "report.style"}
 
@@ -67,16 +90,30 @@ def test_public_functions_have_types():
         if name.split(".")[0] not in ("masks", "kitti", "odometry", "study"):
             continue
         body = tree_of(path).body
-        for node in [*body, *(member for item in body if isinstance(item, ast.ClassDef) for member in item.body)]:
-            if not isinstance(node, ast.FunctionDef) or node.name.startswith("_") or any(
-                    ast.unparse(decorator) in ("fast", "inner") for decorator in node.decorator_list):
+        for node in [
+            *body,
+            *(member for item in body if isinstance(item, ast.ClassDef) for member in item.body),
+        ]:
+            if (
+                not isinstance(node, ast.FunctionDef)
+                or node.name.startswith("_")
+                or any(
+                    ast.unparse(decorator) in ("fast", "inner") for decorator in node.decorator_list
+                )
+            ):
                 continue  # compiled functions get their types from their arguments
             arguments = [*node.args.args, *node.args.kwonlyargs]
-            if node.returns is None or not all(a.annotation for a in arguments if a.arg not in ("self", "cls")):
+            if node.returns is None or not all(
+                a.annotation for a in arguments if a.arg not in ("self", "cls")
+            ):
                 untyped.append(f"{name}: {node.name}")
     assert untyped == []
 
 
 def test_no_file_is_read_with_code_in_it():
     # ruff forbids unsafe functions (pyproject.toml), but not these arguments
-    assert [path.name for path in PATHS if re.search("allow_pickle=True|safe_mode=False", path.read_text())] == []
+    assert [
+        path.name
+        for path in PATHS
+        if re.search("allow_pickle=True|safe_mode=False", path.read_text())
+    ] == []

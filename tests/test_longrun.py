@@ -80,14 +80,20 @@ def chained(inner, outer):
         return error
 
 
-@pytest.mark.parametrize("error, says", [
-    (PermissionError(errno.EACCES, "x", "a.png"), "a.png"),
-    (OSError("Can't write data (error message = 'No space left on device')"), "No space left"),
-    (chained(OSError(errno.ENOSPC, "x", "a.npz"), ValueError("Can't close the ZIP file")), "a.npz"),
-    (MemoryError(), "memory"),
-    (RuntimeError("can't start new thread"), "memory"),
-    (InputError("a.png: truncated"), "a.png"),
-])
+@pytest.mark.parametrize(
+    "error, says",
+    [
+        (PermissionError(errno.EACCES, "x", "a.png"), "a.png"),
+        (OSError("Can't write data (error message = 'No space left on device')"), "No space left"),
+        (
+            chained(OSError(errno.ENOSPC, "x", "a.npz"), ValueError("Can't close the ZIP file")),
+            "a.npz",
+        ),
+        (MemoryError(), "memory"),
+        (RuntimeError("can't start new thread"), "memory"),
+        (InputError("a.png: truncated"), "a.png"),
+    ],
+)
 def test_errors_of_the_machine_are_one_line(error, says, capsys):
     assert longrun.report_error(error) == 1
     line = capsys.readouterr().err

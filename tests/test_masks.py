@@ -12,12 +12,20 @@ SIZE = (376, 1240)
 
 def bands(*names):
     """A label map of vertical bands, 16 pixels each."""
-    return np.repeat(np.array([[ID[name] for name in names]], np.uint8).repeat(16, axis=1), 32, axis=0)
+    return np.repeat(
+        np.array([[ID[name] for name in names]], np.uint8).repeat(16, axis=1), 32, axis=0
+    )
 
 
 def streets():
     """A label map of blocks; enlarged to SIZE, no boundary lies on the centre of a pixel."""
-    return np.random.default_rng(0).choice([7, 8, 11, 23, 26], (20, 20)).astype(np.uint8).repeat(16, 0).repeat(16, 1)
+    return (
+        np.random.default_rng(0)
+        .choice([7, 8, 11, 23, 26], (20, 20))
+        .astype(np.uint8)
+        .repeat(16, 0)
+        .repeat(16, 1)
+    )
 
 
 def test_canny_misses_boundaries_of_neighbouring_ids_and_exact_finds_them():
@@ -49,8 +57,13 @@ def test_without_corrections_masks_have_the_thesiss_bits():
 def test_symmetric_masks_commute_with_mirroring(width):
     def differing(settings):
         made = masks.keypoint_mask(streets(), SIZE, width, settings)
-        return [(masks.keypoint_mask(cv2.flip(streets(), axis), SIZE, width, settings) != cv2.flip(made, axis)).mean()
-                for axis in (0, 1)]
+        return [
+            (
+                masks.keypoint_mask(cv2.flip(streets(), axis), SIZE, width, settings)
+                != cv2.flip(made, axis)
+            ).mean()
+            for axis in (0, 1)
+        ]
 
     assert differing(MaskSettings("exact", symmetric=True)) == [0, 0]
     assert max(differing(MaskSettings("exact"))) > 0.01
@@ -58,7 +71,9 @@ def test_symmetric_masks_commute_with_mirroring(width):
 
 def test_a_symmetric_band_is_centred_on_its_boundary():
     def columns(width, settings):  # the boundary is between columns 47 and 48
-        return np.unique(np.nonzero(masks.keypoint_mask(bands("road", "sky"), (64, 96), width, settings))[1]).tolist()
+        return np.unique(
+            np.nonzero(masks.keypoint_mask(bands("road", "sky"), (64, 96), width, settings))[1]
+        ).tolist()
 
     assert columns(10, MaskSettings("exact", symmetric=True)) == list(range(43, 53))
     assert columns(5, MaskSettings("exact", symmetric=True)) == list(range(45, 51))
@@ -67,9 +82,11 @@ def test_a_symmetric_band_is_centred_on_its_boundary():
 
 @pytest.mark.parametrize("boundaries", masks.BOUNDARIES)
 def test_only_boundaries_of_chosen_classes(boundaries):
-    def around(*classes):  # (road/car at column 32, car/building at 64): whether each boundary is in the mask
-        columns = masks.keypoint_mask(bands("road", "car", "building"), (64, 96), 3,
-                                      MaskSettings(boundaries, classes=classes)).any(axis=0)
+    # (road/car at column 32, car/building at 64): whether each boundary is in the mask
+    def around(*classes):
+        columns = masks.keypoint_mask(
+            bands("road", "car", "building"), (64, 96), 3, MaskSettings(boundaries, classes=classes)
+        ).any(axis=0)
         assert not np.delete(columns, np.r_[28:37, 60:69]).any()
         return bool(columns[28:37].any()), bool(columns[60:69].any())
 
@@ -81,12 +98,16 @@ def test_only_boundaries_of_chosen_classes(boundaries):
 def test_no_keypoints_on_movable_classes_and_within_the_margin():
     def columns(movable):
         settings = MaskSettings("exact", movable=movable)
-        return np.flatnonzero(masks.keypoint_mask(bands("road", "car", "building"), (64, 96), 9, settings).all(axis=0))
+        return np.flatnonzero(
+            masks.keypoint_mask(bands("road", "car", "building"), (64, 96), 9, settings).all(axis=0)
+        )
 
     assert columns(None).tolist() == [*range(27, 36), *range(59, 68)]
     assert columns(0).tolist() == [*range(27, 32), *range(64, 68)]  # the car is at columns 32 to 63
     assert columns(2).tolist() == [*range(27, 30), *range(66, 68)]
-    plain, inside = (masks.keypoint_mask(streets(), SIZE, 5, MaskSettings(margin=margin)) for margin in (0, 7))
+    plain, inside = (
+        masks.keypoint_mask(streets(), SIZE, 5, MaskSettings(margin=margin)) for margin in (0, 7)
+    )
     expected = np.zeros_like(plain)
     expected[7:-7, 7:-7] = plain[7:-7, 7:-7]
     assert np.array_equal(inside, expected) and plain[:7].any()
@@ -98,7 +119,9 @@ def test_other_masks_of_the_literature(boundaries):
     label_map = bands("road", "building", "car").repeat(2, axis=1)  # bands of 32 pixels
 
     def kept(**options):  # the columns
-        mask = masks.keypoint_mask(label_map, label_map.shape, 5, MaskSettings(boundaries, **options))
+        mask = masks.keypoint_mask(
+            label_map, label_map.shape, 5, MaskSettings(boundaries, **options)
+        )
         return set(np.flatnonzero(mask.all(axis=0)))
 
     thesis = kept()
@@ -132,8 +155,13 @@ def test_label_masks_and_written_masks_equal_the_filter(labelled, tmp_path):
 
 def test_wrong_settings_and_missing_files_are_named(labelled, tmp_path):
     sequence, folder = labelled
-    for setting, value in (("boundaries", "fuzzy"), ("classes", ("hedge",)), ("movable", -1), ("margin", -3),
-                           ("keep", "most")):
+    for setting, value in (
+        ("boundaries", "fuzzy"),
+        ("classes", ("hedge",)),
+        ("movable", -1),
+        ("margin", -3),
+        ("keep", "most"),
+    ):
         with pytest.raises(InputError, match=setting):
             MaskSettings(**{setting: value})
     with pytest.raises(InputError, match="dilation width 0"):

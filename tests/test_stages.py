@@ -10,7 +10,9 @@ from thesis_repro import InputError, files, stages
 def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
     folder = stages.stage(tmp_path / "a", data="one", size=3)
     files.write_text(folder / "result", "kept")
-    assert stages.stage(tmp_path / "a", size=3, data="one") == folder and (folder / "result").exists()
+    assert (
+        stages.stage(tmp_path / "a", size=3, data="one") == folder and (folder / "result").exists()
+    )
     before = stages.made_from(folder)
     stages.stage(tmp_path / "a", data="other", size=3)
     assert not (folder / "result").exists() and stages.made_from(folder) != before
@@ -36,7 +38,11 @@ def test_a_checkpoint_is_read_back_and_holds_no_code(tmp_path):
     assert stages.resume(file) is None
     stages.store(file, {"epoch": 3}, {"0": np.eye(2), "job": np.arange(3)})
     job, arrays = stages.resume(file)
-    assert job == {"epoch": 3} and np.array_equal(arrays["0"], np.eye(2)) and np.array_equal(arrays["job"], [0, 1, 2])
+    assert (
+        job == {"epoch": 3}
+        and np.array_equal(arrays["0"], np.eye(2))
+        and np.array_equal(arrays["job"], [0, 1, 2])
+    )
     np.savez(file, job="{}", **{"array 0": np.array([object()])})  # a pickle
     with pytest.raises(InputError, match="state.npz: "):
         stages.resume(file)
@@ -48,14 +54,21 @@ def test_a_checkpoint_is_read_back_and_holds_no_code(tmp_path):
 
 def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "_PACKAGE", tmp_path / "package")
-    plain = {"__init__": "", "room____init__": "", "house": "def f():\n    return 1\n", "garden": "x = 1\n",
-             "room__table": "import beside\nfrom package.room import chair\n",
-             "room__chair": "from package import house\n"}
+    plain = {
+        "__init__": "",
+        "room____init__": "",
+        "house": "def f():\n    return 1\n",
+        "garden": "x = 1\n",
+        "room__table": "import beside\nfrom package.room import chair\n",
+        "room__chair": "from package import house\n",
+    }
     (tmp_path / "beside.py").touch()  # another package beside this one
 
     def version(place="room", **changed):
         for name, text in {**plain, **changed}.items():
-            files.write_text(tmp_path / "package" / f"{name.replace('__', '/', name != '__init__')}.py", text)
+            files.write_text(
+                tmp_path / "package" / f"{name.replace('__', '/', name != '__init__')}.py", text
+            )
         stages.code.cache_clear()
         return stages.code(place)
 
@@ -73,8 +86,18 @@ def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monke
 def test_modules_that_a_run_depends_on():
     paths = stages._modules(["odometry", "study/jobs"])
     names = {str(path.relative_to(stages._PACKAGE).with_suffix("")) for path in paths}
-    assert {"kitti", "masks", "odometry/opencv_exact/five_point", "study/controls", "cityscapes"} <= names
-    assert not {name for name in names if name.startswith(("report", "segmentation", "world", "study/runner"))}
+    assert {
+        "kitti",
+        "masks",
+        "odometry/opencv_exact/five_point",
+        "study/controls",
+        "cityscapes",
+    } <= names
+    assert not {
+        name
+        for name in names
+        if name.startswith(("report", "segmentation", "world", "study/runner"))
+    }
 
 
 def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeypatch):
@@ -117,7 +140,9 @@ def test_changed_and_foreign_files_are_not_deleted(tmp_path, capsys, named):
     assert (str(folder) in capsys.readouterr().out) == (named != "in/result")
 
 
-@pytest.mark.parametrize("text", ["", "frame,x\n0,1.0\n1,2", "frame,x\n0,1.0\n1,two\n", "frame,x\n0,1.0\n"])
+@pytest.mark.parametrize(
+    "text", ["", "frame,x\n0,1.0\n1,2", "frame,x\n0,1.0\n1,two\n", "frame,x\n0,1.0\n"]
+)
 def test_a_damaged_table_is_not_kept(tmp_path, text):
     for content, whole in (("frame,x\n0,1.0\n1,2.0\n", True), (text, False)):
         (tmp_path / "a.csv").write_text(content)

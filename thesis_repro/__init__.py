@@ -1,25 +1,41 @@
-"""A reproduction of a thesis on keypoint masks from semantic segmentation for monocular visual odometry.
+"""A reproduction of a thesis on keypoint masks from semantic segmentation for monocular visual
+odometry.
 
-The main names: Sequence, keypoint_mask, Odometry, OdometrySettings, THESIS, run, build_unet and InputError.
-Names are imported on first use, so TensorFlow is loaded only for build_unet.
+The main names: Sequence, keypoint_mask, Odometry, OdometrySettings, THESIS, run, build_unet and
+InputError. Names are imported on first use, so TensorFlow is loaded only for build_unet.
 """
 
 from importlib import import_module
 
-_HOMES = {"Sequence": "kitti", "keypoint_mask": "masks", "Odometry": "odometry", "OdometrySettings": "odometry",
-          "THESIS": "odometry", "run": "odometry", "build_unet": "segmentation.unet"}
+_HOMES = {
+    "Sequence": "kitti",
+    "keypoint_mask": "masks",
+    "Odometry": "odometry",
+    "OdometrySettings": "odometry",
+    "THESIS": "odometry",
+    "run": "odometry",
+    "build_unet": "segmentation.unet",
+}
 
 __all__ = ["InputError", *_HOMES]
 
 
 def one_line(text):
-    """Return a text as one printable line: line breaks and control characters become escape sequences such as \\n."""
-    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape", "surrogatepass").decode()
-                   for letter in str(text))
+    """Return a text as one printable line: line breaks and control characters become escape
+    sequences such as \\n.
+    """
+    return "".join(
+        letter
+        if letter.isprintable()
+        else letter.encode("unicode_escape", "surrogatepass").decode()
+        for letter in str(text)
+    )
 
 
 class InputError(ValueError):
-    """Bad input. The message is one line that names the file or setting, the problem, and what to do."""
+    """Bad input. The message is one line that names the file or setting, the problem, and what
+    to do.
+    """
 
     def __str__(self):
         return one_line(super().__str__())  # file names may hold any character

@@ -1,6 +1,8 @@
-"""Check the user's KITTI and Cityscapes folders: report missing, wrong and odd files, and which commands can be run.
+"""Check the user's KITTI and Cityscapes folders: report missing, wrong and odd files, and which
+commands can be run.
 
-Odd input can be read, but is probably not what the user intended. It causes a warning, not an error.
+Odd input can be read, but is probably not what the user intended. It causes a warning, not an
+error.
 """
 
 import sys
@@ -20,7 +22,9 @@ class _Problems(list):
     """A list of problems, one line each."""
 
     def call(self, function, *arguments):
-        """Return the result of a function. If it raises InputError, add the message to the list and return None."""
+        """Return the result of a function. If it raises InputError, add the message to the list
+        and return None.
+        """
         try:
             return function(*arguments)
         except InputError as error:
@@ -36,10 +40,11 @@ class _Problems(list):
 
 
 def check_kitti(root, deep=False):
-    """Check all sequences below an odometry root. Returns (lines that describe the sequences, problems).
+    """Check all sequences below an odometry root. Returns (lines that describe the sequences,
+    problems).
 
-    Checks file names and numbers, calibration, times and poses, and the start and end of every frame's file. Decodes
-    the first and the last frame. deep: decodes all frames, on all cores.
+    Checks file names and numbers, calibration, times and poses, and the start and end of every
+    frame's file. Decodes the first and the last frame. deep: decodes all frames, on all cores.
     """
     facts, problems, usable = [], _Problems(), []
     with_truth = problems.call(kitti.sequences, root) or []
@@ -48,9 +53,15 @@ def check_kitti(root, deep=False):
         facts.append(fact)
         problems += sequence_problems
         usable += [] if sequence_problems else [name]
-    for commands, names in (("odometry, predict and masks", usable),
-                            ("evaluate, boresight, study and plan", [name for name in usable if name in with_truth])):
-        facts.append(f"can be run: {commands} with {', '.join(names)}" if names else f"cannot be run: {commands}")
+    for commands, names in (
+        ("odometry, predict and masks", usable),
+        ("evaluate, boresight, study and plan", [name for name in usable if name in with_truth]),
+    ):
+        facts.append(
+            f"can be run: {commands} with {', '.join(names)}"
+            if names
+            else f"cannot be run: {commands}"
+        )
     return facts, sorted(problems)
 
 
@@ -63,7 +74,9 @@ def _check_sequence(root, name, needs_truth, deep):
     frame_folder = kitti.images_of(folder)
     paths = problems.call(files.images, frame_folder)
     if not paths:
-        return f"sequence {name}: no frames", problems or [f"{frame_folder}: holds no PNG or JPEG frames"]
+        return f"sequence {name}: no frames", problems or [
+            f"{frame_folder}: holds no PNG or JPEG frames"
+        ]
     matrix = problems.call(kitti.read_intrinsics, folder / "calib.txt", frame_folder.name)
     poses, times, rows = Path(root) / "poses" / f"{name}.txt", folder / "times.txt", {}
     if needs_truth:
@@ -71,7 +84,9 @@ def _check_sequence(root, name, needs_truth, deep):
     if times.is_file():
         rows[times] = problems.call(kitti.read_times, times)
     counts = {path: len(values) for path, values in rows.items() if values is not None}
-    missing = kitti.missing_frames(paths, max([count for count in counts.values() if count > len(paths)], default=None))
+    missing = kitti.missing_frames(
+        paths, max([count for count in counts.values() if count > len(paths)], default=None)
+    )
     problems += [f"{path}: is missing" for path in missing]
     if not missing:
         problems.call(kitti.check_numbering, paths)
@@ -87,19 +102,22 @@ def _check_sequence(root, name, needs_truth, deep):
 
     problems.call_for_each(check_frame, paths if size else paths[1:], f"sequence {name}")
     complete = kitti.FRAME_COUNTS.get(name, len(paths))
-    notes = {f"{len(paths)} of {len(paths) + len(missing)} frames": bool(missing),
-             f"{len(paths)} frames{f' of {size[1]}x{size[0]}' if size else ''}": not missing,
-             f"in {frame_folder.name}": frame_folder.name != kitti.IMAGE_FOLDERS[0],
-             f"an excerpt of {complete}": complete != len(paths),
-             "no ground truth, so step lengths follow from --speed, or are 1 m": not needs_truth,
-             f"no times.txt, so {1 / kitti.FRAME_TIME:g} frames a second": not times.is_file()}
+    notes = {
+        f"{len(paths)} of {len(paths) + len(missing)} frames": bool(missing),
+        f"{len(paths)} frames{f' of {size[1]}x{size[0]}' if size else ''}": not missing,
+        f"in {frame_folder.name}": frame_folder.name != kitti.IMAGE_FOLDERS[0],
+        f"an excerpt of {complete}": complete != len(paths),
+        "no ground truth, so step lengths follow from --speed, or are 1 m": not needs_truth,
+        f"no times.txt, so {1 / kitti.FRAME_TIME:g} frames a second": not times.is_file(),
+    }
     return f"sequence {name}: {'; '.join(note for note, holds in notes.items() if holds)}", problems
 
 
 def check_cityscapes(root, deep=False, splits=("train", "val")):
     """Check the training and validation split. Returns (lines that describe the splits, problems).
 
-    Checks file names, and the start and end of every file. Decodes the first and the last pair. deep: decodes all.
+    Checks file names, and the start and end of every file. Decodes the first and the last pair.
+    deep: decodes all.
     """
     facts, problems = [], _Problems()
     for split in splits:
@@ -111,7 +129,10 @@ def check_cityscapes(root, deep=False, splits=("train", "val")):
         def check_pair(pair, ids=ids, ends=ends):
             cityscapes.check_complete(pair)
             if deep or pair in ends:
-                size, label_map = files.read_gray(pair.image).shape, cityscapes.read_label_map(pair.label)
+                size, label_map = (
+                    files.read_gray(pair.image).shape,
+                    cityscapes.read_label_map(pair.label),
+                )
                 label_size = label_map.shape
                 ids.update(np.unique(label_map).tolist())
             else:
@@ -119,18 +140,28 @@ def check_cityscapes(root, deep=False, splits=("train", "val")):
             kitti.check_size(pair.label, label_size, size, "its image")
 
         problems.call_for_each(check_pair, pairs, f"split {split}")
-        names = ", ".join(f"{label.name} {label.id}" for label in cityscapes.LABELS if label.id in ids)
-        facts.append(f"split {split}: {sum(None not in pair for pair in pairs)} images with label maps; "
-                     f"{'labels' if deep else 'labels in the first and last'}: {names}")
+        names = ", ".join(
+            f"{label.name} {label.id}" for label in cityscapes.LABELS if label.id in ids
+        )
+        facts.append(
+            f"split {split}: {sum(None not in pair for pair in pairs)} images with label maps; "
+            f"{'labels' if deep else 'labels in the first and last'}: {names}"
+        )
     return facts, sorted(problems)
 
 
 def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=False):
-    """Print the content of the folders, problems and warnings. Returns True if there are no problems."""
+    """Print the content of the folders, problems and warnings. Returns True if there are no
+    problems.
+    """
     has_problems = False
-    check_semantic = partial(check_cityscapes, splits=("train",))  # KITTI's street scenes have one split
-    for option, root, check in (("KITTI", kitti_root, check_kitti), ("CITYSCAPES", cityscapes_root, check_cityscapes),
-                                ("KITTI_SEMANTIC", kitti_semantic, check_semantic)):
+    # KITTI's street scenes have one split
+    check_semantic = partial(check_cityscapes, splits=("train",))
+    for option, root, check in (
+        ("KITTI", kitti_root, check_kitti),
+        ("CITYSCAPES", cityscapes_root, check_cityscapes),
+        ("KITTI_SEMANTIC", kitti_semantic, check_semantic),
+    ):
         if not root:
             continue
         facts, problems = check(root, deep)
@@ -147,71 +178,109 @@ def report(kitti_root=None, cityscapes_root=None, kitti_semantic=None, deep=Fals
 
 # Odd input
 
-FRAME_SECONDS = 0.005, 2  # least and greatest time between frames; times outside are probably not in seconds
+# least and greatest time between frames; times outside are probably not in seconds
+FRAME_SECONDS = 0.005, 2
 MAX_CAR_SPEED = 60  # metres a second; the cars of KITTI drive at most 27
 MIN_FORWARD_SHARE = 0.5  # of a step, along the camera's axis; KITTI has 0.97 or more
-MAX_CENTRE_OFFSET = 0.1, 0.15  # of the principal point, in frame widths and heights; KITTI has at most 0.04
+# of the principal point, in frame widths and heights; KITTI has at most 0.04
+MAX_CENTRE_OFFSET = 0.1, 0.15
 MASK_SAMPLES = 6  # number of frames whose masks are checked
 MIN_COVERAGE, MAX_COVERAGE = 0.005, 0.99
-# Mean gradient inside a mask divided by the mean gradient outside. The thesis's masks cover less than half of a frame
-# and have 0.98 to 1.6. Inverted, they cover more than half and have 0.64 to 1.02.
+# Mean gradient inside a mask divided by the mean gradient outside. The thesis's masks cover less
+# than half of a frame and have 0.98 to 1.6. Inverted, they cover more than half and have 0.64 to
+# 1.02.
 MIN_CONTRAST, MIN_CONTRAST_OF_LARGE_MASK = 0.7, 0.9
 MIN_TURN_SPREAD = 0.3  # degrees a frame; smaller turns cannot be compared
 MIN_CORRELATION, MAX_TURN_DIFFERENCE = 0.4, 0.5  # degrees; correct paths have >= 0.79 and <= 0.04
 
 
 def oddities(sequence):
-    """Warnings, one line each, if a sequence's times, poses, camera matrix or frames are implausible."""
+    """Warnings, one line each, if a sequence's times, poses, camera matrix or frames are
+    implausible.
+    """
     lines, prefix = [], f"sequence {sequence.name}: "
     seconds = np.diff(sequence.times)
     if len(seconds) and not FRAME_SECONDS[0] <= np.median(seconds) <= FRAME_SECONDS[1]:
-        lines.append(f"{prefix}frames are {np.median(seconds):g} s apart; times.txt must be in seconds")
+        lines.append(
+            f"{prefix}frames are {np.median(seconds):g} s apart; times.txt must be in seconds"
+        )
     elif sequence.has_truth and len(seconds):
         motion = np.linalg.inv(sequence.poses[:-1]) @ sequence.poses[1:]
         metres = np.linalg.norm(motion[:, :3, 3], axis=1)
         speed, forward = metres / seconds, motion[metres > 0.1, 2, 3] / metres[metres > 0.1]
         if speed.max() > MAX_CAR_SPEED:
-            lines.append(f"{prefix}at frame {speed.argmax() + 1} the car drives {speed.max():.0f} m/s "
-                         f"(median: {np.median(speed):.3g}); positions must be in metres, one line a frame")
+            lines.append(
+                f"{prefix}at frame {speed.argmax() + 1} the car drives {speed.max():.0f} m/s "
+                f"(median: {np.median(speed):.3g}); positions must be in metres, one line a frame"
+            )
         if len(forward) and np.median(forward) < MIN_FORWARD_SHARE:
-            lines.append(f"{prefix}{np.median(forward):.2f} of a step lies along the camera's axis; poses must be "
-                         "camera to world (inverted?), x right, y down, z ahead")
+            lines.append(
+                f"{prefix}{np.median(forward):.2f} of a step lies along the camera's axis; poses must be "
+                "camera to world (inverted?), x right, y down, z ahead"
+            )
     height, width = sequence.size
     (fx, _, u), (_, fy, v), _ = sequence.intrinsics
     camera = kitti.CAMERAS.get(sequence.name)
     if camera and (height, width) == (camera.height, camera.width):
-        if not np.allclose((fx, fy, u, v), (camera.fx, camera.fy, camera.cx, camera.cy), rtol=0, atol=1e-3):
-            lines.append(f"{prefix}calib.txt has the focal length {fx:g} and centre {u:g}, {v:g}; KITTI's camera has "
-                         f"{camera.fx:g} and {camera.cx:g}, {camera.cy:g}")
-    elif abs(u / width - 0.5) > MAX_CENTRE_OFFSET[0] or abs(v / height - 0.5) > MAX_CENTRE_OFFSET[1]:
-        lines.append(f"{prefix}calib.txt has the centre {u:g}, {v:g}, but frames have {width}x{height} pixels; it must "
-                     "belong to frames of this size")
+        if not np.allclose(
+            (fx, fy, u, v), (camera.fx, camera.fy, camera.cx, camera.cy), rtol=0, atol=1e-3
+        ):
+            lines.append(
+                f"{prefix}calib.txt has the focal length {fx:g} and centre {u:g}, {v:g}; KITTI's camera has "
+                f"{camera.fx:g} and {camera.cx:g}, {camera.cy:g}"
+            )
+    elif (
+        abs(u / width - 0.5) > MAX_CENTRE_OFFSET[0] or abs(v / height - 0.5) > MAX_CENTRE_OFFSET[1]
+    ):
+        lines.append(
+            f"{prefix}calib.txt has the centre {u:g}, {v:g}, but frames have {width}x{height} pixels; it must "
+            "belong to frames of this size"
+        )
     sizes = pd.Series({path: path.stat().st_size for path in sequence.frame_paths})
-    candidates = sizes.index[sizes.duplicated(keep=False)]  # compressed frames seldom have equal sizes
+    # compressed frames seldom have equal sizes
+    candidates = sizes.index[sizes.duplicated(keep=False)]
     copies = candidates[pd.Series(stages.contents(candidates), dtype=object).duplicated()]
     if len(copies):
-        lines.append(f"{prefix}{len(copies)} frames are copies of other frames, first {copies[0].name}; remove them")
+        lines.append(
+            f"{prefix}{len(copies)} frames are copies of other frames, first {copies[0].name}; remove them"
+        )
     return lines
 
 
 def path_oddities(name, estimated, true):
-    """Warnings, one line each, if estimated and true poses, (n, 4, 4), probably belong to different drives."""
-    turns = pd.DataFrame({key: [np.degrees(np.arctan2(step[0, 2], step[2, 2]))
-                                for step in np.linalg.inv(poses[:-1]) @ poses[1:]]
-                          for key, poses in (("estimated", estimated), ("true", true))})
+    """Warnings, one line each, if estimated and true poses, (n, 4, 4), probably belong to
+    different drives.
+    """
+    turns = pd.DataFrame(
+        {
+            key: [
+                np.degrees(np.arctan2(step[0, 2], step[2, 2]))
+                for step in np.linalg.inv(poses[:-1]) @ poses[1:]
+            ]
+            for key, poses in (("estimated", estimated), ("true", true))
+        }
+    )
     spread = (turns.quantile(0.95) - turns.quantile(0.05)) / 2
     if len(turns) < 20 or not spread["estimated"]:
         return []
-    correlation = turns.corr("spearman").iloc[0, 1] if spread.max() > MIN_TURN_SPREAD and spread["true"] else 1
+    correlation = (
+        turns.corr("spearman").iloc[0, 1]
+        if spread.max() > MIN_TURN_SPREAD and spread["true"]
+        else 1
+    )
     difference = (turns["estimated"] - turns["true"]).abs().median()
     if correlation >= MIN_CORRELATION and difference <= MAX_TURN_DIFFERENCE:
         return []
-    return [f"sequence {name}: turns from frame to frame differ from the ground truth by {difference:.2g} degrees "
-            f"(median), correlation {correlation:.2f}; do frames and poses belong to one drive, in the same order?"]
+    return [
+        f"sequence {name}: turns from frame to frame differ from the ground truth by {difference:.2g} degrees "
+        f"(median), correlation {correlation:.2f}; do frames and poses belong to one drive, in the same order?"
+    ]
 
 
 def mask_oddities(source, sequence):
-    """Check MASK_SAMPLES masks (LabelMasks or MaskFolder) of a sequence. Returns (description, [warning] or [])."""
+    """Check MASK_SAMPLES masks (LabelMasks or MaskFolder) of a sequence. Returns (description,
+    [warning] or []).
+    """
     indices = np.unique(np.linspace(0, len(source) - 1, MASK_SAMPLES).round().astype(int))
     sampled_masks = [source[index] for index in indices]
     coverage = np.array([masks.coverage(mask) for mask in sampled_masks])
@@ -219,11 +288,17 @@ def mask_oddities(source, sequence):
     folder, has_labels = source.paths[0].parent, isinstance(source, masks.LabelMasks)
     if has_labels:
         label_maps = [masks.label_map_of(source, index) for index in indices]
-        shares = np.mean([np.bincount(label_map.ravel(), minlength=cityscapes.N_CLASSES) / label_map.size
-                          for label_map in label_maps], axis=0)
+        shares = np.mean(
+            [
+                np.bincount(label_map.ravel(), minlength=cityscapes.N_CLASSES) / label_map.size
+                for label_map in label_maps
+            ],
+            axis=0,
+        )
         largest = [index for index in np.argsort(-shares, kind="stable") if shares[index] >= 0.005]
         description += f" (width {source.dilation_width}); label maps hold " + ", ".join(
-            f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest)
+            f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest
+        )
         faults = _label_faults(label_maps, np.flatnonzero(shares), sequence, source.settings)
     record = stages.record(folder) or {}
     present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)
@@ -237,11 +312,19 @@ def mask_oddities(source, sequence):
     if coverage.min() < MIN_COVERAGE or coverage.mean() > MAX_COVERAGE:
         faults.append(f"leave {coverage.min():.1%} to {coverage.max():.1%} of the frames{option}")
     elif not has_labels:
-        contrast = np.median([_contrast(sequence.frame(index), mask)
-                              for index, mask in zip(indices, sampled_masks, strict=True)])
+        contrast = np.median(
+            [
+                _contrast(sequence.frame(index), mask)
+                for index, mask in zip(indices, sampled_masks, strict=True)
+            ]
+        )
         if contrast < (MIN_CONTRAST_OF_LARGE_MASK if coverage.mean() > 0.5 else MIN_CONTRAST):
-            faults.append(f"keep regions with {contrast:.2f} times the contrast of the rest{option}")
-    return description, [f"{folder}: {'label maps' if has_labels else 'masks'} {faults[0]}"] if faults else []
+            faults.append(
+                f"keep regions with {contrast:.2f} times the contrast of the rest{option}"
+            )
+    return description, [
+        f"{folder}: {'label maps' if has_labels else 'masks'} {faults[0]}"
+    ] if faults else []
 
 
 def _label_faults(label_maps, ids, sequence, settings):
@@ -250,9 +333,13 @@ def _label_faults(label_maps, ids, sequence, settings):
     if len(ids) == 1:
         faults.append(f"hold only {cityscapes.LABELS[ids[0]].name} {ids[0]}")
     elif settings.ids == "labels" and ids.max() < len(cityscapes.TRAINED):
-        faults.append(f"hold no id above {ids.max()}, so no sky, vegetation or cars; --ids train reads train ids")
+        faults.append(
+            f"hold no id above {ids.max()}, so no sky, vegetation or cars; --ids train reads train ids"
+        )
     if (height - width) * (sequence.size[0] - sequence.size[1]) < 0:
-        faults.append(f"have {width}x{height} pixels, the frames {sequence.size[1]}x{sequence.size[0]}; rotated?")
+        faults.append(
+            f"have {width}x{height} pixels, the frames {sequence.size[1]}x{sequence.size[0]}; rotated?"
+        )
     return faults
 
 
@@ -262,7 +349,8 @@ def _contrast(frame, mask):
 
 
 def main(path):
-    """Check the data that the environment's settings name, unless `path` holds the digest of the same files.
+    """Check the data that the environment's settings name, unless `path` holds the digest of the
+    same files.
 
     Returns the exit code. After a check without problems, the digest is written to `path`.
     """
@@ -272,8 +360,16 @@ def main(path):
     with suppress(InputError):  # `report` below names all problems
         for name in kitti.sequences(kitti_root) if kitti_root else ():
             used_files += kitti.Sequence(kitti_root, name).subset(settings.sizes.frames).files
-        for root, split in ((cityscapes_root, "train"), (cityscapes_root, "val"), (settings.kitti_semantic, "train")):
-            used_files += [file for pair in cityscapes.pairs(root, split) for file in pair[1:]] if root else []
+        for root, split in (
+            (cityscapes_root, "train"),
+            (cityscapes_root, "val"),
+            (settings.kitti_semantic, "train"),
+        ):
+            used_files += (
+                [file for pair in cityscapes.pairs(root, split) for file in pair[1:]]
+                if root
+                else []
+            )
         digest = stages.listing(used_files)
     if digest and path.is_file() and path.read_text(encoding="utf-8") == digest:
         return 0

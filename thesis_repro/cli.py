@@ -16,12 +16,18 @@ from pathlib import Path
 from thesis_repro import InputError, longrun, one_line
 from thesis_repro.settings import PROFILES, SEED, frames, number, scheduler_address, widths
 
-# options that name an output file: its content, and the endings that its name may have (none given: any)
-OUTPUT_FILES = {"output": ("poses in KITTI format", ()), "tum": ("poses in TUM format", ()),
-                "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")), "video": ("video", (".mp4",))}
+# options that name an output file: its content, and the endings that its name may have (none given:
+# any)
+OUTPUT_FILES = {
+    "output": ("poses in KITTI format", ()),
+    "tum": ("poses in TUM format", ()),
+    "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
+    "video": ("video", (".mp4",)),
+}
 
 
-# The commands. Their docstrings are shown by --help. Each imports its libraries itself, so that --help is fast.
+# The commands. Their docstrings are shown by --help. Each imports its libraries itself, so that
+# --help is fast.
 
 
 def synthesize(options):
@@ -30,22 +36,31 @@ def synthesize(options):
 
     with longrun.logged(options.out, options.command_line) as run:
         new, total = world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
-        run.end(f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
-                f"{total:,} images with their label maps", total - new)
+        run.end(
+            f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
+            f"{total:,} images with their label maps",
+            total - new,
+        )
 
 
 def check_data(options):
-    """check folders of KITTI, Cityscapes or KITTI's street scenes: their content, damage, and what can be run"""
+    """check folders of KITTI, Cityscapes or KITTI's street scenes: their content, damage, and
+    what can be run
+    """
     from thesis_repro import check
 
     roots = options.kitti, options.cityscapes, options.kitti_semantic
     if not any(roots):
-        raise InputError("no folder to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic")
+        raise InputError(
+            "no folder to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic"
+        )
     return 0 if check.report(*roots, options.deep) else 1
 
 
 def predict(options):
-    """predict label maps (Cityscapes ids as 8-bit PNG, 320x320, named like the frames) for images or sequences"""
+    """predict label maps (Cityscapes ids as 8-bit PNG, 320x320, named like the frames) for
+    images or sequences
+    """
     from thesis_repro.segmentation import quietly
     from thesis_repro.study import cluster
 
@@ -55,9 +70,13 @@ def predict(options):
         raise InputError("--images: two folders have the same name; use two commands")
     # sequences of a KITTI folder always get subfolders, even if there is only one
     has_subfolders = [folder for folder, _ in images] != options.images[:1]
-    sequences = [(paths[:options.frames], options.folder / name if has_subfolders else options.folder)
-                 for name, (_, paths) in zip(names, images)]
-    _check_outputs(options, *options.images, *(paths[0].parent for paths, _ in sequences), *options.model)
+    sequences = [
+        (paths[: options.frames], options.folder / name if has_subfolders else options.folder)
+        for name, (_, paths) in zip(names, images)
+    ]
+    _check_outputs(
+        options, *options.images, *(paths[0].parent for paths, _ in sequences), *options.model
+    )
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction
     model_files = options.model or [prediction.SHIPPED]
@@ -67,18 +86,27 @@ def predict(options):
                 new = prediction.spread_label_maps(pool.run, model_files, sequences)
         else:
             model = prediction.load(tuple(model_files))
-            new = sum(prediction.write_label_maps(model, paths, output) for paths, output in sequences)
+            new = sum(
+                prediction.write_label_maps(model, paths, output) for paths, output in sequences
+            )
         total = sum(len(paths) for paths, _ in sequences)
-        run.end("\n".join(f"{output}: {len(paths)} label maps" for paths, output in sequences), total - new)
+        run.end(
+            "\n".join(f"{output}: {len(paths)} label maps" for paths, output in sequences),
+            total - new,
+        )
 
 
 def masks(options):
-    """write the keypoint masks of a sequence (appendix A.8): 8-bit PNG images, 255 keeps keypoints, 0 ignores them"""
+    """write the keypoint masks of a sequence (appendix A.8): 8-bit PNG images, 255 keeps
+    keypoints, 0 ignores them
+    """
     from thesis_repro.masks import LabelMasks, write_masks
 
     sequence = _sequence(options)
-    mask_sets = [LabelMasks(options.labels, sequence, width, _mask_settings(options))
-                 for width in sorted(set().union(*options.dilation))]
+    mask_sets = [
+        LabelMasks(options.labels, sequence, width, _mask_settings(options))
+        for width in sorted(set().union(*options.dilation))
+    ]
     _check_outputs(options, options.labels, sequence.folder)
     _print_oddities(sequence, mask_sets)
     for label_masks in mask_sets:
@@ -96,13 +124,23 @@ def odometry(options):
     from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import texts
 
-    changes = {field.name: vars(options)[field.name] for field in fields(odometry.OdometrySettings)
-               if vars(options).get(field.name) is not None}
+    changes = {
+        field.name: vars(options)[field.name]
+        for field in fields(odometry.OdometrySettings)
+        if vars(options).get(field.name) is not None
+    }
     settings = replace(odometry.PRESETS[options.pyslam], **changes)
     sequence = _sequence(options)
     masks = _masks(options, sequence)
-    _check_outputs(options, sequence.poses_path, sequence.folder / "calib.txt", sequence.folder / "times.txt",
-                   sequence.frame_paths[0].parent, options.masks, options.labels)
+    _check_outputs(
+        options,
+        sequence.poses_path,
+        sequence.folder / "calib.txt",
+        sequence.folder / "times.txt",
+        sequence.frame_paths[0].parent,
+        options.masks,
+        options.labels,
+    )
     _print_oddities(sequence, [masks] if masks else [])
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.boresight:
@@ -122,14 +160,27 @@ def odometry(options):
         from thesis_repro.report import style, trajectories
 
         truth = sequence.poses if sequence.has_truth else None
-        poses = result.poses if truth is None else metrics.shifted(result.poses, truth, settings.alignment)
+        poses = (
+            result.poses
+            if truth is None
+            else metrics.shifted(result.poses, truth, settings.alignment)
+        )
         drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
         style.write_figure(drawing, options.plot)
-    _print(options, record, "run.txt.j2", sequence=sequence, speed=options.speed, length=metrics.RELATIVE_LENGTH)
+    _print(
+        options,
+        record,
+        "run.txt.j2",
+        sequence=sequence,
+        speed=options.speed,
+        length=metrics.RELATIVE_LENGTH,
+    )
 
 
 def boresight(options):
-    """estimate the constant rotation between camera and ground truth, in degrees, for odometry --boresight"""
+    """estimate the constant rotation between camera and ground truth, in degrees, for odometry
+    --boresight
+    """
     from thesis_repro import kitti, odometry
     from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import texts
@@ -139,29 +190,42 @@ def boresight(options):
     for name in dict.fromkeys(kitti.name_of(options.kitti, name) for name in names):
         sequence = kitti.Sequence(options.kitti, name).subset(options.frames)
         _print_oddities(sequence, [])
-        result = odometry.run(sequence, replace(odometry.THESIS, estimator="refined"), description=f"sequence {name}")
+        result = odometry.run(
+            sequence, replace(odometry.THESIS, estimator="refined"), description=f"sequence {name}"
+        )
         paths[name] = result.poses, sequence.poses
     rotation, table = boresight.estimate(list(paths.values())), boresight.explained(paths)
     _print(options, texts.angles_record(rotation, table), "angles.txt.j2", table=table)
 
 
 def study(options):
-    """compare your own label maps or masks with all keypoints and with controls, in tables, figures and a page"""
+    """compare your own label maps or masks with all keypoints and with controls, in tables,
+    figures and a page
+    """
     from thesis_repro import kitti
     from thesis_repro.settings import ALL_WIDTHS, cores
     from thesis_repro.study import series, sources
 
     if not options.sources:
-        raise InputError("no masks: name a folder of label maps with --labels, or of masks with --masks")
+        raise InputError(
+            "no masks: name a folder of label maps with --labels, or of masks with --masks"
+        )
     has_labels = any(kind == "labels" for kind, _ in options.sources)
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
     planned = series.Study(
-        options.kitti.absolute(), tuple(names or kitti.sequences(options.kitti)),
-        sources.named(options.sources, options.name, _mask_settings(options, has_labels), options.invert),
+        options.kitti.absolute(),
+        tuple(names or kitti.sequences(options.kitti)),
+        sources.named(
+            options.sources, options.name, _mask_settings(options, has_labels), options.invert
+        ),
         tuple(sorted(set().union(*options.widths or [ALL_WIDTHS] if has_labels else []))),
-        options.controls, tuple(dict.fromkeys(options.estimator)), options.repetitions, options.frames)
+        options.controls,
+        tuple(dict.fromkeys(options.estimator)),
+        options.repetitions,
+        options.frames,
+    )
     planned.check()
     if options.plan:
         from thesis_repro.study import plan
@@ -170,10 +234,13 @@ def study(options):
         return 0
     folder = options.folder.absolute()
     _check_outputs(options, options.kitti, *(source.folder for source in planned.sources))
-    from thesis_repro.report import study  # this import takes seconds, so the input is checked first
+    # this import takes seconds, so the input is checked first
+    from thesis_repro.report import study
 
     with longrun.logged(folder, options.command_line) as run, longrun.claimed(folder):
-        warnings = [line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)]
+        warnings = [
+            line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)
+        ]
         summary = planned.run(folder, options.jobs or cores(), options.dask)
         warnings += longrun.warn(planned.path_oddities(summary, folder))
         counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
@@ -183,7 +250,9 @@ def study(options):
 
 
 def evaluate(options):
-    """compare trajectories with the ground truth: the thesis's RMSE and MAE, ATE, RPE, KITTI's t_rel and r_rel"""
+    """compare trajectories with the ground truth: the thesis's RMSE and MAE, ATE, RPE, KITTI's
+    t_rel and r_rel
+    """
     from thesis_repro import check
     from thesis_repro.kitti import true_path
     from thesis_repro.report import style, trajectories
@@ -191,24 +260,40 @@ def evaluate(options):
     sequences = trajectories.by_sequence(options.poses, options.kitti, options.sequence)
     if options.plot and len(sequences) > 1:
         raise InputError("--plot: shows only one sequence; name it with --sequence")
-    _check_outputs(options, *options.poses, *(file for files in sequences.values() for file in files.values()))
+    _check_outputs(
+        options, *options.poses, *(file for files in sequences.values() for file in files.values())
+    )
     rows = []
     for sequence, files in sequences.items():
-        truth, times = (values[:options.frames] for values in true_path(options.kitti, sequence))
-        paths = {name: trajectories.read(file, times, options.frames) for name, file in files.items()}
+        truth, times = (values[: options.frames] for values in true_path(options.kitti, sequence))
+        paths = {
+            name: trajectories.read(file, times, options.frames) for name, file in files.items()
+        }
         for name, (matched, poses) in paths.items():
             longrun.warn(check.path_oddities(name, poses, truth[matched]))
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
-        drawing = trajectories.figure(trajectories.aligned(paths, truth, options.align), truth, f"sequence {sequence}",
-                                      {name: matched for name, (matched, _) in paths.items()})
+        drawing = trajectories.figure(
+            trajectories.aligned(paths, truth, options.align),
+            truth,
+            f"sequence {sequence}",
+            {name: matched for name, (matched, _) in paths.items()},
+        )
         style.write_figure(drawing, options.plot)
     rows += list(trajectories.means(rows))
-    _print(options, rows, "evaluate.txt.j2", alignment=options.align, table=trajectories.table(rows, options.align))
+    _print(
+        options,
+        rows,
+        "evaluate.txt.j2",
+        alignment=options.align,
+        table=trajectories.table(rows, options.align),
+    )
 
 
 def plan(options):
-    """estimate the time and disk space of make figures on this machine, training included (takes a minute)"""
+    """estimate the time and disk space of make figures on this machine, training included
+    (takes a minute)
+    """
     from thesis_repro import cityscapes
     from thesis_repro.settings import read_settings
     from thesis_repro.study import plan
@@ -225,7 +310,9 @@ def plan(options):
 def _sequence(options):
     from thesis_repro.kitti import Sequence
 
-    sequence = Sequence(options.kitti, options.sequence, options.camera, getattr(options, "speed", None))
+    sequence = Sequence(
+        options.kitti, options.sequence, options.camera, getattr(options, "speed", None)
+    )
     return sequence.subset(options.frames)
 
 
@@ -243,13 +330,18 @@ def _print_oddities(sequence, mask_sets):
 
 
 def _image_folders(root):
-    """Yield (folder, its images) for a folder of images, a sequence, or each sequence of a KITTI folder.
+    """Yield (folder, its images) for a folder of images, a sequence, or each sequence of a KITTI
+    folder.
 
     Raises InputError if there are no images, or if frames of a sequence are missing.
     """
     from thesis_repro import files, kitti
 
-    inside = [root / "sequences" / name for name in kitti.with_frames(root)] if (root / "sequences").is_dir() else []
+    inside = (
+        [root / "sequences" / name for name in kitti.with_frames(root)]
+        if (root / "sequences").is_dir()
+        else []
+    )
     for folder in inside or [root]:
         image_folder = kitti.images_of(folder)
         paths = files.images(image_folder)
@@ -263,8 +355,15 @@ def _image_folders(root):
 def _mask_settings(options, has_labels=True):
     from thesis_repro.masks import MaskSettings
 
-    settings = MaskSettings(options.boundaries, options.symmetric, tuple(options.classes), options.without_movable,
-                            options.margin, options.keep, options.ids)
+    settings = MaskSettings(
+        options.boundaries,
+        options.symmetric,
+        tuple(options.classes),
+        options.without_movable,
+        options.margin,
+        options.keep,
+        options.ids,
+    )
     if not has_labels and settings != MaskSettings():
         raise InputError(f"{', '.join(MASKS)}: need --labels DIR, label maps to make masks from")
     return settings
@@ -289,7 +388,9 @@ def _output_files(options):
 
 
 def _check_outputs(options, *inputs):
-    """Raise InputError, before anything runs, if an output cannot be written or would overwrite or mix with inputs."""
+    """Raise InputError, before anything runs, if an output cannot be written or would overwrite
+    or mix with inputs.
+    """
     from thesis_repro.files import check_output
 
     used, folder = {path.resolve() for path in inputs if path}, vars(options).get("folder")
@@ -301,7 +402,9 @@ def _check_outputs(options, *inputs):
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
         check_output(path)
         if not used.isdisjoint((path.resolve(), path.resolve().parent)):
-            raise InputError(f"--{name} {path}: is used by this command, or in a folder of its input; name another")
+            raise InputError(
+                f"--{name} {path}: is used by this command, or in a folder of its input; name another"
+            )
         used.add(path.resolve())
 
 
@@ -310,7 +413,11 @@ def _print(options, record, template, **values):
     from thesis_repro.files import is_stdout, is_stream
     from thesis_repro.report import texts
 
-    text = json.dumps(record) if vars(options).get("json") else texts.render(template, record=record, **values).rstrip()
+    text = (
+        json.dumps(record)
+        if vars(options).get("json")
+        else texts.render(template, record=record, **values).rstrip()
+    )
     outputs = _output_files(options)
     print(text, file=sys.stderr if any(map(is_stdout, outputs.values())) else None)
     for name, path in outputs.items():
@@ -322,7 +429,9 @@ def _print(options, record, template, **values):
 
 
 class _Parser(argparse.ArgumentParser):
-    """An ArgumentParser with one-line errors, without abbreviated options, and with a check for empty paths."""
+    """An ArgumentParser with one-line errors, without abbreviated options, and with a check for
+    empty paths.
+    """
 
     def __init__(self, **options):
         super().__init__(allow_abbrev=False, **options)
@@ -339,60 +448,132 @@ def _path(text):
 
 
 def _setting(read):
-    """Let argparse show the InputError of a function that reads an option, instead of "invalid value"."""
+    """Let argparse show the InputError of a function that reads an option, instead of "invalid
+    value".
+    """
+
     def read_text(text):
         try:
             return read(text)
         except InputError as error:
             raise argparse.ArgumentTypeError(error) from None
+
     return read_text
 
 
 # options of several commands
 SHARED = {
     "--kitti": dict(type=Path, metavar="ROOT", help="KITTI folder, with sequences/ and poses/"),
-    "--sequence": dict(required=True, metavar="NN", help="00 to 21, or without --kitti a folder with your own frames"),
-    "--frames": dict(type=_setting(frames), metavar="N|all", help="use the first N frames of a sequence, >= 5 (all)"),
-    "--camera": dict(metavar="image_N", help="folder of the frames (image_0, or else image_2, read as gray)"),
-    "--cityscapes": dict(type=Path, metavar="ROOT", help="Cityscapes folder (leftImg8bit/, gtFine/ or train/, ...)"),
-    "--output": dict(type=Path, dest="folder", required=True, metavar="DIR", help="folder for all results"),
-    "--plot": dict(type=Path, metavar="FILE", help="draw the paths and their errors (.png, .svg, .pdf, .jpg)"),
+    "--sequence": dict(
+        required=True,
+        metavar="NN",
+        help="00 to 21, or without --kitti a folder with your own frames",
+    ),
+    "--frames": dict(
+        type=_setting(frames),
+        metavar="N|all",
+        help="use the first N frames of a sequence, >= 5 (all)",
+    ),
+    "--camera": dict(
+        metavar="image_N", help="folder of the frames (image_0, or else image_2, read as gray)"
+    ),
+    "--cityscapes": dict(
+        type=Path, metavar="ROOT", help="Cityscapes folder (leftImg8bit/, gtFine/ or train/, ...)"
+    ),
+    "--output": dict(
+        type=Path, dest="folder", required=True, metavar="DIR", help="folder for all results"
+    ),
+    "--plot": dict(
+        type=Path, metavar="FILE", help="draw the paths and their errors (.png, .svg, .pdf, .jpg)"
+    ),
     "--json": dict(action="store_true", help="print JSON instead of text"),
-    "--sequences": dict(nargs="+", action="extend", default=[], metavar="NN", help="sequences to run (all in ROOT)"),
-    "--invert": dict(action="store_true", help="for --masks in which 0 keeps and other values ignore keypoints"),
-    "--dask": dict(type=_setting(scheduler_address), metavar="ADDRESS",
-                   help="run on the workers of a Dask scheduler, tcp://host:8786, with the same results"),
+    "--sequences": dict(
+        nargs="+", action="extend", default=[], metavar="NN", help="sequences to run (all in ROOT)"
+    ),
+    "--invert": dict(
+        action="store_true", help="for --masks in which 0 keeps and other values ignore keypoints"
+    ),
+    "--dask": dict(
+        type=_setting(scheduler_address),
+        metavar="ADDRESS",
+        help="run on the workers of a Dask scheduler, tcp://host:8786, with the same results",
+    ),
 }
 SEQUENCE, REQUIRED = ("--kitti", "--sequence", "--camera", "--frames"), {"required": True}
 WIDTHS = dict(type=_setting(widths), nargs="+", action="extend", metavar="W")
 MASKS = {
-    "--boundaries": dict(metavar="canny|exact", default="canny", help="edges by Canny or all changes of class (canny)"),
-    "--symmetric": dict(action="store_true", help="centre masks on boundaries; the thesis's are half a pixel off"),
-    "--classes": dict(nargs="+", action="extend", default=[], metavar="NAME", help="only boundaries of these classes"),
-    "--without-movable": dict(type=int, nargs="?", const=0, metavar="PIXELS",
-                              help="no keypoints on people and vehicles, nor within PIXELS of them (0)"),
-    "--keep": dict(metavar="boundaries|static|inverse|static-boundaries", default="boundaries",
-                   help="keypoints on boundaries, on all but movable things, on all but boundaries, or on boundaries "
-                        "between static classes (boundaries)"),
-    "--ids": dict(metavar="labels|train", default="labels", help="label maps hold label ids or train ids (labels)"),
-    "--margin": dict(type=int, default=0, metavar="PIXELS", help="no keypoints near the frame's border (0)"),
+    "--boundaries": dict(
+        metavar="canny|exact",
+        default="canny",
+        help="edges by Canny or all changes of class (canny)",
+    ),
+    "--symmetric": dict(
+        action="store_true", help="centre masks on boundaries; the thesis's are half a pixel off"
+    ),
+    "--classes": dict(
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="only boundaries of these classes",
+    ),
+    "--without-movable": dict(
+        type=int,
+        nargs="?",
+        const=0,
+        metavar="PIXELS",
+        help="no keypoints on people and vehicles, nor within PIXELS of them (0)",
+    ),
+    "--keep": dict(
+        metavar="boundaries|static|inverse|static-boundaries",
+        default="boundaries",
+        help="keypoints on boundaries, on all but movable things, on all but boundaries, or on boundaries "
+        "between static classes (boundaries)",
+    ),
+    "--ids": dict(
+        metavar="labels|train",
+        default="labels",
+        help="label maps hold label ids or train ids (labels)",
+    ),
+    "--margin": dict(
+        type=int, default=0, metavar="PIXELS", help="no keypoints near the frame's border (0)"
+    ),
 }
 
 
 def build_parser():
-    parser = _Parser(prog="thesis-repro", description="Keypoint masks from semantic segmentation for monocular visual "
-                     "odometry. thesis-repro COMMAND --help shows options, with defaults in parentheses, and examples.")
-    parser.add_argument("--version", action="version", version=f"thesis-repro {version('thesis-repro')}")
+    parser = _Parser(
+        prog="thesis-repro",
+        description="Keypoint masks from semantic segmentation for monocular visual "
+        "odometry. thesis-repro COMMAND --help shows options, with defaults in parentheses, and examples.",
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"thesis-repro {version('thesis-repro')}"
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    examples = (Path(__file__).parent / "report/templates/examples.txt").read_text(encoding="utf-8").splitlines()
+    examples = (
+        (Path(__file__).parent / "report/templates/examples.txt")
+        .read_text(encoding="utf-8")
+        .splitlines()
+    )
 
     def command(function, *shared, **changes):
-        """Add the parser of a command with options of SHARED and MASKS. changes: arguments that differ, by option."""
+        """Add the parser of a command with options of SHARED and MASKS. changes: arguments that
+        differ, by option.
+        """
         name = function.__name__.replace("_", "-")
         sub = commands.add_parser(
-            name, help=function.__doc__, description=textwrap.fill(function.__doc__, 80),
-            epilog="\n".join(["examples:", *(line for line in examples if line.startswith(f"thesis-repro {name} "))]),
-            formatter_class=argparse.RawDescriptionHelpFormatter)
+            name,
+            help=function.__doc__,
+            description=textwrap.fill(function.__doc__, 80),
+            epilog="\n".join(
+                [
+                    "examples:",
+                    *(line for line in examples if line.startswith(f"thesis-repro {name} ")),
+                ]
+            ),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
         for name in shared:
@@ -401,65 +582,213 @@ def build_parser():
         return sub
 
     add = command(synthesize).add_argument
-    add("out", type=Path, metavar="OUT", help="new folder, or one in which this command was stopped")
+    add(
+        "out", type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
+    )
     add("--profile", choices=tuple(PROFILES), default="demo", help="size of the world (demo)")
 
     add = command(check_data, "--kitti", "--cityscapes").add_argument
-    add("--kitti-semantic", type=Path, metavar="ROOT", help="folder of KITTI's street scenes: train/, trainannot/")
-    add("--deep", action="store_true", help="decode every file, on all cores, not only check its header and end")
+    add(
+        "--kitti-semantic",
+        type=Path,
+        metavar="ROOT",
+        help="folder of KITTI's street scenes: train/, trainannot/",
+    )
+    add(
+        "--deep",
+        action="store_true",
+        help="decode every file, on all cores, not only check its header and end",
+    )
 
     add = command(predict, "--frames", "--dask", "--output").add_argument
-    add("--images", type=Path, nargs="+", action="extend", required=True, metavar="DIR",
-        help="folder of PNG or JPEG images, one sequence, or a KITTI folder; several get a subfolder each")
-    add("--model", type=Path, nargs="+", action="extend", default=[], metavar="FILE",
-        help="trained model (.keras, .hdf5); the outputs of several are averaged (the model in the package)")
+    add(
+        "--images",
+        type=Path,
+        nargs="+",
+        action="extend",
+        required=True,
+        metavar="DIR",
+        help="folder of PNG or JPEG images, one sequence, or a KITTI folder; several get a subfolder each",
+    )
+    add(
+        "--model",
+        type=Path,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="trained model (.keras, .hdf5); the outputs of several are averaged (the model in the package)",
+    )
 
     add = command(masks, *SEQUENCE, *MASKS, "--output").add_argument
     add("--labels", type=Path, required=True, metavar="DIR", help="a label map for each frame")
-    add("--dilation", **WIDTHS, required=True, help="in pixels, such as 5,10 or 1-15; several get a subfolder each")
+    add(
+        "--dilation",
+        **WIDTHS,
+        required=True,
+        help="in pixels, such as 5,10 or 1-15; several get a subfolder each",
+    )
 
     sub = command(odometry, *SEQUENCE, *MASKS, "--invert", "--plot", "--json")
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
-    add("--speed", type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)")
-    either("--masks", type=Path, metavar="DIR", help="a mask for each frame or one for all: 255 keep, 0 ignore")
-    either("--labels", type=Path, metavar="DIR", help="a label map for each frame; needs --dilation")
-    add("--dilation", type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
-    add("--pyslam", choices=("2021", "2024"), default="2021", help="the thesis's PySLAM (2021) or a later one (2021)")
-    add("--estimator", metavar="thesis|inliers|refined",
-        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)")
-    add("--detector", metavar="shi-tomasi|orb", help="keypoint detector; the tracker stays the same (shi-tomasi)")
-    add("--fallback", action="store_true", default=None, help="use all keypoints where masked ones fail")
-    add("--max-keypoints", type=int, metavar="N", help="maximum number of keypoints in a frame (2000)")
-    add("--boresight", type=float, nargs=3, metavar=("PITCH", "YAW", "ROLL"),
-        help="rotate the path by the angles that the command boresight estimates, in degrees")
-    add("--output", type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format")
+    add(
+        "--speed",
+        type=float,
+        metavar="M_PER_S",
+        help="speed, if there is no ground truth (1 m a frame)",
+    )
+    either(
+        "--masks",
+        type=Path,
+        metavar="DIR",
+        help="a mask for each frame or one for all: 255 keep, 0 ignore",
+    )
+    either(
+        "--labels", type=Path, metavar="DIR", help="a label map for each frame; needs --dilation"
+    )
+    add(
+        "--dilation",
+        type=int,
+        metavar="W",
+        help="dilation width, in pixels, of masks from label maps",
+    )
+    add(
+        "--pyslam",
+        choices=("2021", "2024"),
+        default="2021",
+        help="the thesis's PySLAM (2021) or a later one (2021)",
+    )
+    add(
+        "--estimator",
+        metavar="thesis|inliers|refined",
+        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+    )
+    add(
+        "--detector",
+        metavar="shi-tomasi|orb",
+        help="keypoint detector; the tracker stays the same (shi-tomasi)",
+    )
+    add(
+        "--fallback",
+        action="store_true",
+        default=None,
+        help="use all keypoints where masked ones fail",
+    )
+    add(
+        "--max-keypoints",
+        type=int,
+        metavar="N",
+        help="maximum number of keypoints in a frame (2000)",
+    )
+    add(
+        "--boresight",
+        type=float,
+        nargs=3,
+        metavar=("PITCH", "YAW", "ROLL"),
+        help="rotate the path by the angles that the command boresight estimates, in degrees",
+    )
+    add(
+        "--output", type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
+    )
     add("--tum", type=Path, metavar="FILE", help="write the estimated poses in TUM format")
-    add("--video", type=Path, metavar="OUT.mp4", help="write a video of the frames, the keypoints and the path")
+    add(
+        "--video",
+        type=Path,
+        metavar="OUT.mp4",
+        help="write a video of the frames, the keypoints and the path",
+    )
 
     command(boresight, "--kitti", "--sequences", "--frames", "--json", kitti=REQUIRED)
 
-    sub = command(study, "--kitti", "--sequences", "--frames", "--invert", *MASKS, "--output", kitti=REQUIRED)
+    sub = command(
+        study, "--kitti", "--sequences", "--frames", "--invert", *MASKS, "--output", kitti=REQUIRED
+    )
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
-    for kind, content in (("labels", "label maps, any size"), ("masks", "masks, 255 keeps keypoints, 0 ignores them")):
-        add(f"--{kind}", dest="sources", action="append", metavar="DIR",
+    for kind, content in (
+        ("labels", "label maps, any size"),
+        ("masks", "masks, 255 keeps keypoints, 0 ignores them"),
+    ):
+        add(
+            f"--{kind}",
+            dest="sources",
+            action="append",
+            metavar="DIR",
             type=lambda text, kind=kind: (kind, _path(text)),
-            help=f"folder with a subfolder NN for each sequence ({content}); can be repeated")
-    add("--name", action="append", default=[], metavar="NAME", help="name of a --labels or --masks folder (its name)")
-    add("--widths", **WIDTHS, help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)")
-    add("--controls", type=int, nargs="?", const=10, metavar="W", help="run controls, too, for masks of width W (10)")
-    add("--repetitions", type=int, default=5, metavar="N", help="shuffles of the matched points for each run (5)")
-    add("--estimator", nargs="+", choices=("thesis", "refined"), default=["thesis"], help="one or both (thesis)")
-    either("--jobs", type=_setting(partial(number, "JOBS")), metavar="N", help="number of processes (number of cores)")
+            help=f"folder with a subfolder NN for each sequence ({content}); can be repeated",
+        )
+    add(
+        "--name",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="name of a --labels or --masks folder (its name)",
+    )
+    add(
+        "--widths",
+        **WIDTHS,
+        help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",
+    )
+    add(
+        "--controls",
+        type=int,
+        nargs="?",
+        const=10,
+        metavar="W",
+        help="run controls, too, for masks of width W (10)",
+    )
+    add(
+        "--repetitions",
+        type=int,
+        default=5,
+        metavar="N",
+        help="shuffles of the matched points for each run (5)",
+    )
+    add(
+        "--estimator",
+        nargs="+",
+        choices=("thesis", "refined"),
+        default=["thesis"],
+        help="one or both (thesis)",
+    )
+    either(
+        "--jobs",
+        type=_setting(partial(number, "JOBS")),
+        metavar="N",
+        help="number of processes (number of cores)",
+    )
     either("--dask", **SHARED["--dask"])
-    add("--plan", action="store_true", help="print the estimated time and disk space, and run nothing")
+    add(
+        "--plan",
+        action="store_true",
+        help="print the estimated time and disk space, and run nothing",
+    )
 
-    add = command(evaluate, "--kitti", "--sequence", "--frames", "--plot", "--json", sequence={
-        "required": False, "help": "sequence of the files; of folders, evaluate only this sequence"}).add_argument
-    add("poses", type=Path, nargs="+", metavar="FILE_OR_DIR",
+    add = command(
+        evaluate,
+        "--kitti",
+        "--sequence",
+        "--frames",
+        "--plot",
+        "--json",
+        sequence={
+            "required": False,
+            "help": "sequence of the files; of folders, evaluate only this sequence",
+        },
+    ).add_argument
+    add(
+        "poses",
+        type=Path,
+        nargs="+",
+        metavar="FILE_OR_DIR",
         help="trajectory in KITTI format (a line for each frame) or TUM format (matched by time, keyframes suffice), "
-             "or folder with NN.txt or NN.tum for each sequence, which also gets a mean")
-    add("--align", choices=("none", "se3", "sim3", "scale"), default="none",
-        help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)")
+        "or folder with NN.txt or NN.tum for each sequence, which also gets a mean",
+    )
+    add(
+        "--align",
+        choices=("none", "se3", "sim3", "scale"),
+        default="none",
+        help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
+    )
 
     command(plan, "--kitti", "--cityscapes", kitti=REQUIRED)
     return parser
@@ -467,7 +796,9 @@ def build_parser():
 
 def main(arguments=None):
     options = build_parser().parse_args(arguments)
-    options.command_line = shlex.join(["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)])
+    options.command_line = shlex.join(
+        ["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)]
+    )
     try:
         with longrun.stoppable():
             longrun.need_addresses(4 if options.function is predict else 2)

@@ -9,12 +9,15 @@ DIGEST_NAME = "compiled-from"  # a file in the folder of Numba's cache
 
 
 def forget_stale(folder):
-    """Delete Numba's cache of the modules in and below a folder if the bytes of one of them have changed.
+    """Delete Numba's cache of the modules in and below a folder if the bytes of one of them have
+    changed.
 
-    Numba compares only the date and size of the file that defines a function. It misses changes of functions that are
-    called from other files, and changes that a jumping clock hides.
+    Numba compares only the date and size of the file that defines a function. It misses changes of
+    functions that are called from other files, and changes that a jumping clock hides.
     """
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.rglob("*.py")))).hexdigest()
+    digest = hashlib.sha256(
+        b"".join(path.read_bytes() for path in sorted(folder.rglob("*.py")))
+    ).hexdigest()
     record = folder / "__pycache__" / DIGEST_NAME
     try:
         if record.is_file() and record.read_text() == digest:
@@ -32,13 +35,15 @@ for _folder in (path.parent for path in Path(__file__).parent.glob("*/__init__.p
 
 
 def fast(function, **options):
-    """Compile a function of numbers and arrays. The machine code is cached on disk and runs without Python's lock.
+    """Compile a function of numbers and arrays. The machine code is cached on disk and runs without
+    Python's lock.
 
-    Compiled functions may only call functions from their own folder of the package or below it (see `forget_stale`).
-    Division by zero gives infinity or NaN, as in numpy and OpenCV.
+    Compiled functions may only call functions from their own folder of the package or below it (see
+    `forget_stale`). Division by zero gives infinity or NaN, as in numpy and OpenCV.
 
-    Numba compiles a function anew for each combination of types and memory layouts, and compiles the numpy calls in it
-    as well. So callers pass C-contiguous arrays of one type. Loops over numbers compile faster than array expressions.
+    Numba compiles a function anew for each combination of types and memory layouts, and compiles
+    the numpy calls in it as well. So callers pass C-contiguous arrays of one type. Loops over
+    numbers compile faster than array expressions.
     """
     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
     try:
@@ -48,7 +53,8 @@ def fast(function, **options):
 
 
 def inner(function):
-    """Compile a function for calls from compiled functions only: it is inlined there, and Python cannot call it.
+    """Compile a function for calls from compiled functions only: it is inlined there, and Python
+    cannot call it.
 
     This saves compile time and run time.
     """

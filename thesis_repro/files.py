@@ -20,42 +20,57 @@ from tqdm.utils import ObjectWrapper
 from thesis_repro import InputError, longrun
 
 BAR_DELAY = 1  # seconds before a progress bar appears
-END_MARKS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # the last bytes of a complete file
+# the last bytes of a complete file
+END_MARKS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
 TAIL = 4096  # bytes at the end of a file in which `glance` looks for its end mark
 
 
 def read_gray(path):
     """Read one image as 8-bit gray, shape (height, width). Colours become their luminance.
 
-    Raises InputError if the file is not a complete PNG or JPEG image with 8 bits a channel, and if it claims more
-    pixels than Pillow considers safe. JPEG has no checksums, so a changed byte inside a JPEG file goes unnoticed.
+    Raises InputError if the file is not a complete PNG or JPEG image with 8 bits a channel, and if
+    it claims more pixels than Pillow considers safe. JPEG has no checksums, so a changed byte
+    inside a JPEG file goes unnoticed.
     """
     return _read(path, "L", cv2.IMREAD_GRAYSCALE)
 
 
 def read_color(path):
-    """Read one image as 8-bit red, green, blue, shape (height, width, 3). Raises what `read_gray` raises."""
+    """Read one image as 8-bit red, green, blue, shape (height, width, 3). Raises what
+    `read_gray` raises.
+    """
     return _read(path, "RGB", cv2.IMREAD_COLOR_RGB)
 
 
 def read_ids(path):
-    """Read one PNG of numbers such as class ids, shape (height, width) uint8, without changing a number.
+    """Read one PNG of numbers such as class ids, shape (height, width) uint8, without changing a
+    number.
 
-    Raises what `read_gray` raises, and InputError if reading as gray would change numbers: for a palette, fewer than 8
-    bits, channels that differ, or another format.
+    Raises what `read_gray` raises, and InputError if reading as gray would change numbers: for a
+    palette, fewer than 8 bits, channels that differ, or another format.
     """
     with _opened(path) as (_, image):
-        stored = str(image.tile)  # contains Pillow's name of the stored mode: "L;4" is gray with 4 bits
+        # contains Pillow's name of the stored mode: "L;4" is gray with 4 bits
+        stored = str(image.tile)
     channels = np.atleast_3d(read_gray(path) if image.mode == "L" else read_color(path))
-    if image.format != "PNG" or image.mode in ("1", "P") or "L;" in stored or (channels != channels[..., :1]).any():
-        raise InputError(f"{path}: must be an 8-bit gray PNG, which keeps ids as they are; convert it")
+    if (
+        image.format != "PNG"
+        or image.mode in ("1", "P")
+        or "L;" in stored
+        or (channels != channels[..., :1]).any()
+    ):
+        raise InputError(
+            f"{path}: must be an 8-bit gray PNG, which keeps ids as they are; convert it"
+        )
     return np.ascontiguousarray(channels[..., 0])
 
 
 def glance(path):
-    """Return the size (height, width) of an image from its header, and check that the file has its end.
+    """Return the size (height, width) of an image from its header, and check that the file has its
+    end.
 
-    Nothing is decoded, so this is fast. Raises InputError as `read_gray` does, except for damage in the middle.
+    Nothing is decoded, so this is fast. Raises InputError as `read_gray` does, except for damage in
+    the middle.
     """
     with _opened(path) as (file, image):
         file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
@@ -83,7 +98,9 @@ def _read(path, mode, flag):
 
 @contextmanager
 def _opened(path):
-    """Open an image file and read its header: yields (file, image). Turns all errors of the block into InputError."""
+    """Open an image file and read its header: yields (file, image). Turns all errors of the
+    block into InputError.
+    """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -96,30 +113,56 @@ def _opened(path):
         raise
     except Image.DecompressionBombError:
         raise InputError(f"{path}: claims more pixels than any camera has; remove it") from None
-    except (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, cv2.error) as error:
-        reason = getattr(error, "strerror", None) or "it is not a complete PNG or JPEG image; copy it again"
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        IndexError,
+        struct.error,
+        cv2.error,
+    ) as error:
+        reason = (
+            getattr(error, "strerror", None)
+            or "it is not a complete PNG or JPEG image; copy it again"
+        )
         raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
 def listed(folder, pattern="*.png"):
-    """Return the files of a folder that match a pattern, in sorted order, without hidden (temporary) files."""
+    """Return the files of a folder that match a pattern, in sorted order, without hidden
+    (temporary) files.
+    """
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
 
 
 def images(folder):
-    """Return the PNG or JPEG images of a folder, sorted by name with 9 before 10, without hidden files.
+    """Return the PNG or JPEG images of a folder, sorted by name with 9 before 10, without hidden
+    files.
 
     Raises InputError if the folder holds both kinds.
     """
-    paths = [path for path in listed(folder, "*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    paths = [
+        path for path in listed(folder, "*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")
+    ]
     if len({path.suffix.lower() == ".png" for path in paths}) > 1:
         raise InputError(f"{folder}: holds PNG and JPEG images; move those of one kind away")
-    return sorted(paths, key=lambda path: ([(letters, int(digits or -1)) for letters, digits in
-                                            re.findall(r"(\D*)(\d*)", path.stem)], path))
+    return sorted(
+        paths,
+        key=lambda path: (
+            [
+                (letters, int(digits or -1))
+                for letters, digits in re.findall(r"(\D*)(\d*)", path.stem)
+            ],
+            path,
+        ),
+    )
 
 
 def numbers_of(paths):
-    """Return the integers at the ends of file names, or None if a name has none or the names start differently."""
+    """Return the integers at the ends of file names, or None if a name has none or the names
+    start differently.
+    """
     matches = [re.fullmatch(r"(.*?)(\d+)", path.stem) for path in paths]
     if not all(matches) or len({match[1] for match in matches}) > 1:
         return None
@@ -136,10 +179,12 @@ def is_whole(path):
 
 @contextmanager
 def atomic(path):
-    """Yield a temporary path; rename it to `path` when the block ends, or delete it if the block raises an error.
+    """Yield a temporary path; rename it to `path` when the block ends, or delete it if the block
+    raises an error.
 
-    A symbolic link is kept and its target is replaced. A file in a folder of results is added to the list of files
-    written there (see `stages.stage`). A stream (see `is_stream`) gets the bytes when the block ends.
+    A symbolic link is kept and its target is replaced. A file in a folder of results is added to
+    the list of files written there (see `stages.stage`). A stream (see `is_stream`) gets the bytes
+    when the block ends.
     """
     path = Path(path)
     if is_stream(path):
@@ -166,22 +211,30 @@ def atomic(path):
         number, name = longrun.number_of(error), getattr(error, "filename", None)
         if number is None or name not in (None, str(temporary), temporary):
             raise
-        raise OSError(number, os.strerror(number), str(path)) from error  # instead of the temporary name or none
+        # instead of the temporary name or none
+        raise OSError(number, os.strerror(number), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def _add_to_list(path, file):
-    """Add a file that is about to be renamed to `path` to the list of its folder of results, if there is one."""
-    folder = next((folder for folder in path.absolute().parents if (folder / longrun.RECORD).exists()), None)
+    """Add a file that is about to be renamed to `path` to the list of its folder of results, if
+    there is one.
+    """
+    folder = next(
+        (folder for folder in path.absolute().parents if (folder / longrun.RECORD).exists()), None
+    )
     if folder is not None and path.name != longrun.RECORD:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-        with open(folder / longrun.LIST, "a", encoding="utf-8") as written:  # short appends do not mix
+        # short appends do not mix
+        with open(folder / longrun.LIST, "a", encoding="utf-8") as written:
             written.write(f"{digest} {json.dumps(str(path.absolute().relative_to(folder)))}\n")
 
 
 def is_stream(path):
-    """Return whether a path is a device, a pipe or an open stream, which renaming a file cannot replace."""
+    """Return whether a path is a device, a pipe or an open stream, which renaming a file cannot
+    replace.
+    """
     is_open = is_stdout(path) or str(path).startswith(("/dev/std", "/dev/fd/", "/proc/self/fd/"))
     return is_open or path.exists() and not path.is_file() and not path.is_dir()
 
@@ -192,15 +245,21 @@ def is_stdout(path):
 
 
 def check_output(path):
-    """Raise InputError if a file cannot be written to `path`, or could be deleted later with results around it."""
+    """Raise InputError if a file cannot be written to `path`, or could be deleted later with
+    results around it.
+    """
     if is_stream(path):
         return
     path = path.resolve() if path.is_symlink() else path.absolute()
     parent = next(folder for folder in path.parents if folder.exists())
     if path.is_dir() or not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError(f"{path}: cannot be written; name a file in a folder that you may write to")
+        raise InputError(
+            f"{path}: cannot be written; name a file in a folder that you may write to"
+        )
     if any((folder / longrun.RECORD).exists() for folder in path.parents):
-        raise InputError(f"{path}: is in a folder of results, with which it could be deleted; name a file elsewhere")
+        raise InputError(
+            f"{path}: is in a folder of results, with which it could be deleted; name a file elsewhere"
+        )
 
 
 def write_text(path, text):
@@ -222,7 +281,9 @@ def write_array(path, array):
 
 
 def needed(path, notebook):
-    """Return `path`, which an earlier notebook writes. Raises InputError with the notebook's name if it is missing."""
+    """Return `path`, which an earlier notebook writes. Raises InputError with the notebook's
+    name if it is missing.
+    """
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: does not exist yet; run notebook {notebook} first")
@@ -230,19 +291,30 @@ def needed(path, notebook):
 
 
 def progress(iterable=None, description="", total=None, unit="frame", initial=0):
-    """Return a tqdm progress bar on standard error, or on the file that THESIS_REPRO_PROGRESS names.
+    """Return a tqdm progress bar on standard error, or on the file that THESIS_REPRO_PROGRESS
+    names.
 
-    `make figures` sets the variable to its terminal for the bars inside notebooks. Without a terminal, the bar is
-    replaced by a line every 20 seconds.
+    `make figures` sets the variable to its terminal for the bars inside notebooks. Without a
+    terminal, the bar is replaced by a line every 20 seconds.
     """
     stream = sys.stderr
     with suppress(KeyError, OSError):
         stream = open(os.environ["THESIS_REPRO_PROGRESS"], "a", buffering=1)
     live = stream.isatty()
-    return tqdm(iterable, desc=description, total=total, unit=unit, initial=initial, dynamic_ncols=live,
-                file=stream if live else _Lines(stream), mininterval=0.2 if live else 20, leave=not live,
-                delay=BAR_DELAY, ascii=None if live else True,
-                smoothing=0)  # the average over the whole time predicts better than the last steps
+    return tqdm(
+        iterable,
+        desc=description,
+        total=total,
+        unit=unit,
+        initial=initial,
+        dynamic_ncols=live,
+        file=stream if live else _Lines(stream),
+        mininterval=0.2 if live else 20,
+        leave=not live,
+        delay=BAR_DELAY,
+        ascii=None if live else True,
+        smoothing=0,
+    )  # the average over the whole time predicts better than the last steps
 
 
 class _Lines(ObjectWrapper):

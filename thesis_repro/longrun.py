@@ -1,6 +1,8 @@
-"""Long runs: locks on folders, the log, the summary at the end, and one-line errors for a lack of space or memory.
+"""Long runs: locks on folders, the log, the summary at the end, and one-line errors for a lack of
+space or memory.
 
-This module imports only the standard library, so it still works if there is too little memory for other packages.
+This module imports only the standard library, so it still works if there is too little memory for
+other packages.
 """
 
 import ctypes
@@ -24,18 +26,40 @@ from thesis_repro import InputError, one_line
 LOG = "log.txt"
 RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
 LIST = "written.log"  # beside the record: the files that were written there, see `files.atomic`
-TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")  # matches the names that `temporary` returns
+# matches the names that `temporary` returns
+TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")
 # what a user can do about a system error, by its number
-ROOM, ACCESS = "make room on its disk, or name a folder on another", "name a folder that you may write to"
-REMEDIES = {errno.ENOSPC: ROOM, errno.EDQUOT: ROOM, errno.EFBIG: "allow larger files (ulimit -f)", errno.EROFS: ACCESS,
-            errno.EACCES: ACCESS, errno.EPERM: ACCESS, errno.EMFILE: "allow more open files (ulimit -n)",
-            errno.EIO: "check its disk, or the connection to it"}
+ROOM, ACCESS = (
+    "make room on its disk, or name a folder on another",
+    "name a folder that you may write to",
+)
+REMEDIES = {
+    errno.ENOSPC: ROOM,
+    errno.EDQUOT: ROOM,
+    errno.EFBIG: "allow larger files (ulimit -f)",
+    errno.EROFS: ACCESS,
+    errno.EACCES: ACCESS,
+    errno.EPERM: ACCESS,
+    errno.EMFILE: "allow more open files (ulimit -n)",
+    errno.EIO: "check its disk, or the connection to it",
+}
 NO_MEMORY = "memory ran out; free some, or use fewer processes (--jobs, JOBS), and start again"
-WORKER_KILLED = ("a process was killed, most likely because memory ran out; start again with fewer processes (--jobs, "
-                 "JOBS) to resume")
+WORKER_KILLED = (
+    "a process was killed, most likely because memory ran out; start again with fewer processes (--jobs, "
+    "JOBS) to resume"
+)
 # texts of libraries' own errors
-NO_MEMORY_TEXTS = ("MemoryError", "nsufficient memory", "annot allocate memory", "nable to allocate", "bad_alloc",
-                  "ut of memory", "ResourceExhausted", "failed to map segment", "can't start new thread")
+NO_MEMORY_TEXTS = (
+    "MemoryError",
+    "nsufficient memory",
+    "annot allocate memory",
+    "nable to allocate",
+    "bad_alloc",
+    "ut of memory",
+    "ResourceExhausted",
+    "failed to map segment",
+    "can't start new thread",
+)
 
 _log = logging.getLogger("thesis_repro")
 _log.addHandler(logging.NullHandler())
@@ -44,35 +68,56 @@ _log.propagate = False
 
 
 def explain(error):
-    """Return one line for an InputError or for a lack of space, permission or memory; None for any other error.
+    """Return one line for an InputError or for a lack of space, permission or memory; None for any
+    other error.
 
-    The line names the file, if it is known, and says what to do. The causes of the error are searched too.
+    The line names the file, if it is known, and says what to do. The causes of the error are
+    searched too.
     """
     if isinstance(error, InputError):
         return str(error)
     while error is not None:
-        number, path, text = number_of(error), getattr(error, "filename", None), f"{type(error).__name__}: {error}"
+        number, path, text = (
+            number_of(error),
+            getattr(error, "filename", None),
+            f"{type(error).__name__}: {error}",
+        )
         if number == errno.ENOMEM or any(words in text for words in NO_MEMORY_TEXTS):
             return NO_MEMORY
         if text.startswith("TerminatedWorkerError"):  # of joblib
             return WORKER_KILLED
-        if number in REMEDIES or isinstance(error, OSError) and path is not None and number is not None:
+        if (
+            number in REMEDIES
+            or isinstance(error, OSError)
+            and path is not None
+            and number is not None
+        ):
             return f"{path or 'a file'}: {os.strerror(number)}; {REMEDIES.get(number, 'check the path')}"
         error = error.__cause__ or error.__context__
     return None
 
 
 def number_of(error):
-    """Return the system's number of an error, or None. HDF5 and other libraries give the system's text only."""
-    numbers = (number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(number) in str(error))
+    """Return the system's number of an error, or None. HDF5 and other libraries give the
+    system's text only.
+    """
+    numbers = (
+        number
+        for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        if os.strerror(number) in str(error)
+    )
     return getattr(error, "errno", None) or next(numbers, None)
 
 
 def need_addresses(gigabytes):
-    """Raise InputError if `ulimit -v` is too low. Some libraries would then end the process without a message."""
+    """Raise InputError if `ulimit -v` is too low. Some libraries would then end the process
+    without a message.
+    """
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < gigabytes * 2**30:
-        raise InputError(f"ulimit -v {limit // 1024}: too little memory; allow {gigabytes * 2**20} or more")
+        raise InputError(
+            f"ulimit -v {limit // 1024}: too little memory; allow {gigabytes * 2**20} or more"
+        )
 
 
 def remedy(text):
@@ -83,7 +128,9 @@ def remedy(text):
 
 
 def report_error(error):
-    """Print the error that ends a command, and return the exit status. Raises an error that `explain` does not know."""
+    """Print the error that ends a command, and return the exit status. Raises an error that
+    `explain` does not know.
+    """
     line = explain(error)
     if line is None:
         raise error
@@ -97,7 +144,9 @@ def temporary(path):
 
 
 def sweep(folder):
-    """Delete the temporary files of killed runs in and below a folder. The caller must hold its lock."""
+    """Delete the temporary files of killed runs in and below a folder. The caller must hold its
+    lock.
+    """
     for path in Path(folder).rglob(".*"):
         if TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
@@ -108,7 +157,8 @@ _held = set()  # device and inode of each path that this process has locked
 
 @contextmanager
 def claimed(folder):
-    """Create a folder if needed, and lock it until the block ends. Raises InputError if another process has locked it.
+    """Create a folder if needed, and lock it until the block ends. Raises InputError if another
+    process has locked it.
 
     Folders that were created here and are still empty at the end are removed.
     """
@@ -128,7 +178,9 @@ def claimed(folder):
 
 @contextmanager
 def locked(path):
-    """Lock an existing folder or file until the block ends. The same process may lock it again within the block."""
+    """Lock an existing folder or file until the block ends. The same process may lock it again
+    within the block.
+    """
     status = os.stat(path)
     key = status.st_dev, status.st_ino
     if key in _held:
@@ -153,32 +205,53 @@ def locked(path):
 
 
 class _LogFile(MemoryHandler):
-    """The log of a run. It is written once the folder holds results, so a refused run leaves no files."""
+    """The log of a run. It is written once the folder holds results, so a refused run leaves no
+    files.
+    """
 
     def __init__(self, folder, has_results):
-        super().__init__(1, target=logging.FileHandler(folder / LOG, delay=True, encoding="utf-8"), flushOnClose=False)
+        super().__init__(
+            1,
+            target=logging.FileHandler(folder / LOG, delay=True, encoding="utf-8"),
+            flushOnClose=False,
+        )
         self.target.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-        self.target.handleError = lambda record: None  # a full disk is reported when results are written
-        self.folder, self.has_results, self.warnings, self.started = folder, has_results, 0, time.monotonic()
+        # a full disk is reported when results are written
+        self.target.handleError = lambda record: None
+        self.folder, self.has_results, self.warnings, self.started = (
+            folder,
+            has_results,
+            0,
+            time.monotonic(),
+        )
 
     def shouldFlush(self, record):
         self.warnings += record.levelno == logging.WARNING
-        self.has_results = (self.has_results or (self.folder / RECORD).exists()
-                            or any(self.folder.glob(f"*/{RECORD}")))
+        self.has_results = (
+            self.has_results
+            or (self.folder / RECORD).exists()
+            or any(self.folder.glob(f"*/{RECORD}"))
+        )
         return self.has_results
 
     def end(self, text, reused=0):
-        """Print a summary of the run, its time, the number of results reused from an earlier run, and its warnings."""
+        """Print a summary of the run, its time, the number of results reused from an earlier
+        run, and its warnings.
+        """
         seconds = timedelta(seconds=round(time.monotonic() - self.started))
         reused_text = f"from an earlier run: {reused:,}; " if reused else ""
-        say(f"{text}\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}")
+        say(
+            f"{text}\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}"
+        )
 
 
 @contextmanager
 def logged(folder, title, has_results=False):
-    """Log into a folder what `say`, `remark` and `warn` print, Python's warnings, and the error that ends the block.
+    """Log into a folder what `say`, `remark` and `warn` print, Python's warnings, and the error
+    that ends the block.
 
-    Yields the `_LogFile`. title: the first line. has_results: write the log at once, not only when results appear.
+    Yields the `_LogFile`. title: the first line. has_results: write the log at once, not only when
+    results appear.
     """
     handler = _LogFile(Path(folder), has_results)
     loggers = _log, logging.getLogger("py.warnings")
@@ -238,10 +311,15 @@ def stoppable():
 
     They raise KeyboardInterrupt with the signal's number. An ignored signal (nohup) stays ignored.
     """
+
     def stop(number, _):
         raise KeyboardInterrupt(number)
 
-    numbers = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) == signal.SIG_DFL]
+    numbers = [
+        number
+        for number in (signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) == signal.SIG_DFL
+    ]
     for number in numbers:
         signal.signal(number, stop)
     try:
@@ -252,7 +330,9 @@ def stoppable():
 
 
 def end_with_parent():
-    """Let the system kill this worker process when its parent ends, even if the parent is killed (Linux only)."""
+    """Let the system kill this worker process when its parent ends, even if the parent is
+    killed (Linux only).
+    """
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
         if os.getppid() == 1:

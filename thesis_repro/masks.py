@@ -1,6 +1,7 @@
 """The keypoint mask filter (Section 3.6, A.8): from a label map to edges to a dilated mask.
 
-A mask is a uint8 image of the frame's size. Keypoints are allowed where it is 255 and forbidden where it is 0.
+A mask is a uint8 image of the frame's size. Keypoints are allowed where it is 255 and forbidden
+where it is 0.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -18,26 +19,30 @@ from thesis_repro.kitti import Sequence, check_size
 BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
 CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a boundary up to two pixels away
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked or not
-# Where keypoints are allowed: on boundaries, as in the thesis, or as in published SLAM systems with segmentation.
+# Where keypoints are allowed: on boundaries, as in the thesis, or as in published SLAM systems with
+# segmentation.
 KEEP = ("boundaries", "static", "inverse", "static-boundaries")
-DYNASLAM_MARGIN = 15  # pixels around movable objects that DynaSLAM excludes as well (in its Frame.cc)
+# pixels around movable objects that DynaSLAM excludes as well (in its Frame.cc)
+DYNASLAM_MARGIN = 15
 
 
 @dataclass(frozen=True)
 class MaskSettings:
     """Settings of the mask filter. The defaults are the thesis's.
 
-    keep: where keypoints are allowed. "boundaries": on dilated boundaries. "inverse": everywhere else. "static":
-    everywhere except on movable objects and DYNASLAM_MARGIN around them. "static-boundaries": on boundaries between two
-    classes that cannot move.
+    keep: where keypoints are allowed. "boundaries": on dilated boundaries. "inverse": everywhere
+    else. "static": everywhere except on movable objects and DYNASLAM_MARGIN around them.
+    "static-boundaries": on boundaries between two classes that cannot move.
     boundaries: "canny" finds edges in label ids, "exact" marks every change of class (see `edges`).
     canny: both thresholds (Section 3.6), with OpenCV's default 3x3 Sobel operator.
-    symmetric: no shift by half a pixel, so that a mirrored label map gives the mirrored mask (see `edges`, `dilate`).
-    classes: names of labels. Only boundaries of these classes are used, with any neighbour. Empty: all boundaries.
-    movable: no keypoints on people and vehicles, or within this many pixels of them. None: keypoints are allowed there,
-    except with "static".
-    margin: no keypoints within this many pixels of the frame's border. Points there are lost in the next frame, and
-    networks that pad with zeros predict false boundaries there.
+    symmetric: no shift by half a pixel, so that a mirrored label map gives the mirrored mask (see
+    `edges`, `dilate`).
+    classes: names of labels. Only boundaries of these classes are used, with any neighbour. Empty:
+    all boundaries.
+    movable: no keypoints on people and vehicles, or within this many pixels of them. None:
+    keypoints are allowed there, except with "static".
+    margin: no keypoints within this many pixels of the frame's border. Points there are lost in the
+    next frame, and networks that pad with zeros predict false boundaries there.
     ids: ids in the files, Cityscapes' "labels" or its "train" ids (`cityscapes.TRAINED`).
     Raises InputError for an unknown name or a negative number.
     """
@@ -56,7 +61,9 @@ class MaskSettings:
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP), ("ids", IDS)):
             if getattr(self, name) not in known:
-                raise InputError(f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(known)}")
+                raise InputError(
+                    f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(known)}"
+                )
         for name in self.classes:
             if name not in ID:
                 raise InputError(f"classes: {name!r} is no label; choose from {', '.join(ID)}")
@@ -65,19 +72,21 @@ class MaskSettings:
                 raise InputError(f"{name}={pixels}: must be 0 or more pixels")
 
 
-def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings = MaskSettings()) -> np.ndarray:
+def edges(
+    label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings = MaskSettings()
+) -> np.ndarray:
     """Edges between classes at the frame's size, (height, width) uint8, 255 on edges.
 
     label_map: (h, w) uint8 class ids. size: (height, width) of the frame.
 
-    boundaries="canny" is the thesis's way. It enlarges the label map bilinearly, which creates wrong ids along every
-    boundary. Then it runs Canny on the ids, which finds a boundary only if the two ids differ enough.
-    boundaries="exact" is the correction. It enlarges with nearest neighbour and marks every pixel whose right or lower
-    neighbour has another class.
-    symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary. OpenCV's plain nearest
-    neighbour shifts the boundary by half a pixel, and so does a mark on one side only.
-    With `classes` or keep="static-boundaries", only some boundaries are used. Canny does not know classes, so its edges
-    are kept within two pixels of these boundaries.
+    boundaries="canny" is the thesis's way. It enlarges the label map bilinearly, which creates
+    wrong ids along every boundary. Then it runs Canny on the ids, which finds a boundary only if
+    the two ids differ enough. boundaries="exact" is the correction. It enlarges with nearest
+    neighbour and marks every pixel whose right or lower neighbour has another class.
+    symmetric: enlarge by the nearest pixel centres and mark both sides of an exact boundary.
+    OpenCV's plain nearest neighbour shifts the boundary by half a pixel, and so does a mark on one
+    side only. With `classes` or keep="static-boundaries", only some boundaries are used. Canny does
+    not know classes, so its edges are kept within two pixels of these boundaries.
     """
     if settings.boundaries == "canny":
         canny = cv2.Canny(cv2.resize(label_map, size[::-1]), *settings.canny)
@@ -86,8 +95,14 @@ def edges(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings =
         class_edges = edges(label_map, size, replace(settings, boundaries="exact", symmetric=True))
         return canny & dilate(class_edges, CLASS_EDGE_WINDOW)
     enlarged = _enlarge(label_map, size, settings.symmetric)
-    selected = np.isin(enlarged, [ID[name] for name in settings.classes]) if settings.classes else np.ones(size, bool)
-    allowed = ~np.isin(enlarged, MOVABLE) if settings.keep == "static-boundaries" else np.ones(size, bool)
+    selected = (
+        np.isin(enlarged, [ID[name] for name in settings.classes])
+        if settings.classes
+        else np.ones(size, bool)
+    )
+    allowed = (
+        ~np.isin(enlarged, MOVABLE) if settings.keep == "static-boundaries" else np.ones(size, bool)
+    )
     different = np.zeros(size, bool)
     for pixel, neighbour in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         change = (enlarged[pixel] != enlarged[neighbour]) & (selected[pixel] | selected[neighbour])
@@ -107,9 +122,10 @@ def _enlarge(label_map, size, symmetric):
 def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False) -> np.ndarray:
     """Widen edges with a square of ones, `dilation_width` pixels a side.
 
-    A square of even width has no centre pixel, so OpenCV shifts the mask by half a pixel, as in the thesis.
-    symmetric: a square of even width is made one pixel smaller. The mask is as wide as before, because symmetric exact
-    edges are two pixels wide.
+    A square of even width has no centre pixel, so OpenCV shifts the mask by half a pixel, as in the
+    thesis.
+    symmetric: a square of even width is made one pixel smaller. The mask is as wide as before,
+    because symmetric exact edges are two pixels wide.
     """
     check_width(dilation_width, edge_image.shape)
     side = dilation_width - (dilation_width % 2 == 0) if symmetric else dilation_width
@@ -120,34 +136,52 @@ def check_width(dilation_width: int, size: tuple[int, int]) -> None:
     """Raise InputError if a dilation width is not possible for frames of (height, width)."""
     limit = 2 * max(size)  # a wider square always covers the whole frame
     if not 1 <= dilation_width <= limit:
-        raise InputError(f"dilation width {dilation_width}: must be 1 to {limit} pixels for frames of "
-                         f"{size[1]}x{size[0]}")
+        raise InputError(
+            f"dilation width {dilation_width}: must be 1 to {limit} pixels for frames of "
+            f"{size[1]}x{size[0]}"
+        )
 
 
 def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> np.ndarray:
-    """Pixels where keypoints are forbidden, (height, width) booleans: movable objects and the border's margin."""
+    """Pixels where keypoints are forbidden, (height, width) booleans: movable objects and the
+    border's margin.
+    """
     height, width = size
     is_forbidden = np.ones(size, bool)
-    is_forbidden[settings.margin:height - settings.margin, settings.margin:width - settings.margin] = False
+    is_forbidden[
+        settings.margin : height - settings.margin, settings.margin : width - settings.margin
+    ] = False
     if settings.movable is not None:
         moving = _enlarge(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
         is_forbidden |= dilate(moving, 2 * settings.movable + 1) > 0
     return is_forbidden
 
 
-def keypoint_mask(label_map: np.ndarray, size: tuple[int, int], dilation_width: int,
-                  settings: MaskSettings = MaskSettings()) -> np.ndarray:
-    """Keypoint mask of one frame from its label map: `dilate(edges(...))` without the `forbidden` pixels."""
+def keypoint_mask(
+    label_map: np.ndarray,
+    size: tuple[int, int],
+    dilation_width: int,
+    settings: MaskSettings = MaskSettings(),
+) -> np.ndarray:
+    """Keypoint mask of one frame from its label map: `dilate(edges(...))` without the
+    `forbidden` pixels.
+    """
     return _finish_mask(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
 
 
 def _edges_and_forbidden(label_map, size, settings):
-    """Edges and forbidden pixels (None if there are none) of a mask; both do not depend on the dilation width."""
+    """Edges and forbidden pixels (None if there are none) of a mask; both do not depend on the
+    dilation width.
+    """
     if settings.keep == "static":
         movable = DYNASLAM_MARGIN if settings.movable is None else settings.movable
-        return np.full(size, 255, np.uint8), forbidden(label_map, size, replace(settings, movable=movable))
+        return np.full(size, 255, np.uint8), forbidden(
+            label_map, size, replace(settings, movable=movable)
+        )
     has_forbidden = settings.movable is not None or settings.margin
-    return edges(label_map, size, settings), forbidden(label_map, size, settings) if has_forbidden else None
+    return edges(label_map, size, settings), forbidden(
+        label_map, size, settings
+    ) if has_forbidden else None
 
 
 def _finish_mask(edges_and_forbidden, dilation_width, settings):
@@ -163,7 +197,8 @@ def _finish_mask(edges_and_forbidden, dilation_width, settings):
 def boundaries_found(mask: np.ndarray, true_labels: np.ndarray) -> float:
     """Share of the true boundary pixels that a mask keeps, 0 to 1. NaN if there are none.
 
-    true_labels: (h, w) label ids. True boundaries are marked on both sides (`edges`, exact and symmetric).
+    true_labels: (h, w) label ids. True boundaries are marked on both sides (`edges`, exact and
+    symmetric).
     """
     true = edges(true_labels, mask.shape, MaskSettings("exact", symmetric=True)) > 0
     return float((mask[true] > 0).mean()) if true.any() else np.nan
@@ -177,22 +212,35 @@ def coverage(mask: np.ndarray) -> float:
 class LabelMasks:
     """Masks of a sequence, made from label maps on access: masks[i] for frame i.
 
-    folder: holds one label map a frame, of any size, as a PNG with the frame's name. settings: as in `keypoint_mask`.
+    folder: holds one label map a frame, of any size, as a PNG with the frame's name. settings: as
+    in `keypoint_mask`.
     Raises InputError if the folder or a frame's label map is missing.
     """
 
-    def __init__(self, folder: str | Path, sequence: Sequence, dilation_width: int,
-                 settings: MaskSettings = MaskSettings()) -> None:
-        self.paths, self.frame_paths = _paths_by_frame(folder, sequence, "label map"), sequence.frame_paths
+    def __init__(
+        self,
+        folder: str | Path,
+        sequence: Sequence,
+        dilation_width: int,
+        settings: MaskSettings = MaskSettings(),
+    ) -> None:
+        self.paths, self.frame_paths = (
+            _paths_by_frame(folder, sequence, "label map"),
+            sequence.frame_paths,
+        )
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
         check_width(dilation_width, self.size)
-        for name, pixels, limit in (("margin", self.settings.margin, (min(self.size) - 1) // 2),
-                                    ("movable", self.settings.movable or 0, max(self.size) - 1)):
+        for name, pixels, limit in (
+            ("margin", self.settings.margin, (min(self.size) - 1) // 2),
+            ("movable", self.settings.movable or 0, max(self.size) - 1),
+        ):
             if pixels > limit:
-                raise InputError(f"{name}={pixels}: leaves nothing of frames of {self.size[1]}x{self.size[0]}; give at "
-                                 f"most {limit} pixels")
+                raise InputError(
+                    f"{name}={pixels}: leaves nothing of frames of {self.size[1]}x{self.size[0]}; give at "
+                    f"most {limit} pixels"
+                )
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -212,7 +260,8 @@ def _edges_and_forbidden_of_file(path, size, settings):
     return _edges_and_forbidden(_read_once(path, settings.ids == "train"), size, settings)
 
 
-# Masks of several settings share the label map of a frame, and one control takes that of another frame: two are kept.
+# Masks of several settings share the label map of a frame, and one control takes that of another
+# frame: two are kept.
 _read_once = lru_cache(maxsize=2)(read_label_map)
 
 
@@ -225,13 +274,20 @@ def forget_edges() -> None:
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:
     """Write the mask of every frame as a PNG with the frame's name (A.8). `MaskFolder` reads them.
 
-    The folder is a stage (see stages): a stopped run resumes, and masks made from other label maps or settings are
-    deleted.
+    The folder is a stage (see stages): a stopped run resumes, and masks made from other label maps
+    or settings are deleted.
     """
     with longrun.claimed(folder):
-        folder = stages.stage(folder, labels=stages.listing(masks.paths), size=masks.size, **asdict(masks.settings),
-                              dilation_width=masks.dilation_width, frames=stages.listing(masks.frame_paths),
-                              code=stages.code("masks"), **stages.made_with("opencv-python-headless"))
+        folder = stages.stage(
+            folder,
+            labels=stages.listing(masks.paths),
+            size=masks.size,
+            **asdict(masks.settings),
+            dilation_width=masks.dilation_width,
+            frames=stages.listing(masks.frame_paths),
+            code=stages.code("masks"),
+            **stages.made_with("opencv-python-headless"),
+        )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
             if not is_whole(folder / path.name):
                 write_png(folder / path.name, masks[index])
@@ -240,9 +296,10 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
 class MaskFolder:
     """Masks of a sequence read from images with the frames' names: masks[i] for frame i.
 
-    One image is used for all frames if `folder` is a file, or holds a single file without the name of a frame.
-    invert: keypoints are allowed where the image is 0. Raises InputError if the folder or a frame's mask is missing,
-    and as `read_mask` does.
+    One image is used for all frames if `folder` is a file, or holds a single file without the name
+    of a frame.
+    invert: keypoints are allowed where the image is 0. Raises InputError if the folder or a frame's
+    mask is missing, and as `read_mask` does.
     """
 
     def __init__(self, folder: str | Path, sequence: Sequence, invert: bool = False) -> None:
@@ -259,15 +316,18 @@ class MaskFolder:
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """Read a mask for frames of (height, width): uint8, 0 where keypoints are forbidden and one other value elsewhere.
+    """Read a mask for frames of (height, width): uint8, 0 where keypoints are forbidden and one
+    other value elsewhere.
 
     Raises InputError if the size differs or there are more than two values, as in a label map.
     """
     mask = read_gray(path)
     check_size(Path(path), mask.shape, size, "its frame")
     if ((mask != 0) & (mask != mask.max())).any():
-        raise InputError(f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps go "
-                         "with --labels)")
+        raise InputError(
+            f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps go "
+            "with --labels)"
+        )
     return mask
 
 
@@ -277,16 +337,23 @@ def _paths_by_frame(folder, sequence, kind):
     if kind == "mask" and folder.is_file():
         return [folder] * len(sequence)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; it must hold one {kind} for each frame of sequence "
-                         f"{sequence.name}")
+        raise InputError(
+            f"{folder}: no such folder; it must hold one {kind} for each frame of sequence "
+            f"{sequence.name}"
+        )
     present = {path.name: path for path in listed(folder)}
     # A single mask with a frame's name is the mask of that frame only.
     if kind == "mask" and len(present) == 1 and not present.keys() & set(sequence.label_names):
         return list(present.values()) * len(sequence)
-    paths = [present.get(name) or present.get(f"{frame.name}.png")  # some tools append .png to the whole name
-             for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)]
+    # some tools append .png to the whole name
+    paths = [
+        present.get(name) or present.get(f"{frame.name}.png")
+        for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)
+    ]
     missing = [name for name, path in zip(sequence.label_names, paths, strict=True) if path is None]
     if missing:
-        raise InputError(f"{folder / missing[0]}: no such {kind} ({len(missing)} of {len(sequence)} frames of sequence "
-                         f"{sequence.name} have none); each frame needs one")
+        raise InputError(
+            f"{folder / missing[0]}: no such {kind} ({len(missing)} of {len(sequence)} frames of sequence "
+            f"{sequence.name} have none); each frame needs one"
+        )
     return paths

@@ -1,8 +1,9 @@
-"""Stages, checkpoints and digests: which inputs results were made from, and how a stopped job resumes.
+"""Stages, checkpoints and digests: which inputs results were made from, and how a stopped job
+resumes.
 
-A *stage* is a folder of results with a record of their inputs and a list of the files written there (`stage`). A
-*checkpoint* is one file from which a long job resumes (`store`, `resume`). A *digest* stands for the content of an
-input and has twelve hexadecimal digits.
+A *stage* is a folder of results with a record of their inputs and a list of the files written there
+(`stage`). A *checkpoint* is one file from which a long job resumes (`store`, `resume`). A *digest*
+stands for the content of an input and has twelve hexadecimal digits.
 """
 
 import ast
@@ -34,24 +35,35 @@ _PACKAGE = Path(__file__).parent
 def stage(folder, *, replace=True, **inputs):
     """Prepare a folder for results that are made from `inputs` (JSON values), and return its path.
 
-    Results that an earlier run made from the same inputs stay. Temporary files of killed runs are deleted. Results
-    of other inputs are deleted after a message, or InputError is raised if `replace` is False. Raises InputError also
-    if another run uses the folder, if most of its inputs have other names (results of another kind), and if a file
-    that would be deleted is not on the list of files written there or was changed since.
+    Results that an earlier run made from the same inputs stay. Temporary files of killed runs are
+    deleted. Results of other inputs are deleted after a message, or InputError is raised if
+    `replace` is False. Raises InputError also if another run uses the folder, if most of its inputs
+    have other names (results of another kind), and if a file that would be deleted is not on the
+    list of files written there or was changed since.
     """
     folder = Path(folder)
     with longrun.claimed(folder):
         inputs, earlier = json.loads(json.dumps(inputs, default=str)), record(folder)
         names = [path.name for path in folder.iterdir()]
-        if earlier is None and not all(name in (LOG, LIST) or longrun.TEMPORARY.fullmatch(name) for name in names):
-            raise InputError(f"{folder}: holds files that this project did not make; choose an empty or new folder")
+        if earlier is None and not all(
+            name in (LOG, LIST) or longrun.TEMPORARY.fullmatch(name) for name in names
+        ):
+            raise InputError(
+                f"{folder}: holds files that this project did not make; choose an empty or new folder"
+            )
         if earlier is not None and earlier != inputs:
-            changed = ", ".join(sorted(key for key in inputs | earlier if inputs.get(key) != earlier.get(key)))
+            changed = ", ".join(
+                sorted(key for key in inputs | earlier if inputs.get(key) != earlier.get(key))
+            )
             if not replace:
-                raise InputError(f"{folder}: holds results of other settings ({changed}); name another folder")
+                raise InputError(
+                    f"{folder}: holds results of other settings ({changed}); name another folder"
+                )
             if 2 * len(earlier.keys() & inputs.keys()) <= len(earlier.keys() | inputs.keys()):
-                raise InputError(f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
-                                 "choose another folder")
+                raise InputError(
+                    f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
+                    "choose another folder"
+                )
             _delete_results(folder, changed)
         longrun.sweep(folder)
         if earlier != inputs:
@@ -60,7 +72,9 @@ def stage(folder, *, replace=True, **inputs):
 
 
 def _delete_results(folder, changed):
-    """Delete the results in a folder, unless one of its files is not on the list or was changed since."""
+    """Delete the results in a folder, unless one of its files is not on the list or was changed
+    since.
+    """
     written, results, records = defaultdict(set), [], []  # written: digests by path
     for path in folder.rglob(LIST):
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -72,13 +86,18 @@ def _delete_results(folder, changed):
             records.append(path)
         elif path.name != LOG and not longrun.TEMPORARY.fullmatch(path.name):
             if path.is_symlink() or path not in written or _sha256(path) not in written[path]:
-                raise InputError(f"{folder}: cannot delete its results, made with another {changed}: {path} was not "
-                                 "written by this project, or was changed since; move it away, or name another folder")
+                raise InputError(
+                    f"{folder}: cannot delete its results, made with another {changed}: {path} was not "
+                    "written by this project, or was changed since; move it away, or name another folder"
+                )
             results.append(path)
     if results:
         longrun.say(f"{folder}: deleting {len(results):,} files, made with another {changed}")
     # the folder's record goes last, so that a killed deletion can be repeated
-    for path in (*results, *sorted(records, key=lambda path: (-len(path.parts), path.name == RECORD))):
+    for path in (
+        *results,
+        *sorted(records, key=lambda path: (-len(path.parts), path.name == RECORD)),
+    ):
         path.unlink()
         with suppress(OSError):  # the folder is not empty yet
             path.parent.rmdir()
@@ -86,7 +105,9 @@ def _delete_results(folder, changed):
 
 
 def record(folder):
-    """Return the inputs of the results in a stage's folder as a dict, or None if the folder is not a stage."""
+    """Return the inputs of the results in a stage's folder as a dict, or None if the folder is
+    not a stage.
+    """
     path = Path(folder) / RECORD
     if not path.is_file():
         return None
@@ -104,30 +125,39 @@ def made_from(folder):
 def check_worker(folder, made_from, **here):
     """Raise InputError if this worker sees another record in a stage's folder, or has other inputs.
 
-    made_from: the record that the main process sees. here: inputs as this worker has them, such as package versions.
+    made_from: the record that the main process sees. here: inputs as this worker has them, such as
+    package versions.
     """
     if record(folder) != made_from:
-        raise InputError(f"{folder}: this worker sees other files there; all workers need the same folders under the "
-                         "same paths")
+        raise InputError(
+            f"{folder}: this worker sees other files there; all workers need the same folders under the "
+            "same paths"
+        )
     if made_from | here != made_from:
-        raise InputError("this worker has another model, or another version of thesis_repro or its packages; give all "
-                         "workers the same, and restart them")
+        raise InputError(
+            "this worker has another model, or another version of thesis_repro or its packages; give all "
+            "workers the same, and restart them"
+        )
 
 
 TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
 
 
 def kept_table(path, rows=None, **options):
-    """Return the table that an earlier run wrote to a CSV file, or None if there is none or it is damaged.
+    """Return the table that an earlier run wrote to a CSV file, or None if there is none or it is
+    damaged.
 
-    Damaged means empty, cut off, with another number of rows than `rows`, or with text outside TEXT_COLUMNS.
+    Damaged means empty, cut off, with another number of rows than `rows`, or with text outside
+    TEXT_COLUMNS.
     """
     path = Path(path)
     if not path.is_file():
         return None
     with suppress(ValueError, UnicodeError):  # pandas' errors are ValueErrors
         table = pd.read_csv(path, **options)
-        numeric = all(name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table)
+        numeric = all(
+            name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table
+        )
         if numeric and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
             return table
     longrun.say(f"{path}: is damaged and will be made again", warning=True)
@@ -140,7 +170,9 @@ def kept_table(path, rows=None, **options):
 def store(path, job, arrays):
     """Write a checkpoint: `job` (JSON values) and arrays by name."""
     with atomic(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, job=json.dumps(job), **{f"array {name}": array for name, array in arrays.items()})
+        np.savez(
+            file, job=json.dumps(job), **{f"array {name}": array for name, array in arrays.items()}
+        )
 
 
 def resume(path):
@@ -153,7 +185,11 @@ def resume(path):
         return None
     try:
         with np.load(path, allow_pickle=False) as checkpoint:
-            arrays = {name.removeprefix("array "): checkpoint[name] for name in checkpoint.files if name != "job"}
+            arrays = {
+                name.removeprefix("array "): checkpoint[name]
+                for name in checkpoint.files
+                if name != "job"
+            }
             return json.loads(str(checkpoint["job"])), arrays
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         raise InputError(f"{path}: is damaged; delete it to start from the beginning") from None
@@ -164,7 +200,8 @@ def resume(path):
 
 @lru_cache
 def code(*places):
-    """Return a digest of the code of folders ("odometry") or modules ("study/controls") of this package.
+    """Return a digest of the code of folders ("odometry") or modules ("study/controls") of this
+    package.
 
     The modules of this package that they import are included. Comments and docstrings are not.
     """
@@ -172,7 +209,10 @@ def code(*places):
     for path in _modules(places):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
-            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
+            if (
+                isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
+                and ast.get_docstring(node) is not None
+            ):
                 node.body = node.body[1:]
         digest.update(f"{path.relative_to(_PACKAGE)}{ast.dump(tree)}".encode())
     return digest.hexdigest()[:12]
@@ -188,7 +228,9 @@ class _PackageFinder(ModuleFinder):
 
 
 def _modules(places):
-    """Files of folders or modules of this package and of all its modules that they import, sorted."""
+    """Files of folders or modules of this package and of all its modules that they import,
+    sorted.
+    """
     finder = _PackageFinder([str(_PACKAGE.parent)])
     for place in places:
         for path in sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"]:
@@ -197,7 +239,9 @@ def _modules(places):
 
 
 def made_with(*packages):
-    """Return what results depend on besides data and code: package versions and TensorFlow's oneDNN switch."""
+    """Return what results depend on besides data and code: package versions and TensorFlow's
+    oneDNN switch.
+    """
     versions = {name: importlib.metadata.version(name) for name in packages}
     return {"versions": versions, "onednn": os.environ.get("TF_ENABLE_ONEDNN_OPTS")}
 
@@ -214,17 +258,22 @@ def content(path):
     return contents([path])[0]
 
 
-SETTLED = 0.1  # seconds; a younger file may change again without a new date, so its digest is not remembered
+# seconds; a younger file may change again without a new date, so its digest is not remembered
+SETTLED = 0.1
 
 
 def contents(paths):
-    """Return digests of the bytes of files, in order. Raises InputError for a path that is not a regular file.
+    """Return digests of the bytes of files, in order. Raises InputError for a path that is not a
+    regular file.
 
-    The digests are remembered in the build folder. A file is read again only if its path, size, dates or inode differ.
+    The digests are remembered in the build folder. A file is read again only if its path, size,
+    dates or inode differ.
     """
     paths = [Path(path).absolute() for path in paths]
     identities = {path: _identity(path) for path in paths}
-    keys = {path: (json.dumps(str(path)), json.dumps(identity)) for path, identity in identities.items()}
+    keys = {
+        path: (json.dumps(str(path)), json.dumps(identity)) for path, identity in identities.items()
+    }
     digests = {}
     with suppress(OSError, sqlite3.Error), _digest_database() as database:
         query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
@@ -234,10 +283,14 @@ def contents(paths):
     with ThreadPoolExecutor(4) as pool:
         read = pool.map(_sha256, unknown)
         digests |= zip(unknown, progress(read, "reading the data once", len(unknown), unit="file"))
-    settled = [path for path in unknown if max(identities[path][1:3]) < time.time_ns() - SETTLED * 1e9]
+    settled = [
+        path for path in unknown if max(identities[path][1:3]) < time.time_ns() - SETTLED * 1e9
+    ]
     with suppress(OSError, sqlite3.Error), _digest_database() as database:
-        database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)",
-                             [(*keys[path], digests[path]) for path in settled])
+        database.executemany(
+            "INSERT OR REPLACE INTO digests VALUES (?, ?, ?)",
+            [(*keys[path], digests[path]) for path in settled],
+        )
     return [digests[path][:12] for path in paths]
 
 
@@ -250,11 +303,15 @@ def _identity(path):
 
 @contextmanager
 def _digest_database():
-    """Open the database of digests. The caller ignores its errors and then reads the files again."""
+    """Open the database of digests. The caller ignores its errors and then reads the files
+    again.
+    """
     folder = Path(os.environ.get("THESIS_REPRO_BUILD") or _PACKAGE.parent / "build")
     folder.mkdir(parents=True, exist_ok=True)
     with closing(sqlite3.connect(folder / "digests.sqlite", timeout=2)) as database, database:
-        database.execute("CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)")
+        database.execute(
+            "CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)"
+        )
         yield database
 
 

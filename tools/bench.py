@@ -1,7 +1,8 @@
-"""Measure what odometry and segmentation cost on this machine, as ratios: python tools/bench.py --kitti ROOT.
+"""Measure what odometry and segmentation cost on this machine, as ratios: python tools/bench.py
+--kitti ROOT.
 
-Machines differ and are busy, so only the ratio of two measurements taken in turn in one process counts. Prints a table
-and writes it as JSON. A slow machine is no error.
+Machines differ and are busy, so only the ratio of two measurements taken in turn in one process
+counts. Prints a table and writes it as JSON. A slow machine is no error.
 """
 
 import argparse
@@ -47,23 +48,37 @@ def seconds(work, clock=time.perf_counter):
 
 
 def bare_calls(previous, frame, points, intrinsics):
-    """Return the OpenCV calls of one step of the thesis's odometry, as functions without arguments."""
+    """Return the OpenCV calls of one step of the thesis's odometry, as functions without
+    arguments.
+    """
     tracked, followed = keypoints.track(previous, frame, points)
     old, new = (pose.normalise(corners[followed], intrinsics) for corners in (points, tracked))
     camera = {"focal": 1.0, "pp": (0.0, 0.0)}
     search = {"method": cv2.RANSAC, "prob": pose.PROBABILITY, "threshold": THESIS.threshold}
     matrix, _ = cv2.findEssentialMat(new, old, **search, **camera)
     corners = points.reshape(-1, 1, 2)
-    return [lambda: cv2.calcOpticalFlowPyrLK(previous, frame, corners, None, **keypoints.TRACKER),
-            lambda: cv2.findEssentialMat(new, old, **search, **camera),
-            lambda: cv2.recoverPose(matrix, new, old, **camera),
-            lambda: cv2.goodFeaturesToTrack(frame, THESIS.max_keypoints, keypoints.QUALITY, THESIS.min_distance,
-                                            blockSize=keypoints.BLOCK_SIZE)]
+    return [
+        lambda: cv2.calcOpticalFlowPyrLK(previous, frame, corners, None, **keypoints.TRACKER),
+        lambda: cv2.findEssentialMat(new, old, **search, **camera),
+        lambda: cv2.recoverPose(matrix, new, old, **camera),
+        lambda: cv2.goodFeaturesToTrack(
+            frame,
+            THESIS.max_keypoints,
+            keypoints.QUALITY,
+            THESIS.min_distance,
+            blockSize=keypoints.BLOCK_SIZE,
+        ),
+    ]
 
 
 def step_cost(sequence):
-    """Return the milliseconds of a thesis step, a refined step and the bare OpenCV calls: medians of the best of 3."""
-    followers = [Odometry(sequence.intrinsics, replace(THESIS, estimator=name)) for name in ("thesis", "refined")]
+    """Return the milliseconds of a thesis step, a refined step and the bare OpenCV calls:
+    medians of the best of 3.
+    """
+    followers = [
+        Odometry(sequence.intrinsics, replace(THESIS, estimator=name))
+        for name in ("thesis", "refined")
+    ]
     metres, costs = odometry.scales(sequence), []
     clock = time.thread_time  # does not count other processes
     previous = sequence.frame(0)
@@ -74,7 +89,10 @@ def step_cost(sequence):
         before, least = followers, np.full(3, np.inf)
         for _ in range(REPEATS):  # in turn, so that all three share the machine's load
             followers = [copy(follower) for follower in before]
-            row = [seconds(partial(follower.step, frame, metres[index]), clock) for follower in followers]
+            row = [
+                seconds(partial(follower.step, frame, metres[index]), clock)
+                for follower in followers
+            ]
             least = np.minimum(least, [*row, sum(seconds(call, clock) for call in calls)])
         costs.append(1e3 * least)
         previous = frame
@@ -82,25 +100,40 @@ def step_cost(sequence):
 
 
 def shared_cost(sequence):
-    """Return CPU milliseconds a frame of runs in one pass and one by one, and whether their poses are equal."""
+    """Return CPU milliseconds a frame of runs in one pass and one by one, and whether their
+    poses are equal.
+    """
     # edges of the frames stand in for label maps
-    contours = [cv2.Canny(cv2.GaussianBlur(frame, (0, 0), 4), 20, 60) for frame in sequence.frames()]
-    runs = {"": (THESIS, None)} | {f"{width}": (THESIS, [masks.dilate(edges, width) for edges in contours])
-                                   for width in WIDTHS}
+    contours = [
+        cv2.Canny(cv2.GaussianBlur(frame, (0, 0), 4), 20, 60) for frame in sequence.frames()
+    ]
+    runs = {"": (THESIS, None)} | {
+        f"{width}": (THESIS, [masks.dilate(edges, width) for edges in contours]) for width in WIDTHS
+    }
     together, alone = {}, {}
-    costs = [seconds(lambda: together.update(odometry.run_many(sequence, runs)), time.process_time),
-             seconds(lambda: alone.update({name: odometry.run(sequence, *run) for name, run in runs.items()}),
-                     time.process_time)]
+    costs = [
+        seconds(lambda: together.update(odometry.run_many(sequence, runs)), time.process_time),
+        seconds(
+            lambda: alone.update(
+                {name: odometry.run(sequence, *run) for name, run in runs.items()}
+            ),
+            time.process_time,
+        ),
+    ]
     same = all(np.array_equal(together[name].poses, alone[name].poses) for name in runs)
     return *(1e3 * cost / len(sequence) for cost in costs), same
 
 
 def mask_cost(sequence, labels):
-    """Return CPU milliseconds a mask, for the masks of all widths and controls made together and one by one."""
+    """Return CPU milliseconds a mask, for the masks of all widths and controls made together
+    and one by one.
+    """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        controls.masks(method, source, sequence, controls.LINE_WIDTH) for method in controls.MASKS
-        if method != "true-labels"]
+        controls.masks(method, source, sequence, controls.LINE_WIDTH)
+        for method in controls.MASKS
+        if method != "true-labels"
+    ]
     for index in range(len(sequence)):
         for column, forget in enumerate((lambda: None, masks.forget_edges)):
             masks.forget_edges()
@@ -111,19 +144,28 @@ def mask_cost(sequence, labels):
 
 
 def compile_cost():
-    """Return the CPU seconds until the refined odometry is ready, with an empty and with a full Numba cache."""
+    """Return the CPU seconds until the refined odometry is ready, with an empty and with a full
+    Numba cache.
+    """
+
     def clock():
         usage = resource.getrusage(resource.RUSAGE_CHILDREN)
         return usage.ru_utime + usage.ru_stime
 
     with tempfile.TemporaryDirectory() as cache:
-        work = partial(subprocess.run, [sys.executable, "-c", FIRST_USE], check=True,
-                       env={**os.environ, "NUMBA_CACHE_DIR": cache})
+        work = partial(
+            subprocess.run,
+            [sys.executable, "-c", FIRST_USE],
+            check=True,
+            env={**os.environ, "NUMBA_CACHE_DIR": cache},
+        )
         return [seconds(work, clock) for _ in range(2)]
 
 
 def chain_rate(sequence):
-    """Return the frames a second from image file to masked pose on CORES cores, measured in a new process."""
+    """Return the frames a second from image file to masked pose on CORES cores, measured in a
+    new process.
+    """
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(_chain, sequence).result()
 
@@ -138,11 +180,14 @@ def _chain(sequence):
     def prepare(index):
         frame = sequence.frame(index)
         image = cv2.resize(frame, (prediction.SIZE,) * 2)[None, ..., None]
-        return frame, masks.keypoint_mask(prediction.predict(model, image)[0], frame.shape, CONTROL_WIDTH)
+        return frame, masks.keypoint_mask(
+            prediction.predict(model, image)[0], frame.shape, CONTROL_WIDTH
+        )
 
     def drive(frames):
         follower = Odometry(sequence.intrinsics)
-        with ThreadPoolExecutor(CORES) as pool:  # reads and segments frames while the odometry works
+        # reads and segments frames while the odometry works
+        with ThreadPoolExecutor(CORES) as pool:
             for index, (frame, mask) in enumerate(pool.map(prepare, range(frames))):
                 follower.step(frame, metres[index], mask)
 
@@ -158,28 +203,53 @@ def measure(sequence):
 
     def add(what, unit, pair, against):
         measured, reference = map(float, pair)
-        rows.append({"what": what, "unit": unit, "measured": measured, "against": against, "reference": reference,
-                     "ratio": measured / reference})
+        rows.append(
+            {
+                "what": what,
+                "unit": unit,
+                "measured": measured,
+                "against": against,
+                "reference": reference,
+                "ratio": measured / reference,
+            }
+        )
 
-    odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})  # loads compiled code
+    # loads compiled code
+    odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})
     with timing.opencv_threads(1):
         step, refined, bare = step_cost(sequence)
         add("a step of the odometry", "ms", (step, bare), "its bare OpenCV calls")
         add("a refined step", "ms", (refined, step), "a step")
         *pair, same = shared_cost(sequence.subset(12))
-        add(f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits", "ms a frame", pair,
-            "one by one")
+        add(
+            f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits",
+            "ms a frame",
+            pair,
+            "one by one",
+        )
         with tempfile.TemporaryDirectory() as labels:
             prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, labels)
-            add("masks and controls made together", "ms a mask", mask_cost(sequence, Path(labels)), "one by one")
+            add(
+                "masks and controls made together",
+                "ms a mask",
+                mask_cost(sequence, Path(labels)),
+                "one by one",
+            )
     add("first use, compiling", "s", compile_cost(), "second use")
-    add(f"from file to masked pose, {CORES} cores", "frames/s", (chain_rate(sequence), CAMERA), "KITTI's camera")
+    add(
+        f"from file to masked pose, {CORES} cores",
+        "frames/s",
+        (chain_rate(sequence), CAMERA),
+        "KITTI's camera",
+    )
     return pd.DataFrame(rows)
 
 
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kitti", required=True, type=Path, help="KITTI odometry folder (sequences, poses)")
+    parser.add_argument(
+        "--kitti", required=True, type=Path, help="KITTI odometry folder (sequences, poses)"
+    )
     parser.add_argument("--sequence", default="00")
     parser.add_argument("--frames", default=40, type=int, help="frames from its start (40)")
     parser.add_argument("--output", type=Path, default=Path("bench.json"))

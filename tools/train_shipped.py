@@ -1,8 +1,9 @@
 """Train the model in the package and write it with its card: python tools/train_shipped.py --help.
 
-The thesis's U-Net with 16 base filters learns from CamVid, KITTI's semantic benchmark and the embedded world. Some
-pairs of KITTI are held out. The last phase runs twice from the same state: without the held-out pairs, which gives a
-twin that can be measured on them, and with all pairs, which gives the model. A stopped training resumes.
+The thesis's U-Net with 16 base filters learns from CamVid, KITTI's semantic benchmark and the
+embedded world. Some pairs of KITTI are held out. The last phase runs twice from the same state:
+without the held-out pairs, which gives a twin that can be measured on them, and with all pairs,
+which gives the model. A stopped training resumes.
 """
 
 import argparse
@@ -28,13 +29,19 @@ from thesis_repro.world import dataset as world
 
 BASE_FILTERS, WORLD_IMAGES, SEED = 16, 100, 0
 EPOCH = 100  # steps
-LEARNING_RATE, ADAM_SHARE, WEIGHT_DECAY = 0.02, 0.15, 0.004  # ADAM_SHARE: Adam's share of the learning rate
-HELD_OUT = (*range(4), *range(-3, 0))  # indices of KITTI's pairs, in blocks because neighbours show one street
+# ADAM_SHARE: Adam's share of the learning rate
+LEARNING_RATE, ADAM_SHARE, WEIGHT_DECAY = 0.02, 0.15, 0.004
+# indices of KITTI's pairs, in blocks because neighbours show one street
+HELD_OUT = (*range(4), *range(-3, 0))
 SHARES = {"camvid": 0.5, "kitti": 0.4, "world": 0.1}  # of a batch
-KITTI_LOOK = {"camvid": 0.4, "kitti": 0.85, "world": 0.7}  # share shown like KITTI's camera; the rest like CamVid's
-FOCAL = {"camvid": 430, "kitti": 359, "world": 410}  # focal lengths of the images as they are read, pixels
-LOOKS = {"camvid": (289, 385), "kitti": (185, 611)}  # focal lengths across and down of frames stretched to 320x320
-WEIGHT_POWER, WEIGHT_LIMIT = -0.35, 4.0  # a class's weight: its share of the pixels to this power, at most the limit
+# share shown like KITTI's camera; the rest like CamVid's
+KITTI_LOOK = {"camvid": 0.4, "kitti": 0.85, "world": 0.7}
+# focal lengths of the images as they are read, pixels
+FOCAL = {"camvid": 430, "kitti": 359, "world": 410}
+# focal lengths across and down of frames stretched to 320x320
+LOOKS = {"camvid": (289, 385), "kitti": (185, 611)}
+# a class's weight: its share of the pixels to this power, at most the limit
+WEIGHT_POWER, WEIGHT_LIMIT = -0.35, 4.0
 CAMVID_IDS = (7, 8, 11, 13, 17, 20, 21, 23, 24, 25, 26)
 
 
@@ -46,25 +53,36 @@ class Phase(NamedTuple):
 
 COMMON, LAST = Phase(160, 8, 105), Phase(320, 4, 7)  # small crops take a quarter of the time
 
-LIGHT = [A.RandomGamma((60, 165), p=1), A.RandomBrightnessContrast(0.1, 0.3, p=1), A.RandomShadow((0, 0, 1, 1), p=0.2),
-         A.GaussianBlur(blur_limit=0, sigma_limit=(0.4, 1.2), p=0.2), A.GaussNoise(std_range=(1 / 255, 8 / 255), p=0.2)]
+LIGHT = [
+    A.RandomGamma((60, 165), p=1),
+    A.RandomBrightnessContrast(0.1, 0.3, p=1),
+    A.RandomShadow((0, 0, 1, 1), p=0.2),
+    A.GaussianBlur(blur_limit=0, sigma_limit=(0.4, 1.2), p=0.2),
+    A.GaussNoise(std_range=(1 / 255, 8 / 255), p=0.2),
+]
 
 
 class Muon(keras.optimizers.Muon):
-    """Keras' Muon, which also takes kernels of convolutions, as matrices (inputs x outputs); Adam does the rest."""
+    """Keras' Muon, which also takes kernels of convolutions, as matrices (inputs x outputs);
+    Adam does the rest.
+    """
 
     def _should_use_adamw(self, variable):
         return len(variable.shape) != 4 or 1 in variable.shape[:3]
 
     def zeropower_via_newtonschulz5(self, x, steps):
-        return ops.reshape(super().zeropower_via_newtonschulz5(ops.reshape(x, (-1, x.shape[-1])), steps), x.shape)
+        return ops.reshape(
+            super().zeropower_via_newtonschulz5(ops.reshape(x, (-1, x.shape[-1])), steps), x.shape
+        )
 
     def lr_adjust(self, x):
         return ops.reshape(super().lr_adjust(ops.reshape(x, (-1, x.shape[-1]))), x.shape)
 
 
 def view(image, label, source, look, size, random):
-    """Return a random crop (size x size) of an image and its label map, as another camera would show it."""
+    """Return a random crop (size x size) of an image and its label map, as another camera would
+    show it.
+    """
     height, width = label.shape
     across, down = np.array(LOOKS[look]) / FOCAL[source]
     zoom, aspect = np.exp(random.uniform(-0.25, 0.4)), np.exp(random.uniform(-0.1, 0.1))
@@ -78,27 +96,38 @@ def view(image, label, source, look, size, random):
     room = np.maximum(0.0, [width - size / across, height - size / down])
     centre = np.array([width, height]) / 2 + random.uniform(-0.5, 0.5, 2) * room
     matrix = np.column_stack([matrix, size / 2 - matrix @ centre])
-    return tuple(cv2.warpAffine(array, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
-                 for array, flags in ((image, cv2.INTER_LINEAR), (label, cv2.INTER_NEAREST)))
+    return tuple(
+        cv2.warpAffine(array, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
+        for array, flags in ((image, cv2.INTER_LINEAR), (label, cv2.INTER_NEAREST))
+    )
 
 
 class Views(training.Batches):
-    """Batches of views of the sources ({name: [(image, label map)]}), which depend only on SEED and the epoch."""
+    """Batches of views of the sources ({name: [(image, label map)]}), which depend only on SEED
+    and the epoch.
+    """
 
     def __init__(self, sources, phase, steps):
         self.sources, self.phase, self.steps, self.epoch = sources, phase, steps, 0
-        self.sets = [(np.empty((0, phase.size, phase.size, 1), np.uint8), None)]  # `dataset` reads the shape
+        # `dataset` reads the shape
+        self.sets = [(np.empty((0, phase.size, phase.size, 1), np.uint8), None)]
         self.light = augmentation.Augmenter(LIGHT)
 
     def __len__(self):
         return self.steps
 
     def __iter__(self):
-        random, (size, batch_size, _) = np.random.default_rng((SEED, self.phase.size, self.epoch)), self.phase
+        random, (size, batch_size, _) = (
+            np.random.default_rng((SEED, self.phase.size, self.epoch)),
+            self.phase,
+        )
         for _ in range(self.steps):
-            places = (np.arange(batch_size) + random.random()) / batch_size  # evenly spaced, to mix every batch
+            # evenly spaced, to mix every batch
+            places = (np.arange(batch_size) + random.random()) / batch_size
             pairs = []
-            for name in np.array(list(SHARES))[np.searchsorted(np.cumsum(list(SHARES.values()))[:-1], places)]:
+            for name in np.array(list(SHARES))[
+                np.searchsorted(np.cumsum(list(SHARES.values()))[:-1], places)
+            ]:
                 look = "kitti" if random.random() < KITTI_LOOK[name] else "camvid"
                 image, label = self.sources[name][random.integers(len(self.sources[name]))]
                 image, label = view(image, label, name, look, size, random)
@@ -108,9 +137,16 @@ class Views(training.Batches):
 
 
 def class_weights(sources):
-    """Return the weight of each of the 35 ids in the loss: larger for rare classes, 0 for ids not evaluated."""
-    shares = sum(SHARES[name] * np.mean([np.bincount(label.ravel(), minlength=256) / label.size for _, label in pairs],
-                                        axis=0) for name, pairs in sources.items())
+    """Return the weight of each of the 35 ids in the loss: larger for rare classes, 0 for ids
+    not evaluated.
+    """
+    shares = sum(
+        SHARES[name]
+        * np.mean(
+            [np.bincount(label.ravel(), minlength=256) / label.size for _, label in pairs], axis=0
+        )
+        for name, pairs in sources.items()
+    )
     weights = np.zeros(cityscapes.N_CLASSES, np.float32)
     evaluated = list(quality.EVALUATED)
     weights[evaluated] = np.maximum(shares[evaluated], 1e-9) ** WEIGHT_POWER
@@ -118,49 +154,86 @@ def class_weights(sources):
 
 
 def weighted_loss(weights):
-    """Return weighted cross-entropy, which learns fast, plus the Dice loss of the batch's classes, like IoU."""
+    """Return weighted cross-entropy, which learns fast, plus the Dice loss of the batch's
+    classes, like IoU.
+    """
+
     def cross_entropy_and_dice(true, predicted):
         counts = tf.reduce_sum(true * weights, -1)
         surprise = -tf.reduce_sum(true * tf.math.log(predicted + 1e-7), -1)
         cross_entropy = tf.reduce_sum(counts * surprise) / tf.maximum(tf.reduce_sum(counts), 1)
         predicted *= tf.reduce_sum(true, -1, keepdims=True)  # pixels without a class have zeros
-        common, both, count = (tf.reduce_sum(value, (0, 1, 2)) for value in (true * predicted, true + predicted, true))
+        common, both, count = (
+            tf.reduce_sum(value, (0, 1, 2)) for value in (true * predicted, true + predicted, true)
+        )
         present = tf.cast(count > 0, tf.float32)
-        dice = tf.reduce_sum(present * (1 - (2 * common + 1) / (both + 1))) / tf.maximum(tf.reduce_sum(present), 1)
+        dice = tf.reduce_sum(present * (1 - (2 * common + 1) / (both + 1))) / tf.maximum(
+            tf.reduce_sum(present), 1
+        )
         return cross_entropy + dice
 
     return cross_entropy_and_dice
 
 
 def train(camvid, kitti_semantic, folder, common=COMMON, last=LAST, steps=EPOCH):
-    """Train in a folder; return (twin, model), which share all but the last phase, and KITTI's held-out pairs."""
+    """Train in a folder; return (twin, model), which share all but the last phase, and KITTI's
+    held-out pairs.
+    """
     pairs = cityscapes.pairs(kitti_semantic, "train")
     if len(pairs) <= len(HELD_OUT):
-        raise InputError(f"{kitti_semantic}: {len(pairs)} training pairs; more than {len(HELD_OUT)} are needed")
+        raise InputError(
+            f"{kitti_semantic}: {len(pairs)} training pairs; more than {len(HELD_OUT)} are needed"
+        )
     held_out = [pairs[index] for index in HELD_OUT]
     world_images = [world.render_image("train", index, 0.5) for index in range(WORLD_IMAGES)]
-    all_sources = {"camvid": _read(cityscapes.pairs(camvid, "train")), "kitti": _read(pairs), "world": world_images}
-    training_sources = all_sources | {"kitti": _read([pair for pair in pairs if pair not in held_out])}
+    all_sources = {
+        "camvid": _read(cityscapes.pairs(camvid, "train")),
+        "kitti": _read(pairs),
+        "world": world_images,
+    }
+    training_sources = all_sources | {
+        "kitti": _read([pair for pair in pairs if pair not in held_out])
+    }
     keras.utils.set_random_seed(SEED)
     memory.keep_freed()
     model = build_unet((None, None, 1), cityscapes.N_CLASSES, BASE_FILTERS)
-    optimizer = Muon(LEARNING_RATE, adam_lr_ratio=ADAM_SHARE, exclude_embeddings=False, weight_decay=WEIGHT_DECAY,
-                     adam_weight_decay=WEIGHT_DECAY)
+    optimizer = Muon(
+        LEARNING_RATE,
+        adam_lr_ratio=ADAM_SHARE,
+        exclude_embeddings=False,
+        weight_decay=WEIGHT_DECAY,
+        adam_weight_decay=WEIGHT_DECAY,
+    )
     model.compile(optimizer, training.fused_loss(weighted_loss(class_weights(all_sources))))
     optimizer.build(model.trainable_variables)
-    made_from = {"code": stages.code("segmentation/unet"), "tool": stages.content(Path(__file__)),
-                 "phases": [common, last], "steps": steps, "images": stages.listing([pair.image for pair in pairs])}
+    made_from = {
+        "code": stages.code("segmentation/unet"),
+        "tool": stages.content(Path(__file__)),
+        "phases": [common, last],
+        "steps": steps,
+        "images": stages.listing([pair.image for pair in pairs]),
+    }
 
     def fit(name, sources, phase, rate):
         batches = Views(sources, phase, steps)
-        resumable = training.ResumableTraining(stages.stage(folder / name, **made_from), model, batches)
-        model.fit(batches.dataset(), epochs=phase.epochs, initial_epoch=resumable.first_epoch(phase.epochs), verbose=0,
-                  shuffle=False, callbacks=[keras.callbacks.LearningRateScheduler(rate), resumable])
+        resumable = training.ResumableTraining(
+            stages.stage(folder / name, **made_from), model, batches
+        )
+        model.fit(
+            batches.dataset(),
+            epochs=phase.epochs,
+            initial_epoch=resumable.first_epoch(phase.epochs),
+            verbose=0,
+            shuffle=False,
+            callbacks=[keras.callbacks.LearningRateScheduler(rate), resumable],
+        )
 
     def cosine(epoch):
         return LEARNING_RATE * 0.5 * (1 + np.cos(np.pi * (epoch + 0.5) / last.epochs))
 
-    fit("common", training_sources, common, lambda epoch: LEARNING_RATE * (0.5 if epoch == 0 else 1))
+    fit(
+        "common", training_sources, common, lambda epoch: LEARNING_RATE * (0.5 if epoch == 0 else 1)
+    )
     variables = model.variables + optimizer.variables
     state = [variable.numpy() for variable in variables]
     fit("twin", training_sources, last, cosine)
@@ -189,35 +262,62 @@ def _finished(model):
 def measured(model, pairs):
     """Return a model's scores on a set for the card: numbers, and a row for each class present."""
     scores = quality.quality(model, *cityscapes.load(pairs, prediction.SIZE))
-    classes = scores.classes.assign(share=scores.classes["pixels"] / scores.classes["pixels"].sum()).reset_index()
+    classes = scores.classes.assign(
+        share=scores.classes["pixels"] / scores.classes["pixels"].sum()
+    ).reset_index()
     camvid_classes = classes[classes["id"].isin(CAMVID_IDS)]
-    return {"images": len(pairs), "accuracy": scores.accuracy, "mean_iou": camvid_classes["iou"].mean(),
-            "count": len(camvid_classes), "mean_iou_all": scores.mean_iou, "classes": classes.to_dict("records")}
+    return {
+        "images": len(pairs),
+        "accuracy": scores.accuracy,
+        "mean_iou": camvid_classes["iou"].mean(),
+        "count": len(camvid_classes),
+        "mean_iou_all": scores.mean_iou,
+        "classes": classes.to_dict("records"),
+    }
 
 
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("camvid", type=Path, help="folder with train, trainannot, val and valannot")
     parser.add_argument("kitti_semantic", type=Path, help="folder with train and trainannot")
-    parser.add_argument("output", type=Path, help="folder for the state of the training, the model and its card")
-    parser.add_argument("--epochs", type=int, default=COMMON.epochs, help=f"in the common phase ({COMMON.epochs})")
-    parser.add_argument("--last-epochs", type=int, default=LAST.epochs, help=f"in the last phase ({LAST.epochs})")
+    parser.add_argument(
+        "output", type=Path, help="folder for the state of the training, the model and its card"
+    )
+    parser.add_argument(
+        "--epochs", type=int, default=COMMON.epochs, help=f"in the common phase ({COMMON.epochs})"
+    )
+    parser.add_argument(
+        "--last-epochs", type=int, default=LAST.epochs, help=f"in the last phase ({LAST.epochs})"
+    )
     parser.add_argument("--steps", type=int, default=EPOCH, help=f"in an epoch ({EPOCH})")
     options = parser.parse_args(arguments)
     try:
         validation = cityscapes.pairs(options.camvid, "val")
-        common, last = COMMON._replace(epochs=options.epochs), LAST._replace(epochs=options.last_epochs)
-        twin, model, held_out = train(options.camvid, options.kitti_semantic, options.output, common, last,
-                                      options.steps)
+        common, last = (
+            COMMON._replace(epochs=options.epochs),
+            LAST._replace(epochs=options.last_epochs),
+        )
+        twin, model, held_out = train(
+            options.camvid, options.kitti_semantic, options.output, common, last, options.steps
+        )
         file = options.output / prediction.SHIPPED.name
         with files.atomic(file) as temporary:
             model.save(temporary)
-        template = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
-            Path(__file__).with_name("model_card.md.j2").read_text(encoding="utf-8"))
-        files.write_text(options.output / "README.md", template.render(
-            file=file.name, parameters=model.count_params(), steps=options.steps, phases=(common, last),
-            held_out=[pair.name for pair in held_out], camvid=measured(model, validation),
-            kitti=measured(twin, held_out)))
+        template = jinja2.Environment(
+            undefined=jinja2.StrictUndefined, trim_blocks=True
+        ).from_string(Path(__file__).with_name("model_card.md.j2").read_text(encoding="utf-8"))
+        files.write_text(
+            options.output / "README.md",
+            template.render(
+                file=file.name,
+                parameters=model.count_params(),
+                steps=options.steps,
+                phases=(common, last),
+                held_out=[pair.name for pair in held_out],
+                camvid=measured(model, validation),
+                kitti=measured(twin, held_out),
+            ),
+        )
     except InputError as error:
         return longrun.report_error(error)
     print(f"written: {file}, and its card beside it")

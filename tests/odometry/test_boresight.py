@@ -23,7 +23,9 @@ def drive(steps=200, turning=0.02, start=None, seed=3):
         turn = turning * np.sin(index / 15)
         for noise, path in zip((1, 0), paths, strict=True):
             motion = np.eye(4)
-            motion[:3, :3] = Rotation.from_rotvec([0, turn, 0] + noise * random.normal(0, 3e-4, 3)).as_matrix()
+            motion[:3, :3] = Rotation.from_rotvec(
+                [0, turn, 0] + noise * random.normal(0, 3e-4, 3)
+            ).as_matrix()
             motion[:3, 3] = np.array([1.1 * turn, -0.02, 1]) + noise * random.normal(0, 5e-3, 3)
             path.append(path[-1] @ motion)
     return tuple(np.array(path) for path in paths)
@@ -50,7 +52,9 @@ def test_a_known_rotation_is_recovered_within_its_intervals(seed):
     estimated, true = drive(seed=seed)
     result = boresight.estimate([(estimated, corrected(true, KNOWN))])
     assert (result.low < KNOWN).all() and (KNOWN < result.high).all() and result.steps == 200
-    assert (result.high - result.low < 0.5).all() and result.angles == pytest.approx(KNOWN, abs=0.12)
+    assert (result.high - result.low < 0.5).all() and result.angles == pytest.approx(
+        KNOWN, abs=0.12
+    )
 
 
 def test_failed_steps_do_not_count_much():
@@ -59,14 +63,20 @@ def test_failed_steps_do_not_count_much():
     for index in (30, 90, 91, 150):  # a motion to the side with a wrong turn
         wrong = np.eye(4)
         wrong[:3, :3], wrong[:3, 3] = rotation((0, 5.0, 0)), (0.3, 0, 0)
-        broken[index:] = broken[index - 1] @ wrong @ np.linalg.inv(estimated[index - 1]) @ estimated[index:]
+        broken[index:] = (
+            broken[index - 1] @ wrong @ np.linalg.inv(estimated[index - 1]) @ estimated[index:]
+        )
     result = boresight.estimate([(broken, corrected(true, KNOWN))])
     assert result.angles == pytest.approx(KNOWN, abs=0.15)
 
 
 def test_too_little_motion_leaves_angles_undetermined():
     straight = boresight.estimate([drive(turning=0)])
-    assert np.isnan(straight.angles[2]) and np.isnan(straight.low[2]) and np.isfinite(straight.angles[:2]).all()
+    assert (
+        np.isnan(straight.angles[2])
+        and np.isnan(straight.low[2])
+        and np.isfinite(straight.angles[:2]).all()
+    )
     assert straight.usable[2] == 0
     assert np.isnan(boresight.estimate([drive(5)]).angles).all()
 
@@ -80,7 +90,8 @@ def test_the_table_compares_errors_with_and_without_the_boresight():
     assert table["others"].to_dict() == {"04": "05", "05": "04", "00": ""}
     assert (table["rmse_own"] < table["rmse"] / 2).all()
     assert (table["rmse_others"].dropna() < table["rmse"].dropna()[:2] / 2).all() and np.isnan(
-        table.loc["00", "rmse_others"])
+        table.loc["00", "rmse_others"]
+    )
     assert (table[["camera_sway", "truth_sway"]] > 0).any().all()
 
 
@@ -90,12 +101,19 @@ def test_the_commands_estimate_and_apply(small_world, tmp_path, capsys):
     record = json.loads(capsys.readouterr().out)
     assert set(record["sequences"]) == {"00", "01"}
     assert set(record["angles"]) == set(boresight.ANGLES) and record["steps"] > 0
-    assert all((angle["degrees"] is None) == (angle["low"] is None) for angle in record["angles"].values())
+    assert all(
+        (angle["degrees"] is None) == (angle["low"] is None) for angle in record["angles"].values()
+    )
     assert main(["boresight", *kitti, "--sequences", "00", "01"]) == 0
-    assert {"pitch", "yaw", "roll", "rmse_own", "truth_sway"} <= set(capsys.readouterr().out.split())
+    assert {"pitch", "yaw", "roll", "rmse_own", "truth_sway"} <= set(
+        capsys.readouterr().out.split()
+    )
     raw, turned = tmp_path / "raw.txt", tmp_path / "turned.txt"
     summaries = []
-    for options in (["--output", str(raw)], ["--output", str(turned), "--boresight", *map(str, KNOWN)]):
+    for options in (
+        ["--output", str(raw)],
+        ["--output", str(turned), "--boresight", *map(str, KNOWN)],
+    ):
         assert main(["odometry", *kitti, "--sequence", "00", "--json", *options]) == 0
         summaries.append(json.loads(capsys.readouterr().out))
     assert read_poses(turned) == pytest.approx(corrected(read_poses(raw), KNOWN), abs=1e-12)

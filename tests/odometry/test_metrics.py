@@ -19,13 +19,16 @@ def path(positions):
 def ahead(count, factor=1.0, turn=0.0):
     """A straight path of `factor` metres and `turn` degrees a step."""
     poses = path([[0, 0, factor * z] for z in range(count)])
-    poses[:, :3, :3] = Rotation.from_rotvec([[0, turn * index, 0] for index in range(count)], degrees=True).as_matrix()
+    poses[:, :3, :3] = Rotation.from_rotvec(
+        [[0, turn * index, 0] for index in range(count)], degrees=True
+    ).as_matrix()
     return poses
 
 
 def test_rmse_and_mae_by_hand():
     true = path([[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 0, 3]])
-    estimated = path([[9, 9, 9], [5, 5, 6], [5, 5, 10], [5, 2, 8]])  # off by (5, 5, 5) at frame 1, which does not count
+    # off by (5, 5, 5) at frame 1, which does not count
+    estimated = path([[9, 9, 9], [5, 5, 6], [5, 5, 10], [5, 2, 8]])
     # Differences from frame 1 on: (0, 0, 0), (0, 0, 3), (0, -3, 0)
     assert metrics.rmse(estimated, true) == pytest.approx(np.sqrt((0 + 9 + 9) / 3))
     assert metrics.mae(estimated, true) == pytest.approx((0 + 3 + 3) / 9)
@@ -36,7 +39,8 @@ def test_pose_alignment_removes_the_rotation_of_the_first_pose():
     true = ahead(3)
     turn = np.array([[0, 0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
     estimated = turn @ true
-    assert metrics.rmse(estimated, true, "position") == pytest.approx(1.0)  # (1, 0, 0) for (0, 0, 1) on one of two
+    # (1, 0, 0) for (0, 0, 1) on one of two
+    assert metrics.rmse(estimated, true, "position") == pytest.approx(1.0)
     assert metrics.rmse(estimated, true, "pose") == pytest.approx(0.0, abs=1e-12)
 
 
@@ -58,16 +62,22 @@ def test_ate_by_alignment():
     assert similar["rmse"] == pytest.approx(0, abs=1e-9) and similar["scale"] == pytest.approx(1.25)
     assert metrics.rpe(ahead(5, turn=2.0), ahead(5))["rotation_median"] == pytest.approx(2.0)
     straight = metrics.ate(ahead(5), ahead(5), "se3")  # fixes no rotation
-    assert np.isnan(straight["rmse"]) and straight["note"] and metrics.ate(ahead(5), ahead(5))["rmse"] == 0
+    assert (
+        np.isnan(straight["rmse"])
+        and straight["note"]
+        and metrics.ate(ahead(5), ahead(5))["rmse"] == 0
+    )
 
 
 def test_kitti_errors_by_hand():
     # 2 % too long on a straight line: 2 % translation error in every segment, no rotation error
     errors = metrics.kitti_errors(ahead(301, 1.02), ahead(301))
-    # A segment ends at the first frame beyond its length: 101 m from 20 starts and 201 m from 10; 301 m is too far.
+    # A segment ends at the first frame beyond its length: 101 m from 20 starts and 201 m from 10;
+    # 301 m is too far.
     assert errors["segments"] == 30 and errors["note"] == ""
     assert errors["translation_percent"] == pytest.approx(
-        100 * (20 * 0.02 * 101 / 100 + 10 * 0.02 * 201 / 200) / 30)
+        100 * (20 * 0.02 * 101 / 100 + 10 * 0.02 * 201 / 200) / 30
+    )
     assert errors["rotation_deg_per_100m"] == pytest.approx(0, abs=1e-9)
     turning = metrics.kitti_errors(ahead(150, turn=0.01), ahead(150))
     assert turning["rotation_deg_per_100m"] == pytest.approx(0.01 * 101)
@@ -80,7 +90,10 @@ def test_relative_errors_ignore_a_constant_rotation_of_the_camera():
     true = winding()
     estimated = winding(seed=0)
     angles = (2.0, -3.0, 1.0)
-    plain, turned = (metrics.relative_errors(poses, true, 10) for poses in (estimated, corrected(estimated, angles)))
+    plain, turned = (
+        metrics.relative_errors(poses, true, 10)
+        for poses in (estimated, corrected(estimated, angles))
+    )
     for key in ("translation_percent", "rotation_deg_per_100m"):
         assert plain[key] > 0 and turned[key] == pytest.approx(plain[key], rel=1e-3)
     assert metrics.relative_errors(corrected(true, angles), true, 10)["translation_percent"] < 0.01
@@ -100,7 +113,9 @@ def test_errors_of_single_steps():
     true = winding()
     perfect = metrics.step_errors(true, true)
     assert perfect["failed"] == 0 and perfect["direction"] < 0.01 and perfect["rotation"] < 1e-3
-    assert metrics.step_errors(ahead(9, turn=0.5), ahead(9))["rotation"] == pytest.approx(0.5, abs=0.01)
+    assert metrics.step_errors(ahead(9, turn=0.5), ahead(9))["rotation"] == pytest.approx(
+        0.5, abs=0.01
+    )
     for failing in (ahead(9, turn=3.0), ahead(9, factor=-1.0)):
         assert metrics.step_errors(failing, ahead(9))["failed"] == 100
 

@@ -14,27 +14,48 @@ from thesis_repro.masks import MaskFolder
 from thesis_repro.odometry import PYSLAM_2024, THESIS, Odometry, keypoints, metrics, pose
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
-COUNTS = {"points": "n_kps_to_lk", "detected": "n_detected", "tracked": "n_tracked", "inliers": "n_inliers_E",
-          "pose_inliers": "n_inliers_recoverPose"}
+COUNTS = {
+    "points": "n_kps_to_lk",
+    "detected": "n_detected",
+    "tracked": "n_tracked",
+    "inliers": "n_inliers_E",
+    "pose_inliers": "n_inliers_recoverPose",
+}
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("sequence, errors", [
-    ("00", {"00": (1.700609, 0.705170), "00_masked": (1.811076, 0.794264)}), ("06", {"06": (0.357133, 0.146225)})])
+@pytest.mark.parametrize(
+    "sequence, errors",
+    [
+        ("00", {"00": (1.700609, 0.705170), "00_masked": (1.811076, 0.794264)}),
+        ("06", {"06": (0.357133, 0.146225)}),
+    ],
+)
 def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, sequence, errors):
     kitti = Sequence(kitti_real, sequence)
-    runs = {run: (THESIS, MaskFolder(reference / "masks_00", kitti) if "masked" in run else None) for run in errors}
+    runs = {
+        run: (THESIS, MaskFolder(reference / "masks_00", kitti) if "masked" in run else None)
+        for run in errors
+    }
     for run, result in odometry.run_many(kitti, runs).items():
         expected = pd.read_csv(reference / f"{run}.csv")
         assert len(result.frames) == len(expected) == len(kitti)
         for ours, theirs in COUNTS.items():
-            np.testing.assert_array_equal(result.frames[ours].to_numpy(float, na_value=np.nan), expected[theirs])
+            np.testing.assert_array_equal(
+                result.frames[ours].to_numpy(float, na_value=np.nan), expected[theirs]
+            )
         columns = ["x", "y", "z", *odometry.odometry.ROTATION_COLUMNS]
         np.testing.assert_allclose(result.frames[columns], expected[columns], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(result.frames["scale"][1:], expected["gt_scale"][1:], rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(result.frames["updated"][1:], expected["pose_updated"][1:] == 1)
-        assert (metrics.rmse(result.poses, kitti.poses), metrics.mae(result.poses, kitti.poses)) == pytest.approx(
-            errors[run], abs=5e-7)
+        np.testing.assert_allclose(
+            result.frames["scale"][1:], expected["gt_scale"][1:], rtol=0, atol=1e-12
+        )
+        np.testing.assert_array_equal(
+            result.frames["updated"][1:], expected["pose_updated"][1:] == 1
+        )
+        assert (
+            metrics.rmse(result.poses, kitti.poses),
+            metrics.mae(result.poses, kitti.poses),
+        ) == pytest.approx(errors[run], abs=5e-7)
         assert result.flagged.empty
 
 
@@ -42,7 +63,9 @@ def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, sequence, erro
 def test_agrees_with_the_later_pyslam(kitti_real):
     kitti = Sequence(kitti_real, "06")
     result = odometry.run(kitti, PYSLAM_2024)
-    assert metrics.rmse(result.poses, kitti.poses, PYSLAM_2024.alignment) == pytest.approx(0.267954, abs=5e-7)
+    assert metrics.rmse(result.poses, kitti.poses, PYSLAM_2024.alignment) == pytest.approx(
+        0.267954, abs=5e-7
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,21 +82,32 @@ def pyslam_with_bare_calls(sequence, masks=None):
     for index in range(len(sequence)):
         frame, row = sequence.frame(index), {}
         if previous is not None:
-            tracked, status, _ = cv2.calcOpticalFlowPyrLK(previous, frame, points, None, winSize=(21, 21), maxLevel=3,
-                                                          criteria=(3, 30, 0.01))
+            tracked, status, _ = cv2.calcOpticalFlowPyrLK(
+                previous, frame, points, None, winSize=(21, 21), maxLevel=3, criteria=(3, 30, 0.01)
+            )
             old, new = points[status == 1], tracked[status == 1]
-            old_n, new_n = ((inverse @ np.c_[side.astype(float), np.ones(len(side))].T).T[:, :2] for side in (old, new))
-            matrix, inliers = cv2.findEssentialMat(new_n, old_n, focal=1, pp=(0, 0), method=cv2.RANSAC, prob=0.999,
-                                                   threshold=0.0003)
+            old_n, new_n = (
+                (inverse @ np.c_[side.astype(float), np.ones(len(side))].T).T[:, :2]
+                for side in (old, new)
+            )
+            matrix, inliers = cv2.findEssentialMat(
+                new_n, old_n, focal=1, pp=(0, 0), method=cv2.RANSAC, prob=0.999, threshold=0.0003
+            )
             votes, turn, shift, _ = cv2.recoverPose(matrix, new_n, old_n, focal=1, pp=(0, 0))
             scale = np.linalg.norm(sequence.poses[index, :3, 3] - sequence.poses[index - 1, :3, 3])
             if scale > 0.1:
                 position = position + scale * rotation @ shift
                 rotation = rotation @ turn
-            row = {"points": len(points), "tracked": len(new), "inliers": inliers.sum(), "pose_inliers": votes}
+            row = {
+                "points": len(points),
+                "tracked": len(new),
+                "inliers": inliers.sum(),
+                "pose_inliers": votes,
+            }
         if previous is None or len(new) < 2000:
-            points = cv2.goodFeaturesToTrack(frame, 2000, 0.01, 3, blockSize=5,
-                                             mask=None if masks is None else masks[index])
+            points = cv2.goodFeaturesToTrack(
+                frame, 2000, 0.01, 3, blockSize=5, mask=None if masks is None else masks[index]
+            )
         else:
             points = new.reshape(-1, 1, 2)
         previous = frame
@@ -87,7 +121,9 @@ def test_agrees_with_the_same_calls_of_opencv(drive, masks):
     counts, poses = pyslam_with_bare_calls(drive, masks)
     result = odometry.run(drive, masks=masks)
     for column in counts:
-        np.testing.assert_array_equal(result.frames[column].to_numpy(float, na_value=np.nan), counts[column])
+        np.testing.assert_array_equal(
+            result.frames[column].to_numpy(float, na_value=np.nan), counts[column]
+        )
     np.testing.assert_allclose(result.poses, poses, rtol=0, atol=1e-12)
     assert metrics.rmse(result.poses, drive.poses) < 0.05
 
@@ -95,27 +131,46 @@ def test_agrees_with_the_same_calls_of_opencv(drive, masks):
 @pytest.mark.parametrize("mask", [None, "stripes", "nothing", "specks"])
 def test_keypoints_have_opencvs_bits(drive, mask):
     frame = drive.frame(3)
-    masks = {"stripes": Stripes(20)[0], "nothing": np.zeros_like(frame),
-             "specks": (np.random.RandomState(0).rand(*frame.shape) < 0.02).astype(np.uint8)}
-    for image in (frame, frame // 64 * 64, np.full_like(frame, 7)):  # the second has many corners of equal strength
+    masks = {
+        "stripes": Stripes(20)[0],
+        "nothing": np.zeros_like(frame),
+        "specks": (np.random.RandomState(0).rand(*frame.shape) < 0.02).astype(np.uint8),
+    }
+    # the second has many corners of equal strength
+    for image in (frame, frame // 64 * 64, np.full_like(frame, 7)):
         corners = keypoints.find_corners(image)
-        np.testing.assert_array_equal(corners[0], cv2.cornerMinEigenVal(image, keypoints.BLOCK_SIZE))
+        np.testing.assert_array_equal(
+            corners[0], cv2.cornerMinEigenVal(image, keypoints.BLOCK_SIZE)
+        )
         for distance in (0, 1, 2.4, 3, 7):
             for limit in (10, 2000, 0):
                 settings = replace(THESIS, min_distance=distance, max_keypoints=limit)
-                expected = cv2.goodFeaturesToTrack(image, limit, keypoints.QUALITY, distance, mask=masks.get(mask),
-                                                   blockSize=keypoints.BLOCK_SIZE)
-                np.testing.assert_array_equal(keypoints.detect(image, settings, masks.get(mask), corners),
-                                              np.empty((0, 2)) if expected is None else expected[:, 0])
+                expected = cv2.goodFeaturesToTrack(
+                    image,
+                    limit,
+                    keypoints.QUALITY,
+                    distance,
+                    mask=masks.get(mask),
+                    blockSize=keypoints.BLOCK_SIZE,
+                )
+                np.testing.assert_array_equal(
+                    keypoints.detect(image, settings, masks.get(mask), corners),
+                    np.empty((0, 2)) if expected is None else expected[:, 0],
+                )
     expected = cv2.goodFeaturesToTrack(frame, 2000, 0.05, 3, mask=masks.get(mask), blockSize=9)
-    detected = keypoints.SharedKeypoints().detect(frame, replace(THESIS, quality=0.05, block_size=9), masks.get(mask))
-    np.testing.assert_array_equal(detected, np.empty((0, 2)) if expected is None else expected[:, 0])
+    detected = keypoints.SharedKeypoints().detect(
+        frame, replace(THESIS, quality=0.05, block_size=9), masks.get(mask)
+    )
+    np.testing.assert_array_equal(
+        detected, np.empty((0, 2)) if expected is None else expected[:, 0]
+    )
 
 
 def test_tracks_have_opencvs_bits(drive):
     frame = drive.frame(3)
     points = keypoints.detect(frame, THESIS)
-    for shift, window in ((3, 21), (12, 21), (-40, 21), (12, 11)):  # at -40 a window leaves the frame
+    # at -40 a window leaves the frame
+    for shift, window in ((3, 21), (12, 21), (-40, 21), (12, 11)):
         moved = np.roll(frame, shift, axis=1)
         tracker = keypoints.TRACKER | {"winSize": (window, window)}
         expected, status, _ = cv2.calcOpticalFlowPyrLK(frame, moved, points, None, **tracker)
@@ -125,8 +180,10 @@ def test_tracks_have_opencvs_bits(drive):
 
 
 def test_a_mask_in_the_detector_fills_the_limit_and_a_filter_does_not(drive):
-    inside, filtered = (keypoints.detect(drive.frame(0), replace(SMALL, mask_mode=mode), Stripes(40)[0])
-                        for mode in ("detect", "filter"))
+    inside, filtered = (
+        keypoints.detect(drive.frame(0), replace(SMALL, mask_mode=mode), Stripes(40)[0])
+        for mode in ("detect", "filter")
+    )
     assert len(inside) == 500 and 100 < len(filtered) < 400
 
 
@@ -136,7 +193,9 @@ def test_the_pose_vote_has_opencvs_bits(drive, kind):
     for index in range(3):
         points = keypoints.detect(drive.frame(index), THESIS)
         tracked, success = keypoints.track(drive.frame(index), drive.frame(index + 1), points)
-        previous, current = (pose.normalise(side[success], drive.intrinsics) for side in (points, tracked))
+        previous, current = (
+            pose.normalise(side[success], drive.intrinsics) for side in (points, tracked)
+        )
         if kind == "swapped":
             previous, current = current, previous
         elif kind == "few":
@@ -149,7 +208,9 @@ def test_the_pose_vote_has_opencvs_bits(drive, kind):
             previous = random.permutation(previous)
         matrix, _, problem = pose.essential_matrix(current, previous, THESIS.threshold)
         assert problem == ""
-        votes, rotation, translation, _ = cv2.recoverPose(matrix, current, previous, focal=1, pp=(0, 0))
+        votes, rotation, translation, _ = cv2.recoverPose(
+            matrix, current, previous, focal=1, pp=(0, 0)
+        )
         ours = pose.recover_pose(matrix, current, previous)
         assert ours[0] == votes
         np.testing.assert_array_equal(ours[1], rotation)
@@ -160,12 +221,16 @@ def test_the_pose_vote_has_opencvs_bits(drive, kind):
 
 
 class Changed(Street):
-    """A copy of a street with some frames replaced; it notes the frames read, and stops at one of them if asked to."""
+    """A copy of a street with some frames replaced; it notes the frames read, and stops at one
+    of them if asked to.
+    """
 
     def __init__(self, sequence, replaced=None, poses=None, frames=None, killed_at=None):
         self.intrinsics, self.killed_at, self.read = sequence.intrinsics, killed_at, []
         self.poses = (sequence.poses if poses is None else poses)[:frames]
-        self.images = [(replaced or {}).get(index, image) for index, image in enumerate(sequence.images)][:frames]
+        self.images = [
+            (replaced or {}).get(index, image) for index, image in enumerate(sequence.images)
+        ][:frames]
 
     def frame(self, index):
         self.read.append(index)
@@ -201,7 +266,9 @@ def test_implausible_motions_are_flagged_and_kept(drive, monkeypatch):
 
 
 def test_an_empty_mask_keeps_the_tracked_points(drive):
-    masks = [np.full(drive.frame(0).shape, 0 if index == 4 else 255, np.uint8) for index in range(10)]
+    masks = [
+        np.full(drive.frame(0).shape, 0 if index == 4 else 255, np.uint8) for index in range(10)
+    ]
     result = odometry.run(drive, masks=masks)
     assert flags(result) == {4: "no keypoints"}
     assert result.frames["detected"][4] == 0
@@ -212,17 +279,26 @@ def test_an_empty_mask_keeps_the_tracked_points(drive):
 @pytest.mark.parametrize("mode", ["detect", "filter"])
 def test_empty_masks_alone_keep_the_first_pose(drive, mode):
     start = np.diag([-1.0, 1.0, -1.0, 1.0])
-    backwards = Changed(drive, poses=start @ drive.poses, frames=4)  # an excerpt that starts in another direction
-    result = odometry.run(backwards, replace(THESIS, mask_mode=mode), [np.zeros(drive.frame(0).shape, np.uint8)] * 4)
+    # an excerpt that starts in another direction
+    backwards = Changed(drive, poses=start @ drive.poses, frames=4)
+    result = odometry.run(
+        backwards, replace(THESIS, mask_mode=mode), [np.zeros(drive.frame(0).shape, np.uint8)] * 4
+    )
     np.testing.assert_array_equal(result.poses, [start] * 4)
     assert result.flagged.to_dict() == {"no keypoints": 4, "no points": 3}
 
 
-@pytest.mark.parametrize("count, reason", [(4, "fewer than five correspondences"), (5, "several essential matrices")])
+@pytest.mark.parametrize(
+    "count, reason", [(4, "fewer than five correspondences"), (5, "several essential matrices")]
+)
 def test_too_few_correspondences_keep_the_pose(drive, count, reason):
     result = odometry.run(drive, replace(THESIS, max_keypoints=count, min_distance=40))
     full = result.frames[result.frames["tracked"] == count]
-    assert len(full) and (full["flag"].isin([reason, "no agreement"])).all() and (full["flag"] == reason).any()
+    assert (
+        len(full)
+        and (full["flag"].isin([reason, "no agreement"])).all()
+        and (full["flag"] == reason).any()
+    )
     assert not result.frames["updated"].any()
 
 
@@ -251,10 +327,14 @@ def standing(drive):
 
 def cut(drive):
     after = Street(4, start=500.0)
-    return Changed(drive, {5 + index: cv2.flip(after.frame(index), 0) for index in range(4)}, frames=9)
+    return Changed(
+        drive, {5 + index: cv2.flip(after.frame(index), 0) for index in range(4)}, frames=9
+    )
 
 
-@pytest.mark.parametrize("change, flag", [(standing, ["stationary", "no essential matrix"]), (cut, ["no agreement"])])
+@pytest.mark.parametrize(
+    "change, flag", [(standing, ["stationary", "no essential matrix"]), (cut, ["no agreement"])]
+)
 def test_a_standing_camera_and_a_scene_cut_keep_the_pose(drive, change, flag):
     result = odometry.run(change(drive))
     assert flags(result)[5] in flag
@@ -267,8 +347,9 @@ def test_a_standing_camera_and_a_scene_cut_keep_the_pose(drive, change, flag):
 
 def test_shuffled_points_change_the_path_and_repeat_with_the_seed(drive):
     few = Changed(drive, frames=4)
-    first, again, other, plain = (odometry.run(few, replace(SMALL, shuffle_seed=seed)).poses
-                                  for seed in (0, 0, 1, None))
+    first, again, other, plain = (
+        odometry.run(few, replace(SMALL, shuffle_seed=seed)).poses for seed in (0, 0, 1, None)
+    )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-6 and np.abs(first - plain).max() > 1e-6
 
@@ -278,16 +359,21 @@ def test_inliers_of_shuffled_points_are_in_their_order(drive):
     follower.step(drive.frame(0))
     step = follower.step(drive.frame(1), 0.4)
     matrix = np.cross(np.eye(3), step.motion.translation).T @ step.motion.rotation
-    current, previous = (np.c_[pose.normalise(side, drive.intrinsics), np.ones(len(side))]
-                         for side in (step.current, step.previous))
+    current, previous = (
+        np.c_[pose.normalise(side, drive.intrinsics), np.ones(len(side))]
+        for side in (step.current, step.previous)
+    )
     lines, others = current @ matrix.T, previous @ matrix
     distances = np.abs((previous * lines).sum(axis=1)) / np.sqrt(
-        (lines[:, :2] ** 2).sum(axis=1) + (others[:, :2] ** 2).sum(axis=1))
+        (lines[:, :2] ** 2).sum(axis=1) + (others[:, :2] ** 2).sum(axis=1)
+    )
     np.testing.assert_array_equal(step.inliers, distances < THESIS.threshold)
 
 
-@pytest.mark.parametrize("choice", [{"essential_method": "usac"}, {"essential_method": "usac-magsac"},
-                                    {"detector": "orb"}])
+@pytest.mark.parametrize(
+    "choice",
+    [{"essential_method": "usac"}, {"essential_method": "usac-magsac"}, {"detector": "orb"}],
+)
 def test_other_estimators_and_detectors_follow_the_drive(drive, choice):
     few = Changed(drive, frames=5)
     result = odometry.run(few, replace(THESIS, **choice))
@@ -303,7 +389,8 @@ def test_the_later_pyslam_rotates_first_and_checks_the_shift_of_points(drive):
     start = Changed(drive, frames=2)
     late, early = odometry.run(start, replace(THESIS, rotate_first=True)), odometry.run(start)
     expected = early.poses[0][:3, 3] + early.frames["scale"][1] * (
-        late.poses[1][:3, :3] @ (early.poses[1][:3, 3] / early.frames["scale"][1]))
+        late.poses[1][:3, :3] @ (early.poses[1][:3, 3] / early.frames["scale"][1])
+    )
     np.testing.assert_allclose(late.poses[1][:3, 3], expected, atol=1e-12)
 
 
@@ -348,12 +435,18 @@ def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypa
             return super().__getitem__(index)
 
     stripes, few = Counted(20), Changed(drive, frames=6)
-    runs = {(order, estimator): (replace(THESIS, shuffle_seed=order, estimator=estimator), stripes)
-            for order in (None, 1) for estimator in ("thesis", "refined")}
+    runs = {
+        (order, estimator): (replace(THESIS, shuffle_seed=order, estimator=estimator), stripes)
+        for order in (None, 1)
+        for estimator in ("thesis", "refined")
+    }
     for _, estimator in runs:
         odometry.odometry.warm_up(estimator == "refined")  # it estimates essential matrices too
-    monkeypatch.setattr(pose, "essential_matrix",
-                        lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1])
+    monkeypatch.setattr(
+        pose,
+        "essential_matrix",
+        lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1],
+    )
     together = odometry.run_many(few, runs, workers=2)
     assert asked == list(range(len(few))) and len(estimated) == 2 * (len(few) - 1)
     for name, (settings, masks) in runs.items():
@@ -365,7 +458,11 @@ def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypa
 def test_a_killed_pass_resumes_with_the_same_bits(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(odometry.passes, "CHECKPOINT", 4)
     file = tmp_path / "state"
-    runs = {name: run for name, run in variants().items() if name in ("all", "stripes-20", "kept", "refined")}
+    runs = {
+        name: run
+        for name, run in variants().items()
+        if name in ("all", "stripes-20", "kept", "refined")
+    }
     with pytest.raises(KeyboardInterrupt):
         odometry.run_many(Changed(drive, killed_at=6), runs, checkpoint=file)
     resumed_drive = Changed(drive)
@@ -387,8 +484,15 @@ def test_an_exception_in_a_thread_stops_the_pass(drive, monkeypatch):
         odometry.run_many(drive, {"all": (THESIS, None), "reduced": (SMALL, None)}, workers=2)
 
 
-@pytest.mark.parametrize("setting, value", [
-    ("estimator", "best"), ("essential_method", "lmeds"), ("max_keypoints", -1), ("threshold", 0.0)])
+@pytest.mark.parametrize(
+    "setting, value",
+    [
+        ("estimator", "best"),
+        ("essential_method", "lmeds"),
+        ("max_keypoints", -1),
+        ("threshold", 0.0),
+    ],
+)
 def test_wrong_settings_are_named(setting, value):
     with pytest.raises(InputError, match=setting):
         replace(THESIS, **{setting: value})
@@ -398,8 +502,13 @@ def test_wrong_frames_and_masks_are_named(drive):
     follower = Odometry(drive.intrinsics)
     follower.step(drive.frame(0))
     frame = drive.frame(1)
-    for arguments in ((frame, 0.4, np.zeros((10, 10), np.uint8)), (frame, 0.4, np.zeros(frame.shape, bool)),
-                      (frame[:80], 0.4), (frame / 255, 0.4), (frame, float("nan"))):
+    for arguments in (
+        (frame, 0.4, np.zeros((10, 10), np.uint8)),
+        (frame, 0.4, np.zeros(frame.shape, bool)),
+        (frame[:80], 0.4),
+        (frame / 255, 0.4),
+        (frame, float("nan")),
+    ):
         with pytest.raises(InputError, match="frame 1"):
             follower.step(*arguments)
     assert follower.step(frame, 0.4).updated  # the state is unchanged

@@ -13,12 +13,21 @@ from thesis_repro.odometry.opencv_exact import five_point, ransac, rounding
 
 
 def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBABILITY):
-    return cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=probability,
-                                threshold=threshold)
+    return cv2.findEssentialMat(
+        current,
+        previous,
+        focal=1.0,
+        pp=(0.0, 0.0),
+        method=cv2.RANSAC,
+        prob=probability,
+        threshold=threshold,
+    )
 
 
 def scene(random, count, outliers=0.3, noise=2e-4, motion=1.0, depth=(4, 40), turn=0.02):
-    """Correspondences (current, previous) of a camera that moves forward by `motion`; the first ones are outliers."""
+    """Correspondences (current, previous) of a camera that moves forward by `motion`; the first
+    ones are outliers.
+    """
     points = random.uniform([-10, -3, depth[0]], [10, 3, depth[1]], (count, 3))
     rotation = cv2.Rodrigues(random.normal(0, turn, 3))[0]
     moved = points @ rotation.T - motion * (np.array([0, 0, 1]) + random.normal(0, 0.05, 3))
@@ -45,24 +54,34 @@ def assert_same_bits(current, previous, threshold=THESIS.threshold, probability=
 @pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
 def test_same_bits_as_opencv(count, outliers):
     random = np.random.default_rng((count, int(10 * outliers)))
-    assert any([assert_same_bits(*scene(random, count, outliers, noise)) for noise in (0.0, 1e-6, 1e-4, 1e-3)])
+    assert any(
+        [
+            assert_same_bits(*scene(random, count, outliers, noise))
+            for noise in (0.0, 1e-6, 1e-4, 1e-3)
+        ]
+    )
 
 
 KINDS = {
     "sideways, flat": lambda random: scene(random, 300, depth=(20, 20)),
     "hardly moving": lambda random: scene(random, 300, motion=1e-3),
     "turning only": lambda random: scene(random, 300, motion=0.0, turn=0.1),
-    "turning only, exact": lambda random: scene(random, 300, outliers=0.0, noise=0.0, motion=0.0, turn=0.1),
+    "turning only, exact": lambda random: scene(
+        random, 300, outliers=0.0, noise=0.0, motion=0.0, turn=0.1
+    ),
     "standing": lambda random: scene(random, 300, outliers=0.0, noise=1e-6, motion=0.0, turn=0.0),
-    "standing exactly": lambda random: scene(random, 300, outliers=0.0, noise=0.0, motion=0.0, turn=0.0),
+    "standing exactly": lambda random: scene(
+        random, 300, outliers=0.0, noise=0.0, motion=0.0, turn=0.0
+    ),
     "nonsense": lambda random: (random.uniform(-1, 1, (100, 2)), random.uniform(-1, 1, (100, 2))),
     "all equal": lambda random: (np.full((50, 2), 0.25), np.full((50, 2), 0.25)),
     "on a line": lambda random: (np.repeat(random.uniform(-1, 1, (60, 1)), 2, axis=1),) * 2,
     "in pairs": lambda random: tuple(np.repeat(side, 2, axis=0) for side in scene(random, 100)),
     "three places": lambda random: tuple(np.repeat(side, 20, axis=0) for side in scene(random, 3)),
     "on a grid": lambda random: tuple(np.round(side, 1) for side in scene(random, 200)),
-    "not a number": lambda random: tuple(np.where(np.arange(100)[:, None] == 7, np.nan, side)
-                                         for side in scene(random, 100)),
+    "not a number": lambda random: tuple(
+        np.where(np.arange(100)[:, None] == 7, np.nan, side) for side in scene(random, 100)
+    ),
     "far": lambda random: tuple(side * 1e6 for side in scene(random, 100)),
 }
 
@@ -83,11 +102,19 @@ def test_other_thresholds_and_probabilities():
 
 
 def test_few_samples_are_solved_by_opencv(monkeypatch):
-    """This makes the search fast: OpenCV solves a few samples of five and never does the whole search."""
+    """This makes the search fast: OpenCV solves a few samples of five and never does the whole
+    search.
+    """
     real, sizes = cv2.findEssentialMat, []
     current, previous = scene(np.random.default_rng(1), 1000, outliers=0.5)
-    monkeypatch.setattr(cv2, "findEssentialMat", lambda points, *arguments, **options: (
-        sizes.append(len(points)), real(points, *arguments, **options))[1])
+    monkeypatch.setattr(
+        cv2,
+        "findEssentialMat",
+        lambda points, *arguments, **options: (
+            sizes.append(len(points)),
+            real(points, *arguments, **options),
+        )[1],
+    )
     ransac.find_essential_matrix(current, previous, THESIS.threshold, pose.PROBABILITY)
     assert 0 < len(sizes) < 60 and set(sizes) == {5}  # of about 200 samples
 
@@ -97,9 +124,16 @@ def test_opencv_does_the_whole_search_if_the_bounds_were_wrong(monkeypatch):
     assert assert_same_bits(*scene(np.random.default_rng(2), 500))
 
 
-@pytest.mark.parametrize(("options", "fewest", "most_unsure"), [
-    ({}, 1200, 20), ({"depth": (20, 20)}, 600, 90), ({"motion": 1e-2}, 450, 200),
-    ({"motion": 0.0, "turn": 0.1}, 350, 210)], ids=["ahead", "flat", "hardly moving", "turning only"])
+@pytest.mark.parametrize(
+    ("options", "fewest", "most_unsure"),
+    [
+        ({}, 1200, 20),
+        ({"depth": (20, 20)}, 600, 90),
+        ({"motion": 1e-2}, 450, 200),
+        ({"motion": 0.0, "turn": 0.1}, 350, 210),
+    ],
+    ids=["ahead", "flat", "hardly moving", "turning only"],
+)
 def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, most_unsure):
     random, shares, unsure = np.random.default_rng(3), [], 0
     for _ in range(300):
@@ -112,8 +146,10 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
         matrices = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
         assert len(matrices) == len(solutions)
         for matrix in matrices:
-            distances = np.minimum(np.linalg.norm(solutions - matrix, axis=1),
-                                   np.linalg.norm(solutions + matrix, axis=1))
+            distances = np.minimum(
+                np.linalg.norm(solutions - matrix, axis=1),
+                np.linalg.norm(solutions + matrix, axis=1),
+            )
             shares.append((distances / margins).min())
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
 
@@ -131,16 +167,24 @@ def test_real_roots_of_a_known_polynomial():
 
 def test_same_bits_in_threads():
     with ThreadPoolExecutor(4) as pool:
-        assert all(pool.map(lambda seed: assert_same_bits(*scene(np.random.default_rng(seed), 300)), range(8)))
+        assert all(
+            pool.map(
+                lambda seed: assert_same_bits(*scene(np.random.default_rng(seed), 300)), range(8)
+            )
+        )
 
 
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["00", "05", "06"])
 def test_same_bits_on_real_frames(kitti_real, name, monkeypatch):
-    odometry.odometry.warm_up(False)  # now, so that it adds no pair; lru_cache knows only the positional call
+    # now, so that it adds no pair; lru_cache knows only the positional call
+    odometry.odometry.warm_up(False)
     pairs, real = [], ransac.find_essential_matrix
-    monkeypatch.setattr(ransac, "find_essential_matrix", lambda *arguments: (
-        pairs.append(arguments[:2]), real(*arguments))[1])
+    monkeypatch.setattr(
+        ransac,
+        "find_essential_matrix",
+        lambda *arguments: (pairs.append(arguments[:2]), real(*arguments))[1],
+    )
     odometry.run(Sequence(kitti_real, name).subset(12))
     monkeypatch.undo()
     assert len(pairs) == 11

@@ -1,4 +1,6 @@
-"""The refined estimator: the fit, the sign of slow steps and the consistency with the motion prior."""
+"""The refined estimator: the fit, the sign of slow steps and the consistency with the motion
+prior.
+"""
 
 from dataclasses import replace
 
@@ -26,7 +28,9 @@ def turn(degrees):
 
 
 def seen(world, rotation, translation, noise=0.0, seed=0):
-    """Correspondences (current, previous) of points (N, 3) in the current camera and its motion to the previous one."""
+    """Correspondences (current, previous) of points (N, 3) in the current camera and its motion
+    to the previous one.
+    """
     moved = world @ rotation.T + translation
     current, previous = (points[:, :2] / points[:, 2:] for points in (world, moved))
     return current, previous + np.random.default_rng(seed).normal(0, noise, previous.shape)
@@ -45,8 +49,10 @@ def hedge():
 
 def two_motions(*motions, counts):
     """Correspondences of several motions, `counts` of each."""
-    sides = [seen(street(count, seed), *motion, noise=5e-5, seed=seed)
-             for seed, (count, motion) in enumerate(zip(counts, motions, strict=True))]
+    sides = [
+        seen(street(count, seed), *motion, noise=5e-5, seed=seed)
+        for seed, (count, motion) in enumerate(zip(counts, motions, strict=True))
+    ]
     return tuple(np.concatenate(side) for side in zip(*sides, strict=True))
 
 
@@ -55,7 +61,9 @@ def essential(rotation, translation):
 
 
 def fitted(rotation, translation, current, previous):
-    return refine.fit(rotation, translation, current, previous, np.ones(len(current), bool), THESIS.threshold)
+    return refine.fit(
+        rotation, translation, current, previous, np.ones(len(current), bool), THESIS.threshold
+    )
 
 
 def checked(motion, current, previous, scale, prior):
@@ -92,11 +100,17 @@ def test_the_sign_survives_a_slow_step():
 
 def test_normal_equations_are_sums_over_single_points():
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (2 * refine.POINTS_PER_BLOCK + 7, 4))
-    rotation, ahead, scale = Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(), np.array([0.0, 0.6, 0.8]), 0.1
+    rotation, ahead, scale = (
+        Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(),
+        np.array([0.0, 0.6, 0.8]),
+        0.1,
+    )
     current, previous = points[:, :2].copy(), points[:, 2:].copy()
     totals = refine._normal_equations(rotation, ahead, current, previous, scale)
-    parts = [refine._normal_equations(rotation, ahead, current[k:k + 1], previous[k:k + 1], scale)
-             for k in range(len(points))]
+    parts = [
+        refine._normal_equations(rotation, ahead, current[k : k + 1], previous[k : k + 1], scale)
+        for k in range(len(points))
+    ]
     for total, terms in zip(totals, zip(*parts, strict=True), strict=True):
         np.testing.assert_allclose(total, sum(terms), rtol=1e-12, atol=1e-12)
 
@@ -105,14 +119,18 @@ def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
     current, previous = seen(street(200), turn(1), AHEAD)
     for sign in (1, -1):
         direction = sign * np.array([0.05, -0.03, 1.0]) / np.linalg.norm([0.05, -0.03, 1.0])
-        rotation, translation = refine.refine(turn(1.2), direction, current, previous, np.arange(200) < 150,
-                                              THESIS.threshold)
+        rotation, translation = refine.refine(
+            turn(1.2), direction, current, previous, np.arange(200) < 150, THESIS.threshold
+        )
         np.testing.assert_allclose(rotation, turn(1), atol=1e-8)
         np.testing.assert_allclose(translation, sign * AHEAD, atol=1e-7)
 
 
 def test_points_on_one_line_do_not_determine_the_motion():
-    line, known = fitted(turn(1), AHEAD, *hedge()), fitted(turn(1), AHEAD, *seen(street(), turn(1), AHEAD))
+    line, known = (
+        fitted(turn(1), AHEAD, *hedge()),
+        fitted(turn(1), AHEAD, *seen(street(), turn(1), AHEAD)),
+    )
     assert not motion_prior._determined(line)
     assert known.rotation_std_deg < 0.02 and known.heading_std_deg < 0.3
     assert np.isinf(fitted(turn(1), AHEAD, *seen(street(4), turn(1), AHEAD)).rotation_std_deg)
@@ -125,7 +143,9 @@ def test_the_search_near_an_expected_motion_finds_it_among_fewer_points():
     true, other = (turn(2), AHEAD), (turn(-1), np.array([0.8, 0.0, 0.6]))
     points = two_motions(true, other, counts=(120, 180))
     for rotation, translation in (true, other):
-        motion = ransac_with_prior(*points, THESIS.threshold, turn(0.5) @ rotation, translation, 1.5, 20)
+        motion = ransac_with_prior(
+            *points, THESIS.threshold, turn(0.5) @ rotation, translation, 1.5, 20
+        )
         assert degrees_apart(rotation, motion[0]) < 0.3 and abs(motion[1] @ translation) > 0.99
     assert ransac_with_prior(*points, THESIS.threshold, turn(60), AHEAD, 1.5, 20) is None
 
@@ -135,7 +155,9 @@ def test_a_consistent_motion_is_used_as_it_is():
     motion = fitted(turn(1), AHEAD, *points)
     used, prior, flag = checked(motion, *points, 0.5, MotionPrior(turn(2), AHEAD, 1.0))
     assert flag == "" and prior.scale == 0.5 and used.inliers is motion.inliers
-    assert degrees_apart(motion.rotation, used.rotation) < 1e-3 and used.translation @ AHEAD > 0.9999
+    assert (
+        degrees_apart(motion.rotation, used.rotation) < 1e-3 and used.translation @ AHEAD > 0.9999
+    )
     np.testing.assert_array_equal(prior.rotation, used.rotation)
 
 
@@ -154,12 +176,18 @@ def test_of_two_motions_the_consistent_one_is_used_and_flagged():
     wrong = fitted(*other, *points)
     assert degrees_apart(turn(-1), wrong.rotation) < 0.1
     used, prior, flag = checked(wrong, *points, 1.0, MotionPrior(turn(2.4), AHEAD, 1.0))
-    assert flag == AMBIGUOUS and degrees_apart(turn(2), used.rotation) < 0.1 and used.translation[2] > 0.99
+    assert (
+        flag == AMBIGUOUS
+        and degrees_apart(turn(2), used.rotation) < 0.1
+        and used.translation[2] > 0.99
+    )
     assert used.inliers[:150].mean() > 0.9 and used.inliers[150:].mean() < 0.3
     np.testing.assert_array_equal(prior.rotation, used.rotation)
 
 
-@pytest.mark.parametrize("motion", [(turn(8), AHEAD), (turn(0.5), -AHEAD), (turn(-4), np.array([0.8, 0, 0.6]))])
+@pytest.mark.parametrize(
+    "motion", [(turn(8), AHEAD), (turn(0.5), -AHEAD), (turn(-4), np.array([0.8, 0, 0.6]))]
+)
 def test_an_inconsistent_motion_that_nothing_else_explains_is_used_and_flagged_once(motion):
     """A sharp turn at a low frame rate, and reversing after a stop."""
     points = seen(street() + [0, 0, 5], *motion, noise=5e-5)
@@ -177,7 +205,8 @@ def test_a_motion_that_no_point_determines_repeats_the_prior():
     motion = fitted(turn(7), np.array([1.0, 0.0, 0.0]), *hedge())
     used, after, flag = checked(motion, *hedge(), 0.5, prior)
     assert flag == NOT_DETERMINED and after is prior
-    np.testing.assert_allclose(used.rotation, turn(0.5), atol=1e-12)  # the same curve over half the distance
+    # the same curve over half the distance
+    np.testing.assert_allclose(used.rotation, turn(0.5), atol=1e-12)
     np.testing.assert_array_equal(used.translation, AHEAD)
 
 
@@ -213,7 +242,10 @@ def test_a_line_beside_the_road_costs_one_flagged_step(seed):
 def test_on_a_plain_drive_the_fit_has_no_flags_and_its_errors_are_smaller_and_vary_less():
     drive, errors = Street(5), {}
     for estimator in ("thesis", "inliers", "refined"):
-        results = [odometry.run(drive, replace(THESIS, estimator=estimator, shuffle_seed=seed)) for seed in range(3)]
+        results = [
+            odometry.run(drive, replace(THESIS, estimator=estimator, shuffle_seed=seed))
+            for seed in range(3)
+        ]
         assert all(result.flagged.empty for result in results)
         errors[estimator] = [metrics.rmse(result.poses, drive.poses) for result in results]
     assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
@@ -223,7 +255,9 @@ def test_on_a_plain_drive_the_fit_has_no_flags_and_its_errors_are_smaller_and_va
 @pytest.mark.real
 @pytest.mark.parametrize("seed", [None, 2, 4])
 def test_a_turn_is_estimated_from_few_keypoints(kitti_real, seed):
-    """05, frames 128 to 149: the points are far away, so a shift to the side explains them as well as the turn."""
+    """05, frames 128 to 149: the points are far away, so a shift to the side explains them as
+    well as the turn.
+    """
     sequence = Sequence(kitti_real, "05")
     settings = replace(REFINED, max_keypoints=500, shuffle_seed=seed)
     follower = Odometry(sequence.intrinsics, settings, sequence.poses[128])
@@ -241,11 +275,15 @@ def test_a_turn_is_estimated_from_few_keypoints(kitti_real, seed):
 
 @pytest.mark.real
 def test_a_second_start_leaves_a_poor_minimum(kitti_real):
-    """05, frames 0 and 1: without a second start, six shuffles of 300 points give headings up to 11 degrees apart."""
+    """05, frames 0 and 1: without a second start, six shuffles of 300 points give headings up
+    to 11 degrees apart.
+    """
     sequence = Sequence(kitti_real, "05")
     directions = []
     for seed in range(6):
-        follower = Odometry(sequence.intrinsics, replace(REFINED, max_keypoints=300, shuffle_seed=seed or None))
+        follower = Odometry(
+            sequence.intrinsics, replace(REFINED, max_keypoints=300, shuffle_seed=seed or None)
+        )
         follower.step(sequence.frame(0))
         directions.append(follower.step(sequence.frame(1), 1.0).motion.translation)
     assert np.degrees(np.arccos(np.min(np.array(directions) @ np.transpose(directions)))) < 4
@@ -263,12 +301,23 @@ def test_the_fallback_uses_all_keypoints_if_masks_leave_too_few(small_world, est
     few[:, :, :4] = 255  # too few keypoints for any motion
     last = few.copy()
     last[:-2] = 255
-    runs = {"few": (settings, few), "last": (settings, last), "without": (plain, last), "no mask": (settings, None)}
+    runs = {
+        "few": (settings, few),
+        "last": (settings, last),
+        "without": (plain, last),
+        "no mask": (settings, None),
+    }
     results = odometry.run_many(drive, runs)
     every = odometry.run(drive, plain)
-    assert np.array_equal(results["few"].poses, every.poses) and np.array_equal(results["no mask"].poses, every.poses)
-    assert results["few"].flagged[ALL_KEYPOINTS] == len(drive) - 1 and ALL_KEYPOINTS not in results["no mask"].flagged
-    assert results["last"].flagged[ALL_KEYPOINTS] == 1  # only the last step starts from a frame with few keypoints
+    assert np.array_equal(results["few"].poses, every.poses) and np.array_equal(
+        results["no mask"].poses, every.poses
+    )
+    assert (
+        results["few"].flagged[ALL_KEYPOINTS] == len(drive) - 1
+        and ALL_KEYPOINTS not in results["no mask"].flagged
+    )
+    # only the last step starts from a frame with few keypoints
+    assert results["last"].flagged[ALL_KEYPOINTS] == 1
     assert np.array_equal(results["last"].poses, every.poses)
     assert ALL_KEYPOINTS not in results["without"].flagged
     assert not np.array_equal(results["without"].poses[-1], every.poses[-1])

@@ -13,62 +13,123 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
     rows = audit.WORDS["rows"]
     assert [int(row["row"]) for row in rows] == list(range(1, len(rows) + 1)) and len(rows) >= 70
     assert all(row[key].strip() for row in rows for key in ("where", "does", "right", "switch"))
-    assert {spec["row"] for spec in audit.WORDS["measured"] + audit.WORDS["arithmetic"]} <= {row["row"] for row in rows}
-    assert all({*spec["metrics"]} <= {*audit.WORDS["metrics"]} for spec in audit.WORDS["measured"]
-               if "unit" not in spec and "label" not in spec)
+    assert {spec["row"] for spec in audit.WORDS["measured"] + audit.WORDS["arithmetic"]} <= {
+        row["row"] for row in rows
+    }
+    assert all(
+        {*spec["metrics"]} <= {*audit.WORDS["metrics"]}
+        for spec in audit.WORDS["measured"]
+        if "unit" not in spec and "label" not in spec
+    )
 
 
-@pytest.mark.parametrize("row, quantity, metric, value", [
-    ("1", "sum", "RMSE", -13.2), ("1", "mean", "MAE", -2.33), ("1", "median", "RMSE", -5.27),
-    ("3", "reduction", "", 2.626), ("4", "larger", "MAE", 7), ("41", "improved", "RMSE", 6),
-    ("41", "sign", "RMSE", 50), ("60", "keypoints", "", 761.7)])
+@pytest.mark.parametrize(
+    "row, quantity, metric, value",
+    [
+        ("1", "sum", "RMSE", -13.2),
+        ("1", "mean", "MAE", -2.33),
+        ("1", "median", "RMSE", -5.27),
+        ("3", "reduction", "", 2.626),
+        ("4", "larger", "MAE", 7),
+        ("41", "improved", "RMSE", 6),
+        ("41", "sign", "RMSE", 50),
+        ("60", "keypoints", "", 761.7),
+    ],
+)
 def test_arithmetic_with_the_thesiss_tables(row, quantity, metric, value):
     table = audit.table(audit.of_tables(), "made up")
-    rows = table[(table["row"] == row) & (table["quantity"] == audit.WORDS["quantities"][quantity])
-                 & (table["metric"] == metric)]
+    rows = table[
+        (table["row"] == row)
+        & (table["quantity"] == audit.WORDS["quantities"][quantity])
+        & (table["metric"] == metric)
+    ]
     assert rows["value"].item() == pytest.approx(value, abs=0.011)
 
 
 def test_rows_without_a_measurement_stay_and_words_appear_once():
-    measurements = [audit.measurement("13", "spread", [1, 2, 3]), audit.measurement("13", "spread", 5)]
+    measurements = [
+        audit.measurement("13", "spread", [1, 2, 3]),
+        audit.measurement("13", "spread", 5),
+    ]
     table = audit.table(measurements, "made up")
     assert list(dict.fromkeys(table["row"])) == [row["row"] for row in audit.WORDS["rows"]]
     lines = table[table["row"] == "13"]
-    assert lines["value"].tolist() == [2, 5] and lines["n"].tolist() == [3, 1] and set(lines["data"]) == {"made up"}
+    assert (
+        lines["value"].tolist() == [2, 5]
+        and lines["n"].tolist() == [3, 1]
+        and set(lines["data"]) == {"made up"}
+    )
     assert lines["where"].iloc[0] and not lines["where"].iloc[1]
     with pytest.raises(ValueError, match="999"):
         audit.table([{"row": "999"}], "made up")
 
 
-@pytest.mark.parametrize("value, shown", [(1.0018, 1.002), (1.00002, 1.00002), (0.999996, 0.999996), (1.0, 1.0),
-                                          (123.456, 123.5)])
+@pytest.mark.parametrize(
+    "value, shown",
+    [(1.0018, 1.002), (1.00002, 1.00002), (0.999996, 0.999996), (1.0, 1.0), (123.456, 123.5)],
+)
 def test_a_value_near_one_is_not_rounded_to_one(value, shown):
     assert audit.rounded(value) == shown
 
 
 def test_ablations_become_ratios_of_their_reference():
-    factors = {"baseline": 1.0, "masked": 0.5, "nearest": 0.25, "strongest-100": 4.0, "dropout": 1.0}
-    runs = made_up.runs([f"{number:02d}" for number in range(8)], lambda _, method, __: factors[method],
-                        dict.fromkeys(factors, [None]), estimators=ablations.ESTIMATORS, noise=0.02)
+    factors = {
+        "baseline": 1.0,
+        "masked": 0.5,
+        "nearest": 0.25,
+        "strongest-100": 4.0,
+        "dropout": 1.0,
+    }
+    runs = made_up.runs(
+        [f"{number:02d}" for number in range(8)],
+        lambda _, method, __: factors[method],
+        dict.fromkeys(factors, [None]),
+        estimators=ablations.ESTIMATORS,
+        noise=0.02,
+    )
     runs = runs.assign(failed=1.0, across=0.1, down=0.2, sim3=runs["rmse"])
     measurements = pd.DataFrame(audit.of_ablations(runs))
-    ratios = measurements[measurements["unit"] == "ratio"].set_index(["row", "metric", "estimator"])["value"]
-    assert ratios["10", "RMSE", "refined"] == pytest.approx(0.5, rel=0.05) and ratios["10", "keypoints", ""] == 1
+    ratios = measurements[measurements["unit"] == "ratio"].set_index(
+        ["row", "metric", "estimator"]
+    )["value"]
+    assert (
+        ratios["10", "RMSE", "refined"] == pytest.approx(0.5, rel=0.05)
+        and ratios["10", "keypoints", ""] == 1
+    )
     assert ratios["59", "RMSE", "thesis"] == pytest.approx(1, rel=0.05)
     assert set(measurements["frames"]) == {100}
     assert not measurements["row"].isin(["48"]).any()  # ORB was not run
 
 
 def test_other_tables_are_measured_by_sequence_with_their_number_of_frames():
-    shares = pd.DataFrame({"sequence": ["00", "00", "01"], "frame": [0, 5, 0], "lost": [10.0, 30.0, 40.0],
-                           "road/sidewalk": [np.nan, np.nan, 60.0], "building/fence": np.nan})
+    shares = pd.DataFrame(
+        {
+            "sequence": ["00", "00", "01"],
+            "frame": [0, 5, 0],
+            "lost": [10.0, 30.0, 40.0],
+            "road/sidewalk": [np.nan, np.nan, 60.0],
+            "building/fence": np.nan,
+        }
+    )
     rows = audit.measured(shares, "boundaries")
     assert {(row["quantity"], row["value"], row["n"], row["frames"]) for row in rows} == {
-        ("boundary pixels lost", 30, 2, 2), ("boundary pixels lost, road/sidewalk", 60, 1, 2)}
-    tracks = pd.DataFrame({"sequence": ["00"] * 4, "frame": [0, 0, 3, 3], "method": ["all keypoints", "masks"] * 2,
-                           "residual": [1.0, 2.0, 1.0, 8.0]})
+        ("boundary pixels lost", 30, 2, 2),
+        ("boundary pixels lost, road/sidewalk", 60, 1, 2),
+    }
+    tracks = pd.DataFrame(
+        {
+            "sequence": ["00"] * 4,
+            "frame": [0, 0, 3, 3],
+            "method": ["all keypoints", "masks"] * 2,
+            "residual": [1.0, 2.0, 1.0, 8.0],
+        }
+    )
     (row,) = audit.measured(tracks, "tracks")
-    assert (row["row"], row["frames"], row["n"]) == ("32", 2, 1) and row["value"] == pytest.approx(4)
-    angles = pd.DataFrame({"sequence": ["00", "01"], "pitch": [0.1, 0.3], "rmse": [2.0, 2.0], "rmse_own": [1.0, 1.0]})
+    assert (row["row"], row["frames"], row["n"]) == ("32", 2, 1) and row["value"] == pytest.approx(
+        4
+    )
+    angles = pd.DataFrame(
+        {"sequence": ["00", "01"], "pitch": [0.1, 0.3], "rmse": [2.0, 2.0], "rmse_own": [1.0, 1.0]}
+    )
     values = {row["metric"]: row["value"] for row in audit.measured(angles, "boresight")}
     assert values == pytest.approx({"": 0.2, "RMSE": 0.5})

@@ -15,7 +15,15 @@ def test_evidence_has_every_method_and_error_and_no_frames(small_world, tmp_path
     evidence.write(*arguments, frames=6, repetitions=1)
     files = list((tmp_path / "out").iterdir())
     assert {path.suffix for path in files} == {".csv", ".md", ".svg"}
-    assert {path.stem for path in files} == {"README", "audit", "comparison", "failures", "runs", "switches", "widths"}
+    assert {path.stem for path in files} == {
+        "README",
+        "audit",
+        "comparison",
+        "failures",
+        "runs",
+        "switches",
+        "widths",
+    }
     failures = pd.read_csv(tmp_path / "out" / "failures.csv")
     assert list(failures["steps"][:2]) == ["00", "01"]
     assert failures["number"][:2].sum() == failures["number"][2:].sum() == 10
@@ -23,7 +31,10 @@ def test_evidence_has_every_method_and_error_and_no_frames(small_world, tmp_path
     assert (failures["agreeing, masks"] <= failures["tracked, masks"]).all()
     runs = pd.read_csv(tmp_path / "out" / "runs.csv", dtype={"sequence": str})
     assert set(runs["sequence"]) == {"00", "01"} and set(runs["frames"]) == {6}
-    assert set(compare.METHODS) <= set(runs["method"]) and {*compare.JUDGING_METRICS, "rmse"} <= set(runs)
+    assert set(compare.METHODS) <= set(runs["method"]) and {
+        *compare.JUDGING_METRICS,
+        "rmse",
+    } <= set(runs)
     corrected = runs[runs["method"] == "corrected"]
     assert set(corrected["dilation_width"]) == {jobs.CONTROL_WIDTH}
     assert set(corrected["estimator"]) == set(jobs.ESTIMATORS)

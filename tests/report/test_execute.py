@@ -16,45 +16,73 @@ from thesis_repro.settings import ROOT
 
 pytestmark = pytest.mark.slow
 
-COMMAND = [str(Path(sys.executable).parent / "jupyter-nbconvert"), "--to", "notebook", "--execute",
-           "--log-level=CRITICAL", "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
-           "--Execution.log_file=out/done.log", "--output-dir", "out", "--output", "done", "one.ipynb"]
+COMMAND = [
+    str(Path(sys.executable).parent / "jupyter-nbconvert"),
+    "--to",
+    "notebook",
+    "--execute",
+    "--log-level=CRITICAL",
+    "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
+    "--Execution.log_file=out/done.log",
+    "--output-dir",
+    "out",
+    "--output",
+    "done",
+    "one.ipynb",
+]
 
 
 @pytest.fixture
 def start(tmp_path):
     """start(*cells): start nbconvert, as the Makefile does, on a notebook of these cells."""
+
     def started(*cells):
         cells = [nbformat.v4.new_code_cell(cell) for cell in cells]
         nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "one.ipynb")
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         # processes in the background of a shell script ignore SIGINT
-        return subprocess.Popen(COMMAND, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True,
-                                stderr=subprocess.PIPE, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+        return subprocess.Popen(
+            COMMAND,
+            cwd=tmp_path,
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+            stderr=subprocess.PIPE,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
 
     return started
 
 
 def test_progress_is_shown_and_logs_of_compiled_libraries_are_not(start, tmp_path):
-    process = start("import os\nopen(os.environ['THESIS_REPRO_PROGRESS'], 'a').write('half way\\n')\nprint('mine')\n"
-                    "os.write(2, b'I0000 00:00:1.1 3010 port.cc:153] oneDNN custom operations are on.')")
+    process = start(
+        "import os\nopen(os.environ['THESIS_REPRO_PROGRESS'], 'a').write('half way\\n')\nprint('mine')\n"
+        "os.write(2, b'I0000 00:00:1.1 3010 port.cc:153] oneDNN custom operations are on.')"
+    )
     stdout, stderr = process.communicate()
     assert process.returncode == 0 and stderr == "half way\n"
     assert stdout.startswith("one\none: done in ")
     (cell,) = nbformat.read(tmp_path / "out" / "done.ipynb", 4).cells
-    assert [output.get("text") for output in cell.outputs if output.output_type == "stream"] == ["mine\n"]
+    assert [output.get("text") for output in cell.outputs if output.output_type == "stream"] == [
+        "mine\n"
+    ]
     assert "port.cc" in (tmp_path / "out" / "done.log").read_text()
 
 
 def test_a_failure_leaves_one_line_and_a_log_and_no_notebook(start, tmp_path):
-    process = start("from thesis_repro import InputError\nprint('so far')",
-                    "raise InputError('00.txt: no such file; check KITTI\\nmore of it')")
+    process = start(
+        "from thesis_repro import InputError\nprint('so far')",
+        "raise InputError('00.txt: no such file; check KITTI\\nmore of it')",
+    )
     _, stderr = process.communicate()
     error, log_file = stderr.splitlines()
     assert process.returncode == 1 and "out/done.log" in log_file
     assert error == "one failed: InputError: 00.txt: no such file; check KITTI\\nmore of it"
     log = (tmp_path / "out" / "done.log").read_text()
-    assert "ERROR   one failed: InputError: 00.txt: no such file" in (tmp_path / "out" / "log.txt").read_text()
+    assert (
+        "ERROR   one failed: InputError: 00.txt: no such file"
+        in (tmp_path / "out" / "log.txt").read_text()
+    )
     assert "raise InputError" in log and "more of it" in log and "\x1b" not in log
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"done.log", "log.txt"}
 
@@ -63,19 +91,32 @@ def test_a_dead_kernel_is_reported(start, tmp_path):
     process = start("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
     _, stderr = process.communicate()
     assert process.returncode == 1 and stderr.startswith("one failed: the kernel died")
-    assert "Traceback" not in stderr and "DeadKernelError" in (tmp_path / "out" / "done.log").read_text()
+    assert (
+        "Traceback" not in stderr
+        and "DeadKernelError" in (tmp_path / "out" / "done.log").read_text()
+    )
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_notebook_leaves_no_kernel_running(start, tmp_path, sent):
-    process = start("import os, time\nfrom pathlib import Path\n"
-                    "try:\n    Path('pid').write_text(str(os.getpid()))\n    time.sleep(100)\n"
-                    "finally:\n    Path('tidied').touch()")
+    process = start(
+        "import os, time\nfrom pathlib import Path\n"
+        "try:\n    Path('pid').write_text(str(os.getpid()))\n    time.sleep(100)\n"
+        "finally:\n    Path('tidied').touch()"
+    )
     wait_for((tmp_path / "pid").is_file)
     time.sleep(0.5)
     process.send_signal(sent)
     _, stderr = process.communicate(timeout=120)
-    assert process.returncode == 130 and stderr.startswith("one was interrupted") and stderr.count("\n") == 1
-    alive = {kernel.pid for kernel in psutil.process_iter(["status"]) if kernel.info["status"] != psutil.STATUS_ZOMBIE}
+    assert (
+        process.returncode == 130
+        and stderr.startswith("one was interrupted")
+        and stderr.count("\n") == 1
+    )
+    alive = {
+        kernel.pid
+        for kernel in psutil.process_iter(["status"])
+        if kernel.info["status"] != psutil.STATUS_ZOMBIE
+    }
     assert (tmp_path / "tidied").is_file() and int((tmp_path / "pid").read_text()) not in alive
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"done.log", "log.txt"}

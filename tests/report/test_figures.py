@@ -1,4 +1,6 @@
-"""Figures of chapter 2 and of frames show the numbers of the data and can be read; axes that figures share."""
+"""Figures of chapter 2 and of frames show the numbers of the data and can be read; axes that
+figures share.
+"""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -18,7 +20,7 @@ def texts(figure):
 def textured(shift=0, size=(120, 400)):
     noise = np.random.default_rng(0).integers(0, 256, (size[0] // 4, size[1] // 2), np.uint8)
     wide = noise.repeat(4, 0).repeat(4, 1)
-    return wide[:, 40 - shift:40 - shift + size[1]].copy()
+    return wide[:, 40 - shift : 40 - shift + size[1]].copy()
 
 
 def turning():
@@ -27,13 +29,20 @@ def turning():
     poses[:, 2, 3] = 0, 2, 4, 5, 6
     poses[3:, 0, 3] = 1, 2
     turn = np.radians(30)
-    poses[3:, :3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    poses[3:, :3, :3] = [
+        [np.cos(turn), 0, np.sin(turn)],
+        [0, 1, 0],
+        [-np.sin(turn), 0, np.cos(turn)],
+    ]
     return poses
 
 
 def convolution(channels=1):
     random = np.random.default_rng(0)
-    patch, kernel = random.integers(0, 256, (12, 12, channels)), random.normal(0, 0.2, (3, 3, channels))
+    patch, kernel = (
+        random.integers(0, 256, (12, 12, channels)),
+        random.normal(0, 0.2, (3, 3, channels)),
+    )
     response = np.random.default_rng(1).normal(0, 50, (12, 12))
     response[6, 4] = 1.25 + (patch[5:8, 3:6] * kernel).sum()
     return patch, kernel, 1.25, response, np.maximum(response, 0), (6, 4)
@@ -42,7 +51,11 @@ def convolution(channels=1):
 FRAME, LATER = textured(), textured(5)
 BLANK = np.zeros_like(FRAME)
 LABEL_MAP = np.full(FRAME.shape, ID["road"], np.uint8)
-LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = ID["car"], ID["sky"], ID["license plate"]
+LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = (
+    ID["car"],
+    ID["sky"],
+    ID["license plate"],
+)
 MOVED = np.roll(LABEL_MAP, 14, axis=1)
 MASK = 255 * (LABEL_MAP == ID["car"]).astype(np.uint8)
 POINTS = np.array([[110.0, 50.0], [120.0, 60.0]])
@@ -52,18 +65,34 @@ DRAWN = {
     "2.8": lambda: chapter2.figure_2_08(turning(), "sequence 00"),
     "2.9": lambda: chapter2.figure_2_09(FRAME, LATER, "sequence 00"),
     "2.9 without corners": lambda: chapter2.figure_2_09(MASK, BLANK, "sequence 00"),
-    "2.11": lambda: chapter2.figure_2_11(FRAME, LATER, (POINTS, POINTS), POINTS[:0], POINTS, ("frame 0", "frame 5")),
-    "2.12": lambda: chapter2.figure_2_12(FRAME, POINTS, LABEL_MAP, POINTS, ("frame 0", "its label map")),
+    "2.11": lambda: chapter2.figure_2_11(
+        FRAME, LATER, (POINTS, POINTS), POINTS[:0], POINTS, ("frame 0", "frame 5")
+    ),
+    "2.12": lambda: chapter2.figure_2_12(
+        FRAME, POINTS, LABEL_MAP, POINTS, ("frame 0", "its label map")
+    ),
     "3.3": lambda: frames.figure_3_03(FRAME, LABEL_MAP, np.roll(LABEL_MAP, 9), LABELS[ID["car"]]),
     "3.6": lambda: frames.figure_3_06(FRAME, LABEL_MAP, MASK, MASK, 10),
-    "masks": lambda: frames.figure_masks(FRAME, dict.fromkeys("abc", MASK), dict.fromkeys("abc", POINTS), MASK),
-    "4.2": lambda: frames.figure_4_02(FRAME[:, :120], LABEL_MAP[:, :120], LABEL_MAP[:, 100:220], "this model"),
-    "4.3": lambda: frames.figure_4_03(FRAME, LABEL_MAP[::2, ::3], "sequence 00, frame 0", LABEL_MAP),
+    "masks": lambda: frames.figure_masks(
+        FRAME, dict.fromkeys("abc", MASK), dict.fromkeys("abc", POINTS), MASK
+    ),
+    "4.2": lambda: frames.figure_4_02(
+        FRAME[:, :120], LABEL_MAP[:, :120], LABEL_MAP[:, 100:220], "this model"
+    ),
+    "4.3": lambda: frames.figure_4_03(
+        FRAME, LABEL_MAP[::2, ::3], "sequence 00, frame 0", LABEL_MAP
+    ),
     "4.4": lambda: frames.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
     "4.5": lambda: frames.figure_4_05(FRAME, POINTS, LABEL_MAP, MASK, POINTS, 10, "sequence 00"),
-    "4.8": lambda: frames.figure_4_08(flicker.follow([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"),
-    "4.8 without keypoints": lambda: frames.figure_4_08(flicker.follow([FRAME] * 2, [BLANK] * 2, 5), "00"),
-    "paths": lambda: trajectories.figure({"masked": turning(), "$all$": 2 * turning()}, turning(), "sequence 00"),
+    "4.8": lambda: frames.figure_4_08(
+        flicker.follow([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"
+    ),
+    "4.8 without keypoints": lambda: frames.figure_4_08(
+        flicker.follow([FRAME] * 2, [BLANK] * 2, 5), "00"
+    ),
+    "paths": lambda: trajectories.figure(
+        {"masked": turning(), "$all$": 2 * turning()}, turning(), "sequence 00"
+    ),
     "paths without truth": lambda: trajectories.figure({"masked": turning()}, None, "sequence 11"),
 }
 
@@ -75,7 +104,9 @@ def test_texts_of_figures_can_be_read(name):
 
 def test_numbers_of_the_convolution_sum_to_its_response():
     figure = chapter2.figure_2_02(*convolution())
-    field, weights, products = ([float(text.get_text()) for text in axes.texts] for axes in figure.axes[3:6])
+    field, weights, products = (
+        [float(text.get_text()) for text in axes.texts] for axes in figure.axes[3:6]
+    )
     assert products == pytest.approx(np.multiply(field, weights), abs=0.02)
     assert 1.25 + sum(products) == pytest.approx(convolution()[3][6, 4], abs=0.05)
     assert f"{convolution()[3][6, 4]:.2f}" in figure.get_supxlabel()
@@ -83,7 +114,8 @@ def test_numbers_of_the_convolution_sum_to_its_response():
 
 def test_the_iou_figure_shows_areas_and_their_ratio():
     label_map, prediction = (np.full((20, 20), ID["road"], np.uint8) for _ in range(2))
-    label_map[:10], prediction[:15] = ID["car"], ID["car"]  # 200 and 300 pixels, one inside the other
+    # 200 and 300 pixels, one inside the other
+    label_map[:10], prediction[:15] = ID["car"], ID["car"]
     shown = " ".join(texts(frames.figure_3_03(label_map, label_map, prediction, LABELS[ID["car"]])))
     assert all(number in shown for number in ("200 / 300", "0.67", "200 pixels", "300 pixels"))
 
@@ -95,7 +127,8 @@ def test_the_unet_figure_shows_the_sizes_of_the_model():
     figure = chapter2.figure_2_07(build_unet((32, 32, 1), 35, base_filters=2))
     assert problems(figure) == []
     assert {"32x32", "2x2", "35"} <= set(texts(figure)) and "64" not in texts(figure)
-    assert sum(getattr(text, "arrow_patch", None) is not None for text in figure.axes[0].texts) == 4  # skip connections
+    # skip connections
+    assert sum(getattr(text, "arrow_patch", None) is not None for text in figure.axes[0].texts) == 4
 
 
 def test_relative_motions_are_shown():
@@ -113,16 +146,24 @@ def test_matched_points_of_a_shifted_frame():
         assert (len(in_first), len(lost) > 0, len(new) > 0) == (0, first is FRAME, second is FRAME)
     left = np.where(np.arange(FRAME.shape[1]) < 100, np.uint8(255), BLANK)
     in_first, _, lost, new = flicker.found_again(FRAME, LATER, left, left)
-    assert max(in_first[:, 0].max(), lost[:, 0].max(), new[:, 0].max()) < 100 and len(in_first) > len(lost)
+    assert max(in_first[:, 0].max(), lost[:, 0].max(), new[:, 0].max()) < 100 and len(
+        in_first
+    ) > len(lost)
 
 
 def test_keypoints_jump_with_a_moving_boundary_alone():
     frame = textured(size=(120, 240))
     car = np.where(MASK[:, :240] > 0, ID["car"], ID["road"]).astype(np.uint8)
-    still, jumping = (flicker.follow([frame, frame], [car, later], 5, first=7) for later in (car, np.roll(car, 14, 1)))
+    still, jumping = (
+        flicker.follow([frame, frame], [car, later], 5, first=7)
+        for later in (car, np.roll(car, 14, 1))
+    )
     assert [view.frame for view in still] == [7, 8] and still[0].expected is None
     assert len(still[1].expected) == len(still[0].keypoints) > 0 and still[1].jumped == 0
-    assert jumping[1].jumped > len(jumping[1].expected) / 3 and still[0].crop.shape == still[0].edges.shape
+    assert (
+        jumping[1].jumped > len(jumping[1].expected) / 3
+        and still[0].crop.shape == still[0].edges.shape
+    )
 
 
 def test_saved_figures_have_repeatable_bytes_and_a_note(tmp_path):
@@ -132,12 +173,31 @@ def test_saved_figures_have_repeatable_bytes_and_a_note(tmp_path):
     for name in ("plot.svg", "picture.webp"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
         assert b"a note" in (tmp_path / "first" / name).read_bytes()
-    style.save_figure(chapter2.figure_2_08(turning(), "title"), tmp_path / "first", "picture", "a note")
-    assert sorted(path.name for path in (tmp_path / "first").iterdir()) == ["picture.svg", "plot.svg"]
+    style.save_figure(
+        chapter2.figure_2_08(turning(), "title"), tmp_path / "first", "picture", "a note"
+    )
+    assert sorted(path.name for path in (tmp_path / "first").iterdir()) == [
+        "picture.svg",
+        "plot.svg",
+    ]
 
 
-@pytest.mark.parametrize("low, high", [(1, 1), (1.01, 1.02), (0.97, 1.3), (0.3, 4), (2, 90), (1, 130), (1e-3, 1e5),
-                                       (300, 2000), (1.5, 0.7), (np.nan, 1.2), (0, np.inf)])
+@pytest.mark.parametrize(
+    "low, high",
+    [
+        (1, 1),
+        (1.01, 1.02),
+        (0.97, 1.3),
+        (0.3, 4),
+        (2, 90),
+        (1, 130),
+        (1e-3, 1e5),
+        (300, 2000),
+        (1.5, 0.7),
+        (np.nan, 1.2),
+        (0, np.inf),
+    ],
+)
 def test_a_ratio_axis_has_a_few_round_ticks_within_it(low, high):
     axis = plt.figure().add_subplot().yaxis
     style.ratio_axis(axis, [low, high])
@@ -146,4 +206,6 @@ def test_a_ratio_axis_has_a_few_round_ticks_within_it(low, high):
     assert axis.get_scale() == "log" and 2 <= len(ticks) <= 8
     assert all(bottom <= value <= top for value in (low, high) if 0 < value < np.inf)
     assert not len(axis.get_ticklocs(minor=True))
-    assert all(float(axis.get_major_formatter()(tick)) == pytest.approx(tick, rel=1e-5) for tick in ticks)
+    assert all(
+        float(axis.get_major_formatter()(tick)) == pytest.approx(tick, rel=1e-5) for tick in ticks
+    )

@@ -12,34 +12,66 @@ class Gap:
     """Scores of two models on two domains; the second domain of the first model has no sky."""
 
     scores = pd.DataFrame(
-        [(OWN, VALIDATION, 20, 2, 0.6, 0.9), (OWN, STREETS, 7, 1, 0.3, float("nan")),
-         (SHIPPED, VALIDATION, 20, 2, 0.5, 0.8), (SHIPPED, STREETS, 7, 2, 0.4, 0.7)],
+        [
+            (OWN, VALIDATION, 20, 2, 0.6, 0.9),
+            (OWN, STREETS, 7, 1, 0.3, float("nan")),
+            (SHIPPED, VALIDATION, 20, 2, 0.5, 0.8),
+            (SHIPPED, STREETS, 7, 2, 0.4, 0.7),
+        ],
         columns=["model", "domain", "images", "classes", "mean_iou", "sky_recall"],
     ).assign(accuracy=0.7, dark=0.1, dark_wrong=0.4, lit_wrong=0.2)
-    classes = pd.DataFrame([
-        {"model": row.model, "domain": row.domain, "class": name, "id": number, "share": 0.5, "iou": iou}
-        for row in scores.itertuples() for name, number, iou in (("road", 7, 0.8), ("sky", 23, 0.7))[:row.classes]])
+    classes = pd.DataFrame(
+        [
+            {
+                "model": row.model,
+                "domain": row.domain,
+                "class": name,
+                "id": number,
+                "share": 0.5,
+                "iou": iou,
+            }
+            for row in scores.itertuples()
+            for name, number, iou in (("road", 7, 0.8), ("sky", 23, 0.7))[: row.classes]
+        ]
+    )
     flicker = pd.Series({OWN: 0.05, SHIPPED: 0.03, EXACT: 0.01})
 
 
 def test_the_table_and_the_figure_show_each_model_and_domain():
     table = gap.table(Gap).set_index("measure")
-    assert list(table) == [f"{OWN}: {VALIDATION}", f"{OWN}: {STREETS}", f"{SHIPPED}: {VALIDATION}",
-                           f"{SHIPPED}: {STREETS}", EXACT]
+    assert list(table) == [
+        f"{OWN}: {VALIDATION}",
+        f"{OWN}: {STREETS}",
+        f"{SHIPPED}: {VALIDATION}",
+        f"{SHIPPED}: {STREETS}",
+        EXACT,
+    ]
     scores = table[f"{OWN}: {VALIDATION}"]
-    assert scores[["images", "classes present", "mean IoU over these", "IoU: sky"]].tolist() == [20, 2, 0.6, 0.7]
+    assert scores[["images", "classes present", "mean IoU over these", "IoU: sky"]].tolist() == [
+        20,
+        2,
+        0.6,
+        0.7,
+    ]
     assert scores["dark ground taken for something else (%)"] == 40
     assert pd.isna(table.loc["IoU: sky", f"{OWN}: {STREETS}"])
     assert table.loc["pixels that flicker (%)"].dropna().tolist() == [5, 3, 1]
     assert table.index.is_unique
     figure = gap.figure(Gap)
     assert [axes.get_title() for axes in figure.axes] == [OWN, SHIPPED]
-    assert sorted(bar.get_height() for bar in figure.axes[0].patches if bar.get_height() > 0) == [0.7, 0.8, 0.8]
+    assert sorted(bar.get_height() for bar in figure.axes[0].patches if bar.get_height() > 0) == [
+        0.7,
+        0.8,
+        0.8,
+    ]
 
 
 def test_the_quality_of_label_maps_is_recorded(tmp_path):
     assert gap.label_map_quality(tmp_path) == []
-    style.save_table(Gap.scores.assign(used=Gap.scores["model"] == SHIPPED), tmp_path, gap.RECORD, "note")
+    style.save_table(
+        Gap.scores.assign(used=Gap.scores["model"] == SHIPPED), tmp_path, gap.RECORD, "note"
+    )
     rows = gap.label_map_quality(tmp_path)
-    assert [(row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows] == [
-        (VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]
+    assert [
+        (row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows
+    ] == [(VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]

@@ -23,11 +23,16 @@ SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><pat
 CSV = 'sequence,RMSE (m),change (%),"change (%), thesis"\n00,0.5,-3.25,1.0\n01,12.0,4.5,\nsequences improved,,1.0,0.0\n'
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 VOID = {"img", "meta"}
-ARTEFACTS = [*(artefact for chapter in captions.CHAPTERS.values() for artefact in chapter), *captions.ADDED]
+ARTEFACTS = [
+    *(artefact for chapter in captions.CHAPTERS.values() for artefact in chapter),
+    *captions.ADDED,
+]
 
 
 class Reader(HTMLParser):
-    """The text of a page and its elements as (tag, attributes); fails if tags are not closed in order."""
+    """The text of a page and its elements as (tag, attributes); fails if tags are not closed in
+    order.
+    """
 
     def __init__(self, text):
         super().__init__()
@@ -50,28 +55,45 @@ class Reader(HTMLParser):
         self.text += data
 
     def values(self, tag, attribute):
-        return [attributes[attribute] for name, attributes in self.elements if name == tag and attribute in attributes]
+        return [
+            attributes[attribute]
+            for name, attributes in self.elements
+            if name == tag and attribute in attributes
+        ]
 
 
 @pytest.fixture
 def run(tmp_path):
     """A run in a folder with a space in its name: every artefact, and one executed notebook."""
-    settings = read_settings({"THESIS_REPRO_BUILD": str(tmp_path / "my build"),
-                              "THESIS_REPRO_FIGURES": str(tmp_path / "figures")})
+    settings = read_settings(
+        {
+            "THESIS_REPRO_BUILD": str(tmp_path / "my build"),
+            "THESIS_REPRO_FIGURES": str(tmp_path / "figures"),
+        }
+    )
     settings.figures.mkdir()
     for artefact in ARTEFACTS:
-        for ending in page.ENDINGS[artefact["kind"]][:1 if artefact["kind"] == "figure" else None]:
+        for ending in page.ENDINGS[artefact["kind"]][: 1 if artefact["kind"] == "figure" else None]:
             text = {".svg": SVG, ".csv": CSV}.get(ending, "What it shows")
             (settings.figures / f"{artefact['name']}{ending}").write_text(text)
     executed = settings.build / "notebooks" / "08_results.ipynb"
     executed.parent.mkdir(parents=True)
-    cell = nbformat.v4.new_code_cell('keep(figure, "figure_4_06")', execution_count=1,
-                                     outputs=[nbformat.v4.new_output("stream", text="a number: 42")])
-    nbformat.write(nbformat.v4.new_notebook(
-        cells=[nbformat.v4.new_markdown_cell("# Results"), cell],
-        metadata={"language_info": {"name": "python", "version": "3.11.99"}}), executed)
+    cell = nbformat.v4.new_code_cell(
+        'keep(figure, "figure_4_06")',
+        execution_count=1,
+        outputs=[nbformat.v4.new_output("stream", text="a number: 42")],
+    )
+    nbformat.write(
+        nbformat.v4.new_notebook(
+            cells=[nbformat.v4.new_markdown_cell("# Results"), cell],
+            metadata={"language_info": {"name": "python", "version": "3.11.99"}},
+        ),
+        executed,
+    )
     os.utime(executed, (1709210096,) * 2)  # 29 February 2024
-    return SimpleNamespace(settings=settings, page=settings.figures / "index.html", executed=executed)
+    return SimpleNamespace(
+        settings=settings, page=settings.figures / "index.html", executed=executed
+    )
 
 
 def read(run):
@@ -81,8 +103,11 @@ def read(run):
 
 def test_the_answer_comes_first_and_41_artefacts_in_the_order_of_the_thesis(run):
     shown = read(run)
-    ids = [attributes["id"] for tag, attributes in shown.elements
-           if tag in ("figure", "section", "h2") and "chapter" not in attributes["id"]]
+    ids = [
+        attributes["id"]
+        for tag, attributes in shown.elements
+        if tag in ("figure", "section", "h2") and "chapter" not in attributes["id"]
+    ]
     added = [f"{artefact['kind']}-{artefact['name']}" for artefact in captions.ADDED[1:]]
     added.remove(page.OPENING[2])
     in_order = [name for name in captions.THESIS if name not in page.OPENING]
@@ -119,11 +144,28 @@ document.querySelector("pre").textContent = JSON.stringify(faults); }</script>""
 
 
 def faults_in_a_browser(folder, scratch):
-    """Faults of a page at 400 and 1400 pixels, unfolded: too wide, missing images, dead links and overlapping texts."""
+    """Faults of a page at 400 and 1400 pixels, unfolded: too wide, missing images, dead links
+    and overlapping texts.
+    """
     (folder / "probe.html").write_text(PROBE)  # a window cannot be as narrow
-    dumped = subprocess.run([BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--dump-dom",
-                             "--allow-file-access-from-files", "--window-size=1600,900", f"--user-data-dir={scratch}",
-                             (folder / "probe.html").as_uri()], capture_output=True, text=True, timeout=120, check=True)
+    dumped = subprocess.run(
+        [
+            BROWSER,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--hide-scrollbars",
+            "--dump-dom",
+            "--allow-file-access-from-files",
+            "--window-size=1600,900",
+            f"--user-data-dir={scratch}",
+            (folder / "probe.html").as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
     return json.loads(html.unescape(re.search("<pre>(.*?)</pre>", dumped.stdout, re.DOTALL)[1]))
 
 
@@ -131,28 +173,53 @@ def faults_in_a_browser(folder, scratch):
 def test_a_browser_shows_the_page_of_the_repository_without_faults(tmp_path):
     figures = tmp_path / "figures"
     shutil.copytree(ROOT / "figures", figures)
-    (figures / page.PAGE).write_text(page.build(replace(read_settings({}), figures=figures, build=tmp_path)))
+    (figures / page.PAGE).write_text(
+        page.build(replace(read_settings({}), figures=figures, build=tmp_path))
+    )
     assert faults_in_a_browser(figures, tmp_path / "scratch") == []
-    folded = '<p style="height: 0">Folded <img src="none.svg"></p><p>over <a href="#nowhere">it</a></p>'
-    (figures / page.PAGE).write_text(f'<details>{folded}</details><div style="width: 900px">wide</div>')
+    folded = (
+        '<p style="height: 0">Folded <img src="none.svg"></p><p>over <a href="#nowhere">it</a></p>'
+    )
+    (figures / page.PAGE).write_text(
+        f'<details>{folded}</details><div style="width: 900px">wide</div>'
+    )
     faults = faults_in_a_browser(figures, tmp_path / "scratch")
-    assert {fault.split(" at ")[0] for fault in faults} >= {"wider than 400", "no image none.svg", "dead link #nowhere"}
+    assert {fault.split(" at ")[0] for fault in faults} >= {
+        "wider than 400",
+        "no image none.svg",
+        "dead link #nowhere",
+    }
     assert any(fault.startswith("over it on Folded") for fault in faults)
 
 
 def test_missing_artefacts_are_listed_unless_their_data_were_not_given(run, tmp_path):
-    for name in ("figure_4_06.svg", "table_3_2.csv", "figure_3_05.svg", "findings.md", "domain_gap.svg"):
+    for name in (
+        "figure_4_06.svg",
+        "table_3_2.csv",
+        "figure_3_05.svg",
+        "findings.md",
+        "domain_gap.svg",
+    ):
         (run.settings.figures / name).unlink()
     shown = read(run)
-    assert (run.settings.figures / "table_3_2.csv").read_bytes() == (ROOT / "figures" / "table_3_2.csv").read_bytes()
+    assert (run.settings.figures / "table_3_2.csv").read_bytes() == (
+        ROOT / "figures" / "table_3_2.csv"
+    ).read_bytes()
     assert "39 of 41" in shown.text and "figure_4_06.svg" not in shown.values("img", "src")
-    assert shown.values("a", "href").count("#figure_3_05") == 2 and "Notebook 08_results makes it" in shown.text
+    assert (
+        shown.values("a", "href").count("#figure_3_05") == 2
+        and "Notebook 08_results makes it" in shown.text
+    )
     on_real_frames = replace(run.settings, kitti_is_embedded=False)
     text = page.build(on_real_frames)
     missing = re.search(r'<p class="missing">Missing:(.*?)</p>', text, re.DOTALL)[1]
-    assert "#figure_4_06" in missing and "figure_3_05" not in missing and "domain_gap" not in missing
+    assert (
+        "#figure_4_06" in missing and "figure_3_05" not in missing and "domain_gap" not in missing
+    )
     assert text.count("CITYSCAPES=/path") == text.count("KITTI_SEMANTIC=/path") == 1
-    assert "KITTI_SEMANTIC=/path" not in page.build(replace(on_real_frames, kitti_semantic=tmp_path))
+    assert "KITTI_SEMANTIC=/path" not in page.build(
+        replace(on_real_frames, kitti_semantic=tmp_path)
+    )
 
 
 def test_links_are_relative_and_exist_and_no_folder_of_the_machine_is_named(run):
@@ -160,7 +227,11 @@ def test_links_are_relative_and_exist_and_no_folder_of_the_machine_is_named(run)
     links = shown.values("a", "href") + shown.values("img", "src")
     assert any("08_results.html" in link for link in links)
     for link in links:
-        assert link[1:] in shown.ids if link.startswith("#") else (run.settings.figures / unquote(link)).is_file(), link
+        assert (
+            link[1:] in shown.ids
+            if link.startswith("#")
+            else (run.settings.figures / unquote(link)).is_file()
+        ), link
     for path in (run.page, run.executed.with_suffix(".html")):
         text = path.read_text()
         assert "script" not in {tag for tag, _ in Reader(text).elements}
@@ -170,15 +241,26 @@ def test_links_are_relative_and_exist_and_no_folder_of_the_machine_is_named(run)
 
 def test_the_page_in_git_does_not_depend_on_the_machine_or_day(run):
     text = read(run).text
-    assert "29 February 2024" in text and platform.python_version() in text and "tensorflow 2." in text
+    assert (
+        "29 February 2024" in text and platform.python_version() in text and "tensorflow 2." in text
+    )
     in_git = replace(run.settings, figures=ROOT / "figures")  # read, not written
     before = page.build(in_git)
-    assert platform.python_version() not in before.replace("tensorflow", "") and "2024" not in before
+    assert (
+        platform.python_version() not in before.replace("tensorflow", "") and "2024" not in before
+    )
     os.utime(run.executed, (1900000000,) * 2)
     assert page.build(in_git) == before and "2030" in page.build(run.settings)
     shown = Reader(before)
-    links = [link for link in shown.values("a", "href") + shown.values("img", "src") if not link.startswith("#")]
-    assert len(links) > 80 and [link for link in links if "/" in link] == [page.EVIDENCE, "../docs/own-masks.md"]
+    links = [
+        link
+        for link in shown.values("a", "href") + shown.values("img", "src")
+        if not link.startswith("#")
+    ]
+    assert len(links) > 80 and [link for link in links if "/" in link] == [
+        page.EVIDENCE,
+        "../docs/own-masks.md",
+    ]
     assert str(Path("my build", "embedded-demo", "notebooks")) in shown.text
 
 
@@ -187,15 +269,24 @@ def test_markup_in_names_and_texts_is_escaped(run, tmp_path):
     kitti = tmp_path / f"kitti{attack}"
     kitti.mkdir()
     settings = replace(run.settings, kitti=kitti, kitti_is_embedded=False, run=f"run{attack}")
-    (settings.figures / "table_4_2.csv").write_text(f'sequence,"{attack.replace(chr(34), chr(34) * 2)}"\n<script>,1\n')
-    (settings.figures / "findings.md").write_text(f"# {attack}\n\n[a](javascript:alert(1)) <script>alert(1)</script>")
+    (settings.figures / "table_4_2.csv").write_text(
+        f'sequence,"{attack.replace(chr(34), chr(34) * 2)}"\n<script>,1\n'
+    )
+    (settings.figures / "findings.md").write_text(
+        f"# {attack}\n\n[a](javascript:alert(1)) <script>alert(1)</script>"
+    )
     run.executed.rename(run.executed.with_name(f"09{attack}.ipynb".replace("/", "")))
     page.update(settings)
     text = run.page.read_text()
     shown = Reader(text)
-    assert not {"script", "onerror"} & {name for tag, attributes in shown.elements for name in (tag, *attributes)}
-    assert "javascript" not in "".join(shown.values("a", "href")) and "x" not in shown.values("img", "src")
-    assert shown.text.count(attack) >= 5  # the run, the folder, the notebook, the table's header, the text
+    assert not {"script", "onerror"} & {
+        name for tag, attributes in shown.elements for name in (tag, *attributes)
+    }
+    assert "javascript" not in "".join(shown.values("a", "href")) and "x" not in shown.values(
+        "img", "src"
+    )
+    # the run, the folder, the notebook, the table's header, the text
+    assert shown.text.count(attack) >= 5
     for link in shown.values("a", "href"):
         assert link.startswith("#") or (settings.figures / unquote(link)).is_file(), link
 
@@ -204,7 +295,11 @@ def test_a_table_shows_the_numbers_of_its_file(run):
     read(run)
     table = re.search(r'<figure id="table_4_2".*?</figure>', run.page.read_text(), re.DOTALL)[0]
     rows = [re.findall(r"<t[dh]>(.*?)</t[dh]>", row) for row in table.split("<tr")[2:]]
-    assert rows == [["00", "0.5", "-3.25", "1"], ["01", "12.0", "4.50", ""], ["sequences improved", "", "1.00", "0"]]
+    assert rows == [
+        ["00", "0.5", "-3.25", "1"],
+        ["01", "12.0", "4.50", ""],
+        ["sequences improved", "", "1.00", "0"],
+    ]
 
 
 def test_an_update_renders_changed_notebooks_only(run):
@@ -226,14 +321,21 @@ def test_numbers_of_the_run_and_of_the_thesis(run):
     (run.settings.build / "model").mkdir()
     (run.settings.build / "model" / "history.csv").write_text(
         "epoch,loss,f1-score,iou_score,val_loss,val_f1-score,val_iou_score\n"
-        "1,0.9,0.1,0.1,0.8,0.21,0.2\n2,0.7,0.3,0.2,0.9,0.2,0.1\n")
+        "1,0.9,0.1,0.1,0.8,0.21,0.2\n2,0.7,0.3,0.2,0.9,0.2,0.1\n"
+    )
     (run.settings.figures / "timings").mkdir()
     (run.settings.figures / "timings" / "seconds.csv").write_text(
         "sequence,method,dilation_width,seconds\n"
-        "00,baseline,,4\n01,baseline,,6\n00,masked,1,4\n01,masked,1,4\n00,masked,2,11\n")
+        "00,baseline,,4\n01,baseline,,6\n00,masked,1,4\n01,masked,1,4\n00,masked,2,11\n"
+    )
     (run.settings.figures / "table_4_1.csv").write_text("sequence,mean keypoints\n00,500\n01,300\n")
     text = read(run).text
-    assert "Here: 4.0 to 6.7 times fewer" in text and "gives 2.0 to 4.1 times fewer than 2000" in text
-    assert "Here: 2 epochs, the best was 1; train loss 0.90, F1 0.10, IoU 0.10; validation loss 0.80, F1 0.21" in text
+    assert (
+        "Here: 4.0 to 6.7 times fewer" in text and "gives 2.0 to 4.1 times fewer than 2000" in text
+    )
+    assert (
+        "Here: 2 epochs, the best was 1; train loss 0.90, F1 0.10, IoU 0.10; validation loss 0.80, F1 0.21"
+        in text
+    )
     assert "5 to 10 % of the time saved." in text and "Here: -10 to 20 % of the time saved" in text
     assert "15,337,571 parameters" in text

@@ -19,7 +19,9 @@ def best_of(runs):
 
 
 def runs_of(names, errors, widths=(5, 10, 15), **options):
-    methods = {"baseline": [None], "reduced": [None], "masked": widths} | {name: [10] for name in CONTROLS}
+    methods = {"baseline": [None], "reduced": [None], "masked": widths} | {
+        name: [10] for name in CONTROLS
+    }
     return made_up.runs(names, errors, methods, **options)
 
 
@@ -28,22 +30,42 @@ def halved(name, method, _):
     return (0.5 if method == "masked" else 1.0) * (1 + int(name) / 10)
 
 
-@pytest.mark.parametrize("metric, key, total, mean, median, improved", [
-    ("rmse", "table_4_2_rmse_percent_change", -13.2, -1.2, -5.27, 6),
-    ("mae", "table_4_3_mae_percent_change", -25.65, -2.33, 1.76, 4)])
-def test_tables_of_the_thesiss_numbers_equal_the_thesiss(metric, key, total, mean, median, improved):
+@pytest.mark.parametrize(
+    "metric, key, total, mean, median, improved",
+    [
+        ("rmse", "table_4_2_rmse_percent_change", -13.2, -1.2, -5.27, 6),
+        ("mae", "table_4_3_mae_percent_change", -25.65, -2.33, 1.76, 4),
+    ],
+)
+def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
+    metric, key, total, mean, median, improved
+):
     reported = REPORTED[key]
-    runs = runs_of(list(reported), lambda name, method, width: 2.0 if method == "baseline" else 2 * (
-        1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0))
+    runs = runs_of(
+        list(reported),
+        lambda name, method, width: (
+            2.0
+            if method == "baseline"
+            else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
+        ),
+    )
     table = tables.table_of_change(best_of(runs), runs, metric, "thesis").set_index("sequence")
-    assert list(table) == [f"{metric.upper()}, all keypoints (m)", f"{metric.upper()}, best mask (m)", "change (%)",
-                           "change (%), thesis"]
+    assert list(table) == [
+        f"{metric.upper()}, all keypoints (m)",
+        f"{metric.upper()}, best mask (m)",
+        "change (%)",
+        "change (%), thesis",
+    ]
     for column in ("change (%)", "change (%), thesis"):
         assert table.loc["sum (the thesis's aggregate)", column] == pytest.approx(total, abs=0.06)
-        assert table.loc[["mean", "median"], column].tolist() == pytest.approx([mean, median], abs=0.05)
+        assert table.loc[["mean", "median"], column].tolist() == pytest.approx(
+            [mean, median], abs=0.05
+        )
         assert table.loc["sequences improved", column] == improved
     widths = tables.table_4_1(runs, "thesis")
-    assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[:2] == [10, 11]
+    assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[
+        :2
+    ] == [10, 11]
 
 
 def test_ratios_in_the_tables_equal_the_comparison():
@@ -53,27 +75,46 @@ def test_ratios_in_the_tables_equal_the_comparison():
     assert len(shown) == 2 * (1 + 2 * len(CONTROLS))
     of_rmse = table[table["tested"] & (table["method"] != "baseline") & (table["metric"] == "rmse")]
     for row in of_rmse[of_rmse["reference"] == "baseline"].itertuples():
-        cell = shown[(shown["estimator"] == ESTIMATORS[row.estimator]) & (shown["over"] == "all keypoints")
-                     & shown["keypoints"].str.startswith(compare.METHODS[row.method])]["RMSE"].iloc[0]
-        ratio, low, high = map(float, cell.replace("(", "").replace(")", "").replace("-", " ").split())
+        cell = shown[
+            (shown["estimator"] == ESTIMATORS[row.estimator])
+            & (shown["over"] == "all keypoints")
+            & shown["keypoints"].str.startswith(compare.METHODS[row.method])
+        ]["RMSE"].iloc[0]
+        ratio, low, high = map(
+            float, cell.replace("(", "").replace(")", "").replace("-", " ").split()
+        )
         assert (ratio, low, high) == pytest.approx((row.ratio, row.low, row.high), abs=0.0051)
     assert set(shown[shown["over"] != "all keypoints"]["verdict"]) == {compare.LOWER}
     widths = comparison.table_widths(runs).set_index("sequence")
     expected = compare.ratios(best_of(runs), compare.of_method(runs, "baseline"), "rmse")
-    assert widths.loc[ELEVEN, "best width: RMSE"].astype(float).to_numpy() == pytest.approx(expected, abs=0.0051)
+    assert widths.loc[ELEVEN, "best width: RMSE"].astype(float).to_numpy() == pytest.approx(
+        expected, abs=0.0051
+    )
     unknown = runs_of(["77"], lambda *_: 1.0)  # a sequence that the thesis does not have
-    assert np.isnan(tables.table_of_change(best_of(unknown), unknown, "rmse", "thesis").loc[0, "change (%), thesis"])
+    assert np.isnan(
+        tables.table_of_change(best_of(unknown), unknown, "rmse", "thesis").loc[
+            0, "change (%), thesis"
+        ]
+    )
     assert pd.isna(tables.table_4_1(unknown, "thesis").loc[0, "width, thesis"])
 
 
-@pytest.mark.parametrize("value, text", [(1.09, "1.09"), (1.0018, "1.0018"), (0.9951, "0.9951"), (1.0, "1.00")])
+@pytest.mark.parametrize(
+    "value, text", [(1.09, "1.09"), (1.0018, "1.0018"), (0.9951, "0.9951"), (1.0, "1.00")]
+)
 def test_a_ratio_near_one_has_more_digits(value, text):
     assert texts.number(value) == text
 
 
-@pytest.mark.parametrize("errors, names, verdict", [
-    (halved, ELEVEN, compare.LOWER), (lambda *of: 1 / halved(*of), ELEVEN, compare.HIGHER),
-    (lambda *_: 1.0, ELEVEN[:6], compare.NO_CLEAR_DIFFERENCE), (halved, ["00", "05"], compare.NO_CLEAR_DIFFERENCE)])
+@pytest.mark.parametrize(
+    "errors, names, verdict",
+    [
+        (halved, ELEVEN, compare.LOWER),
+        (lambda *of: 1 / halved(*of), ELEVEN, compare.HIGHER),
+        (lambda *_: 1.0, ELEVEN[:6], compare.NO_CLEAR_DIFFERENCE),
+        (halved, ["00", "05"], compare.NO_CLEAR_DIFFERENCE),
+    ],
+)
 @pytest.mark.parametrize("sources", [("",), ("net", "hand")])
 def test_findings_follow_the_verdict(errors, names, verdict, sources):
     runs = runs_of(names, errors, noise=0.02, sources=sources)
@@ -89,19 +130,32 @@ def test_findings_follow_the_verdict(errors, names, verdict, sources):
 
 def test_findings_without_refined_runs_or_masks():
     runs = runs_of(["00", "01"], halved, repetitions=1)
-    for part in (runs[(runs["estimator"] == "thesis") & ~runs["method"].isin(CONTROLS)],
-                 runs[runs["method"] == "baseline"]):
+    for part in (
+        runs[(runs["estimator"] == "thesis") & ~runs["method"].isin(CONTROLS)],
+        runs[runs["method"] == "baseline"],
+    ):
         assert "embedded world" in texts.findings(part, compare.comparisons(part), "embedded world")
 
 
-@pytest.mark.parametrize("names, noise, sources", [
-    (["00"], 0, ("",)), (["00", "05", "06"], 0, ("net", "by hand")), (ELEVEN, 0.9, ("",)), (["00", "05"], 0.9, ("",))])
+@pytest.mark.parametrize(
+    "names, noise, sources",
+    [
+        (["00"], 0, ("",)),
+        (["00", "05", "06"], 0, ("net", "by hand")),
+        (ELEVEN, 0.9, ("",)),
+        (["00", "05"], 0.9, ("",)),
+    ],
+)
 def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources):
     runs = runs_of(names, lambda *_: 0.1, noise=noise, sources=sources)
     table = compare.comparisons(runs)
     if sources == ("",):
         for metric in ("rmse", "mae"):
-            for draw in (chapter4.figure_against_width, chapter4.figure_of_methods, chapter4.figure_of_sequences):
+            for draw in (
+                chapter4.figure_against_width,
+                chapter4.figure_of_methods,
+                chapter4.figure_of_sequences,
+            ):
                 draw(runs, metric).draw_without_rendering()
         chapter4.figure_4_07(runs).draw_without_rendering()
     figure = comparison.figure_comparison(table)
@@ -112,8 +166,13 @@ def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources
 def test_the_comparison_figure_shows_ratios_and_their_interval():
     table = compare.comparisons(runs_of(ELEVEN, halved, noise=0.1))
     axes = comparison.figure_comparison(table).axes[0]
-    row = table[(table["estimator"] == "thesis") & (table["metric"] == comparison.SHOWN[0]) & table["tested"]
-                & (table["method"] == "masked") & (table["reference"] == "baseline")].iloc[0]
+    row = table[
+        (table["estimator"] == "thesis")
+        & (table["metric"] == comparison.SHOWN[0])
+        & table["tested"]
+        & (table["method"] == "masked")
+        & (table["reference"] == "baseline")
+    ].iloc[0]
     dots, interval, marker = axes.lines[:3]
     assert dots.get_xdata() == pytest.approx(row[ELEVEN].astype(float).to_numpy())
     assert interval.get_xdata() == pytest.approx([row["low"], row["high"]])
@@ -123,8 +182,10 @@ def test_the_comparison_figure_shows_ratios_and_their_interval():
 def test_the_figure_of_paths_shows_repetitions_and_their_errors():
     runs = compare.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
     along = np.c_[np.zeros(4), np.zeros(4), np.arange(4.0)]
-    paths = {(row.sequence, row.run): along + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
-             for row in runs.itertuples()}
+    paths = {
+        (row.sequence, row.run): along + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
+        for row in runs.itertuples()
+    }
     figure = chapter4.figure_paths({"00": along, "05": along}, runs[::-1], paths, "baseline")
     true, *lines = figure.axes[0].lines
     assert len(lines) == 3 and len(figure.axes) == 4
@@ -135,7 +196,10 @@ def test_the_figure_of_paths_shows_repetitions_and_their_errors():
 
 def test_error_bars_span_the_repetitions():
     runs = runs_of(["00"], lambda *_: 0.1)  # the mean of three equal numbers is rounded
-    for figure in (chapter4.figure_of_methods(runs, "rmse"), chapter4.figure_of_sequences(runs, "rmse")):
+    for figure in (
+        chapter4.figure_of_methods(runs, "rmse"),
+        chapter4.figure_of_sequences(runs, "rmse"),
+    ):
         (segment,) = figure.axes[0].collections[0].get_segments()
         assert segment[:, 1] == pytest.approx([0.1, 0.1])
     rows = (runs["method"] == "baseline") & (runs["estimator"] == "thesis")
@@ -145,10 +209,19 @@ def test_error_bars_span_the_repetitions():
 
 
 def test_the_table_of_times_has_sums():
-    measured = pd.DataFrame([(method, stage, 10.0) for method, stages in
-                             (("all keypoints", "read detection tracking pose"),
-                              ("masked, width 10", "read segmentation mask detection tracking pose"))
-                             for stage in stages.split()], columns=["method", "stage", "milliseconds"])
+    measured = pd.DataFrame(
+        [
+            (method, stage, 10.0)
+            for method, stages in (
+                ("all keypoints", "read detection tracking pose"),
+                ("masked, width 10", "read segmentation mask detection tracking pose"),
+            )
+            for stage in stages.split()
+        ],
+        columns=["method", "stage", "milliseconds"],
+    )
     table = tables.table_budget(measured).set_index("stage")
-    assert table.loc["all stages (ms)"].tolist() == [40, 60] and table.loc["frames a second"].tolist() == [25, 16.7]
+    assert table.loc["all stages (ms)"].tolist() == [40, 60] and table.loc[
+        "frames a second"
+    ].tolist() == [25, 16.7]
     assert np.isnan(table.loc["segmentation (ms)", "all keypoints"])

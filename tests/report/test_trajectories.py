@@ -16,7 +16,12 @@ from thesis_repro.kitti import write_kitti_poses, write_tum
 from thesis_repro.odometry import metrics
 from thesis_repro.report import trajectories
 
-EVO = {"none": [], "se3": ["--align"], "sim3": ["--align", "--correct_scale"], "scale": ["--correct_scale"]}
+EVO = {
+    "none": [],
+    "se3": ["--align"],
+    "sim3": ["--align", "--correct_scale"],
+    "scale": ["--correct_scale"],
+}
 
 
 @pytest.fixture
@@ -29,17 +34,31 @@ def files(tmp_path):
 
 
 def evaluate(files, *options):
-    return main(["evaluate", "--kitti", str(files), "--sequence", "7", str(files / "good.txt"), str(files / "long.txt"),
-                 *map(str, options)])
+    return main(
+        [
+            "evaluate",
+            "--kitti",
+            str(files),
+            "--sequence",
+            "7",
+            str(files / "good.txt"),
+            str(files / "long.txt"),
+            *map(str, options),
+        ]
+    )
 
 
 def printed_by(tool, *arguments, monkeypatch, capsys):
     """The numbers that a tool of evo prints: {"rmse": 0.123456, ...}."""
-    logging.getLogger("evo").handlers.clear()  # handlers of the previous call print to another stream
+    # handlers of the previous call print to another stream
+    logging.getLogger("evo").handlers.clear()
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", [tool, *map(str, arguments)])
     getattr(entry_points, tool.removeprefix("evo_"))()
-    return {name: float(value) for name, value in re.findall(r"(\w+)\t([0-9.e+-]+)", capsys.readouterr().out)}
+    return {
+        name: float(value)
+        for name, value in re.findall(r"(\w+)\t([0-9.e+-]+)", capsys.readouterr().out)
+    }
 
 
 @pytest.mark.slow
@@ -52,9 +71,12 @@ def test_errors_equal_those_of_evos_tools(files, alignment, monkeypatch, capsys)
         arguments = ["kitti", files / "poses/07.txt", f"{row['trajectory']}.txt", *EVO[alignment]]
         ape = printed_by("evo_ape", *arguments, monkeypatch=monkeypatch, capsys=capsys)
         rpe = printed_by("evo_rpe", *arguments, monkeypatch=monkeypatch, capsys=capsys)
-        turns = printed_by("evo_rpe", *arguments, "-r", "angle_deg", monkeypatch=monkeypatch, capsys=capsys)
+        turns = printed_by(
+            "evo_rpe", *arguments, "-r", "angle_deg", monkeypatch=monkeypatch, capsys=capsys
+        )
         for key in ("rmse", "mean", "median", "max"):
-            assert row[f"ate_{key}_m"] == pytest.approx(ape[key], abs=5.1e-7)  # evo prints six digits
+            # evo prints six digits
+            assert row[f"ate_{key}_m"] == pytest.approx(ape[key], abs=5.1e-7)
             assert row[f"rpe_translation_{key}_m"] == pytest.approx(rpe[key], abs=5.1e-7)
             assert row[f"rpe_rotation_{key}_deg"] == pytest.approx(turns[key], abs=5.1e-7)
 
@@ -64,20 +86,25 @@ def test_the_thesiss_rmse_is_printed(files, capsys):
     later = metrics.shifted(estimated, true)[1:]
     assert metrics.ate(later, true[1:])["rmse"] == pytest.approx(metrics.rmse(estimated, true))
     assert evaluate(files, "--align", "scale") == 0
-    rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line}
+    rows = {
+        line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line
+    }
     assert rows[str(files / "good")][2] == f"{metrics.rmse(estimated, true):.6f}"
     assert float(rows[str(files / "long")][-1]) == pytest.approx(1 / 1.2, abs=0.02)
 
 
 def test_tum_keyframes_are_matched_by_time(files, capsys):
     kept, times = np.delete(np.arange(160), [3, 50, 51]), 0.1 * np.arange(160)
-    write_tum(files / "long.txt", winding(seed=1)[kept], times[kept] + 0.004)  # within the tolerance
+    # within the tolerance
+    write_tum(files / "long.txt", winding(seed=1)[kept], times[kept] + 0.004)
     assert evaluate(files, "--json", "--plot", files / "both.svg") == 0
     out, err = capsys.readouterr()
     assert str(files / "both.svg") in err and (files / "both.svg").read_text().startswith("<?xml")
     good, keyframes = json.loads(out)
     assert (good["poses"], keyframes["poses"], keyframes["frames"]) == (160, 157, 160)
-    assert keyframes["rmse_m"] == pytest.approx(metrics.rmse(winding(seed=1)[kept], winding()[kept]))
+    assert keyframes["rmse_m"] == pytest.approx(
+        metrics.rmse(winding(seed=1)[kept], winding()[kept])
+    )
     write_tum(files / "long.txt", winding(), times + 1000)
     assert evaluate(files) == 1 and "long.txt" in capsys.readouterr().err
 
@@ -107,7 +134,9 @@ def test_trajectories_that_cannot_be_compared_are_named(files, capsys):
     for options, named in (([], "long.txt: 9"), (["--plot", files / "both.doc"], "both.doc")):
         assert evaluate(files, *options) == 1
         assert named in capsys.readouterr().err
-    assert main(["evaluate", "--kitti", str(files), "--sequence", "11", str(files / "good.txt")]) == 1
+    assert (
+        main(["evaluate", "--kitti", str(files), "--sequence", "11", str(files / "good.txt")]) == 1
+    )
     assert "poses/11.txt" in capsys.readouterr().err
     with pytest.raises(InputError, match="alignment='sim'"):
         trajectories.evaluate({"good": (np.arange(160), winding())}, winding(), "sim")

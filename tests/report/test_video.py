@@ -32,8 +32,14 @@ def test_a_frame_shows_kept_and_discarded_keypoints(drive):
     image = video.draw_frame(drive.frame(1), step, mask=mask)
     inside = cv2.erode(mask, np.ones((7, 7))) > 0  # away from the edges, which dots cross
     outside = cv2.dilate(mask, np.ones((7, 7))) == 0
-    assert painted(image, video.KEPT)[inside].sum() > 500 and not painted(image, video.KEPT)[outside].any()
-    assert painted(image, video.DISCARDED)[outside].sum() > 500 and not painted(image, video.DISCARDED)[inside].any()
+    assert (
+        painted(image, video.KEPT)[inside].sum() > 500
+        and not painted(image, video.KEPT)[outside].any()
+    )
+    assert (
+        painted(image, video.DISCARDED)[outside].sum() > 500
+        and not painted(image, video.DISCARDED)[inside].any()
+    )
     assert painted(image, video.OUTLINE).any() and painted(image, video.INLIER).any()
 
 
@@ -41,7 +47,8 @@ def test_the_video_has_every_frame(drive, tmp_path):
     video.write_video(tmp_path / "drive.mp4", drive, masks=Stripes(60))
     with av.open(str(tmp_path / "drive.mp4")) as file:
         stream = file.streams.video[0]
-        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")  # browsers play it
+        # browsers play it
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert stream.average_rate == pytest.approx(10, rel=0.01)
         frames = [frame.to_ndarray(format="gray") for frame in file.decode(stream)]
     assert [frame.shape for frame in frames] == [(280, 480)] * 4

@@ -25,7 +25,9 @@ def test_integer_label_maps_give_the_same_as_one_hot_masks(pair):
         image_a, label_a = integer(image, label, seed)
         image_b, mask_b = one_hot(image, mask, seed)
         # the appendix ends with a Lambda that rounds and clips the masks
-        assert np.array_equal(augmentation.one_hot(label_a, 35), mask_b.round().clip(0, 1)), f"seed {seed}"
+        assert np.array_equal(augmentation.one_hot(label_a, 35), mask_b.round().clip(0, 1)), (
+            f"seed {seed}"
+        )
         assert np.array_equal(image_a, image_b), f"seed {seed}"
         outside += (label_a == augmentation.NOTHING).any()
     assert outside > len(SEEDS) / 4  # otherwise the border fill is not tested
@@ -33,9 +35,13 @@ def test_integer_label_maps_give_the_same_as_one_hot_masks(pair):
 
 def test_noise_is_as_strong_as_in_the_thesis():
     gray = np.full((200, 200, 1), 128, np.uint8)
-    noise = next(t for t in augmentation.transform_list(200) if isinstance(t, albumentations.GaussNoise))
+    noise = next(
+        t for t in augmentation.transform_list(200) if isinstance(t, albumentations.GaussNoise)
+    )
     noise.p = 1
-    spread = [augmentation.Augmenter([noise])(gray, gray[..., 0], seed)[0].std() for seed in range(40)]
+    spread = [
+        augmentation.Augmenter([noise])(gray, gray[..., 0], seed)[0].std() for seed in range(40)
+    ]
 
     # a variance of 10 to 50; today's default is a standard deviation of 51 to 112
     assert 2.7 < min(spread) < 4.0 and 6.0 < max(spread) < 7.3

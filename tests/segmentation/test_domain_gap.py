@@ -47,14 +47,17 @@ def test_pixels_near_a_boundary_are_ignored():
 
 
 def test_flicker_of_a_moving_picture_with_and_without_noise():
-    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (160, 300), np.uint8), (0, 0), 2)
+    texture = cv2.GaussianBlur(
+        np.random.default_rng(0).integers(0, 256, (160, 300), np.uint8), (0, 0), 2
+    )
     texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
     patches = np.random.default_rng(1).choice([ROAD, BUILDING, SKY], (4, 8))
     classes = np.kron(patches, np.ones((40, 40))).astype(np.uint8)
-    frames = [texture[:, shift:shift + 240] for shift in (0, 3, 6)]
-    true = [classes[:, shift:shift + 240] for shift in (0, 3, 6)]
+    frames = [texture[:, shift : shift + 240] for shift in (0, 3, 6)]
+    true = [classes[:, shift : shift + 240] for shift in (0, 3, 6)]
     wrong = [label_map.copy() for label_map in true]
-    wrong[1][np.random.default_rng(2).random(wrong[1].shape) < 0.2] = CAR  # a fifth of one frame flips
+    # a fifth of one frame flips
+    wrong[1][np.random.default_rng(2).random(wrong[1].shape) < 0.2] = CAR
 
     steady = domain_gap.flicker(true, frames)
     assert len(steady) == 2 and (steady < 0.01).all()

@@ -24,7 +24,9 @@ def untrained(seed, size=SIZE, channels=1):
     values = np.random.default_rng(seed)
     for layer in model.layers:
         if isinstance(layer, keras.layers.BatchNormalization):
-            layer.set_weights([values.uniform(0.5, 1.5, weights.shape) for weights in layer.get_weights()])
+            layer.set_weights(
+                [values.uniform(0.5, 1.5, weights.shape) for weights in layer.get_weights()]
+            )
     return model
 
 
@@ -50,33 +52,47 @@ def contents(folder):
 def test_predict_gives_the_most_probable_class(model):
     labels = prediction.predict(model, IMAGES, batch_size=3)
 
-    assert labels.dtype == np.uint8 and labels.shape == (7, SIZE, SIZE) and len(np.unique(labels)) > 3
+    assert (
+        labels.dtype == np.uint8 and labels.shape == (7, SIZE, SIZE) and len(np.unique(labels)) > 3
+    )
     assert np.array_equal(labels, model.predict(IMAGES.astype(np.float32), verbose=0).argmax(-1))
     with pytest.raises(InputError):
         prediction.predict(model, IMAGES[:, :32, :32])
 
 
-def test_written_label_maps_are_the_predictions_and_replace_those_of_another_model(model, frames, tmp_path):
+def test_written_label_maps_are_the_predictions_and_replace_those_of_another_model(
+    model, frames, tmp_path
+):
     prediction.write_label_maps(untrained(2), frames[:3], tmp_path)
     prediction.write_label_maps(model, frames, tmp_path, batch_size=4)
-    images = np.stack([cv2.resize(files.read_gray(path), (SIZE, SIZE)) for path in frames])[..., None]
+    images = np.stack([cv2.resize(files.read_gray(path), (SIZE, SIZE)) for path in frames])[
+        ..., None
+    ]
     expected = prediction.predict(model, images, batch_size=4)
 
     assert sorted(contents(tmp_path)) == [path.name for path in frames]
     for path, label_map in zip(frames, expected, strict=True):
         written = cityscapes.read_label_map(tmp_path / path.name)
-        assert written.shape == (320, 320) and np.array_equal(written, np.kron(label_map, np.ones((5, 5), np.uint8)))
+        assert written.shape == (320, 320) and np.array_equal(
+            written, np.kron(label_map, np.ones((5, 5), np.uint8))
+        )
 
 
-def test_a_killed_prediction_resumes_and_ends_with_the_same_bytes(model, frames, tmp_path, kill_when):
+def test_a_killed_prediction_resumes_and_ends_with_the_same_bytes(
+    model, frames, tmp_path, kill_when
+):
     model.save(tmp_path / "model.keras")
-    code = ("import time, sys; from thesis_repro import files; from thesis_repro.segmentation import prediction, "
-            "training; "
-            "write = files.write_png; files.write_png = lambda *a: (time.sleep(0.05), write(*a)); "
-            "prediction.write_label_maps(training.load_model(sys.argv[1]), sys.argv[3:], sys.argv[2], batch_size=2)")
+    code = (
+        "import time, sys; from thesis_repro import files; from thesis_repro.segmentation import prediction, "
+        "training; "
+        "write = files.write_png; files.write_png = lambda *a: (time.sleep(0.05), write(*a)); "
+        "prediction.write_label_maps(training.load_model(sys.argv[1]), sys.argv[3:], sys.argv[2], batch_size=2)"
+    )
     output = tmp_path / "killed"
-    kill_when([sys.executable, "-c", code, tmp_path / "model.keras", output, *frames],
-              lambda: len(contents(output)) >= 3)
+    kill_when(
+        [sys.executable, "-c", code, tmp_path / "model.keras", output, *frames],
+        lambda: len(contents(output)) >= 3,
+    )
     written = {name: (output / name).stat().st_mtime_ns for name in contents(output)}
     assert 0 < len(written) < len(frames)
 
@@ -87,7 +103,9 @@ def test_a_killed_prediction_resumes_and_ends_with_the_same_bytes(model, frames,
     assert any((output / name).stat().st_mtime_ns == time for name, time in written.items())
 
 
-def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(model, frames, tmp_path, monkeypatch):
+def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(
+    model, frames, tmp_path, monkeypatch
+):
     model.save(tmp_path / "model.keras")
     prediction.load.cache_clear()
     monkeypatch.setattr(prediction, "PART", 4)
@@ -103,7 +121,9 @@ def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(model
     assert len(made) == 5 and max(made) == 2
     for paths, folder in sequences:
         prediction.write_label_maps(model, paths, tmp_path / "alone" / folder.name, batch_size=2)
-        assert contents(folder) == contents(tmp_path / "alone" / folder.name) and len(contents(folder)) == len(paths)
+        assert contents(folder) == contents(tmp_path / "alone" / folder.name) and len(
+            contents(folder)
+        ) == len(paths)
     assert stages.record(sequences[0][1]) == stages.record(tmp_path / "alone" / "00")
 
     removed = sequences[0][1] / frames[3].name
@@ -112,7 +132,8 @@ def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(model
     made.clear()
     prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences, batch_size=2)
     assert made == [1] and removed.is_file()
-    assert written == {path: path.stat().st_mtime_ns for path in written}  # files of the same batch are kept
+    # files of the same batch are kept
+    assert written == {path: path.stat().st_mtime_ns for path in written}
 
 
 def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_path):
@@ -131,7 +152,9 @@ def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_pa
     untrained(2).save(tmp_path / "other.keras")
     for run in another_model, another_folder, lost:
         with pytest.raises(InputError):
-            prediction.spread_label_maps(run, [tmp_path / "model.keras"], [(frames[:3], tmp_path / "out")])
+            prediction.spread_label_maps(
+                run, [tmp_path / "model.keras"], [(frames[:3], tmp_path / "out")]
+            )
         assert contents(tmp_path / "out") == {}
 
 
@@ -139,7 +162,9 @@ def test_an_unreadable_image_leaves_no_partial_files(model, frames, tmp_path):
     broken = tmp_path / "000004.png"
     broken.write_bytes(frames[4].read_bytes()[:500])
     with pytest.raises(InputError, match="000004.png"):
-        prediction.write_label_maps(model, [*frames[:4], broken, *frames[5:]], tmp_path / "out", batch_size=2)
+        prediction.write_label_maps(
+            model, [*frames[:4], broken, *frames[5:]], tmp_path / "out", batch_size=2
+        )
     assert not (tmp_path / "out" / "000004.png").exists()
     for path in (tmp_path / "out").glob("*.png"):
         assert cityscapes.read_label_map(path).shape == (320, 320)
@@ -154,13 +179,17 @@ def test_colour_input(tmp_path):
     prediction.write_label_maps(model, [tmp_path / "street.png"], tmp_path / "out")
 
     expected = prediction.predict(model, picture[None])[0]
-    assert np.array_equal(cityscapes.read_label_map(tmp_path / "out" / "street.png")[::5, ::5], expected)
+    assert np.array_equal(
+        cityscapes.read_label_map(tmp_path / "out" / "street.png")[::5, ::5], expected
+    )
     assert not np.array_equal(expected, prediction.predict(model, picture[None, ..., ::-1])[0])
 
 
 def test_an_ensemble_predicts_from_the_mean_probability(model, tmp_path):
     members = [model, model, untrained(2)]
-    mean = np.mean([member.predict(IMAGES.astype(np.float32), verbose=0) for member in members], axis=0)
+    mean = np.mean(
+        [member.predict(IMAGES.astype(np.float32), verbose=0) for member in members], axis=0
+    )
 
     labels = prediction.predict(prediction.ensemble(members), IMAGES)
     assert (labels == mean.argmax(-1)).mean() > 0.9999
@@ -179,7 +208,9 @@ def test_the_shipped_model_is_the_thesiss_network_and_recognises_streets(kitti_r
     for sequence in ("00", "06"):
         frames = sorted((kitti_real / "sequences" / sequence / "image_0").glob("*.png"))[:200:10]
         prediction.write_label_maps(model, frames, tmp_path / sequence)
-        maps = np.stack([cityscapes.read_label_map(tmp_path / sequence / path.name) for path in frames])
+        maps = np.stack(
+            [cityscapes.read_label_map(tmp_path / sequence / path.name) for path in frames]
+        )
         # the road lies in front of the car; sky, trees or houses are at the top
         assert (maps[:, 250:310, 120:200] == 7).mean() > 0.7
         assert np.isin(maps[:, :40], [11, 21, 23]).mean() > 0.8
@@ -189,7 +220,7 @@ def test_the_shipped_model_is_the_thesiss_network_and_recognises_streets(kitti_r
 def test_model_files_that_cannot_be_used_are_named(suffix, model, tmp_path):
     whole, half, five = (tmp_path / f"{name}{suffix}" for name in ("whole", "half", "five"))
     model.save(whole)
-    half.write_bytes(whole.read_bytes()[:whole.stat().st_size // 2])
+    half.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     build_unet((SIZE, SIZE, 1), 5, 2).save(five)
     for path in half, five, tmp_path / f"none{suffix}":
         with pytest.raises(InputError, match=path.name):

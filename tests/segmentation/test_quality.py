@@ -14,10 +14,18 @@ def test_confusion_matrix_and_cityscapes_scores():
     confusion = quality.confusion_matrix(true, predicted)
     mean_iou, accuracy, table = quality.cityscapes_scores(confusion)
 
-    assert confusion.sum() == 7 and confusion[7, 11] == 1 and confusion[0, 7] == 1 and confusion[23, 5] == 1
-    assert table["iou"].to_dict() == pytest.approx({"road": 2 / 3, "building": 2 / 3, "sky": 0})  # 0 is not evaluated
+    assert (
+        confusion.sum() == 7
+        and confusion[7, 11] == 1
+        and confusion[0, 7] == 1
+        and confusion[23, 5] == 1
+    )
+    # 0 is not evaluated
+    assert table["iou"].to_dict() == pytest.approx({"road": 2 / 3, "building": 2 / 3, "sky": 0})
     assert mean_iou == pytest.approx(4 / 9) and accuracy == pytest.approx(4 / 6)
-    assert table.loc["building", ["pixels", "precision", "recall"]].tolist() == pytest.approx([2, 2 / 3, 1])
+    assert table.loc["building", ["pixels", "precision", "recall"]].tolist() == pytest.approx(
+        [2, 2 / 3, 1]
+    )
 
 
 def test_quality_agrees_with_keras_and_with_a_plain_count():
@@ -25,7 +33,9 @@ def test_quality_agrees_with_keras_and_with_a_plain_count():
     labels = np.random.default_rng(1).choice(np.array([7, 11, 23, 26], np.uint8), IMAGES.shape[:3])
     measured = quality.quality(model, IMAGES, labels, batch_size=3)
     model.compile("adam", training.total_loss(), metrics=training.metrics())
-    expected = model.evaluate(training.Batches([(IMAGES, labels)], 3).dataset(), verbose=0, return_dict=True)
+    expected = model.evaluate(
+        training.Batches([(IMAGES, labels)], 3).dataset(), verbose=0, return_dict=True
+    )
     predicted = prediction.predict(model, IMAGES)
 
     assert measured.iou_score == pytest.approx(expected["iou_score"], abs=1e-5)
@@ -46,6 +56,11 @@ def test_the_shipped_model_is_as_good_on_camvid_as_its_card_says(camvid_real):
     card = (prediction.SHIPPED.parent / "README.md").read_text()
 
     assert len(images) == 101 and len(measured.classes) == 11
-    assert f"pixel accuracy **{measured.accuracy:.3f}**, mean IoU **{measured.mean_iou:.3f}**" in card
+    assert (
+        f"pixel accuracy **{measured.accuracy:.3f}**, mean IoU **{measured.mean_iou:.3f}**" in card
+    )
     for name, row in measured.classes.iterrows():
-        assert f"| {name} | {row['id']:.0f} | " in card and f"| {row['iou']:.3f} | {row['precision']:.3f} |" in card
+        assert (
+            f"| {name} | {row['id']:.0f} | " in card
+            and f"| {row['iou']:.3f} | {row['precision']:.3f} |" in card
+        )

@@ -22,17 +22,28 @@ def digest():
     keras.utils.set_random_seed(0)
     model = build_unet((96, 96, 1), 35, 4)
     model.compile(keras.optimizers.Adam(), training.fused_loss(training.total_loss()))
-    model.fit(training.Batches([(images, labels)], 3, 0).dataset(), epochs=2, shuffle=False, verbose=0)
+    model.fit(
+        training.Batches([(images, labels)], 3, 0).dataset(), epochs=2, shuffle=False, verbose=0
+    )
     values = [*model.get_weights(), model.predict(images, verbose=0)]
     return hashlib.sha256(b"".join(value.tobytes() for value in values)).hexdigest()
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
-                    reason="needs two cores and a system that can restrict a process to one")
+@pytest.mark.skipif(
+    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
+    reason="needs two cores and a system that can restrict a process to one",
+)
 def test_one_core_and_all_give_the_same_bits():
-    code = ("import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
-            "import test_same_bits; print(test_same_bits.digest())")
-    one_core = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True,
-                              cwd=Path(__file__).parent, check=True)
+    code = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
+        "import test_same_bits; print(test_same_bits.digest())"
+    )
+    one_core = subprocess.run(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parent,
+        check=True,
+    )
     assert one_core.stdout.split()[-1] == digest()

@@ -33,11 +33,15 @@ SETS = (*street(9, 0), *street(4, 1))
 
 
 def network(filters):
-    """Return a small network with the U-Net's kinds of layers; the U-Net takes ten times as long to compile."""
-    layers = [keras.Input((SIZE, SIZE, 1), name="image"),
-              keras.layers.Conv2D(4 * filters, 3, padding="same", activation="relu", name="features"),
-              keras.layers.BatchNormalization(name="normalized"),
-              keras.layers.Conv2D(35, 1, activation="softmax", name="classes")]
+    """Return a small network with the U-Net's kinds of layers; the U-Net takes ten times as
+    long to compile.
+    """
+    layers = [
+        keras.Input((SIZE, SIZE, 1), name="image"),
+        keras.layers.Conv2D(4 * filters, 3, padding="same", activation="relu", name="features"),
+        keras.layers.BatchNormalization(name="normalized"),
+        keras.layers.Conv2D(35, 1, activation="softmax", name="classes"),
+    ]
     return keras.Sequential(layers, name="small")
 
 
@@ -46,22 +50,38 @@ def prepared(sets=SETS, filters=2, rate=0.01, strategy=None):
     keras.utils.set_random_seed(0)
     with (strategy or training.strategy()).scope():
         model = network(filters)
-        model.compile(keras.optimizers.Adam(rate), training.fused_loss(training.total_loss()),
-                      metrics=training.metrics())
+        model.compile(
+            keras.optimizers.Adam(rate),
+            training.fused_loss(training.total_loss()),
+            metrics=training.metrics(),
+        )
         model.optimizer.build(model.trainable_variables)
     augmented = augmentation.augment_set(*sets[:2], augmentation.training_augmenter(SIZE), 0)
-    return model, training.Batches([sets[:2], augmented], 4, seed=0), training.Batches([sets[2:]], 4)
+    return (
+        model,
+        training.Batches([sets[:2], augmented], 4, seed=0),
+        training.Batches([sets[2:]], 4),
+    )
 
 
 def train(folder, epochs=3, patience=5, pause=0, **options):
-    """Run the fit of notebook 4; pause: seconds after each batch, which leave time to kill the process."""
+    """Run the fit of notebook 4; pause: seconds after each batch, which leave time to kill the
+    process.
+    """
     model, batches, validation = prepared(**options)
     stop = keras.callbacks.EarlyStopping(patience=patience)
     best = keras.callbacks.ModelCheckpoint(folder / training.MODEL, save_best_only=True)
     resumable = training.ResumableTraining(folder, model, batches, [stop, best])
     wait = keras.callbacks.LambdaCallback(on_train_batch_end=lambda batch, logs: time.sleep(pause))
-    model.fit(batches.dataset(), validation_data=validation.dataset(), epochs=epochs, shuffle=False, verbose=0,
-              initial_epoch=resumable.first_epoch(epochs), callbacks=[stop, best, resumable, wait])
+    model.fit(
+        batches.dataset(),
+        validation_data=validation.dataset(),
+        epochs=epochs,
+        shuffle=False,
+        verbose=0,
+        initial_epoch=resumable.first_epoch(epochs),
+        callbacks=[stop, best, resumable, wait],
+    )
     return resumable
 
 
@@ -76,13 +96,17 @@ def test_history_and_best_model(trained):
     history = pd.read_csv(trained / "history.csv")
 
     assert history["epoch"].tolist() == [1, 2, 3]
-    assert {"loss", "iou_score", "f1-score", "val_loss", "val_iou_score", "val_f1-score"} < set(history.columns)
+    assert {"loss", "iou_score", "f1-score", "val_loss", "val_iou_score", "val_f1-score"} < set(
+        history.columns
+    )
     assert history["loss"].iloc[-1] < history["loss"].iloc[0]
     # the model in the folder is the one with the lowest validation loss
     _, _, validation = prepared()
     model = training.load_model(trained / "model.keras")
     model.compile("adam", training.total_loss())
-    assert model.evaluate(validation.dataset(), verbose=0) == pytest.approx(history["val_loss"].min(), abs=1e-5)
+    assert model.evaluate(validation.dataset(), verbose=0) == pytest.approx(
+        history["val_loss"].min(), abs=1e-5
+    )
 
 
 def test_loss_is_the_sum_of_dice_and_focal_loss():
@@ -94,7 +118,9 @@ def test_loss_is_the_sum_of_dice_and_focal_loss():
     dice = (2 * tp + 1e-5) / (true.sum((0, 1, 2)) + predicted.sum((0, 1, 2)) + 1e-5)
     focal = -(true * 0.25 * (1 - predicted) ** 2 * np.log(predicted)).mean()
 
-    assert float(training.total_loss()(true, predicted)) == pytest.approx(1 - (weights * dice).mean() + focal, rel=1e-4)
+    assert float(training.total_loss()(true, predicted)) == pytest.approx(
+        1 - (weights * dice).mean() + focal, rel=1e-4
+    )
 
 
 def test_fused_loss_is_the_same_loss_with_the_same_gradient():
@@ -122,7 +148,11 @@ def test_each_epoch_shows_each_image_once_in_another_order():
     batches, seen = training.Batches([SETS[:2], second], 4, seed=3), []
     for batches.epoch in (0, 1, 1):
         seen.append([image.tobytes() for images, _ in batches for image in images])
-    assert sorted(seen[0]) == sorted(seen[1]) == sorted(image.tobytes() for image in (*SETS[0], *second[0]))
+    assert (
+        sorted(seen[0])
+        == sorted(seen[1])
+        == sorted(image.tobytes() for image in (*SETS[0], *second[0]))
+    )
     assert seen[0] != seen[1] == seen[2]
 
 
@@ -131,11 +161,17 @@ def test_the_network_gets_raw_grey_levels_and_one_hot_masks():
     labels[0, 0] = augmentation.NOTHING
     (images, masks), *_ = training.Batches([(SETS[0], labels)], 4).dataset()
     assert np.array_equal(images.numpy(), SETS[0][:4].astype(np.float32))
-    assert np.array_equal(masks.numpy(), augmentation.one_hot(labels[:4], 35)) and not masks.numpy()[0, 0].any()
+    assert (
+        np.array_equal(masks.numpy(), augmentation.one_hot(labels[:4], 35))
+        and not masks.numpy()[0, 0].any()
+    )
 
 
 def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
-    sets, augmenter = [SETS[:2], (np.zeros_like(SETS[0]), SETS[1])], augmentation.training_augmenter(SIZE)
+    sets, augmenter = (
+        [SETS[:2], (np.zeros_like(SETS[0]), SETS[1])],
+        augmentation.training_augmenter(SIZE),
+    )
     batches, changed = training.Batches(sets, 18, seed=0, augmenter=augmenter), []
     for batches.epoch in (0, 1):
         images = {image.tobytes() for image in next(iter(batches))[0]}
@@ -146,25 +182,35 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
 
 
 def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_when):
-    code = (f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
-            f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)")
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+        f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)"
+    )
     kill_when([sys.executable, "-c", code], (tmp_path / "state.npz").exists)
     assert len(pd.read_csv(tmp_path / "history.csv")) < 3
 
     assert train(tmp_path).history["epoch"].tolist() == [1, 2, 3]
     assert (tmp_path / "history.csv").read_text() == (trained / "history.csv").read_text()
-    networks = [training.load_model(folder / training.MODEL).variables for folder in (tmp_path, trained)]
-    assert all(np.array_equal(resumed, undisturbed) for resumed, undisturbed in zip(*networks, strict=True))
+    networks = [
+        training.load_model(folder / training.MODEL).variables for folder in (tmp_path, trained)
+    ]
+    assert all(
+        np.array_equal(resumed, undisturbed) for resumed, undisturbed in zip(*networks, strict=True)
+    )
 
 
 def test_several_devices_share_each_batch(tmp_path):
-    code = ("import sys; import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
-            "tf.config.set_logical_device_configuration(cpu, [tf.config.LogicalDeviceConfiguration()] * 2); "
-            f"sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
-            f"folder, two = t.Path({str(tmp_path)!r}), tf.distribute.MirroredStrategy(['CPU:0', 'CPU:1']); "
-            "t.train(folder, 2, strategy=two); "
-            "assert t.training.ResumableTraining(folder, *t.prepared(strategy=two)[:2]).first_epoch(3) == 2")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    code = (
+        "import sys; import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
+        "tf.config.set_logical_device_configuration(cpu, [tf.config.LogicalDeviceConfiguration()] * 2); "
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+        f"folder, two = t.Path({str(tmp_path)!r}), tf.distribute.MirroredStrategy(['CPU:0', 'CPU:1']); "
+        "t.train(folder, 2, strategy=two); "
+        "assert t.training.ResumableTraining(folder, *t.prepared(strategy=two)[:2]).first_epoch(3) == 2"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     history = pd.read_csv(tmp_path / "history.csv")
     assert history["epoch"].tolist() == [1, 2] and history["loss"].iloc[1] < history["loss"].iloc[0]
@@ -178,8 +224,10 @@ def test_checkpoints_that_are_damaged_or_of_another_network_are_refused(trained,
             training.ResumableTraining(folder, model, batches)
 
 
-@pytest.mark.parametrize(("images", "labels"), [
-    (SETS[0][:0], SETS[1][:0]), (SETS[0], np.full_like(SETS[1], 35)), (SETS[0], SETS[1][:, :8])])
+@pytest.mark.parametrize(
+    ("images", "labels"),
+    [(SETS[0][:0], SETS[1][:0]), (SETS[0], np.full_like(SETS[1], 35)), (SETS[0], SETS[1][:, :8])],
+)
 def test_sets_that_cannot_be_trained_on_are_refused(images, labels):
     with pytest.raises(InputError):
         training.Batches([(images, labels)], 4)
@@ -198,8 +246,12 @@ def test_early_stopping_keeps_the_best_and_stays_stopped(tmp_path):
 def test_every_change_of_a_training_changes_its_record():
     model, batches, validation = prepared()
     records = [training.made_from(model, batches, validation)]
-    for name, value in (("seed", 1), ("batch_size", 5), ("augmenter", augmentation.training_augmenter(SIZE)),
-                        ("sets", [(SETS[0] // 2, SETS[1])])):
+    for name, value in (
+        ("seed", 1),
+        ("batch_size", 5),
+        ("augmenter", augmentation.training_augmenter(SIZE)),
+        ("sets", [(SETS[0] // 2, SETS[1])]),
+    ):
         changed = copy(batches)
         setattr(changed, name, value)
         records.append(training.made_from(model, changed, validation))
@@ -219,7 +271,9 @@ def test_the_appendixs_hdf5_loads(trained, tmp_path):
     x, y = SETS[2].astype(np.float32), augmentation.one_hot(SETS[3], 35)
 
     # with loss and metrics, as in the appendix
-    with_loss = keras.models.load_model(tmp_path / "model.hdf5", custom_objects={
-        loss.name: loss, **{score.name: score for score in scores}})
+    with_loss = keras.models.load_model(
+        tmp_path / "model.hdf5",
+        custom_objects={loss.name: loss, **{score.name: score for score in scores}},
+    )
     assert with_loss.evaluate(x, y, verbose=0) == pytest.approx(model.evaluate(x, y, verbose=0))
     assert np.array_equal(training.load_model(tmp_path / "model.hdf5")(x), model(x))

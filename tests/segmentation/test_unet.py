@@ -22,7 +22,10 @@ def test_every_row_of_figure_a1():
 
 
 def test_corrected_blocks_and_base_filters():
-    rows = {row["layer"].split()[0]: row for row in summary_rows(build_unet((64, 64, 3), 5, 8, corrected_blocks=True))}
+    rows = {
+        row["layer"].split()[0]: row
+        for row in summary_rows(build_unet((64, 64, 3), 5, 8, corrected_blocks=True))
+    }
 
     assert len(rows) == 41 + 3 * 9
     assert rows["conv2d"]["connected_to"] == "input_2[0][0]"

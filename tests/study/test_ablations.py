@@ -17,17 +17,25 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2, baseline_repetitions=3)
     settings, thesis_masks = runs["masked", "thesis", 0]
     assert settings == THESIS and np.array_equal(
-        thesis_masks[0], masks.LabelMasks(small_labels / "00", sequence, 10)[0])
+        thesis_masks[0], masks.LabelMasks(small_labels / "00", sequence, 10)[0]
+    )
     dropped, same = runs["filter", "thesis", 0]
     assert dropped.mask_mode == "filter" and same is thesis_masks
-    repetitions = {estimator: {key[2] for key in runs if key[:2] == ("baseline", estimator)}
-                   for estimator in ("thesis", "refined")}
+    repetitions = {
+        estimator: {key[2] for key in runs if key[:2] == ("baseline", estimator)}
+        for estimator in ("thesis", "refined")
+    }
     assert repetitions == {"thesis": {0, 1, 2}, "refined": {0, 1}}
     for method in ("nearest", "symmetric"):
         mask = runs[method, "thesis", 0][1][0]
-        assert not np.array_equal(mask, thesis_masks[0]) and 0.5 < mask.sum() / thesis_masks[0].sum() < 2
+        assert (
+            not np.array_equal(mask, thesis_masks[0])
+            and 0.5 < mask.sum() / thesis_masks[0].sum() < 2
+        )
     label_map = cv2.imread(str(small_labels / "00" / sequence.frame_paths[0].name), 0)
-    vegetation = np.isin(cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST), (21, 22))
+    vegetation = np.isin(
+        cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST), (21, 22)
+    )
     assert np.array_equal(runs["no-vegetation", "thesis", 0][1][0] == 0, vegetation)
 
 
@@ -47,17 +55,26 @@ REPORTED = pd.Series([0.0] * 11)
 
 def errors(spread, repetitions=200):
     random = np.random.default_rng(0)
-    return pd.DataFrame([{"sequence": f"{name:02d}", "rmse": (name + 1) * np.exp(random.normal(0, spread))}
-                         for name in range(4) for _ in range(repetitions)])
+    return pd.DataFrame(
+        [
+            {"sequence": f"{name:02d}", "rmse": (name + 1) * np.exp(random.normal(0, spread))}
+            for name in range(4)
+            for _ in range(repetitions)
+        ]
+    )
 
 
 def test_the_null_distribution_agrees_with_order_statistics():
-    assert np.abs(ablations.null_distribution(errors(0), REPORTED).iloc[:, :3].to_numpy()).max() < 1e-9
+    assert (
+        np.abs(ablations.null_distribution(errors(0), REPORTED).iloc[:, :3].to_numpy()).max() < 1e-9
+    )
     spread = 0.2
     runs = errors(spread, 2000)
     table = ablations.null_distribution(runs, REPORTED)
     # a standard normal's least of 15 is -1.736 on average, its median 0
-    assert table.loc["median", "expected"] == pytest.approx(100 * (np.exp(-1.736 * spread) - 1), abs=2.5)
+    assert table.loc["median", "expected"] == pytest.approx(
+        100 * (np.exp(-1.736 * spread) - 1), abs=2.5
+    )
     assert table.loc["mean", "low"] < table.loc["mean", "expected"] < table.loc["mean", "high"] < 0
     assert (table["share_as_low"] == 100).all()  # every study reports less than 0
     scaled = runs.assign(rmse=runs["rmse"] * runs["sequence"].astype(int).add(1) * 7)
@@ -71,9 +88,13 @@ def test_tracks_of_a_known_motion_have_small_residuals_and_cover_fields():
     street.size = street.images[0].shape
     corner = np.zeros(street.size, np.uint8)
     corner[60:100, 380:440] = 255
-    table = ablations.tracks(street, {"all": None, "stripes": Stripes(40), "corner": [corner] * 3}, pairs=2)
+    table = ablations.tracks(
+        street, {"all": None, "stripes": Stripes(40), "corner": [corner] * 3}, pairs=2
+    )
     means = table.groupby("method")[["residual", "fields"]].mean()
-    assert (means["residual"] < 1).all() and means.loc["corner", "fields"] < means.loc["all", "fields"]
+    assert (means["residual"] < 1).all() and means.loc["corner", "fields"] < means.loc[
+        "all", "fields"
+    ]
 
 
 def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
@@ -82,5 +103,13 @@ def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
     near = ablations.boundaries(label_map, (188, 620))
     label_map[:, 160:] = 23
     far = ablations.boundaries(label_map, (188, 620))
-    assert near["lost"] == 100 == near["road/sidewalk"] and far["lost"] == 0 and np.isnan(far["road/sidewalk"])
-    assert far["invented"] > 0 == ablations.boundaries(np.full_like(label_map, 20), (188, 620))["invented"]
+    assert (
+        near["lost"] == 100 == near["road/sidewalk"]
+        and far["lost"] == 0
+        and np.isnan(far["road/sidewalk"])
+    )
+    assert (
+        far["invented"]
+        > 0
+        == ablations.boundaries(np.full_like(label_map, 20), (188, 620))["invented"]
+    )

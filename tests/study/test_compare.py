@@ -12,6 +12,7 @@ EIGHT = [f"{number:02d}" for number in range(8)]
 
 def runs_of(factors, sequences=EIGHT, width=10, **options):
     """Runs by {method: factor on the error of all keypoints, or a function of the sequence}."""
+
     def error(name, method, _):
         factor = factors.get(method, 1.0)
         return (1 + int(name)) * (factor(name) if callable(factor) else factor)
@@ -49,8 +50,15 @@ def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
     assert np.isnan(compare.geometric_mean([np.nan])["ratio"])
 
 
-@pytest.mark.parametrize("factor, verdict", [(0.5, "lower"), (2.0, "higher"), (1.0, "no clear difference"),
-                                             (lambda name: 2.0 ** (int(name) % 2 * 2 - 1), "no clear difference")])
+@pytest.mark.parametrize(
+    "factor, verdict",
+    [
+        (0.5, "lower"),
+        (2.0, "higher"),
+        (1.0, "no clear difference"),
+        (lambda name: 2.0 ** (int(name) % 2 * 2 - 1), "no clear difference"),
+    ],
+)
 def test_the_verdict_follows_the_interval(factor, verdict):
     masked, baseline = arms(runs_of({"masked": factor}), "masked", "baseline")
     assert ratio_of(masked[masked["sequence"] < "06"], baseline)["verdict"] == verdict
@@ -74,16 +82,28 @@ def test_masks_are_compared_with_all_keypoints_and_every_control():
     factors = {"masked": 0.5, "mirrored": 1.0, "fewer": 0.25, "reduced": 3.0}
     table = compare.comparisons(runs_of(factors))
     pairs = set(zip(table["method"], table["reference"]))
-    assert pairs == {("baseline", "baseline"), ("masked", "baseline"), ("mirrored", "baseline"), ("fewer", "baseline"),
-                     ("masked", "mirrored"), ("masked", "fewer")}
+    assert pairs == {
+        ("baseline", "baseline"),
+        ("masked", "baseline"),
+        ("mirrored", "baseline"),
+        ("fewer", "baseline"),
+        ("masked", "mirrored"),
+        ("masked", "fewer"),
+    }
     rows = table[table["metric"] == "rmse"].set_index(["method", "reference", "estimator"])
     assert rows.loc[("masked", "fewer", "refined"), "ratio"] == pytest.approx(2)
     assert rows.loc[("masked", "mirrored", "thesis"), EIGHT].tolist() == pytest.approx([0.5] * 8)
     primary = compare.primary_comparison(table)
-    assert set(primary["estimator"]) == {"refined"} and list(primary["metric"]) == list(compare.JUDGING_METRICS)
+    assert set(primary["estimator"]) == {"refined"} and list(primary["metric"]) == list(
+        compare.JUDGING_METRICS
+    )
     assert compare.overall(primary["verdict"]) == "lower"
-    assert set(compare.primary_comparison(table[table["estimator"] == "thesis"])["estimator"]) == {"thesis"}
-    against = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS).set_index(["reference", "metric"])["verdict"]
+    assert set(compare.primary_comparison(table[table["estimator"] == "thesis"])["estimator"]) == {
+        "thesis"
+    }
+    against = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS).set_index(
+        ["reference", "metric"]
+    )["verdict"]
     assert set(against["mirrored"]) == {"lower"} and set(against["fewer"]) == {"higher"}
     assert compare.overall(["lower", "higher"]) == compare.overall([]) == "no clear difference"
 
@@ -104,7 +124,8 @@ def test_the_tested_width_is_the_width_of_the_controls():
     assert compare.tested_width(narrow) == 5
     assert compare.tested_width(runs_of({"masked": 0.5}, width=7)) == 7  # the only width
     assert compare.tested_width(runs_of({})) == 10
-    assert compare.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None  # ready-made masks
+    # ready-made masks
+    assert compare.tested_width(runs_of({"masked": 0.5}).assign(dilation_width=np.nan)) is None
     assert (compare.keypoints_left(narrow) == 505).all()
     assert compare.tested_width(pd.concat([narrow, runs_of({"mirrored": 1.0}, width=7)])) == 10
 
@@ -113,7 +134,8 @@ def test_sequences_far_off_the_mean_are_named():
     runs = runs_of({"masked": lambda name: 6.0 if name == "03" else 0.1 if name == "05" else 1.0})
     rows = compare.comparisons(runs)
     assert set(rows.loc[rows["method"] == "masked", "far_off"].map(tuple)) == {("03", "05")}
-    assert compare.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []  # two sequences do not show which one is far off
+    # two sequences do not show which one is far off
+    assert compare.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []
     assert compare.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
     assert compare.far_off(pd.Series({"00": 1.0, "01": 0.6, "02": 1.4, "03": 90.0})) == ["03"]
 

@@ -22,31 +22,45 @@ def sequence(small_world):
 @pytest.fixture(scope="module")
 def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
-    return {method: controls.masks(method, Source(small_labels), sequence, WIDTH) for method in controls.MASKS} | {
-        "masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
+    return {
+        method: controls.masks(method, Source(small_labels), sequence, WIDTH)
+        for method in controls.MASKS
+    } | {"masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
 
 
 def test_masks_of_controls_are_valid_and_repeatable(sequence, made):
     for method, source in made.items():
         assert len(source) == len(sequence)
         mask = source[3]
-        assert mask.shape == sequence.size and mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}, method
+        assert (
+            mask.shape == sequence.size
+            and mask.dtype == np.uint8
+            and set(np.unique(mask)) == {0, 255}
+        ), method
         assert mask.flags.c_contiguous
         source[7]
         assert np.array_equal(source[3], mask), method
         assert np.array_equal(mask, made["masked"][3]) == (method in ("masked", "fallback")), method
 
 
-def test_controls_use_the_frame_and_settings_of_their_name(sequence, small_world, small_labels, made):
+def test_controls_use_the_frame_and_settings_of_their_name(
+    sequence, small_world, small_labels, made
+):
     for index, other in ((0, 6), (5, 11), (6, 0), (11, 5)):
         assert np.array_equal(made["other-frame"][index], made["masked"][other])
         assert np.array_equal(made["mirrored"][index], cv2.flip(made["masked"][index], 1))
     predicted = cv2.imread(str(small_labels / "00" / "000005.png"), cv2.IMREAD_GRAYSCALE)
-    true = cv2.imread(str(small_world / "kitti/sequences/00/labels_0/000005.png"), cv2.IMREAD_GRAYSCALE)
+    true = cv2.imread(
+        str(small_world / "kitti/sequences/00/labels_0/000005.png"), cv2.IMREAD_GRAYSCALE
+    )
     for method, label_map, settings in (
-            ("true-labels", true, masks.MaskSettings()), ("exact-boundaries", predicted, masks.MaskSettings("exact")),
-            ("corrected", predicted, masks.MaskSettings("exact", symmetric=True, movable=2, margin=10))):
-        assert np.array_equal(made[method][5], masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)), method
+        ("true-labels", true, masks.MaskSettings()),
+        ("exact-boundaries", predicted, masks.MaskSettings("exact")),
+        ("corrected", predicted, masks.MaskSettings("exact", symmetric=True, movable=2, margin=10)),
+    ):
+        assert np.array_equal(
+            made[method][5], masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)
+        ), method
 
 
 def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
@@ -69,7 +83,9 @@ def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
 
 @pytest.mark.parametrize("value", [0, 255])
 def test_controls_of_empty_and_full_masks(sequence, made, monkeypatch, value):
-    monkeypatch.setattr(masks.LabelMasks, "__getitem__", lambda self, index: np.full(self.size, value, np.uint8))
+    monkeypatch.setattr(
+        masks.LabelMasks, "__getitem__", lambda self, index: np.full(self.size, value, np.uint8)
+    )
     lines, edges = (masks.coverage(made[method][0]) for method in ("random-lines", "image-edges"))
     assert lines > 0.99 and edges > 0.5 if value else lines == edges == 0
 
@@ -85,18 +101,24 @@ def test_spread_keypoints_have_the_asked_number(sequence):
     assert controls.min_distance(sequence, max(counts)) == odometry.THESIS.min_distance
 
 
-def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(small_world, small_labels, tmp_path):
+def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
+    small_world, small_labels, tmp_path
+):
     kitti = small_world / "kitti"
     jobs = first_jobs(kitti, ["00"], {"thesis": (5, WIDTH), "refined": ()}, tested=5)
     assert {job.dilation_width for job in jobs if job.method in controls.MASKS} == {5}
     runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
     left = compare.keypoints_left(runs)
     masked = compare.of_method(runs, "masked")
-    jobs += reduced_jobs(thesis_tables.best_widths(masked)) + keypoint_control_jobs(left, kitti, 5, width=5)
+    jobs += reduced_jobs(thesis_tables.best_widths(masked)) + keypoint_control_jobs(
+        left, kitti, 5, width=5
+    )
     assert len({job.name for job in jobs}) == len(jobs)
     runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5).set_index("run")
     assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
     number = runs["mean_keypoints"]
     assert left["00"] == number["masked-05-0"] < number["masked-10-0"]
     assert number[number.index.str.startswith("fewer")].iloc[0] == pytest.approx(left["00"], abs=1)
-    assert number[number.index.str.startswith("spread")].iloc[0] == pytest.approx(left["00"], rel=0.05)
+    assert number[number.index.str.startswith("spread")].iloc[0] == pytest.approx(
+        left["00"], rel=0.05
+    )

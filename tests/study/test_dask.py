@@ -22,7 +22,8 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES, CHECKPOINT = 12, 4
-# loaded by the workers: makes them slow enough to be killed in a pass, and logs the frames that they read
+# loaded by the workers: makes them slow enough to be killed in a pass, and logs the frames that
+# they read
 PRELOAD = """
 import os, time
 from thesis_repro.odometry import passes
@@ -43,16 +44,32 @@ if passes.CHECKPOINT != {checkpoint}:  # Dask loads this more than once
 def start(folder, *arguments):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     with open(folder / "dask.log", "a") as log:
-        return subprocess.Popen([sys.executable, "-m", "dask", *map(str, arguments)], cwd=folder, stdout=log,
-                                stderr=log, env=environment)
+        return subprocess.Popen(
+            [sys.executable, "-m", "dask", *map(str, arguments)],
+            cwd=folder,
+            stdout=log,
+            stderr=log,
+            env=environment,
+        )
 
 
 @pytest.fixture
 def scheduler(tmp_path):
     """Address of a scheduler without workers."""
     file = tmp_path / "scheduler.json"
-    process = start(tmp_path, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
-                    "--dashboard-address", "127.0.0.1:0", "--scheduler-file", file)
+    process = start(
+        tmp_path,
+        "scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+        "--dashboard-address",
+        "127.0.0.1:0",
+        "--scheduler-file",
+        file,
+    )
     try:
         wait_for(lambda: file.is_file() and file.read_text().strip().endswith("}"))
         yield pd.read_json(file, typ="series")["address"]
@@ -67,9 +84,24 @@ def workers(scheduler, tmp_path):
     log = tmp_path / "frames.log"
     log.touch()
     (tmp_path / "slow.py").write_text(PRELOAD.format(checkpoint=CHECKPOINT, log=str(log)))
-    processes = [start(tmp_path, "worker", scheduler, "--no-nanny", "--nthreads", 1, "--no-dashboard", "--host",
-                       "127.0.0.1", "--preload", tmp_path / "slow.py", "--local-directory", tmp_path / "scratch")
-                 for _ in range(2)]
+    processes = [
+        start(
+            tmp_path,
+            "worker",
+            scheduler,
+            "--no-nanny",
+            "--nthreads",
+            1,
+            "--no-dashboard",
+            "--host",
+            "127.0.0.1",
+            "--preload",
+            tmp_path / "slow.py",
+            "--local-directory",
+            tmp_path / "scratch",
+        )
+        for _ in range(2)
+    ]
     from dask.distributed import Client
 
     try:
@@ -83,7 +115,9 @@ def workers(scheduler, tmp_path):
 
 
 def reads(log):
-    return [(int(process), (name, int(index))) for process, name, index in map(str.split, log.open())]
+    return [
+        (int(process), (name, int(index))) for process, name, index in map(str.split, log.open())
+    ]
 
 
 def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, scheduler, tmp_path):
@@ -94,9 +128,14 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
 
     def kill():
         """Kill a worker within a pass that has a checkpoint, once other runs have finished."""
+
         def victims():
             last = dict(reads(log))  # the frame that each worker read last
-            return [process for process, (_, index) in last.items() if index >= CHECKPOINT + 1 and index < FRAMES - 3]
+            return [
+                process
+                for process, (_, index) in last.items()
+                if index >= CHECKPOINT + 1 and index < FRAMES - 3
+            ]
 
         wait_for(lambda: list(there.rglob("*.csv")) and victims())
         killed.extend(victims()[:1])
@@ -111,7 +150,10 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
 
     pd.testing.assert_frame_equal(result, here, check_exact=True)
     for job in jobs:
-        one, two = (pd.read_csv(tmp_path / where / job.sequence / f"{job.name}.csv") for where in ("here", "there"))
+        one, two = (
+            pd.read_csv(tmp_path / where / job.sequence / f"{job.name}.csv")
+            for where in ("here", "there")
+        )
         exact = [column for column in one if not column.endswith("_seconds")]
         pd.testing.assert_frame_equal(one[exact], two[exact], check_exact=True)
     # finished runs were kept, and the stopped pass resumed from its checkpoint
@@ -127,14 +169,17 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
 
 def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 1)
-    for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):  # without workers, none, no address
+    # without workers, none, no address
+    for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
         with pytest.raises(InputError, match=address) as error:
             with cluster.open_pool(1, address):
                 pass
         assert "\n" not in str(error.value)
 
 
-def test_a_worker_with_other_folders_or_other_code_is_reported(small_world, small_labels, tmp_path, monkeypatch):
+def test_a_worker_with_other_folders_or_other_code_is_reported(
+    small_world, small_labels, tmp_path, monkeypatch
+):
     jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
     record = runner.stages.record(tmp_path / "00")
@@ -143,24 +188,36 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(small_world, smal
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
     older = runner._run_pass(jobs, *inputs, tmp_path, record, 1)
-    assert elsewhere[jobs[0]] != older[jobs[0]] and not (tmp_path / "00" / "baseline-0.csv").exists()
+    assert (
+        elsewhere[jobs[0]] != older[jobs[0]] and not (tmp_path / "00" / "baseline-0.csv").exists()
+    )
 
 
-def test_label_maps_of_workers_have_the_bits_of_one_process(workers, scheduler, small_world, small_model, tmp_path,
-                                                            monkeypatch):
+def test_label_maps_of_workers_have_the_bits_of_one_process(
+    workers, scheduler, small_world, small_model, tmp_path, monkeypatch
+):
     from thesis_repro.cli import main
     from thesis_repro.segmentation import prediction
 
     monkeypatch.setattr(prediction, "PART", 4)
-    monkeypatch.setattr(prediction, "spread_label_maps", partial(prediction.spread_label_maps, batch_size=4))
-    monkeypatch.setattr(prediction, "write_label_maps", partial(prediction.write_label_maps, batch_size=4))
+    monkeypatch.setattr(
+        prediction, "spread_label_maps", partial(prediction.spread_label_maps, batch_size=4)
+    )
+    monkeypatch.setattr(
+        prediction, "write_label_maps", partial(prediction.write_label_maps, batch_size=4)
+    )
     command = ["predict", "--images", small_world / "kitti", "--model", small_model]  # 00 and 01
     assert main([*map(str, command), "--output", str(tmp_path / "alone")]) == 0
-    assert main([*map(str, command), "--output", str(tmp_path / "spread"), "--dask", scheduler]) == 0
+    assert (
+        main([*map(str, command), "--output", str(tmp_path / "spread"), "--dask", scheduler]) == 0
+    )
 
     def contents(folder):
-        return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")
-                if path.name not in (longrun.LOG, longrun.LIST)}
+        return {
+            path.relative_to(folder): path.read_bytes()
+            for path in folder.rglob("*.*")
+            if path.name not in (longrun.LOG, longrun.LIST)
+        }
 
     assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)
     assert contents(tmp_path / "spread") == contents(tmp_path / "alone")

@@ -30,7 +30,9 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     sequence = Sequence(small_world / "kitti", "01")
     alone = odometry.run(sequence, masks=LabelMasks(small_labels / "01", sequence, 15))
     row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
-    expected = metrics.errors(alone.poses, sequence.poses) | metrics.step_errors(alone.poses, sequence.poses)
+    expected = metrics.errors(alone.poses, sequence.poses) | metrics.step_errors(
+        alone.poses, sequence.poses
+    )
     assert {name: row[name] for name in expected} == pytest.approx(expected, nan_ok=True, rel=0)
     assert row["se3"] <= row["rmse"]
     best = thesis_tables.best_widths(compare.of_method(summary, "masked")).loc["01"]
@@ -45,7 +47,9 @@ def test_kittis_errors_need_paths_of_100_metres(frames, t_rel):
     true = np.tile(np.eye(4), (frames, 1, 1))
     true[:, 2, 3] = np.arange(frames)
     table = pd.DataFrame({"detected": [9.0] * frames, "flag": ""})
-    measured = runner.measures(odometry.Result(true, table).with_poses(true * [1, 1, 1, 1.02]).frames, true)
+    measured = runner.measures(
+        odometry.Result(true, table).with_poses(true * [1, 1, 1, 1.02]).frames, true
+    )
     assert measured["t_rel"] == pytest.approx(t_rel, nan_ok=True)
     assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
 
@@ -61,8 +65,9 @@ def test_only_missing_runs_are_run_again(small_world, small_labels, finished, mo
 
 
 @pytest.mark.parametrize("error", [OSError("pulled the plug"), KeyboardInterrupt()])
-def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(small_world, small_labels, finished, tmp_path,
-                                                              monkeypatch, error):
+def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(
+    small_world, small_labels, finished, tmp_path, monkeypatch, error
+):
     folder, jobs, _ = finished
     jobs = [job for job in jobs if job.method != "reduced"]
     monkeypatch.setattr(odometry.passes, "CHECKPOINT", 5)
@@ -80,7 +85,9 @@ def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(small_world, small
         with pytest.raises(KeyboardInterrupt):
             runner.run(jobs, small_world / "kitti", small_labels, tmp_path)
     else:
-        assert set(runner.run(jobs, small_world / "kitti", small_labels, tmp_path)["sequence"]) == {"00"}
+        assert set(runner.run(jobs, small_world / "kitti", small_labels, tmp_path)["sequence"]) == {
+            "00"
+        }
     assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".log", ".npz"}
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
     read.clear()
@@ -90,38 +97,58 @@ def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(small_world, small
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
     assert not list(tmp_path.rglob("pass-*"))
     for job in jobs:
-        whole, resumed = (pd.read_csv(root / job.sequence / f"{job.name}.csv") for root in (folder, tmp_path))
+        whole, resumed = (
+            pd.read_csv(root / job.sequence / f"{job.name}.csv") for root in (folder, tmp_path)
+        )
         exact = [column for column in whole if not column.endswith("seconds")]
         pd.testing.assert_frame_equal(whole[exact], resumed[exact], check_exact=True)
 
 
-def test_a_failed_run_is_reported_and_stops_no_other_run(small_world, small_labels, tmp_path, capsys):
+def test_a_failed_run_is_reported_and_stops_no_other_run(
+    small_world, small_labels, tmp_path, capsys
+):
     shutil.copytree(small_labels, tmp_path / "labels")
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
-    jobs = [*first_jobs(small_world / "kitti", ["00"], {"thesis": WIDTHS}), Job("00", "true-labels", 10),
-            Job("00", "mirrored", 10), Job("00", "masked", dilation_width=0)]
-    summary = runner.run(jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5)
+    jobs = [
+        *first_jobs(small_world / "kitti", ["00"], {"thesis": WIDTHS}),
+        Job("00", "true-labels", 10),
+        Job("00", "mirrored", 10),
+        Job("00", "masked", dilation_width=0),
+    ]
+    summary = runner.run(
+        jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5
+    )
     assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
     printed = capsys.readouterr().out
-    assert f"sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: {broken}: " in printed
+    assert (
+        f"sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: {broken}: "
+        in printed
+    )
     assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
     with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
         runner.run(jobs[-1:], small_world / "kitti", small_labels, tmp_path / "none")
 
 
 def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path):
-    kitti, jobs = small_world / "kitti", [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)]
+    kitti, jobs = (
+        small_world / "kitti",
+        [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)],
+    )
 
     def keypoints(*settings):
-        summary = runner.run(jobs, kitti, [Source(small_labels, "labels", "", *settings)], tmp_path, frames=4)
+        summary = runner.run(
+            jobs, kitti, [Source(small_labels, "labels", "", *settings)], tmp_path, frames=4
+        )
         return summary.set_index("method")["mean_keypoints"]
 
     thesis = keypoints()
     assert thesis["masked"] != thesis["exact-boundaries"]
     exact = keypoints(MaskSettings("exact"))  # the same folder: the first results are replaced
     assert exact["masked"] == exact["exact-boundaries"] == thesis["exact-boundaries"]
-    chosen = MaskSettings("exact", symmetric=True, classes=("road", "building"), movable=3, margin=20)
+    chosen = MaskSettings(
+        "exact", symmetric=True, classes=("road", "building"), movable=3, margin=20
+    )
     few = keypoints(chosen)
     sequence = Sequence(kitti, "00").subset(4)
     alone = odometry.run(sequence, masks=LabelMasks(small_labels / "00", sequence, 10, chosen))
@@ -141,7 +168,9 @@ def test_without_a_mounting_angle_the_rmse_stays(small_world, small_labels, tmp_
     kitti = small_world / "kitti"
     jobs = first_jobs(kitti, ["00", "01"], {"refined": (10,)})
     runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=6)
-    corrected = runner.with_boresight_correction(runs, kitti, tmp_path, frames=6)["rmse_boresight_corrected"]
+    corrected = runner.with_boresight_correction(runs, kitti, tmp_path, frames=6)[
+        "rmse_boresight_corrected"
+    ]
     # no angle is determined on six frames, so nothing is removed
     assert corrected.tolist() == pytest.approx(runs["rmse"].tolist())
     thesis_runs = runner.with_boresight_correction(runs.assign(estimator="thesis"), kitti, tmp_path)
@@ -150,12 +179,19 @@ def test_without_a_mounting_angle_the_rmse_stays(small_world, small_labels, tmp_
 
 def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitti):
     label_maps, ready = Source(tiny_kitti, name="net"), Source(tiny_kitti, "masks", "ready")
-    jobs = first_jobs(small_world / "kitti", ["00"], {"thesis": (5, 10), "refined": ()}, tested=10,
-                      sources=(label_maps, ready), repetitions=2)
+    jobs = first_jobs(
+        small_world / "kitti",
+        ["00"],
+        {"thesis": (5, 10), "refined": ()},
+        tested=10,
+        sources=(label_maps, ready),
+        repetitions=2,
+    )
     assert len({job.name for job in jobs}) == len(jobs)
     rows = pd.DataFrame([vars(job) for job in jobs])
     count = rows.groupby(["source", "method", "estimator"]).size()
-    assert count["", "baseline", "thesis"] == count["", "baseline", "refined"] == 2  # once for all sources
+    # once for all sources
+    assert count["", "baseline", "thesis"] == count["", "baseline", "refined"] == 2
     assert count["net", "masked", "thesis"] == 4 and count["net", "masked", "refined"] == 2
     assert count["ready", "masked", "refined"] == 2
     assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()

@@ -26,15 +26,23 @@ def masks(small_world, small_labels, tmp_path_factory):
     """Ready-made masks of width 7, one folder a sequence."""
     root = tmp_path_factory.mktemp("ready")
     for name in ("00", "01"):
-        write_masks(LabelMasks(small_labels / name, Sequence(small_world / "kitti", name), 7), root / name)
+        write_masks(
+            LabelMasks(small_labels / name, Sequence(small_world / "kitti", name), 7), root / name
+        )
     return root
 
 
 @pytest.fixture(scope="module")
 def study(small_world, small_labels, masks):
     planned = series.Study(
-        small_world / "kitti", ("00", "01"), (Source(small_labels, name="net"), Source(masks, "masks", "by-hand")),
-        (5, 7), tested=7, repetitions=2, frames=FRAMES)
+        small_world / "kitti",
+        ("00", "01"),
+        (Source(small_labels, name="net"), Source(masks, "masks", "by-hand")),
+        (5, 7),
+        tested=7,
+        repetitions=2,
+        frames=FRAMES,
+    )
     planned.check()
     return planned
 
@@ -53,24 +61,38 @@ def files(folder):
 def test_ready_made_masks_give_the_errors_of_label_maps_of_that_width(done):
     _, runs = done
     masked = runs[(runs["method"] == "masked") & (runs["dilation_width"] != 5)]
-    net, by_hand = (masked.loc[masked["source"] == name, "rmse"].tolist() for name in ("net", "by-hand"))
+    net, by_hand = (
+        masked.loc[masked["source"] == name, "rmse"].tolist() for name in ("net", "by-hand")
+    )
     assert len(net) == 4 and net == by_hand
     # the baseline is shared
-    assert (runs["method"] == "baseline").sum() == 4 and set(runs.loc[runs["method"] == "baseline", "source"]) == {""}
+    assert (runs["method"] == "baseline").sum() == 4 and set(
+        runs.loc[runs["method"] == "baseline", "source"]
+    ) == {""}
 
 
 def test_evo_reads_the_written_paths(done, study):
     folder, runs = done
     poses = runner.run_poses(runs[runs["repetition"] == 0], folder / "runs")
-    files = {form: {str(path.relative_to(folder / "paths" / form).with_suffix("")): path
-                    for path in (folder / "paths" / form).rglob("*.txt")} for form in ("kitti", "tum")}
+    files = {
+        form: {
+            str(path.relative_to(folder / "paths" / form).with_suffix("")): path
+            for path in (folder / "paths" / form).rglob("*.txt")
+        }
+        for form in ("kitti", "tum")
+    }
     names = {f"{name}/{run}" for name, run in poses} | {"00/truth", "01/truth"}
     assert files["kitti"].keys() == files["tum"].keys() == names
     times = Sequence(study.kitti, "00").times[:FRAMES]
     for (name, run), expected in poses.items():
-        assert np.array_equal(file_interface.read_kitti_poses_file(files["kitti"][f"{name}/{run}"]).poses_se3, expected)
+        assert np.array_equal(
+            file_interface.read_kitti_poses_file(files["kitti"][f"{name}/{run}"]).poses_se3,
+            expected,
+        )
         tum = file_interface.read_tum_trajectory_file(files["tum"][f"{name}/{run}"])
-        assert np.array_equal(tum.timestamps, times) and np.allclose(tum.poses_se3, expected, atol=1e-9)
+        assert np.array_equal(tum.timestamps, times) and np.allclose(
+            tum.poses_se3, expected, atol=1e-9
+        )
 
 
 def test_figures_and_tables_of_a_study(done, study):
@@ -83,7 +105,9 @@ def test_figures_and_tables_of_a_study(done, study):
         latex = (folder / f"{name}.tex").read_text()
         rows = pd.read_csv(folder / f"{name}.csv")
         body = latex.partition("\\midrule")[2].partition("\\bottomrule")[0]
-        assert body.count("\\\\") == len(rows) and body.count("&") == len(rows) * (len(rows.columns) - 1)
+        assert body.count("\\\\") == len(rows) and body.count("&") == len(rows) * (
+            len(rows.columns) - 1
+        )
         assert (folder / f"{name}.md").is_file()
     links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
     assert {"sources.webp", "paths-01.pdf", "errors.tex"} <= set(links)
@@ -92,11 +116,13 @@ def test_figures_and_tables_of_a_study(done, study):
     assert len(sources.axes) == 3 * len(study.sources)
     for path in folder.glob("paths/*/01/net/masked-07-0.txt"):
         path.unlink()  # as if the run had failed
-    assert len(report.figure_paths(study, "01", folder).axes[0].lines) == 3  # all keypoints, by hand, ground truth
+    # all keypoints, by hand, ground truth
+    assert len(report.figure_paths(study, "01", folder).axes[0].lines) == 3
 
 
-def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(done, study, small_labels, tmp_path,
-                                                                        monkeypatch):
+def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
+    done, study, small_labels, tmp_path, monkeypatch
+):
     folder, runs = tmp_path / "out", done[1]
     shutil.copytree(done[0], folder)
     times = files(folder)
@@ -108,18 +134,49 @@ def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(done, st
     shutil.copytree(small_labels, other)
     for path in other.rglob("*.png"):
         cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path), 0), 1))
-    replace(study, sources=(Source(other, name="net"), study.sources[1])).run(folder)  # another network of this name
-    changed = {path for path in times if not path.is_file() or path.stat().st_mtime_ns != times[path]}
+    # another network of this name
+    replace(study, sources=(Source(other, name="net"), study.sources[1])).run(folder)
+    changed = {
+        path for path in times if not path.is_file() or path.stat().st_mtime_ns != times[path]
+    }
     assert changed and {path.parent.name for path in changed} == {"net"}
 
 
-def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(done, study, small_world, small_labels, masks, tmp_path,
-                                                               kill_when):
+def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
+    done, study, small_world, small_labels, masks, tmp_path, kill_when
+):
     folder = tmp_path / "out"
-    command = [sys.executable, "-m", "thesis_repro", "study", "--kitti", small_world / "kitti",
-               "--labels", small_labels, "--masks", masks, "--name", "net", "--name", "by-hand", "--widths", 5, 7,
-               "--controls", 7, "--repetitions", 2, "--frames", FRAMES, "--estimator", "thesis", "--jobs", 2,
-               "--output", folder]
+    command = [
+        sys.executable,
+        "-m",
+        "thesis_repro",
+        "study",
+        "--kitti",
+        small_world / "kitti",
+        "--labels",
+        small_labels,
+        "--masks",
+        masks,
+        "--name",
+        "net",
+        "--name",
+        "by-hand",
+        "--widths",
+        5,
+        7,
+        "--controls",
+        7,
+        "--repetitions",
+        2,
+        "--frames",
+        FRAMES,
+        "--estimator",
+        "thesis",
+        "--jobs",
+        2,
+        "--output",
+        folder,
+    ]
     kill_when(command, lambda: files(folder))
     finished = files(folder)
     assert study.run(folder).equals(done[1])
@@ -127,8 +184,13 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(done, study, smal
 
 
 def test_a_single_sequence_may_have_plain_folders(small_world, small_labels, masks, tmp_path):
-    single = series.Study(small_world / "kitti", ("00",), (Source(small_labels / "00", name="a"),
-                                                           Source(masks / "00", "masks", "b")), (5,), frames=4)
+    single = series.Study(
+        small_world / "kitti",
+        ("00",),
+        (Source(small_labels / "00", name="a"), Source(masks / "00", "masks", "b")),
+        (5,),
+        frames=4,
+    )
     assert compare.sources(single.run(tmp_path / "out")) == ["a", "b"]
 
 
@@ -139,33 +201,58 @@ def test_results_of_another_length_are_kept(done, study):
     assert files(done[0]) == before
 
 
-@pytest.mark.parametrize("options, named", [
-    ("", "--labels"),
-    ("--labels nowhere", "nowhere: "),
-    ("--labels {labels} --labels {labels}", "small_labels"),
-    ("--labels {labels} --name a --name b", "--name b: 2 names for 1"),
-    ("--labels {labels} --name a/b", "--name a/b: "),
-    ("--masks {masks} --widths 5", "--widths: "),
-    ("--masks {masks} --symmetric", "--labels"),
-    ("--masks {labels}", "320x320"),
-    ("--labels {labels}/00", "2 are asked for"),
-    ("--labels {less} --sequences 00", "2 of 12 frames of sequence 00"),
-    ("--labels {labels} --repetitions 0", "--repetitions 0: ")])
-def test_bad_input_is_one_line_before_anything_runs(small_world, small_labels, masks, tmp_path, capsys, options, named):
+@pytest.mark.parametrize(
+    "options, named",
+    [
+        ("", "--labels"),
+        ("--labels nowhere", "nowhere: "),
+        ("--labels {labels} --labels {labels}", "small_labels"),
+        ("--labels {labels} --name a --name b", "--name b: 2 names for 1"),
+        ("--labels {labels} --name a/b", "--name a/b: "),
+        ("--masks {masks} --widths 5", "--widths: "),
+        ("--masks {masks} --symmetric", "--labels"),
+        ("--masks {labels}", "320x320"),
+        ("--labels {labels}/00", "2 are asked for"),
+        ("--labels {less} --sequences 00", "2 of 12 frames of sequence 00"),
+        ("--labels {labels} --repetitions 0", "--repetitions 0: "),
+    ],
+)
+def test_bad_input_is_one_line_before_anything_runs(
+    small_world, small_labels, masks, tmp_path, capsys, options, named
+):
     less = tmp_path / "less"
     shutil.copytree(small_labels / "00", less / "00")
     for index in (3, 4):
         (less / "00" / f"{index:06d}.png").unlink()
     words = options.format(labels=small_labels, masks=masks, less=less).split()
-    assert main(["study", "--kitti", str(small_world / "kitti"), *words, "--output", str(tmp_path / "out")]) == 1
+    assert (
+        main(
+            [
+                "study",
+                "--kitti",
+                str(small_world / "kitti"),
+                *words,
+                "--output",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 1
+    )
     error = capsys.readouterr().err.strip()
-    assert error.startswith("error: ") and named in error and "\n" not in error and not (tmp_path / "out").exists()
+    assert (
+        error.startswith("error: ")
+        and named in error
+        and "\n" not in error
+        and not (tmp_path / "out").exists()
+    )
 
 
 def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_labels, tmp_path):
     shutil.copytree(small_labels / "00", tmp_path / "labels" / "00")
     damaged = tmp_path / "labels" / "00" / "000002.png"
     damaged.write_bytes(damaged.read_bytes()[:-20])
-    study = series.Study(small_world / "kitti", ("00",), (Source(tmp_path / "labels", name="net"),), (5,), frames=5)
+    study = series.Study(
+        small_world / "kitti", ("00",), (Source(tmp_path / "labels", name="net"),), (5,), frames=5
+    )
     with pytest.raises(series.InputError, match="every run with masks failed"):
         study.run(tmp_path / "out")

@@ -27,12 +27,19 @@ def sequence(small_world, monkeypatch):
 
 def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
     keypoint_mask = masks.keypoint_mask
-    monkeypatch.setattr(masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0])
+    monkeypatch.setattr(
+        masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0]
+    )
     table = timing.measure(sequence, model, width=5)
-    assert list(table.columns) == ["method", "stage", "milliseconds"] and (table["milliseconds"] > 0).all()
+    assert (
+        list(table.columns) == ["method", "stage", "milliseconds"]
+        and (table["milliseconds"] > 0).all()
+    )
     stages_of = table.groupby("method")["stage"].agg(list)
     assert stages_of["masked, width 5"] == list(timing.STAGES)
-    assert stages_of["all keypoints"] == [stage for stage in timing.STAGES if stage not in ("segmentation", "mask")]
+    assert stages_of["all keypoints"] == [
+        stage for stage in timing.STAGES if stage not in ("segmentation", "mask")
+    ]
     slow = table.set_index(["method", "stage"])["milliseconds"]
     assert slow["masked, width 5", "mask"] > 500 > slow.drop(("masked, width 5", "mask")).max()
 
@@ -40,12 +47,17 @@ def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
 def test_timed_steps_equal_the_steps_of_a_run(sequence, model, tmp_path, monkeypatch):
     steps = []
     step = odometry.Odometry.step
-    monkeypatch.setattr(odometry.Odometry, "step", lambda *given: steps.append(step(*given)) or steps[-1])
+    monkeypatch.setattr(
+        odometry.Odometry, "step", lambda *given: steps.append(step(*given)) or steps[-1]
+    )
     timing.measure(sequence, model, 5)
     short = sequence.subset(5)
     prediction.write_label_maps(model, short.frame_paths, tmp_path)
     made = masks.LabelMasks(tmp_path, short, 5)
-    for timed, expected in ((steps[:10:2], odometry.run(short)), (steps[1:10:2], odometry.run(short, masks=made))):
+    for timed, expected in (
+        (steps[:10:2], odometry.run(short)),
+        (steps[1:10:2], odometry.run(short, masks=made)),
+    ):
         assert np.array_equal([timed_step.pose for timed_step in timed], expected.poses)
         assert [timed_step.detected for timed_step in timed] == expected.frames["detected"].tolist()
 

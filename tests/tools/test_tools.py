@@ -41,14 +41,26 @@ def test_a_wrong_turn_is_counted_once():
     turned[2:, :3, :3] = [[0.999, 0, 0.0447], [0, 1, 0], [-0.0447, 0, 0.999]]  # 2.6 degrees, once
     for flag, unflagged in (("", 1), ("ambiguous motion", 0)):
         frames = pd.DataFrame({"flag": ["", "", flag, "", "motion not determined", ""]})
-        counts = reliability.count_steps(odometry.Result(turned, frames), SimpleNamespace(poses=line), np.arange(6) > 0)
+        counts = reliability.count_steps(
+            odometry.Result(turned, frames), SimpleNamespace(poses=line), np.arange(6) > 0
+        )
         assert (counts["steps"], counts["wrong"], counts["unflagged"]) == (5, 1, unflagged)
         assert counts["largest"] == pytest.approx(2.56, abs=0.01) and counts["not_determined"] == 1
 
 
 def test_a_run_is_compared_with_its_shuffles_and_a_series_resumes(small_world, tmp_path):
-    arguments = ["--kitti", str(small_world / "kitti"), "--frames", "5", "--keypoints", "300", "--shuffles", "2",
-                 "--output", str(tmp_path)]
+    arguments = [
+        "--kitti",
+        str(small_world / "kitti"),
+        "--frames",
+        "5",
+        "--keypoints",
+        "300",
+        "--shuffles",
+        "2",
+        "--output",
+        str(tmp_path),
+    ]
     assert reliability.main(arguments) == 0
     trials = tmp_path / "00-all.csv"
     table = pd.read_csv(trials)
@@ -73,11 +85,13 @@ def test_muon_treats_convolutions_as_matrices():
 
 def test_a_view_looks_like_that_of_another_camera():
     label = np.zeros((188, 620), np.uint8)
-    label[94 - 18:94 + 18, 310 - 18:310 + 18] = 1  # a square in KITTI's frame
+    label[94 - 18 : 94 + 18, 310 - 18 : 310 + 18] = 1  # a square in KITTI's frame
     for look, (across, down) in train_shipped.LOOKS.items():
         shapes = []
         for seed in range(40):
-            _, shown = train_shipped.view(label, label, "kitti", look, 320, np.random.default_rng(seed))
+            _, shown = train_shipped.view(
+                label, label, "kitti", look, 320, np.random.default_rng(seed)
+            )
             rows, columns = np.nonzero(shown)
             if len(rows) > 20 and not shown[[0, -1]].any() and not shown[:, [0, -1]].any():
                 shapes.append(np.ptp(rows) / np.ptp(columns))
@@ -87,11 +101,23 @@ def test_a_view_looks_like_that_of_another_camera():
 @pytest.mark.torture
 def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path):
     kitti_semantic = camvid_real.parent / "kitti_semantic"
-    arguments = [str(camvid_real), str(kitti_semantic), str(tmp_path), "--epochs", "1", "--last-epochs", "1",
-                 "--steps", "1"]
+    arguments = [
+        str(camvid_real),
+        str(kitti_semantic),
+        str(tmp_path),
+        "--epochs",
+        "1",
+        "--last-epochs",
+        "1",
+        "--steps",
+        "1",
+    ]
     assert train_shipped.main(arguments) == 0
     model = keras.models.load_model(tmp_path / "streets.keras", compile=False)
-    assert model.output_shape == (None, 320, 320, 35) and "20001" in (tmp_path / "README.md").read_text()
+    assert (
+        model.output_shape == (None, 320, 320, 35)
+        and "20001" in (tmp_path / "README.md").read_text()
+    )
 
 
 @pytest.mark.torture
@@ -103,5 +129,7 @@ def test_all_proposals_are_trained_and_measured(camvid_real):
 
 def test_make_weights_requires_both_folders():
     for setting, missing in (("CAMVID=x", "KITTI_SEMANTIC"), ("KITTI_SEMANTIC=x", "CAMVID")):
-        done = subprocess.run(["make", "weights", setting, "-o", "setup"], cwd=ROOT, capture_output=True, text=True)
+        done = subprocess.run(
+            ["make", "weights", setting, "-o", "setup"], cwd=ROOT, capture_output=True, text=True
+        )
         assert done.returncode and missing in done.stderr

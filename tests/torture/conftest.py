@@ -1,4 +1,6 @@
-"""Kills, faults and bad input, tried on real commands; trials marked `torture` are run by `make torture` alone."""
+"""Kills, faults and bad input, tried on real commands; trials marked `torture` are run by `make
+torture` alone.
+"""
 
 import sys
 from pathlib import Path
@@ -25,29 +27,64 @@ except Exception as error:
 
 @pytest.fixture
 def words(small_world, small_labels, small_model):
-    """words(name, output): a command that writes `output`. The ending of "odometry.png" says which output it is."""
+    """words(name, output): a command that writes `output`. The ending of "odometry.png" says
+    which output it is.
+    """
     kitti = small_world / "kitti"
     options = {".txt": "--output", ".png": "--plot", ".mp4": "--video"}
 
     def command(name, output="out"):
         if name.startswith("odometry"):
-            return thesis("odometry", "--kitti", kitti, "--sequence", "00", options[name[-4:]], f"{output}{name[-4:]}")
+            return thesis(
+                "odometry",
+                "--kitti",
+                kitti,
+                "--sequence",
+                "00",
+                options[name[-4:]],
+                f"{output}{name[-4:]}",
+            )
         return {
             "synthesize": thesis("synthesize", output, "--profile", "smoke"),
             "training": [sys.executable, "-c", TRAINING, output],
-            "predict": thesis("predict", "--images", kitti / "sequences/00", "--model", small_model, "--output",
-                              output),
-            "study": thesis("study", "--kitti", kitti, "--labels", small_labels, "--widths", 5, "--repetitions", 1,
-                            "--jobs", 2, "--output", output)}[name]
+            "predict": thesis(
+                "predict",
+                "--images",
+                kitti / "sequences/00",
+                "--model",
+                small_model,
+                "--output",
+                output,
+            ),
+            "study": thesis(
+                "study",
+                "--kitti",
+                kitti,
+                "--labels",
+                small_labels,
+                "--widths",
+                5,
+                "--repetitions",
+                1,
+                "--jobs",
+                2,
+                "--output",
+                output,
+            ),
+        }[name]
 
     return command
 
 
 @pytest.fixture
 def folder(tmp_path, tiny_kitti, tiny_cityscapes):
-    """A folder with kitti, cityscapes, labels and masks of sequence 00, path.txt, and a user's own mine/letter.txt."""
-    for name, picture in (("labels", np.repeat([[7], [23]], 16, axis=0).repeat(40, axis=1)),
-                          ("masks", np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1))):
+    """A folder with kitti, cityscapes, labels and masks of sequence 00, path.txt, and a user's
+    own mine/letter.txt.
+    """
+    for name, picture in (
+        ("labels", np.repeat([[7], [23]], 16, axis=0).repeat(40, axis=1)),
+        ("masks", np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1)),
+    ):
         (tmp_path / name).mkdir()
         for index in range(4):
             cv2.imwrite(str(tmp_path / name / f"{index:06d}.png"), picture.astype(np.uint8))

@@ -21,14 +21,21 @@ from thesis_repro.masks import forget_edges
 pytestmark = pytest.mark.slow
 
 FRAMES = "kitti/sequences/00/image_0"
-FRAME, POSES, CALIB, TIMES = (f"{FRAMES}/000002.png", "kitti/poses/00.txt", "kitti/sequences/00/calib.txt",
-                              "kitti/sequences/00/times.txt")
+FRAME, POSES, CALIB, TIMES = (
+    f"{FRAMES}/000002.png",
+    "kitti/poses/00.txt",
+    "kitti/sequences/00/calib.txt",
+    "kitti/sequences/00/times.txt",
+)
 LABEL, MASK, IDENTITY = "labels/000002.png", "masks/000002.png", b"1 0 0 0 0 1 0 0 0 0 1 0\n"
 ODOMETRY = "odometry --kitti kitti --sequence 00 --output out/path.txt"
 LABELLED, MASKED = f"{ODOMETRY} --labels labels --dilation 3", f"{ODOMETRY} --masks masks"
 MASKS = "masks --kitti kitti --sequence 00 --labels labels --dilation 3 --output out"
 STUDY = "study --kitti kitti --labels labels --output out"
-EVALUATE, PREDICT = "evaluate --kitti kitti --sequence 00 path.txt", "predict --images kitti/sequences/00 --output out"
+EVALUATE, PREDICT = (
+    "evaluate --kitti kitti --sequence 00 path.txt",
+    "predict --images kitti/sequences/00 --output out",
+)
 MODEL = f"{PREDICT} --model a.keras"
 NOISE = np.random.default_rng(0).integers(0, 256, (48, 64), np.uint8)
 
@@ -36,6 +43,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, (48, 64), np.uint8)
 @pytest.fixture
 def inside(folder, monkeypatch, capfd):
     """inside(words): run a command in `folder` and in this process; returns a `trials.Result`."""
+
     def run(words):
         monkeypatch.chdir(folder)
         before = trials.snapshot(folder)
@@ -45,7 +53,9 @@ def inside(folder, monkeypatch, capfd):
             code = main(words)
         except SystemExit as ended:
             code = ended.code
-        return trials.Result(code, *capfd.readouterr(), trials.changes(before, trials.snapshot(folder)))
+        return trials.Result(
+            code, *capfd.readouterr(), trials.changes(before, trials.snapshot(folder))
+        )
 
     return run
 
@@ -57,7 +67,11 @@ def picture(pixels, ending=".png"):
 def archive(config, weights=b""):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
-        for name, content in (("metadata.json", "{}"), ("config.json", json.dumps(config)), ("weights", weights)):
+        for name, content in (
+            ("metadata.json", "{}"),
+            ("config.json", json.dumps(config)),
+            ("weights", weights),
+        ):
             file.writestr(name, content)
     return buffer.getvalue()
 
@@ -70,34 +84,75 @@ def nan_model(path):
     keras.Model(images, keras.layers.Conv2D(35, 1, kernel_initializer=nan)(images)).save(path)
 
 
-# (command, file, {fault: content of the file, None if it is missing, or a function that makes it}); the error names
-# the file. More contents are in tests/test_readers.py and tests/test_files.py
+# (command, file, {fault: content of the file, None if it is missing, or a function that makes it});
+# the error names the file. More contents are in tests/test_readers.py and tests/test_files.py
 BROKEN = [
     *[(words, FRAME, {"missing": None}) for words in (ODOMETRY, MASKS, STUDY, PREDICT)],
-    (ODOMETRY, FRAME, {
-        "16 bits": picture(NOISE.astype(np.uint16)), "a folder": Path.mkdir, "a pipe": os.mkfifo,
-        "a broken link": lambda path: path.symlink_to("/nowhere/000002.png"),
-        "another size": picture(np.zeros((20, 20), np.uint8)),
-        "a bomb": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\xea\x60\0\0\xea\x60\x08\0\0\0\0\xc5\xa4\x12\x7e"}),
+    (
+        ODOMETRY,
+        FRAME,
+        {
+            "16 bits": picture(NOISE.astype(np.uint16)),
+            "a folder": Path.mkdir,
+            "a pipe": os.mkfifo,
+            "a broken link": lambda path: path.symlink_to("/nowhere/000002.png"),
+            "another size": picture(np.zeros((20, 20), np.uint8)),
+            "a bomb": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\xea\x60\0\0\xea\x60\x08\0\0\0\0\xc5\xa4\x12\x7e",
+        },
+    ),
     (ODOMETRY, f"{FRAMES}/000000.png", {"missing": None, "1x1": picture([[7]])}),
     (ODOMETRY, f"{FRAMES}/2.png", {"a number twice": picture(NOISE)}),
-    (LABELLED, LABEL, {"missing": None, "a JPEG": picture(NOISE % 30, ".jpg"),
-                       "colours": picture(np.full((9, 9, 3), (9, 7, 3), np.uint8))}),
+    (
+        LABELLED,
+        LABEL,
+        {
+            "missing": None,
+            "a JPEG": picture(NOISE % 30, ".jpg"),
+            "colours": picture(np.full((9, 9, 3), (9, 7, 3), np.uint8)),
+        },
+    ),
     (MASKED, MASK, {"missing": None, "a label map": picture(NOISE % 30)}),
-    ("study --kitti kitti --masks masks --output out", MASK, {"another size": picture(np.zeros((9, 9), np.uint8))}),
-    (ODOMETRY, CALIB, {"missing": None, "another camera's": b"P0: 718.8 0 607.2 0 0 718.8 24 0 0 0 1 0\n"}),
-    (ODOMETRY, POSES, {"too few": IDENTITY * 3, "too many": IDENTITY * 5,
-                       "too far": b"1 0 0 1e300 0 1 0 0 0 0 1 0\n" * 4}),
+    (
+        "study --kitti kitti --masks masks --output out",
+        MASK,
+        {"another size": picture(np.zeros((9, 9), np.uint8))},
+    ),
+    (
+        ODOMETRY,
+        CALIB,
+        {"missing": None, "another camera's": b"P0: 718.8 0 607.2 0 0 718.8 24 0 0 0 1 0\n"},
+    ),
+    (
+        ODOMETRY,
+        POSES,
+        {
+            "too few": IDENTITY * 3,
+            "too many": IDENTITY * 5,
+            "too far": b"1 0 0 1e300 0 1 0 0 0 0 1 0\n" * 4,
+        },
+    ),
     (ODOMETRY, TIMES, {"too few": b"0\n1\n"}),
     (EVALUATE, "path.txt", {"missing": None, "too few": IDENTITY}),
-    (MODEL, "a.keras", {
-        "no numbers": nan_model, "a pickle": pickle.dumps({"a": 1}),
-        "code": archive({"module": "keras.layers", "class_name": "Lambda", "config": {"function": "x"}}),
-        "foreign": archive({"module": "os", "class_name": "system", "config": {"command": "touch harmed"}}),
-        "a bomb": lambda path: path.write_bytes(archive({}, bytes(300_000_000)))}),
+    (
+        MODEL,
+        "a.keras",
+        {
+            "no numbers": nan_model,
+            "a pickle": pickle.dumps({"a": 1}),
+            "code": archive(
+                {"module": "keras.layers", "class_name": "Lambda", "config": {"function": "x"}}
+            ),
+            "foreign": archive(
+                {"module": "os", "class_name": "system", "config": {"command": "touch harmed"}}
+            ),
+            "a bomb": lambda path: path.write_bytes(archive({}, bytes(300_000_000))),
+        },
+    ),
 ]
 # command -> what the error names; the files are sound
-REFUSED = [line.split(" -> ") for line in f"""
+REFUSED = [
+    line.split(" -> ")
+    for line in f"""
 {ODOMETRY} --labels labels -> --labels
 {ODOMETRY} --dilation 3 -> --dilation
 {ODOMETRY} --camera image_9 -> 'image_9'
@@ -115,19 +170,29 @@ plan --kitti kitti --cityscapes nowhere -> nowhere
 synthesize mine --profile smoke -> mine
 predict --images labels mine/../labels --output out -> --images
 predict --images labels --output labels -> --output labels
-""".strip().splitlines()]
+""".strip().splitlines()
+]
 
 
-@pytest.mark.parametrize("words, path, content", [
-    pytest.param(words, path, content, id=f"{words.split()[0]} {path} {fault}")
-    for words, path, faults in BROKEN for fault, content in faults.items()])
+@pytest.mark.parametrize(
+    "words, path, content",
+    [
+        pytest.param(words, path, content, id=f"{words.split()[0]} {path} {fault}")
+        for words, path, faults in BROKEN
+        for fault, content in faults.items()
+    ],
+)
 def test_a_broken_file_is_named(words, path, content, folder, inside):
     (folder / path).unlink(missing_ok=True)
     if callable(content):
         content(folder / path)
     elif content is not None:
         (folder / path).write_bytes(content)
-    trials.refused(inside(words.split()), Path(path).name, left=["out", "out/*"] if words in (MASKS, MODEL) else [])
+    trials.refused(
+        inside(words.split()),
+        Path(path).name,
+        left=["out", "out/*"] if words in (MASKS, MODEL) else [],
+    )
 
 
 @pytest.mark.parametrize("words, named", REFUSED)
@@ -137,17 +202,34 @@ def test_a_wrong_option_is_named(words, named, inside):
 
 def test_every_option_refuses_a_missing_or_wrong_value(inside):
     """Exit code 2, and the option is named."""
-    commands = next(action for action in build_parser()._actions if action.dest == "command").choices
-    options = [(command, action) for command, parser in commands.items() for action in parser._actions
-               if action.option_strings and action.dest != "help"]
+    commands = next(
+        action for action in build_parser()._actions if action.dest == "command"
+    ).choices
+    options = [
+        (command, action)
+        for command, parser in commands.items()
+        for action in parser._actions
+        if action.option_strings and action.dest != "help"
+    ]
     assert len(options) > 40
     for command, action in options:
-        option, wrong = action.option_strings[-1], {int: "1.5", float: "fast", Path: ""}.get(action.type, "nonsense")
-        cases = [[command, f"{option}=yes" if action.nargs == 0 else option]] if action.nargs != "?" else []
+        option, wrong = (
+            action.option_strings[-1],
+            {int: "1.5", float: "fast", Path: ""}.get(action.type, "nonsense"),
+        )
+        cases = (
+            [[command, f"{option}=yes" if action.nargs == 0 else option]]
+            if action.nargs != "?"
+            else []
+        )
         if action.choices or action.type in (int, float, Path):
             cases.append([command, option, wrong])
         for words in cases:
             trials.refused(inside(words), option, code=2)
-    for words, named in ((["nonsense"], "'nonsense'"), (f"{LABELLED} --masks masks".split(), "--masks"),
-                         (f"{STUDY} --jobs 0".split(), "--jobs"), (f"{STUDY} --dask inproc://1".split(), "--dask")):
+    for words, named in (
+        (["nonsense"], "'nonsense'"),
+        (f"{LABELLED} --masks masks".split(), "--masks"),
+        (f"{STUDY} --jobs 0".split(), "--jobs"),
+        (f"{STUDY} --dask inproc://1".split(), "--dask"),
+    ):
         trials.refused(inside(words), named, code=2)

@@ -25,8 +25,12 @@ def disk(tmp_path):
     folder.mkdir()
 
     def sized(kilobytes, *options):
-        words = ",".join([f"size={kilobytes}k", *(["remount"] if os.path.ismount(folder) else []), *options])
-        if subprocess.run(["mount", "-t", "tmpfs", "-o", words, "tmpfs", folder], capture_output=True).returncode:
+        words = ",".join(
+            [f"size={kilobytes}k", *(["remount"] if os.path.ismount(folder) else []), *options]
+        )
+        if subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", words, "tmpfs", folder], capture_output=True
+        ).returncode:
             pytest.skip("only root may mount a small disk")
         return folder
 
@@ -34,9 +38,17 @@ def disk(tmp_path):
     subprocess.run(["umount", "-l", folder], capture_output=True)
 
 
-@pytest.mark.parametrize("name, kilobytes", [
-    ("odometry.txt", 0), long("odometry.mp4", 0), long("synthesize", 300), long("training", 40), long("predict", 24),
-    long("study", 40)])
+@pytest.mark.parametrize(
+    "name, kilobytes",
+    [
+        ("odometry.txt", 0),
+        long("odometry.mp4", 0),
+        long("synthesize", 300),
+        long("training", 40),
+        long("predict", 24),
+        long("study", 40),
+    ],
+)
 def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes):
     """The error names the output; with room made, the same command resumes."""
     disk(1000, "ro")
@@ -48,10 +60,16 @@ def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes)
     resumes(words, name, tmp_path, "disk/out")
 
 
-@pytest.mark.parametrize("name, limit, megabytes, named", [
-    ("odometry.txt", resource.RLIMIT_AS, 300, "memory"), long("synthesize", resource.RLIMIT_AS, 700, "memory"),
-    long("predict", resource.RLIMIT_AS, 3080, "memory"), long("study", resource.RLIMIT_AS, 2000, "memory"),
-    long("odometry.png", resource.RLIMIT_FSIZE, 1 / 256, "out.png")])
+@pytest.mark.parametrize(
+    "name, limit, megabytes, named",
+    [
+        ("odometry.txt", resource.RLIMIT_AS, 300, "memory"),
+        long("synthesize", resource.RLIMIT_AS, 700, "memory"),
+        long("predict", resource.RLIMIT_AS, 3080, "memory"),
+        long("study", resource.RLIMIT_AS, 2000, "memory"),
+        long("odometry.png", resource.RLIMIT_FSIZE, 1 / 256, "out.png"),
+    ],
+)
 def test_limits_of_memory_and_of_file_size(words, tmp_path, name, limit, megabytes, named):
     set_limit = partial(resource.setrlimit, limit, (int(megabytes * 2**20),) * 2)
     refused(run(words(name), tmp_path, before=set_limit), named, left=["out", "out/*"])
@@ -61,7 +79,11 @@ def test_limits_of_memory_and_of_file_size(words, tmp_path, name, limit, megabyt
 @pytest.mark.parametrize("name", ["synthesize", "study"])
 def test_a_killed_worker(words, tmp_path, name):
     def workers():
-        return [child for child in psutil.Process(process.pid).children() if "popen_loky" in " ".join(child.cmdline())]
+        return [
+            child
+            for child in psutil.Process(process.pid).children()
+            if "popen_loky" in " ".join(child.cmdline())
+        ]
 
     process = start(words(name), tmp_path)
     wait_for(lambda: process.poll() is not None or workers())
@@ -76,8 +98,13 @@ def test_a_killed_worker(words, tmp_path, name):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_a_terminated_study_ends_its_workers(words, tmp_path, number):
     process = start(words("study"), tmp_path)
-    wait_for(lambda: list((tmp_path / "out").rglob("pass-*")) or process.poll() is not None
-             or len(psutil.Process(process.pid).children()) > 2)
+    wait_for(
+        lambda: (
+            list((tmp_path / "out").rglob("pass-*"))
+            or process.poll() is not None
+            or len(psutil.Process(process.pid).children()) > 2
+        )
+    )
     workers = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(number)
     process.communicate(timeout=60)
@@ -87,5 +114,11 @@ def test_a_terminated_study_ends_its_workers(words, tmp_path, number):
 
 
 def test_a_closed_pipe_is_no_error(words, tmp_path):
-    result = run(["bash", "-c", f"{shlex.join(map(str, words('odometry.txt')))} | head -1"], tmp_path)
-    assert "Traceback" not in result.stderr and len(result.stdout.splitlines()) == 1 and (tmp_path / "out.txt").exists()
+    result = run(
+        ["bash", "-c", f"{shlex.join(map(str, words('odometry.txt')))} | head -1"], tmp_path
+    )
+    assert (
+        "Traceback" not in result.stderr
+        and len(result.stdout.splitlines()) == 1
+        and (tmp_path / "out.txt").exists()
+    )

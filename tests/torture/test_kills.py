@@ -1,4 +1,6 @@
-"""Commands killed at random moments resume and leave the bytes of an undisturbed run, and no temporary files."""
+"""Commands killed at random moments resume and leave the bytes of an undisturbed run, and no
+temporary files.
+"""
 
 import random
 import shutil
@@ -18,9 +20,10 @@ pytestmark = pytest.mark.torture
 def torture(command, where, results, kills, prepare=lambda: None, **environment):
     """Kill a command `kills` times while it writes, then let it end.
 
-    `prepare` fills the folder `results` before the undisturbed run and before the killed one. Kills are spread over the
-    time of the undisturbed run. A run may end before it is killed.
+    `prepare` fills the folder `results` before the undisturbed run and before the killed one. Kills
+    are spread over the time of the undisturbed run. A run may end before it is killed.
     """
+
     def clear():
         shutil.rmtree(where / results, ignore_errors=True)
         prepare()
@@ -40,7 +43,8 @@ def torture(command, where, results, kills, prepare=lambda: None, **environment)
     killed = 0
     for number in draw.sample(range(kills), kills):
         process = begin()
-        time.sleep((number + draw.random()) / kills * seconds / (1 + killed))  # a resumed run is shorter
+        # a resumed run is shorter
+        time.sleep((number + draw.random()) / kills * seconds / (1 + killed))
         if process.poll() is None:
             kill(process)
             killed += 1
@@ -54,13 +58,18 @@ def torture(command, where, results, kills, prepare=lambda: None, **environment)
     no_temporary_files(where)
 
 
-@pytest.mark.parametrize("name, kills", [("synthesize", 6), ("training", 4), ("predict", 4), ("study", 7)])
+@pytest.mark.parametrize(
+    "name, kills", [("synthesize", 6), ("training", 4), ("predict", 4), ("study", 7)]
+)
 def test_a_command_that_writes(words, tmp_path, name, kills):
     torture(words(name), tmp_path, "out", kills)
 
 
 def test_the_page(tmp_path):
-    changes = {"THESIS_REPRO_BUILD": str(tmp_path / "build"), "THESIS_REPRO_FIGURES": str(tmp_path / "figures")}
+    changes = {
+        "THESIS_REPRO_BUILD": str(tmp_path / "build"),
+        "THESIS_REPRO_FIGURES": str(tmp_path / "figures"),
+    }
     settings = read_settings(changes)
 
     def prepare():
@@ -69,8 +78,12 @@ def test_the_page(tmp_path):
         settings.figures.mkdir(exist_ok=True)
         output = nbformat.v4.new_output("stream", text="1\n" * 2000)
         cell = nbformat.v4.new_code_cell("1", id="one", outputs=[output])
-        notebook = nbformat.v4.new_notebook(cells=[cell], metadata={"language_info": {"name": "python"}})
+        notebook = nbformat.v4.new_notebook(
+            cells=[cell], metadata={"language_info": {"name": "python"}}
+        )
         for number in range(12):
             nbformat.write(notebook, executed / f"{number:02d}_some.ipynb")
 
-    torture([sys.executable, "-m", "thesis_repro.report.page"], tmp_path, ".", 5, prepare, **changes)
+    torture(
+        [sys.executable, "-m", "thesis_repro.report.page"], tmp_path, ".", 5, prepare, **changes
+    )

@@ -10,7 +10,7 @@ import trials
 
 pytestmark = pytest.mark.torture
 
-ODD = "it's \"50%\" <script>&$x$_ é漢\n{b} #[1]*"
+ODD = 'it\'s "50%" <script>&$x$_ é漢\n{b} #[1]*'
 SEQUENCE = "<b>&\"'$_$ %s é"
 
 
@@ -37,41 +37,111 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
     where = ["--kitti", root / "kitti", "--sequence", SEQUENCE]
     before = trials.snapshot(root / "kitti"), trials.snapshot(labels)
     for words in (
-            ["odometry", *where, "--labels", labels, "--dilation", 3, "--output", out / "p'$_$.txt", "--tum",
-             out / "%s\n.tum", "--plot", out / "%d.svg", "--video", out / "%03d é.mp4"],
-            ["masks", *where, "--labels", labels, "--dilation", 3, "--output", out / "masks\n&"],
-            ["odometry", *where, "--masks", out / "masks\n&", "--output", out / "q<script>.txt", "--plot",
-             out / "$_$.png"],
-            ["evaluate", *where, out / "p'$_$.txt", out / "q<script>.txt", "--plot", out / "both.svg"],
-            ["boresight", "--kitti", root / "kitti", "--sequences", SEQUENCE],
-            ["check-data", "--kitti", root / "kitti", "--deep"],
-            ["study", "--kitti", root / "kitti", "--labels", labels, "--masks", out / "masks\n&", "--repetitions", 1,
-             "--widths", 2, 3, "--jobs", 1, "--controls", 3, "--output", out / "study"],
-            ["predict", "--images", root / "kitti/sequences" / SEQUENCE, "--output", out / "labels {2}"],
-            ["synthesize", out / "world", "--profile", "smoke"]):
+        [
+            "odometry",
+            *where,
+            "--labels",
+            labels,
+            "--dilation",
+            3,
+            "--output",
+            out / "p'$_$.txt",
+            "--tum",
+            out / "%s\n.tum",
+            "--plot",
+            out / "%d.svg",
+            "--video",
+            out / "%03d é.mp4",
+        ],
+        ["masks", *where, "--labels", labels, "--dilation", 3, "--output", out / "masks\n&"],
+        [
+            "odometry",
+            *where,
+            "--masks",
+            out / "masks\n&",
+            "--output",
+            out / "q<script>.txt",
+            "--plot",
+            out / "$_$.png",
+        ],
+        ["evaluate", *where, out / "p'$_$.txt", out / "q<script>.txt", "--plot", out / "both.svg"],
+        ["boresight", "--kitti", root / "kitti", "--sequences", SEQUENCE],
+        ["check-data", "--kitti", root / "kitti", "--deep"],
+        [
+            "study",
+            "--kitti",
+            root / "kitti",
+            "--labels",
+            labels,
+            "--masks",
+            out / "masks\n&",
+            "--repetitions",
+            1,
+            "--widths",
+            2,
+            3,
+            "--jobs",
+            1,
+            "--controls",
+            3,
+            "--output",
+            out / "study",
+        ],
+        [
+            "predict",
+            "--images",
+            root / "kitti/sequences" / SEQUENCE,
+            "--output",
+            out / "labels {2}",
+        ],
+        ["synthesize", out / "world", "--profile", "smoke"],
+    ):
         trials.succeed(trials.thesis(*words), tmp_path, before=without_network)
         assert (trials.snapshot(root / "kitti"), trials.snapshot(labels)) == before, words
     assert {path.name for path in out.iterdir()} == {
-        "p'$_$.txt", "%s\n.tum", "%d.svg", "%03d é.mp4", "masks\n&", "q<script>.txt", "$_$.png", "both.svg", "study",
-        "labels {2}", "world"}
+        "p'$_$.txt",
+        "%s\n.tum",
+        "%d.svg",
+        "%03d é.mp4",
+        "masks\n&",
+        "q<script>.txt",
+        "$_$.png",
+        "both.svg",
+        "study",
+        "labels {2}",
+        "world",
+    }
     page = (out / "study" / "index.html").read_text()
     assert "&lt;b&gt;&amp;" in page and "&lt;i&gt;&amp;" in page
     assert not any(tag in page for tag in ("<script", "<b>", "<i>"))
 
 
 def test_make_takes_odd_folders_and_refuses_unknown_settings(tiny_kitti, tmp_path):
-    odd = tmp_path / ODD.replace("$x$_", "").replace("\n", " ")  # make expands $ and ends at a line break
+    # make expands $ and ends at a line break
+    odd = tmp_path / ODD.replace("$x$_", "").replace("\n", " ")
     tiny_kitti.rename(odd)
 
     def make(*words):
-        return subprocess.run(["make", "-C", trials.ROOT, "-o", ".venv/ready", *words], capture_output=True, text=True,
-                              env=trials.environment())
+        return subprocess.run(
+            ["make", "-C", trials.ROOT, "-o", ".venv/ready", *words],
+            capture_output=True,
+            text=True,
+            env=trials.environment(),
+        )
 
     assert make("check-data", f"KITTI={odd}").returncode == 0
     planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={odd}", f"BUILD={tmp_path / 'build'}")
-    assert planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout, planned
-    for word, named in (("EPOCHS=0", "EPOCHS=0: "), ("EPOCH=3", "EPOCH: "), ("KITTI=", "KITTI"),
-                        ("GPU=no", "GPU=no"), ("FIGURES=a b", "FIGURES"), ("DASK_SCHEDULER=mine", "mine")):
+    assert (
+        planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout
+    ), planned
+    for word, named in (
+        ("EPOCHS=0", "EPOCHS=0: "),
+        ("EPOCH=3", "EPOCH: "),
+        ("KITTI=", "KITTI"),
+        ("GPU=no", "GPU=no"),
+        ("FIGURES=a b", "FIGURES"),
+        ("DASK_SCHEDULER=mine", "mine"),
+    ):
         refused = make("figures", word, f"BUILD={tmp_path / 'other'}")
         assert refused.returncode != 0 and not (tmp_path / "other").exists(), refused
         assert named in refused.stderr and "Traceback" not in refused.stderr, refused
@@ -79,16 +149,30 @@ def test_make_takes_odd_folders_and_refuses_unknown_settings(tiny_kitti, tmp_pat
 
 def test_caches_that_cannot_be_written(tmp_path, tiny_kitti):
     package, home = tmp_path / "package" / "thesis_repro", tmp_path / "home"
-    shutil.copytree(trials.ROOT / "thesis_repro", package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        trials.ROOT / "thesis_repro", package, ignore=shutil.ignore_patterns("__pycache__")
+    )
     home.mkdir()
     folders = [home, package.parent, package, *package.rglob("*/")]
     for folder in folders:
         folder.chmod(0o555)
-    no_caches = dict.fromkeys(("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "NUMBA_CACHE_DIR", "KERAS_HOME"))
-    for words, output in (("odometry --kitti kitti --sequence 00 --plot path.png", "path.png"),
-                          ("predict --images kitti/sequences/00 --output out", "out")):
-        result = trials.succeed(trials.thesis(*words.split()), tmp_path, before=without_root_privileges,
-                                PYTHONPATH=package.parent, HOME=home, **no_caches)
-        assert {path.split("/")[0] for path in result.left} == {output} and "Traceback" not in result.stderr
+    no_caches = dict.fromkeys(
+        ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "NUMBA_CACHE_DIR", "KERAS_HOME")
+    )
+    for words, output in (
+        ("odometry --kitti kitti --sequence 00 --plot path.png", "path.png"),
+        ("predict --images kitti/sequences/00 --output out", "out"),
+    ):
+        result = trials.succeed(
+            trials.thesis(*words.split()),
+            tmp_path,
+            before=without_root_privileges,
+            PYTHONPATH=package.parent,
+            HOME=home,
+            **no_caches,
+        )
+        assert {path.split("/")[0] for path in result.left} == {
+            output
+        } and "Traceback" not in result.stderr
     for folder in folders:
         folder.chmod(0o755)

@@ -16,7 +16,8 @@ import pandas as pd
 from thesis_repro import longrun
 
 ROOT = Path(__file__).resolve().parents[2]
-SET_BY_TESTS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}  # in tests/conftest.py
+# in tests/conftest.py
+SET_BY_TESTS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
 
 
 class Result(NamedTuple):
@@ -34,16 +35,29 @@ def thesis(*words):
 
 def environment(**changes):
     """A user's environment with some variables changed; None removes one."""
-    variables = {name: value for name, value in os.environ.items()
-                 if name not in SET_BY_TESTS and not name.startswith("THESIS_REPRO_")}
+    variables = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in SET_BY_TESTS and not name.startswith("THESIS_REPRO_")
+    }
     variables |= {"PYTHONPATH": str(ROOT), "THESIS_REPRO_PROGRESS": os.devnull} | changes
     return {name: str(value) for name, value in variables.items() if value is not None}
 
 
 def start(command, where, before=None, **changes):
-    """Start a command in a folder; `before` is called in the new process, `changes` are of the environment."""
-    return subprocess.Popen(list(map(str, command)), cwd=where, env=environment(**changes), preexec_fn=before,
-                            start_new_session=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    """Start a command in a folder; `before` is called in the new process, `changes` are of the
+    environment.
+    """
+    return subprocess.Popen(
+        list(map(str, command)),
+        cwd=where,
+        env=environment(**changes),
+        preexec_fn=before,
+        start_new_session=True,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
 
 
 def finish(process):
@@ -76,13 +90,21 @@ def kill(process):
 
 
 def snapshot(where):
-    """{path: (size, date)} of all files below a folder but logs; None for folders. Files may vanish meanwhile."""
+    """{path: (size, date)} of all files below a folder but logs; None for folders. Files may
+    vanish meanwhile.
+    """
     versions = {}
-    for path in (Path(folder, name) for folder, folders, names in os.walk(where) for name in (*folders, *names)):
+    for path in (
+        Path(folder, name)
+        for folder, folders, names in os.walk(where)
+        for name in (*folders, *names)
+    ):
         with suppress(FileNotFoundError):
             status = path.lstat()
             if path.name != longrun.LOG:
-                versions[path.relative_to(where)] = None if path.is_dir() else (status.st_size, status.st_mtime_ns)
+                versions[path.relative_to(where)] = (
+                    None if path.is_dir() else (status.st_size, status.st_mtime_ns)
+                )
     return versions
 
 
@@ -92,19 +114,32 @@ def changes(before, after):
 
 
 def refused(result, named, code=1, left=()):
-    """Check the exit code, that one line of error has the text `named`, and that only `left` ("out/*") changed."""
+    """Check the exit code, that one line of error has the text `named`, and that only `left`
+    ("out/*") changed.
+    """
     output = f"exit {result.returncode}\n{result.stdout}\n{result.stderr}"
     assert result.returncode == code and "Traceback" not in result.stdout + result.stderr, output
-    errors = [line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))]
-    assert len(errors) == 1 and str(named) in errors[0], f"not one line that names {named}: {output}"
-    unexpected = [path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)]
+    errors = [
+        line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))
+    ]
+    assert len(errors) == 1 and str(named) in errors[0], (
+        f"not one line that names {named}: {output}"
+    )
+    unexpected = [
+        path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)
+    ]
     assert not unexpected, f"left behind: {', '.join(unexpected)}\n{output}"
 
 
 def contents(folder):
-    """{path: digest} of all files below a folder but logs; without times, which differ between runs."""
-    return {str(path.relative_to(folder)): sha256(_content(path)).hexdigest() for path in Path(folder).rglob("*")
-            if path.is_file() and path.name not in (longrun.LOG, longrun.LIST)}
+    """{path: digest} of all files below a folder but logs; without times, which differ between
+    runs.
+    """
+    return {
+        str(path.relative_to(folder)): sha256(_content(path)).hexdigest()
+        for path in Path(folder).rglob("*")
+        if path.is_file() and path.name not in (longrun.LOG, longrun.LIST)
+    }
 
 
 def _content(path):
@@ -113,7 +148,9 @@ def _content(path):
         return table[[name for name in table if not name.endswith("_seconds")]].to_csv().encode()
     if path.suffix == ".keras":
         with zipfile.ZipFile(path) as file:
-            return b"".join(file.read(name) for name in sorted(file.namelist()) if name.endswith(".h5"))
+            return b"".join(
+                file.read(name) for name in sorted(file.namelist()) if name.endswith(".h5")
+            )
     return path.read_bytes()
 
 

@@ -1,4 +1,6 @@
-"""The embedded world: exact poses and label maps, equal bytes for equal seeds, both layouts, errors and resuming."""
+"""The embedded world: exact poses and label maps, equal bytes for equal seeds, both layouts,
+errors and resuming.
+"""
 
 import shutil
 
@@ -13,7 +15,14 @@ from thesis_repro.world.things import Faces
 
 pytestmark = pytest.mark.slow
 
-SMALL = {"sequences": ("00", "07"), "frames": 12, "scale": 0.2, "train_images": 2, "validation_images": 1, "jobs": 1}
+SMALL = {
+    "sequences": ("00", "07"),
+    "frames": 12,
+    "scale": 0.2,
+    "train_images": 2,
+    "validation_images": 1,
+    "jobs": 1,
+}
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +33,11 @@ def out(tmp_path_factory):
 
 
 def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*"))
-            if path.is_file() and path.name != longrun.LIST}  # the list's order depends on the run
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != longrun.LIST
+    }  # the list's order depends on the run
 
 
 def test_layouts_are_read_by_the_readers_of_real_data(out):
@@ -44,8 +56,13 @@ def test_layouts_are_read_by_the_readers_of_real_data(out):
         assert len(pairs) == count
         images, labels = cityscapes.load(pairs, 64)
         assert {ID["road"], ID["sky"]} <= set(np.unique(labels))
-    parts = cityscapes.pairs(out / "cityscapes", "train")[0].image.relative_to(out / "cityscapes").parts
-    assert parts[:2] == ("leftImg8bit", "train") and parts[3] == f"{parts[2]}_000000_000000_leftImg8bit.png"
+    parts = (
+        cityscapes.pairs(out / "cityscapes", "train")[0].image.relative_to(out / "cityscapes").parts
+    )
+    assert (
+        parts[:2] == ("leftImg8bit", "train")
+        and parts[3] == f"{parts[2]}_000000_000000_leftImg8bit.png"
+    )
 
 
 def test_scaled_intrinsics_keep_the_rays_of_the_image_borders():
@@ -53,9 +70,12 @@ def test_scaled_intrinsics_keep_the_rays_of_the_image_borders():
     for scale in (0.2, 0.5, 1.0):
         (height, width), matrix = drives.scaled_camera("00", scale)
         for edge, full in ((-0.5, -0.5), (width - 0.5, camera.width - 0.5)):
-            assert (edge - matrix[0, 2]) / matrix[0, 0] == pytest.approx((full - camera.cx) / camera.fx)
+            assert (edge - matrix[0, 2]) / matrix[0, 0] == pytest.approx(
+                (full - camera.cx) / camera.fx
+            )
         assert (height - 0.5 - matrix[1, 2]) / matrix[1, 1] == pytest.approx(
-            (camera.height - 0.5 - camera.cy) / camera.fy)
+            (camera.height - 0.5 - camera.cy) / camera.fy
+        )
     assert matrix[0].tolist() == [camera.fx, 0, camera.cx]
 
 
@@ -66,11 +86,21 @@ def test_drives_are_realistic(name, frames):
     poses = drives.relative_to_first(drives.way(name, frames, seed=0)[1])
     assert np.array_equal(poses[0], np.eye(4))
     rotations = poses[:, :3, :3]
-    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (frames, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (frames, 1, 1)), atol=1e-12
+    )
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert steps.max() < (2.6 if name == "01" else 1.7)  # 94 and 61 km/h
-    turns = np.degrees(np.arccos(np.clip((np.trace(rotations[:-1].transpose(0, 2, 1) @ rotations[1:], axis1=1,
-                                                   axis2=2) - 1) / 2, -1, 1)))
+    turns = np.degrees(
+        np.arccos(
+            np.clip(
+                (np.trace(rotations[:-1].transpose(0, 2, 1) @ rotations[1:], axis1=1, axis2=2) - 1)
+                / 2,
+                -1,
+                1,
+            )
+        )
+    )
     assert turns.max() < 4.5
     standing = int((steps == 0).sum())
     assert standing >= 4 if name == "07" else standing == 0
@@ -80,15 +110,24 @@ def test_drives_are_realistic(name, frames):
 
 
 def test_drives_are_unequal_and_one_is_closed():
-    paths = {name: drives.relative_to_first(drives.way(name, drive.frames, seed=0)[1])
-             for name, drive in drives.DRIVES.items()}
-    lengths = [np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() for poses in paths.values()]
-    assert all(57 < length < 120 for length in lengths) and len({len(poses) for poses in paths.values()}) > 8
+    paths = {
+        name: drives.relative_to_first(drives.way(name, drive.frames, seed=0)[1])
+        for name, drive in drives.DRIVES.items()
+    }
+    lengths = [
+        np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() for poses in paths.values()
+    ]
+    assert (
+        all(57 < length < 120 for length in lengths)
+        and len({len(poses) for poses in paths.values()}) > 8
+    )
     assert np.linalg.norm(paths["09"][-1, :3, 3]) < 1
 
 
 def epipolar_errors(before, after, relative, intrinsics, keep):
-    """Return the distances (pixels) of Lucas-Kanade tracks from the epipolar lines of a relative pose."""
+    """Return the distances (pixels) of Lucas-Kanade tracks from the epipolar lines of a
+    relative pose.
+    """
     settings = {"winSize": (21, 21), "maxLevel": 3, "criteria": (3, 30, 0.01)}
     mask = np.where(keep, 255, 0).astype(np.uint8)
     points = cv2.goodFeaturesToTrack(before, 2000, 0.01, 3, mask=mask, blockSize=5)
@@ -100,7 +139,9 @@ def epipolar_errors(before, after, relative, intrinsics, keep):
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     inverse = np.linalg.inv(intrinsics)
     lines = np.c_[x, np.ones(len(x))] @ (inverse.T @ cross @ relative[:3, :3] @ inverse).T
-    return np.abs((lines * np.c_[y, np.ones(len(y))]).sum(axis=1)) / np.hypot(lines[:, 0], lines[:, 1])
+    return np.abs((lines * np.c_[y, np.ones(len(y))]).sum(axis=1)) / np.hypot(
+        lines[:, 0], lines[:, 1]
+    )
 
 
 def test_tracked_points_agree_with_the_poses():
@@ -123,12 +164,34 @@ def test_tracked_points_agree_with_the_poses():
 
 
 def test_every_class_occurs_in_each_part_of_the_world():
-    needed = {ID[name] for name in ("road", "sidewalk", "building", "wall", "fence", "pole", "traffic sign",
-                                    "vegetation", "terrain", "sky", "person", "car")}
+    needed = {
+        ID[name]
+        for name in (
+            "road",
+            "sidewalk",
+            "building",
+            "wall",
+            "fence",
+            "pole",
+            "traffic sign",
+            "vegetation",
+            "terrain",
+            "sky",
+            "person",
+            "car",
+        )
+    }
     for part in ("train", "val"):
-        assert needed <= set().union(*(np.unique(dataset.render_image(part, index, 0.25)[1]) for index in range(20)))
-    assert needed <= set().union(*(np.unique(dataset.render_frame(name, index, scale=0.25)[1])
-                                   for name in dataset.SEQUENCES for index in (0, 25)))
+        assert needed <= set().union(
+            *(np.unique(dataset.render_image(part, index, 0.25)[1]) for index in range(20))
+        )
+    assert needed <= set().union(
+        *(
+            np.unique(dataset.render_frame(name, index, scale=0.25)[1])
+            for name in dataset.SEQUENCES
+            for index in (0, 25)
+        )
+    )
 
 
 def one_square(z=10.0, half=2.0, texture="stone", label="building"):
@@ -145,7 +208,8 @@ def view(faces, size=(80, 120)):
 
 @pytest.mark.parametrize("half", [1.9, 2.0, 2.03, 2.06, 2.1])
 def test_label_of_a_pixel_is_that_of_most_of_its_samples(half):
-    # The square's edges lie 10 half pixels around (39.5, 59.5); a pixel has samples a quarter pixel off its centre.
+    # The square's edges lie 10 half pixels around (39.5, 59.5); a pixel has samples a quarter pixel
+    # off its centre.
     _, labels = view(one_square(half=half, label="wall"))
     inside = []
     for count, middle in ((80, 39.5), (120, 59.5)):
@@ -184,8 +248,12 @@ def test_same_seed_gives_the_same_bytes_for_any_number_of_processes(out, tmp_pat
 
 def test_a_stopped_run_resumes_and_keeps_complete_files(out, tmp_path):
     folder = shutil.copytree(out, tmp_path / "stopped")
-    missing = [folder / "kitti/sequences/07/image_0/000004.png", folder / "kitti/sequences/00/labels_0/000011.png",
-               folder / "kitti/poses/00.txt", sorted((folder / "cityscapes").rglob("*.png"))[0]]
+    missing = [
+        folder / "kitti/sequences/07/image_0/000004.png",
+        folder / "kitti/sequences/00/labels_0/000011.png",
+        folder / "kitti/poses/00.txt",
+        sorted((folder / "cityscapes").rglob("*.png"))[0],
+    ]
     for path in missing:
         path.unlink()
     # a temporary file of a killed run
@@ -202,12 +270,23 @@ def test_the_two_halves_make_the_whole_in_either_order(out, tmp_path):
         half = tmp_path / str(number)
         for part in order:
             dataset.write(half, **SMALL, only=part)
-            assert {path.name for path in half.iterdir() if path.is_dir()} == set(order[:order.index(part) + 1])
+            assert {path.name for path in half.iterdir() if path.is_dir()} == set(
+                order[: order.index(part) + 1]
+            )
         assert contents(half) == contents(out)
 
 
-@pytest.mark.parametrize("bad", [{"sequences": ("11",)}, {"sequences": ()}, {"frames": 1}, {"scale": 3}, {"seed": -1},
-                                 {"train_images": 0.5}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"sequences": ("11",)},
+        {"sequences": ()},
+        {"frames": 1},
+        {"scale": 3},
+        {"seed": -1},
+        {"train_images": 0.5},
+    ],
+)
 def test_bad_parameters_write_nothing(tmp_path, bad):
     with pytest.raises(InputError, match=next(iter(bad))):
         dataset.write(tmp_path / "new", **{**SMALL, **bad})

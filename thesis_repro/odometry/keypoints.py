@@ -1,4 +1,6 @@
-"""Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2), for one run or for many runs."""
+"""Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2), for one
+run or for many runs.
+"""
 
 from collections.abc import Iterable
 from functools import lru_cache
@@ -12,8 +14,11 @@ from thesis_repro.odometry.settings import THESIS, OdometrySettings
 QUALITY = THESIS.quality  # least strength, as a share of the strongest corner (inside the mask)
 BLOCK_SIZE = THESIS.block_size
 WINDOW, LEVELS = THESIS.window, THESIS.levels
-TRACKER = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS,
-           "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)}
+TRACKER = {
+    "winSize": (WINDOW, WINDOW),
+    "maxLevel": LEVELS,
+    "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01),
+}
 
 NO_POINTS = np.empty((0, 2), np.float32)
 
@@ -21,13 +26,18 @@ Corners = tuple[np.ndarray, np.ndarray]  # see find_corners
 Start = tuple[np.ndarray | None, np.ndarray]  # a frame to track from and its points (N, 2)
 
 
-def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None,
-           corners: Corners | None = None) -> np.ndarray:
+def detect(
+    frame: np.ndarray,
+    settings: OdometrySettings,
+    mask: np.ndarray | None = None,
+    corners: Corners | None = None,
+) -> np.ndarray:
     """Keypoints of a frame (height, width): (N, 2) float32 pixels, strongest first. N may be 0.
 
-    `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the detector searches
-    inside the mask only and returns up to max_keypoints. With "filter" it searches the whole frame, and keypoints
-    outside the mask are dropped. corners: result of `find_corners` for this frame, if known.
+    `mask` (height, width) allows keypoints where it is not 0. With settings.mask_mode "detect" the
+    detector searches inside the mask only and returns up to max_keypoints. With "filter" it
+    searches the whole frame, and keypoints outside the mask are dropped. corners: result of
+    `find_corners` for this frame, if known.
 
     Shi-Tomasi keypoints equal those of cv2.goodFeaturesToTrack to the bit.
     """
@@ -39,8 +49,14 @@ def detect(frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | Non
         strength, ranked = corners or find_corners(frame, settings.block_size)
         # OpenCV computes the limit in double precision and rounds it to single.
         limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * settings.quality)
-        points = _spread(strength, ranked, limit, np.empty((0, 0), np.uint8) if inside is None else inside,
-                         settings.max_keypoints, float(settings.min_distance))
+        points = _spread(
+            strength,
+            ranked,
+            limit,
+            np.empty((0, 0), np.uint8) if inside is None else inside,
+            settings.max_keypoints,
+            float(settings.min_distance),
+        )
     if mask is None or settings.mask_mode == "detect":
         return points
     columns, rows = np.rint(points).astype(int).T
@@ -52,22 +68,29 @@ def _orb(max_keypoints):
     return cv2.ORB_create(max_keypoints)
 
 
-def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: int = WINDOW,
-          levels: int = LEVELS) -> tuple[np.ndarray, np.ndarray]:
+def track(
+    previous: np.ndarray,
+    current: np.ndarray,
+    points: np.ndarray,
+    window: int = WINDOW,
+    levels: int = LEVELS,
+) -> tuple[np.ndarray, np.ndarray]:
     """Track points (N, 2) from the previous frame into the current one.
 
-    Returns the tracked points, (N, 2) float32, and whether tracking succeeded, (N,) booleans. window, levels: as in
-    OdometrySettings.
+    Returns the tracked points, (N, 2) float32, and whether tracking succeeded, (N,) booleans.
+    window, levels: as in OdometrySettings.
 
-    The result equals that of OpenCV's plain call to the bit, in less time. Points are sorted by row, so that the pixels
-    of neighbouring points are still in the processor's cache. The matching error is not computed, because nothing uses
-    it. Computing it, OpenCV also rejects points whose window leaves the frame; this function does that itself.
+    The result equals that of OpenCV's plain call to the bit, in less time. Points are sorted by
+    row, so that the pixels of neighbouring points are still in the processor's cache. The matching
+    error is not computed, because nothing uses it. Computing it, OpenCV also rejects points whose
+    window leaves the frame; this function does that itself.
     """
     order = np.argsort(points[:, 1])
     tracked, success = np.empty_like(points), np.empty(len(points), bool)
     tracker = TRACKER | {"winSize": (window, window), "maxLevel": levels}
-    tracked[order], status, _ = cv2.calcOpticalFlowPyrLK(previous, current, points[order], None,
-                                                         flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, **tracker)
+    tracked[order], status, _ = cv2.calcOpticalFlowPyrLK(
+        previous, current, points[order], None, flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, **tracker
+    )
     corner = tracked - (window - 1) / 2
     success[order] = status.ravel() == 1
     return tracked, success & ((corner >= -window) & (corner < current.shape[::-1])).all(axis=1)
@@ -76,24 +99,47 @@ def track(previous: np.ndarray, current: np.ndarray, points: np.ndarray, window:
 class SharedKeypoints:
     """`detect` and `track` for many runs over one frame, with the same results as separate calls.
 
-    The corner strength does not depend on the mask, so it is computed once a frame. Lucas-Kanade tracks each point
-    independently, so all points of all runs are tracked in one call.
+    The corner strength does not depend on the mask, so it is computed once a frame. Lucas-Kanade
+    tracks each point independently, so all points of all runs are tracked in one call.
     """
 
     def __init__(self) -> None:
-        self._tracks: tuple[np.ndarray, ...] = ()  # both frames, sorted keys of all points, result of `track`
-        self._corners: tuple[np.ndarray, int, Corners] | None = None  # frame, block size, result of `find_corners`
+        # both frames, sorted keys of all points, result of `track`
+        self._tracks: tuple[np.ndarray, ...] = ()
+        # frame, block size, result of `find_corners`
+        self._corners: tuple[np.ndarray, int, Corners] | None = None
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
-        """Track the points of all runs that have the same previous frame into `frame`. Few runs have another one."""
-        with_points = [(previous, points) for previous, points in starts if previous is not None and len(points)]
+        """Track the points of all runs that have the same previous frame into `frame`. Few runs
+        have another one.
+        """
+        with_points = [
+            (previous, points)
+            for previous, points in starts
+            if previous is not None and len(points)
+        ]
         if with_points:
             first, _ = with_points[0]
-            keys = np.unique(np.concatenate([_key(points) for previous, points in with_points if previous is first]))
-            self._tracks = first, frame, keys, *track(first, frame, keys.view(np.float32).reshape(-1, 2))
+            keys = np.unique(
+                np.concatenate(
+                    [_key(points) for previous, points in with_points if previous is first]
+                )
+            )
+            self._tracks = (
+                first,
+                frame,
+                keys,
+                *track(first, frame, keys.view(np.float32).reshape(-1, 2)),
+            )
 
-    def track(self, previous: np.ndarray, current: np.ndarray, points: np.ndarray, window: int = WINDOW,
-              levels: int = LEVELS) -> tuple[np.ndarray, np.ndarray]:
+    def track(
+        self,
+        previous: np.ndarray,
+        current: np.ndarray,
+        points: np.ndarray,
+        window: int = WINDOW,
+        levels: int = LEVELS,
+    ) -> tuple[np.ndarray, np.ndarray]:
         is_shared = self._tracks and previous is self._tracks[0] and current is self._tracks[1]
         if not is_shared or (window, levels) != (WINDOW, LEVELS):
             return track(previous, current, points, window, levels)
@@ -101,7 +147,9 @@ class SharedKeypoints:
         indices = np.searchsorted(keys, _key(points))
         return tracked.take(indices, axis=0), success[indices]
 
-    def detect(self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None) -> np.ndarray:
+    def detect(
+        self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None
+    ) -> np.ndarray:
         size = settings.block_size
         if self._corners is None or frame is not self._corners[0] or size != self._corners[1]:
             self._corners = frame, size, find_corners(frame, size)
@@ -113,29 +161,46 @@ def _key(points):
 
 
 def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
-    """Corner strength of each pixel, equal to cv2.cornerMinEigenVal to the bit, and its ranked local maxima.
+    """Corner strength of each pixel, equal to cv2.cornerMinEigenVal to the bit, and its ranked
+    local maxima.
 
-    The maxima are indices into the flattened image, strongest first. Of equal maxima, the last pixel comes first.
-    Pixels on the border are left out.
+    The maxima are indices into the flattened image, strongest first. Of equal maxima, the last
+    pixel comes first. Pixels on the border are left out.
     """
     scale = 1 / (4 * BLOCK_SIZE * 255)  # 4 is the sum of the smoothing weights 1, 2, 1
-    dx, dy = (cv2.copyMakeBorder(cv2.Sobel(frame, cv2.CV_32F, *order, scale=scale), *[BLOCK_SIZE // 2] * 4,
-                                 cv2.BORDER_REFLECT_101) for order in ((1, 0), (0, 1)))
-    strength = _min_eigenvalues(dx, dy) if block_size == BLOCK_SIZE else cv2.cornerMinEigenVal(frame, block_size)
+    dx, dy = (
+        cv2.copyMakeBorder(
+            cv2.Sobel(frame, cv2.CV_32F, *order, scale=scale),
+            *[BLOCK_SIZE // 2] * 4,
+            cv2.BORDER_REFLECT_101,
+        )
+        for order in ((1, 0), (0, 1))
+    )
+    strength = (
+        _min_eigenvalues(dx, dy)
+        if block_size == BLOCK_SIZE
+        else cv2.cornerMinEigenVal(frame, block_size)
+    )
     is_peak = (strength == cv2.dilate(strength, None)) & (strength > 0)
     is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
     peaks = np.flatnonzero(is_peak)
-    # Positive floats sort like their bit patterns, so one sort of integers ranks by strength and then by index.
-    return strength, np.sort(strength.ravel()[peaks].view(np.int32).astype(np.int64) << 32 | peaks)[::-1] & 0xFFFFFFFF
+    # Positive floats sort like their bit patterns, so one sort of integers ranks by strength and
+    # then by index.
+    return strength, np.sort(strength.ravel()[peaks].view(np.int32).astype(np.int64) << 32 | peaks)[
+        ::-1
+    ] & 0xFFFFFFFF
 
 
 @fast
 def _min_eigenvalues(dx, dy):
-    """Smaller eigenvalue of the gradient matrix, summed over squares of BLOCK_SIZE; the padded border is cut off."""
+    """Smaller eigenvalue of the gradient matrix, summed over squares of BLOCK_SIZE; the padded
+    border is cut off.
+    """
     height, width = dx.shape[0] - BLOCK_SIZE + 1, dx.shape[1] - BLOCK_SIZE + 1
     smaller = np.empty((height, width), np.float32)
     products, half = np.empty((3, dx.shape[1]), np.float32), np.float32(0.5)
-    rows, sums = np.zeros((BLOCK_SIZE, 3, width)), np.zeros((3, width))  # in OpenCV's order and double precision
+    # in OpenCV's order and double precision
+    rows, sums = np.zeros((BLOCK_SIZE, 3, width)), np.zeros((3, width))
     for y in range(dx.shape[0]):
         for x in range(dx.shape[1]):
             products[0, x] = dx[y, x] * dx[y, x]
@@ -144,21 +209,33 @@ def _min_eigenvalues(dx, dy):
         for k in range(3):
             product, row, total = products[k], rows[y % BLOCK_SIZE, k], sums[k]
             for x in range(width):
-                along = np.float64(product[x]) + product[x + 1] + product[x + 2] + product[x + 3] + product[x + 4]
+                along = (
+                    np.float64(product[x])
+                    + product[x + 1]
+                    + product[x + 2]
+                    + product[x + 3]
+                    + product[x + 4]
+                )
                 total[x] = total[x] - row[x] + along
                 row[x] = along
         if y >= BLOCK_SIZE - 1:
             for x in range(width):
-                xx, xy, yy = np.float32(sums[0, x]) * half, np.float32(sums[1, x]), np.float32(sums[2, x]) * half
+                xx, xy, yy = (
+                    np.float32(sums[0, x]) * half,
+                    np.float32(sums[1, x]),
+                    np.float32(sums[2, x]) * half,
+                )
                 smaller[y - BLOCK_SIZE + 1, x] = xx + yy - np.sqrt((xx - yy) * (xx - yy) + xy * xy)
     return smaller
 
 
 @fast
 def _spread(strength, ranked, limit, mask, max_keypoints, min_distance):
-    """Strongest corners above `limit`, inside the mask if it is not empty, at least `min_distance` apart.
+    """Strongest corners above `limit`, inside the mask if it is not empty, at least `min_distance`
+    apart.
 
-    As in OpenCV, neighbours are searched in adjacent grid cells only, so a fractional distance is not kept exactly.
+    As in OpenCV, neighbours are searched in adjacent grid cells only, so a fractional distance is
+    not kept exactly.
     """
     height, width = strength.shape
     cell = max(int(np.rint(min_distance)), 1)
@@ -166,7 +243,9 @@ def _spread(strength, ranked, limit, mask, max_keypoints, min_distance):
     head = np.empty((grid_rows, grid_columns), np.int32)  # last corner taken in a cell
     head[:] = -1
     below = np.empty(len(ranked), np.int32)  # the corner taken before it in the same cell
-    taken = np.empty((len(ranked) if max_keypoints <= 0 else min(len(ranked), max_keypoints), 2), np.float32)
+    taken = np.empty(
+        (len(ranked) if max_keypoints <= 0 else min(len(ranked), max_keypoints), 2), np.float32
+    )
     count = 0
     for index in ranked:
         y, x = index // width, index % width

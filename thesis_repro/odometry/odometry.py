@@ -24,7 +24,9 @@ MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more t
 
 @dataclass
 class Step:
-    """Results for one frame. Its N correspondences are `previous` and `current`, (N, 2) pixels; `inliers` is (N,)."""
+    """Results for one frame. Its N correspondences are `previous` and `current`, (N, 2) pixels;
+    `inliers` is (N,).
+    """
 
     frame: int
     scale: float = 0.0  # metres moved since the previous frame that was not skipped
@@ -32,17 +34,23 @@ class Step:
     detected: int | None = None  # number of new keypoints; None if the detector did not run
     previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
-    keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)  # tracked into the next frame
+    # tracked into the next frame
+    keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     motion: Motion = Motion()
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres
     updated: bool = False  # whether this step moved the pose
     flags: list[str] = field(default_factory=list)
-    frames: tuple[np.ndarray, np.ndarray] | None = None  # previous and current, if a fallback is possible
+    # previous and current, if a fallback is possible
+    frames: tuple[np.ndarray, np.ndarray] | None = None
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
     def inliers(self) -> np.ndarray:
-        return np.zeros(len(self.current), bool) if self.motion.inliers is None else self.motion.inliers
+        return (
+            np.zeros(len(self.current), bool)
+            if self.motion.inliers is None
+            else self.motion.inliers
+        )
 
     def copy(self) -> "Step":
         """Copy with the same correspondences, for another estimator."""
@@ -51,13 +59,20 @@ class Step:
     def row(self) -> dict[str, Any]:
         """One row of Result.frames."""
         tracked = None if self.points is None else len(self.current)
-        return {"frame": self.frame, "points": self.points, "detected": self.detected, "tracked": tracked,
-               "inliers": None if tracked is None else int(self.inliers.sum()),
-               "pose_inliers": None if tracked is None else self.motion.pose_inliers,
-               "scale": self.scale, "updated": self.updated, "flag": "; ".join(self.flags),
-               **dict(zip("xyz", self.pose[:3, 3].tolist(), strict=True)),
-               **dict(zip(ROTATION_COLUMNS, self.pose[:3, :3].ravel().tolist(), strict=True)),
-               **{f"{name}_seconds": value for name, value in self.seconds.items()}}
+        return {
+            "frame": self.frame,
+            "points": self.points,
+            "detected": self.detected,
+            "tracked": tracked,
+            "inliers": None if tracked is None else int(self.inliers.sum()),
+            "pose_inliers": None if tracked is None else self.motion.pose_inliers,
+            "scale": self.scale,
+            "updated": self.updated,
+            "flag": "; ".join(self.flags),
+            **dict(zip("xyz", self.pose[:3, 3].tolist(), strict=True)),
+            **dict(zip(ROTATION_COLUMNS, self.pose[:3, :3].ravel().tolist(), strict=True)),
+            **{f"{name}_seconds": value for name, value in self.seconds.items()},
+        }
 
 
 FRAME_COLUMNS = tuple(Step(0).row())
@@ -66,14 +81,22 @@ FRAME_COLUMNS = tuple(Step(0).row())
 class Odometry:
     """Monocular visual odometry, frame by frame.
 
-    `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since the previous frame in
-    metres, and an optional mask of the same size (keypoints are forbidden where it is 0). It returns a Step. It calls
-    `observe`, `estimate` and `compose`. Only `estimate` is expensive, and it uses no state of earlier steps.
+    `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since
+    the previous frame in metres, and an optional mask of the same size (keypoints are forbidden
+    where it is 0). It returns a Step. It calls `observe`, `estimate` and `compose`. Only `estimate`
+    is expensive, and it uses no state of earlier steps.
     """
 
-    def __init__(self, intrinsics: np.ndarray, settings: OdometrySettings = THESIS, start: np.ndarray | None = None,
-                 shared: keypoints.SharedKeypoints | None = None):
-        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. shared: keypoints shared with other runs."""
+    def __init__(
+        self,
+        intrinsics: np.ndarray,
+        settings: OdometrySettings = THESIS,
+        start: np.ndarray | None = None,
+        shared: keypoints.SharedKeypoints | None = None,
+    ):
+        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. shared: keypoints
+        shared with other runs.
+        """
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
@@ -90,8 +113,12 @@ class Odometry:
         self.estimate(step)
         return self.compose(step)
 
-    def observe(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
-        """Track the points into this frame and detect new keypoints. Returns a Step without a motion."""
+    def observe(
+        self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None
+    ) -> Step:
+        """Track the points into this frame and detect new keypoints. Returns a Step without a
+        motion.
+        """
         step = Step(frame=self.count, scale=float(scale))
         self._check(frame, scale, mask)
         self.count += 1
@@ -107,9 +134,12 @@ class Odometry:
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
             step.points = len(self.points)
-            tracked, was_tracked = self.keypoints.track(self.previous, frame, self.points,
-                                                         self.settings.window, self.settings.levels)
-            step.previous, step.current = (side.compress(was_tracked, axis=0) for side in (self.points, tracked))
+            tracked, was_tracked = self.keypoints.track(
+                self.previous, frame, self.points, self.settings.window, self.settings.levels
+            )
+            step.previous, step.current = (
+                side.compress(was_tracked, axis=0) for side in (self.points, tracked)
+            )
             tracked = step.current
         elif self.previous is not None or step.frame > 0:
             step.points = 0
@@ -131,8 +161,9 @@ class Odometry:
     def estimate(self, step: Step, essential: "Essential | None" = None) -> "Essential | None":
         """Estimate the motion from the step's correspondences. Returns the essential matrix.
 
-        essential: the result of another Odometry for the same correspondences. Its settings may differ in `estimator`
-        only. This method is thread-safe, because it reads no state that later steps change.
+        essential: the result of another Odometry for the same correspondences. Its settings may
+        differ in `estimator` only. This method is thread-safe, because it reads no state that later
+        steps change.
         """
         if not step.points:
             return None
@@ -145,17 +176,23 @@ class Odometry:
         started = time.perf_counter()
         current, previous, inliers = essential.current, essential.previous, essential.inliers
         if settings.estimator == "refined":
-            motion = fit(*smaller_rotation(essential.matrix), current, previous, inliers, settings.threshold)
+            motion = fit(
+                *smaller_rotation(essential.matrix), current, previous, inliers, settings.threshold
+            )
             step.motion = replace(motion, inliers=essential.inliers_of_step())
         else:
             voters = inliers if settings.estimator == "inliers" else slice(None)
-            votes, rotation, translation = pose.recover_pose(essential.matrix, current[voters], previous[voters])
+            votes, rotation, translation = pose.recover_pose(
+                essential.matrix, current[voters], previous[voters]
+            )
             step.motion = Motion(rotation, translation, essential.inliers_of_step(), votes)
         step.seconds["pose"] = time.perf_counter() - started
         return essential
 
     def compose(self, step: Step) -> Step:
-        """Move the pose by the step's motion, or keep it if a rule says so (see the table in odometry/__init__.py)."""
+        """Move the pose by the step's motion, or keep it if a rule says so (see the table in
+        odometry/__init__.py).
+        """
         settings = self.settings
         if step.frames is not None and step.scale > settings.scale_gate and self._in_doubt(step):
             self._use_all_keypoints(step)
@@ -165,8 +202,11 @@ class Odometry:
                 step.flags.append(motion.problem)
             elif _by_chance(motion.inliers):
                 step.flags.append("no agreement")
-            elif (step.scale <= settings.scale_gate
-                  or settings.shift_gate and _mean_shift(step) < settings.shift_gate):
+            elif (
+                step.scale <= settings.scale_gate
+                or settings.shift_gate
+                and _mean_shift(step) < settings.shift_gate
+            ):
                 step.flags.append("stationary")
             else:
                 if settings.estimator == "refined":
@@ -186,8 +226,14 @@ class Odometry:
             return True
         if not isinstance(motion, RefinedMotion):
             current, previous = self._normalised(step)
-            measured_motion = measured(motion.rotation, motion.translation, current, previous, motion.inliers,
-                                       self.settings.threshold)
+            measured_motion = measured(
+                motion.rotation,
+                motion.translation,
+                current,
+                previous,
+                motion.inliers,
+                self.settings.threshold,
+            )
             motion = replace(measured_motion, translation=motion.translation)
         return not is_consistent(motion, step.scale, self.prior)
 
@@ -195,20 +241,28 @@ class Odometry:
         previous_frame, frame = step.frames
         points = keypoints.detect(previous_frame, self.settings)
         if len(points):
-            current, was_tracked = keypoints.track(previous_frame, frame, points,
-                                                   self.settings.window, self.settings.levels)
-            step.points, step.previous, step.current = len(points), points[was_tracked], current[was_tracked]
+            current, was_tracked = keypoints.track(
+                previous_frame, frame, points, self.settings.window, self.settings.levels
+            )
+            step.points, step.previous, step.current = (
+                len(points),
+                points[was_tracked],
+                current[was_tracked],
+            )
             step.flags.append(ALL_KEYPOINTS)
             self.estimate(step)
 
     def _normalised(self, step):
-        return tuple(pose.normalise(points, self.intrinsics) for points in (step.current, step.previous))
+        return tuple(
+            pose.normalise(points, self.intrinsics) for points in (step.current, step.previous)
+        )
 
     def _check_consistency(self, step):
         started = time.perf_counter()
         current, previous = self._normalised(step)
-        step.motion, self.prior, flag = check_consistency(step.motion, current, previous, step.scale,
-                                                            self.settings.threshold, self.prior)
+        step.motion, self.prior, flag = check_consistency(
+            step.motion, current, previous, step.scale, self.settings.threshold, self.prior
+        )
         if flag:
             step.flags.append(flag)
         step.seconds["pose"] += time.perf_counter() - started
@@ -222,16 +276,22 @@ class Odometry:
 
     def _check(self, frame, scale, mask):
         if frame.dtype != np.uint8 or frame.ndim != 2:
-            raise InputError(f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
-                             "the odometry needs 8-bit gray, (height, width)")
+            raise InputError(
+                f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
+                "the odometry needs 8-bit gray, (height, width)"
+            )
         if not np.isfinite(scale) or scale < 0:
             raise InputError(f"frame {self.count}: scale {scale} is not a distance in metres")
         if mask is not None and (mask.shape != frame.shape or mask.dtype != np.uint8):
-            raise InputError(f"frame {self.count}: the mask is {mask.dtype} of shape {mask.shape}, the frame uint8 of "
-                             f"shape {frame.shape}; masks must be 8-bit and as large as their frames")
+            raise InputError(
+                f"frame {self.count}: the mask is {mask.dtype} of shape {mask.shape}, the frame uint8 of "
+                f"shape {frame.shape}; masks must be 8-bit and as large as their frames"
+            )
         if self.previous is not None and frame.shape != self.previous.shape:
-            raise InputError(f"frame {self.count}: shape {frame.shape}, earlier frames {self.previous.shape}; "
-                             "all frames must have the same size")
+            raise InputError(
+                f"frame {self.count}: shape {frame.shape}, earlier frames {self.previous.shape}; "
+                "all frames must have the same size"
+            )
 
 
 @dataclass(frozen=True)
@@ -257,15 +317,20 @@ def _essential(step, settings, intrinsics):
     started = time.perf_counter()
     order: np.ndarray | slice = slice(None)
     if settings.shuffle_seed is not None:
-        order = np.random.default_rng((settings.shuffle_seed, step.frame)).permutation(len(step.current))
-    current, previous = (pose.normalise(points, intrinsics)[order] for points in (step.current, step.previous))
+        order = np.random.default_rng((settings.shuffle_seed, step.frame)).permutation(
+            len(step.current)
+        )
+    current, previous = (
+        pose.normalise(points, intrinsics)[order] for points in (step.current, step.previous)
+    )
     result = pose.essential_matrix(current, previous, settings.threshold, settings.essential_method)
     return Essential(current, previous, order, *result, time.perf_counter() - started)
 
 
 def _by_chance(inliers):
-    # With PySLAM's threshold, two unrelated frames have 7 inliers among 20 points, 9 among 100, 12 among 300, and 24 to
-    # 43 among 1600. In consecutive real frames, 45 to 85 % of the points are inliers.
+    # With PySLAM's threshold, two unrelated frames have 7 inliers among 20 points, 9 among 100, 12
+    # among 300, and 24 to 43 among 1600. In consecutive real frames, 45 to 85 % of the points are
+    # inliers.
     return inliers.sum() <= 8 + 0.03 * len(inliers)
 
 
@@ -276,7 +341,9 @@ MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
 def _implausible(step):
     """Flags of a motion that a car cannot make. The pose is moved nevertheless."""
     turn = np.degrees(np.arccos(np.clip((np.trace(step.motion.rotation) - 1) / 2, -1, 1)))
-    return ["still picture"] * bool(_mean_shift(step) < MAX_NOISE_SHIFT) + ["too large a turn"] * bool(turn > MAX_TURN)
+    return ["still picture"] * bool(_mean_shift(step) < MAX_NOISE_SHIFT) + [
+        "too large a turn"
+    ] * bool(turn > MAX_TURN)
 
 
 def _mean_shift(step):
@@ -285,7 +352,9 @@ def _mean_shift(step):
 
 @lru_cache
 def warm_up(refined: bool) -> None:
-    """Load or compile the compiled functions, so that the measured time of the first frame does not include it."""
+    """Load or compile the compiled functions, so that the measured time of the first frame does
+    not include it.
+    """
     was_collecting = gc.isenabled()
     gc.disable()  # garbage collection takes an eighth of the compiler's time and frees little
     try:

@@ -1,4 +1,6 @@
-"""Run the odometry over a sequence: one run, or many runs in one pass that shares detection and tracking."""
+"""Run the odometry over a sequence: one run, or many runs in one pass that shares detection and
+tracking.
+"""
 
 import hashlib
 import time
@@ -21,25 +23,43 @@ from thesis_repro.odometry.refined.motion_prior import MotionPrior
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 CHECKPOINT = 300  # frames
-# Runs with the same KEYPOINT_SETTINGS share keypoints. If ESSENTIAL_SETTINGS agree too, they share essential matrices.
-KEYPOINT_SETTINGS = ("detector", "max_keypoints", "min_distance", "quality", "block_size", "window", "levels",
-                     "mask_mode", "redetect_below", "fallback")
+# Runs with the same KEYPOINT_SETTINGS share keypoints. If ESSENTIAL_SETTINGS agree too, they share
+# essential matrices.
+KEYPOINT_SETTINGS = (
+    "detector",
+    "max_keypoints",
+    "min_distance",
+    "quality",
+    "block_size",
+    "window",
+    "levels",
+    "mask_mode",
+    "redetect_below",
+    "fallback",
+)
 ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
 SHARED_TIMES = ("detect_seconds", "track_seconds")  # measured for all runs of a pass together
-DTYPES = {"frame": int, "updated": bool,
-          **dict.fromkeys(("points", "detected", "tracked", "inliers", "pose_inliers"), "Int64")}
+DTYPES = {
+    "frame": int,
+    "updated": bool,
+    **dict.fromkeys(("points", "detected", "tracked", "inliers", "pose_inliers"), "Int64"),
+}
 NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "mask_seconds"]
 
 
 class Masks(Protocol):
-    """An object whose item i is the mask of frame i, (height, width) uint8. Keypoints are forbidden where it is 0."""
+    """An object whose item i is the mask of frame i, (height, width) uint8. Keypoints are
+    forbidden where it is 0.
+    """
 
     def __getitem__(self, index: int, /) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
 class Result:
-    """poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing values are blank."""
+    """poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing
+    values are blank.
+    """
 
     poses: np.ndarray
     frames: pd.DataFrame
@@ -48,17 +68,21 @@ class Result:
     @property
     def flagged(self) -> pd.Series:
         """Number of frames by flag."""
-        return self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
+        return (
+            self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
+        )
 
     def with_poses(self, poses: np.ndarray) -> "Result":
         """Copy with other poses (n, 4, 4), also in the table of frames."""
         columns = dict(zip("xyz", poses[:, :3, 3].T, strict=True)) | dict(
-            zip(ROTATION_COLUMNS, poses[:, :3, :3].reshape(-1, 9).T, strict=True))
+            zip(ROTATION_COLUMNS, poses[:, :3, :3].reshape(-1, 9).T, strict=True)
+        )
         return replace(self, poses=poses, frames=self.frames.assign(**columns))
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:
-    """First pose of the estimate: the identity, as in PySLAM, unless the ground truth starts at another pose.
+    """First pose of the estimate: the identity, as in PySLAM, unless the ground truth starts at
+    another pose.
 
     Complete KITTI sequences start at the identity (up to 1e-10); excerpts do not.
     """
@@ -75,11 +99,17 @@ def scales(sequence: Sequence) -> np.ndarray:
     """
     if not sequence.has_truth:
         return sequence.assumed_steps
-    return np.concatenate([[0.0], [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]])
+    return np.concatenate(
+        [[0.0], [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]]
+    )
 
 
-def run(sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None,
-        description: str | None = None) -> Result:
+def run(
+    sequence: Sequence,
+    settings: OdometrySettings = THESIS,
+    masks: Masks | None = None,
+    description: str | None = None,
+) -> Result:
     """Run the odometry over a kitti.Sequence. Returns a Result.
 
     masks: see Masks. description: text of the progress bar; None for no bar.
@@ -88,17 +118,24 @@ def run(sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | 
     return _run(sequence, {"": (settings, masks)}, None, description, None, 1)[""]
 
 
-def run_many(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
-             description: str | None = None, checkpoint: Path | None = None, workers: int = 1) -> dict[str, Result]:
-    """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}, equal to separate runs.
+def run_many(
+    sequence: Sequence,
+    runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
+    description: str | None = None,
+    checkpoint: Path | None = None,
+    workers: int = 1,
+) -> dict[str, Result]:
+    """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}, equal
+    to separate runs.
 
-    Frames are decoded, corner strengths computed and points tracked once for all runs. The times of detection and
-    tracking are blank, because they cannot be measured for a single run. Runs with the same masks object and the same
-    KEYPOINT_SETTINGS share masks and keypoints. Runs that differ only in `estimator` share essential matrices.
+    Frames are decoded, corner strengths computed and points tracked once for all runs. The times of
+    detection and tracking are blank, because they cannot be measured for a single run. Runs with
+    the same masks object and the same KEYPOINT_SETTINGS share masks and keypoints. Runs that differ
+    only in `estimator` share essential matrices.
     workers: number of threads for the estimators.
-    checkpoint: file in which the state is stored every CHECKPOINT frames. A stopped pass resumes from it if it is
-    started again with the same file, sequence and settings. The caller deletes the file after storing the results, and
-    uses another file for other masks.
+    checkpoint: file in which the state is stored every CHECKPOINT frames. A stopped pass resumes
+    from it if it is started again with the same file, sequence and settings. The caller deletes the
+    file after storing the results, and uses another file for other masks.
     """
     return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
 
@@ -115,7 +152,9 @@ class _Run:
 
 @dataclass
 class _Estimate:
-    """Runs that share the essential matrix of one frame, one Step for each run, and the estimating thread."""
+    """Runs that share the essential matrix of one frame, one Step for each run, and the
+    estimating thread.
+    """
 
     runs: list[_Run]
     steps: list[Step]
@@ -128,14 +167,25 @@ class _Estimate:
             essential = run.odometry.estimate(step, essential)
 
 
-def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
-         shared: keypoints.SharedKeypoints | None, description: str | None, checkpoint: Path | None,
-         workers: int) -> dict[str, Result]:
-    members = {name: _Run(Odometry(sequence.intrinsics, settings, start_pose(sequence), shared), masks,
-                          np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan))
-               for name, (settings, masks) in runs.items()}
+def _run(
+    sequence: Sequence,
+    runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
+    shared: keypoints.SharedKeypoints | None,
+    description: str | None,
+    checkpoint: Path | None,
+    workers: int,
+) -> dict[str, Result]:
+    members = {
+        name: _Run(
+            Odometry(sequence.intrinsics, settings, start_pose(sequence), shared),
+            masks,
+            np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan),
+        )
+        for name, (settings, masks) in runs.items()
+    }
     groups = _groups(members.values())
-    leaders = [group[0][0] for group in groups]  # the first run of each group detects and tracks for its group
+    # the first run of each group detects and tracks for its group
+    leaders = [group[0][0] for group in groups]
     step_lengths = scales(sequence)
     job = _job(sequence, members)
     done = _resume(checkpoint, job, members, leaders)
@@ -147,7 +197,10 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
         for index in indices:
             frame = sequence.frame(index)
             if shared is not None:
-                shared.expect(frame, [(leader.odometry.previous, leader.odometry.points) for leader in leaders])
+                shared.expect(
+                    frame,
+                    [(leader.odometry.previous, leader.odometry.points) for leader in leaders],
+                )
             estimates = []
             for leader, group in zip(leaders, groups, strict=True):
                 started = time.perf_counter()
@@ -155,7 +208,9 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
                 mask_seconds = time.perf_counter() - started
                 step = leader.odometry.observe(frame, step_lengths[index], mask)
                 for runs_of_matrix in group:
-                    estimate = _Estimate(runs_of_matrix, [step.copy() for _ in runs_of_matrix], mask_seconds)
+                    estimate = _Estimate(
+                        runs_of_matrix, [step.copy() for _ in runs_of_matrix], mask_seconds
+                    )
                     if workers > 1:
                         estimate.future = pool.submit(estimate.work)
                     else:
@@ -169,11 +224,15 @@ def _run(sequence: Sequence, runs: Mapping[str, tuple[OdometrySettings, Masks | 
                 pending = []
                 _store(checkpoint, job, index + 1, members, leaders)
         _finish(pending)
-    return {name: _result(member, SHARED_TIMES if shared else ()) for name, member in members.items()}
+    return {
+        name: _result(member, SHARED_TIMES if shared else ()) for name, member in members.items()
+    }
 
 
 def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
-    """Groups of runs with the same keypoints. Each group is a list of lists of runs that share an essential matrix."""
+    """Groups of runs with the same keypoints. Each group is a list of lists of runs that share
+    an essential matrix.
+    """
     groups: dict[tuple, dict[tuple, list[_Run]]] = {}
     for member in members:
         settings = member.odometry.settings
@@ -191,8 +250,10 @@ def _finish(estimates: Iterable[_Estimate]) -> None:
         for run, step in zip(estimate.runs, estimate.steps, strict=True):
             row = run.odometry.compose(step).row()
             flag = row.pop("flag")
-            run.numbers[step.frame] = [np.nan if value is None else value
-                                       for value in (*row.values(), estimate.mask_seconds)]
+            run.numbers[step.frame] = [
+                np.nan if value is None else value
+                for value in (*row.values(), estimate.mask_seconds)
+            ]
             if flag:
                 run.flags[step.frame] = flag
 
@@ -204,26 +265,43 @@ def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
     """Inputs of a pass. A pass resumes from a checkpoint only if they are equal."""
     arrays = (sequence.intrinsics, start_pose(sequence), scales(sequence))
     numbers = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
-    return {"sequence": sequence.name, "frames": len(sequence), "numbers": numbers, "opencv": cv2.__version__,
-            "columns": NUMBER_COLUMNS,
-            "runs": {name: asdict(member.odometry.settings) for name, member in members.items()}}
+    return {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        "numbers": numbers,
+        "opencv": cv2.__version__,
+        "columns": NUMBER_COLUMNS,
+        "runs": {name: asdict(member.odometry.settings) for name, member in members.items()},
+    }
 
 
-def _store(checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: list[_Run]) -> None:
+def _store(
+    checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: list[_Run]
+) -> None:
     last = leaders[0].odometry  # the previous frame is the same in all runs
-    arrays = {"numbers": np.array([member.numbers[:done] for member in members.values()]),
-              "poses": np.array([member.odometry.pose for member in members.values()]),
-              **{f"prior {part}": np.array([getattr(member.odometry.prior, part) for member in members.values()])
-                 for part in MotionPrior._fields},
-              **{f"points {index}": leader.odometry.points for index, leader in enumerate(leaders)}}
+    arrays = {
+        "numbers": np.array([member.numbers[:done] for member in members.values()]),
+        "poses": np.array([member.odometry.pose for member in members.values()]),
+        **{
+            f"prior {part}": np.array(
+                [getattr(member.odometry.prior, part) for member in members.values()]
+            )
+            for part in MotionPrior._fields
+        },
+        **{f"points {index}": leader.odometry.points for index, leader in enumerate(leaders)},
+    }
     if last.previous is not None:
         arrays["previous"] = last.previous
     flags = {name: member.flags for name, member in members.items()}
     stages.store(checkpoint, {"job": job, "done": done, "gap": last.gap, "flags": flags}, arrays)
 
 
-def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
-    """Restore the state from a checkpoint of the same job. Returns the number of finished frames, 0 without one."""
+def _resume(
+    checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]
+) -> int:
+    """Restore the state from a checkpoint of the same job. Returns the number of finished
+    frames, 0 without one.
+    """
     try:
         stored = stages.resume(checkpoint) if checkpoint else None
     except InputError:  # a damaged file: start from the first frame
@@ -233,8 +311,9 @@ def _resume(checkpoint: Path | None, job: dict, members: Mapping[str, _Run], lea
     state, arrays = stored
     done = int(state["done"])
     priors = zip(*(arrays[f"prior {part}"] for part in MotionPrior._fields), strict=True)
-    for (name, member), numbers, pose, prior in zip(members.items(), arrays["numbers"], arrays["poses"], priors,
-                                                    strict=True):
+    for (name, member), numbers, pose, prior in zip(
+        members.items(), arrays["numbers"], arrays["poses"], priors, strict=True
+    ):
         member.numbers[:done] = numbers
         member.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
         member.odometry.pose, member.odometry.prior = pose, MotionPrior(*prior)

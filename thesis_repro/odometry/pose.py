@@ -1,7 +1,9 @@
-"""Relative motion of a calibrated camera from point correspondences (Section 2.2): essential matrix, then motion.
+"""Relative motion of a calibrated camera from point correspondences (Section 2.2): essential
+matrix, then motion.
 
-As in PySLAM, points of the current frame come first. So the rotation and the unit translation take coordinates of the
-current camera to coordinates of the previous camera. A camera-to-world pose is moved by them without an inverse.
+As in PySLAM, points of the current frame come first. So the rotation and the unit translation take
+coordinates of the current camera to coordinates of the previous camera. A camera-to-world pose is
+moved by them without an inverse.
 """
 
 from dataclasses import dataclass
@@ -14,7 +16,8 @@ from thesis_repro.odometry.opencv_exact import ransac
 
 PROBABILITY = 0.999  # of RANSAC
 MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farther points do not vote
-LIMIT_MARGIN = 1e-7  # for homogeneous points of unit norm; points nearer to a limit are left to OpenCV
+# for homogeneous points of unit norm; points nearer to a limit are left to OpenCV
+LIMIT_MARGIN = 1e-7
 MIN_CORRESPONDENCES = 5
 
 ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
@@ -22,11 +25,14 @@ ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsa
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of the camera between two frames. If it is not known, `rotation` is None and `problem` says why."""
+    """Motion of the camera between two frames. If it is not known, `rotation` is None and
+    `problem` says why.
+    """
 
     rotation: np.ndarray | None = None  # 3x3
     translation: np.ndarray | None = None  # 3, unit length
-    inliers: np.ndarray | None = None  # N booleans: correspondences that agree with the essential matrix
+    # N booleans: correspondences that agree with the essential matrix
+    inliers: np.ndarray | None = None
     pose_inliers: int = 0  # correspondences in front of both cameras and not too far away
     problem: str = ""
 
@@ -34,30 +40,40 @@ class Motion:
 def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Normalised image coordinates (N, 2), in double precision, of pixels (N, 2).
 
-    u * (1 / fx) + (-cx / fx) equals the product of the inverse camera matrix and (u, v, 1) to the last bit. The formula
-    (u - cx) / fx does not. RANSAC amplifies a difference in the last bit, so the trajectory would be another one.
+    u * (1 / fx) + (-cx / fx) equals the product of the inverse camera matrix and (u, v, 1) to the
+    last bit. The formula (u - cx) / fx does not. RANSAC amplifies a difference in the last bit, so
+    the trajectory would be another one.
     """
     focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
     return points * (1 / focal) + (-intrinsics[:2, 2] / focal)
 
 
-def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float,
-                     method: str = "ransac") -> tuple[np.ndarray | None, np.ndarray, str]:
+def essential_matrix(
+    current: np.ndarray, previous: np.ndarray, threshold: float, method: str = "ransac"
+) -> tuple[np.ndarray | None, np.ndarray, str]:
     """Essential matrix of normalised correspondences (N, 2). Returns (matrix, inliers, problem).
 
-    If there is no matrix or more than one, `matrix` is None and `problem` says why. (From exactly five correspondences,
-    OpenCV returns all solutions in one array.)
+    If there is no matrix or more than one, `matrix` is None and `problem` says why. (From exactly
+    five correspondences, OpenCV returns all solutions in one array.)
     """
     no_inliers = np.zeros(len(current), bool)
     if len(current) < MIN_CORRESPONDENCES:
         return None, no_inliers, "fewer than five correspondences"
     try:
         if method == "ransac":
-            matrix, inliers = ransac.find_essential_matrix(current, previous, threshold, PROBABILITY)
+            matrix, inliers = ransac.find_essential_matrix(
+                current, previous, threshold, PROBABILITY
+            )
         else:
-            matrix, inliers = cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0),
-                                                   method=ESSENTIAL_METHODS[method], prob=PROBABILITY,
-                                                   threshold=threshold)
+            matrix, inliers = cv2.findEssentialMat(
+                current,
+                previous,
+                focal=1.0,
+                pp=(0.0, 0.0),
+                method=ESSENTIAL_METHODS[method],
+                prob=PROBABILITY,
+                threshold=threshold,
+            )
     except cv2.error:  # the USAC estimators raise on degenerate points
         matrix = None
     if matrix is None or inliers is None or not np.isfinite(matrix).all():
@@ -67,22 +83,29 @@ def essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float
     return matrix, inliers.ravel() > 0, ""
 
 
-def recover_pose(matrix: np.ndarray, current: np.ndarray,
-                 previous: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
-    """Motion from an essential matrix: (votes, R, t), equal to cv2.recoverPose(matrix, current, previous) to the bit.
+def recover_pose(
+    matrix: np.ndarray, current: np.ndarray, previous: np.ndarray
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """Motion from an essential matrix: (votes, R, t), equal to cv2.recoverPose(matrix, current,
+    previous) to the bit.
 
-    An essential matrix allows four motions. A point votes for a motion if it lies in front of both cameras and nearer
-    than MAX_DEPTH. The motion with most votes wins. OpenCV triangulates every point four times with a singular value
-    decomposition. Here a few steps of inverse iteration decide how nearly all points vote, for both signs of the
-    translation at once. OpenCV's triangulation decides only about points close to a limit.
+    An essential matrix allows four motions. A point votes for a motion if it lies in front of both
+    cameras and nearer than MAX_DEPTH. The motion with most votes wins. OpenCV triangulates every
+    point four times with a singular value decomposition. Here a few steps of inverse iteration
+    decide how nearly all points vote, for both signs of the translation at once. OpenCV's
+    triangulation decides only about points close to a limit.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
-    motions = [(rotation, sign * translation) for sign in (1.0, -1.0) for rotation in (first, second)]
+    motions = [
+        (rotation, sign * translation) for sign in (1.0, -1.0) for rotation in (first, second)
+    ]
     votes, doubtful = np.zeros(4, np.int64), [np.empty(0, np.int64)] * 2
-    # A car's rotation is the smaller one. Its votes are counted first; the other's only while it can still win.
+    # A car's rotation is the smaller one. Its votes are counted first; the other's only while it
+    # can still win.
     for index in (0, 1) if np.trace(first) >= np.trace(second) else (1, 0):
         votes[index], votes[index + 2], doubtful[index] = _count_in_front(
-            current, previous, motions[index][0], translation.ravel(), votes.max())
+            current, previous, motions[index][0], translation.ravel(), votes.max()
+        )
     most_certain = votes.max()
     for index, motion in enumerate(motions):
         points = doubtful[index % 2]
@@ -105,7 +128,8 @@ def _triangulate_and_count(current, previous, rotation, translation):
 
 @fast
 def _count_in_front(current, previous, rotation, t, least):
-    """Count the votes for (rotation, t) and (rotation, -t), and list the points that are too close to a limit.
+    """Count the votes for (rotation, t) and (rotation, -t), and list the points that are too close
+    to a limit.
 
     Stops as soon as neither motion can reach `least` votes.
     """
@@ -116,8 +140,8 @@ def _count_in_front(current, previous, rotation, t, least):
     for index in range(len(current)):
         if max(forward, backward) + doubts + len(current) - index < least:
             break
-        # Rows x * P[2] - P[0] and y * P[2] - P[1] of both cameras. The point is the right singular vector of the least
-        # singular value.
+        # Rows x * P[2] - P[0] and y * P[2] - P[1] of both cameras. The point is the right singular
+        # vector of the least singular value.
         u, v = previous[index, 0], previous[index, 1]
         a[0, 0] = -1.0
         a[0, 2] = current[index, 0]
@@ -130,14 +154,21 @@ def _count_in_front(current, previous, rotation, t, least):
         a[3, 3] = v * t[2] - t[1]
         for i in range(4):
             for j in range(i + 1):
-                b[i, j] = a[0, i] * a[0, j] + a[1, i] * a[1, j] + a[2, i] * a[2, j] + a[3, i] * a[3, j]
+                b[i, j] = (
+                    a[0, i] * a[0, j] + a[1, i] * a[1, j] + a[2, i] * a[2, j] + a[3, i] * a[3, j]
+                )
         sure, x, y, z, w = _least_eigenvector(b)
         depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + t[2] * w
         if w < 0:
             z, w, depth = -z, -w, -depth
-        if (not sure or w < LIMIT_MARGIN or abs(z) < LIMIT_MARGIN or abs(depth) < LIMIT_MARGIN
-                or abs(abs(z) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN
-                or abs(abs(depth) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN):
+        if (
+            not sure
+            or w < LIMIT_MARGIN
+            or abs(z) < LIMIT_MARGIN
+            or abs(depth) < LIMIT_MARGIN
+            or abs(abs(z) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN
+            or abs(abs(depth) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN
+        ):
             doubtful[doubts] = index
             doubts += 1
         elif 0 < z < MAX_DEPTH * w and 0 < depth < MAX_DEPTH * w:
@@ -149,7 +180,9 @@ def _count_in_front(current, previous, rotation, t, least):
 
 @inner
 def _least_eigenvector(b):
-    """Unit eigenvector of the least eigenvalue of b (lower triangle), after a flag: whether the iteration converged."""
+    """Unit eigenvector of the least eigenvalue of b (lower triangle), after a flag: whether the
+    iteration converged.
+    """
     for j in range(4):  # Cholesky
         for k in range(j):
             b[j, j] -= b[j, k] * b[j, k]

@@ -6,9 +6,13 @@ from dataclasses import dataclass
 from thesis_repro import InputError
 from thesis_repro.odometry import pose
 
-CHOICES = {"detector": ("shi-tomasi", "orb"), "mask_mode": ("detect", "filter"),
-           "essential_method": tuple(pose.ESSENTIAL_METHODS), "estimator": ("thesis", "inliers", "refined"),
-           "alignment": ("position", "pose")}
+CHOICES = {
+    "detector": ("shi-tomasi", "orb"),
+    "mask_mode": ("detect", "filter"),
+    "essential_method": tuple(pose.ESSENTIAL_METHODS),
+    "estimator": ("thesis", "inliers", "refined"),
+    "alignment": ("position", "pose"),
+}
 
 
 @dataclass(frozen=True)
@@ -16,23 +20,28 @@ class OdometrySettings:
     """Settings of the odometry. The defaults are the thesis's.
 
     detector: "shi-tomasi", or "orb" (detection only; points are still tracked).
-    max_keypoints: largest number of keypoints, 0 for no limit.
-    min_distance, quality, block_size (all Shi-Tomasi): least distance between keypoints, pixels; least strength of a
-    keypoint, relative to the strongest one; side of the square over which gradients are summed, pixels.
-    window, levels: side of the tracker's window, pixels, and the number of times it halves the frame.
-    mask_mode: "detect" gives the mask to the detector, which returns up to max_keypoints inside it; "filter" drops
-    keypoints outside the mask.
-    redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all of them.
-    essential_method: how the essential matrix is estimated: "ransac", or OpenCV's "usac" or "usac-magsac".
+    max_keypoints: largest number of keypoints, 0 for no limit. min_distance, quality, block_size
+    (all Shi-Tomasi): least distance between keypoints, pixels; least strength of a keypoint,
+    relative to the strongest one; side of the square over which gradients are summed, pixels.
+    window, levels: side of the tracker's window, pixels, and the number of times it halves the
+    frame.
+    mask_mode: "detect" gives the mask to the detector, which returns up to max_keypoints inside it;
+    "filter" drops keypoints outside the mask.
+    redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all
+    of them.
+    essential_method: how the essential matrix is estimated: "ransac", or OpenCV's "usac" or
+    "usac-magsac".
     threshold: largest distance of an inlier in this estimation, in normalised image coordinates.
-    shuffle_seed: seed with which the matched points are shuffled before RANSAC; None: not shuffled. RANSAC's own seed
-    is fixed.
-    estimator: how the motion follows from the essential matrix, which allows four motions. "thesis": all points vote
-    for one of the four, as in PySLAM. "inliers": only the inliers vote (audit rows 13, 29). "refined": the smaller of
-    the two possible rotations is taken, and the motion is refitted by least squares to all points near it. If a car
-    cannot make this motion within a frame, another one is searched for (refined.motion_prior).
-    fallback: estimate a step from all keypoints if the masked keypoints do not determine its motion, or if the motion
-    differs too much from the previous step's (refined.motion_prior). Without masks it does nothing.
+    shuffle_seed: seed with which the matched points are shuffled before RANSAC; None: not shuffled.
+    RANSAC's own seed is fixed.
+    estimator: how the motion follows from the essential matrix, which allows four motions.
+    "thesis": all points vote for one of the four, as in PySLAM. "inliers": only the inliers vote
+    (audit rows 13, 29). "refined": the smaller of the two possible rotations is taken, and the
+    motion is refitted by least squares to all points near it. If a car cannot make this motion
+    within a frame, another one is searched for (refined.motion_prior).
+    fallback: estimate a step from all keypoints if the masked keypoints do not determine its
+    motion, or if the motion differs too much from the previous step's (refined.motion_prior).
+    Without masks it does nothing.
     scale_gate: metres; a shorter step does not move the pose.
     shift_gate: pixels; a step with a smaller mean shift of its points does not move the pose.
     rotate_first: rotate the pose before moving it.
@@ -61,20 +70,35 @@ class OdometrySettings:
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if getattr(self, name) not in known:
-                raise InputError(f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
-                                 f"choose one of {', '.join(known)}")
+                raise InputError(
+                    f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
+                    f"choose one of {', '.join(known)}"
+                )
         for name, least, most in (
-                ("max_keypoints", 0, 2**31 - 1), ("min_distance", 0, 10_000), ("redetect_below", 0, 2**31 - 1),
-                ("quality", 0, 1), ("block_size", 1, 31), ("window", 3, 101), ("levels", 0, 10),
-                ("shuffle_seed", 0, 2**32 - 1), ("scale_gate", 0, math.inf), ("shift_gate", 0, math.inf)):
+            ("max_keypoints", 0, 2**31 - 1),
+            ("min_distance", 0, 10_000),
+            ("redetect_below", 0, 2**31 - 1),
+            ("quality", 0, 1),
+            ("block_size", 1, 31),
+            ("window", 3, 101),
+            ("levels", 0, 10),
+            ("shuffle_seed", 0, 2**32 - 1),
+            ("scale_gate", 0, math.inf),
+            ("shift_gate", 0, math.inf),
+        ):
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
-                raise InputError(f"odometry setting {name}: {value} is not in the range {least} to {most}")
+                raise InputError(
+                    f"odometry setting {name}: {value} is not in the range {least} to {most}"
+                )
         if not 0 < self.threshold < math.inf:
-            raise InputError(f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003")
+            raise InputError(
+                f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003"
+            )
 
 
 THESIS = OdometrySettings()
-PYSLAM_2024 = OdometrySettings(threshold=0.0004, rotate_first=True, shift_gate=1.5, scale_gate=0.015,
-                               alignment="pose")
+PYSLAM_2024 = OdometrySettings(
+    threshold=0.0004, rotate_first=True, shift_gate=1.5, scale_gate=0.015, alignment="pose"
+)
 PRESETS = {"2021": THESIS, "2024": PYSLAM_2024}

@@ -1,7 +1,9 @@
-"""The audit: where the thesis contradicts itself, its code or its libraries, and the measured effect of each.
+"""The audit: where the thesis contradicts itself, its code or its libraries, and the measured
+effect of each.
 
-audit.json holds the rows and lists which columns are measured for them. `table` joins the measurements to the rows.
-Ratios come from `study.compare`. Intervals are bootstrap intervals over `n` values: sequences unless said otherwise.
+audit.json holds the rows and lists which columns are measured for them. `table` joins the
+measurements to the rows. Ratios come from `study.compare`. Intervals are bootstrap intervals over
+`n` values: sequences unless said otherwise.
 """
 
 import json
@@ -22,57 +24,93 @@ NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n
 
 
 def measurement(row, quantity, values, unit="", **more):
-    """Return one measurement for a row of the audit: the mean of one or several values, its interval and their number.
+    """Return one measurement for a row of the audit: the mean of one or several values, its
+    interval and their number.
 
-    quantity: a text, or the key of one in audit.json. more: further columns (metric, estimator, frames, data).
+    quantity: a text, or the key of one in audit.json. more: further columns (metric, estimator,
+    frames, data).
     """
     values = np.asarray(values, float).ravel()
     values = values[~np.isnan(values)]
     low, high = compare.mean_interval(values)
-    return {"row": row, "quantity": WORDS["quantities"].get(quantity, quantity), "unit": unit,
-            "value": values.mean() if len(values) else np.nan, "low": low, "high": high, "n": len(values), **more}
+    return {
+        "row": row,
+        "quantity": WORDS["quantities"].get(quantity, quantity),
+        "unit": unit,
+        "value": values.mean() if len(values) else np.nan,
+        "low": low,
+        "high": high,
+        "n": len(values),
+        **more,
+    }
 
 
 def ratio(row, quantity, ratios, **more):
     """Return one measurement for a row of the audit: the geometric mean of one ratio a sequence."""
     mean = compare.geometric_mean(ratios)
-    return measurement(row, quantity, [], "ratio", value=mean["ratio"], low=mean["low"], high=mean["high"],
-                       n=mean["n"], **more)
+    return measurement(
+        row,
+        quantity,
+        [],
+        "ratio",
+        value=mean["ratio"],
+        low=mean["low"],
+        high=mean["high"],
+        n=mean["n"],
+        **more,
+    )
 
 
 def table(measurements, data="this run"):
-    """Return the audit as a table with one line a measurement. The first line of each row has the row's texts.
+    """Return the audit as a table with one line a measurement. The first line of each row has the
+    row's texts.
 
-    data: the origin of measurements that name none. Numbers are rounded (see `rounded`). Raises ValueError if a
-    measurement's row is not in audit.json.
+    data: the origin of measurements that name none. Numbers are rounded (see `rounded`). Raises
+    ValueError if a measurement's row is not in audit.json.
     """
-    words = pd.DataFrame(WORDS["rows"]).rename(columns={"does": "the thesis or its code",
-                                                        "right": "what would be right"})
-    numbers = pd.DataFrame(measurements).reindex(columns=["row", *NUMBERS]).astype(dict.fromkeys(TEXTS, object))
+    words = pd.DataFrame(WORDS["rows"]).rename(
+        columns={"does": "the thesis or its code", "right": "what would be right"}
+    )
+    numbers = (
+        pd.DataFrame(measurements)
+        .reindex(columns=["row", *NUMBERS])
+        .astype(dict.fromkeys(TEXTS, object))
+    )
     unknown = set(numbers["row"]) - set(words["row"])
     if unknown:
-        raise ValueError(f"audit.json has no rows for these measurements: {', '.join(sorted(unknown))}")
-    lines = words.merge(numbers.fillna({"data": data}), on="row", how="left").fillna(dict.fromkeys(TEXTS, ""))
+        raise ValueError(
+            f"audit.json has no rows for these measurements: {', '.join(sorted(unknown))}"
+        )
+    lines = words.merge(numbers.fillna({"data": data}), on="row", how="left").fillna(
+        dict.fromkeys(TEXTS, "")
+    )
     lines.loc[lines["row"].duplicated(), words.columns.drop("row")] = ""
     lines[["value", "low", "high"]] = lines[["value", "low", "high"]].map(rounded)
     return lines.astype({"n": "Int64", "frames": "Int64"})
 
 
 def rounded(value):
-    """Round a number to four significant digits, or to eight close to 1, to show whether an interval excludes 1."""
+    """Round a number to four significant digits, or to eight close to 1, to show whether an
+    interval excludes 1.
+    """
     return float(f"{value:.{8 if abs(value - 1) < 5e-4 else 4}g}")
 
 
 def measured(table, kind):
     """Return the measurements that audit.json lists for one kind of table.
 
-    Where audit.json gives a unit, they are means over sequences. Otherwise they are ratios to a reference method, or to
-    another column ("over") of the same rows.
-    kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (as in `ablations`),
-    "shares" (of pixels, one row a frame), "boresight" (`boresight.explained`).
+    Where audit.json gives a unit, they are means over sequences. Otherwise they are ratios to a
+    reference method, or to another column ("over") of the same rows.
+    kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (as
+    in `ablations`), "shares" (of pixels, one row a frame), "boresight" (`boresight.explained`).
     """
     measurements = []
-    requested = [(spec, metric) for spec in WORDS["measured"] if spec["runs"] == kind for metric in spec["metrics"]]
+    requested = [
+        (spec, metric)
+        for spec in WORDS["measured"]
+        if spec["runs"] == kind
+        for metric in spec["metrics"]
+    ]
     for spec, metric in requested:
         if metric not in table:
             continue
@@ -80,20 +118,35 @@ def measured(table, kind):
         pairs = [(name, name) for name in compare.ESTIMATORS] if by_estimator else [("", "")]
         for estimator, reference_estimator in spec.get("estimators", pairs):
             rows = _select(table, estimator, spec.get("method"), spec.get("widths"))
-            names = {"metric": spec.get("label", WORDS["metrics"].get(metric, "")), "estimator": estimator}
+            names = {
+                "metric": spec.get("label", WORDS["metrics"].get(metric, "")),
+                "estimator": estimator,
+            }
             if "unit" in spec:
                 means = rows.groupby("sequence")[metric].mean()
-                measurements.append(measurement(spec["row"], spec["quantity"], means, spec["unit"], **names))
+                measurements.append(
+                    measurement(spec["row"], spec["quantity"], means, spec["unit"], **names)
+                )
             else:
-                reference = (rows.assign(**{metric: rows[spec["over"]]}) if "over" in spec else _select(
-                    table, reference_estimator, spec.get("reference"), spec.get("reference_widths")))
+                reference = (
+                    rows.assign(**{metric: rows[spec["over"]]})
+                    if "over" in spec
+                    else _select(
+                        table,
+                        reference_estimator,
+                        spec.get("reference"),
+                        spec.get("reference_widths"),
+                    )
+                )
                 ratios = compare.ratios(rows, reference, metric)
                 measurements.append(ratio(spec["row"], spec["quantity"], ratios, **names))
     return _with_frames(measurements, table)
 
 
 def _select(table, estimator, method, widths):
-    """Select the rows of an estimator, a method and some widths; an empty estimator, or None, selects all."""
+    """Select the rows of an estimator, a method and some widths; an empty estimator, or None,
+    selects all.
+    """
     if estimator and "estimator" in table:
         table = table[table["estimator"] == estimator]
     if widths == "best":
@@ -105,7 +158,9 @@ def _select(table, estimator, method, widths):
 
 
 def _with_frames(measurements, table):
-    """Add the table's mean number of frames a sequence, if known, and drop measurements without values."""
+    """Add the table's mean number of frames a sequence, if known, and drop measurements without
+    values.
+    """
     sequences, frames = table.groupby("sequence"), np.nan
     if "frames" in table:
         frames = round(sequences["frames"].first().mean())
@@ -115,37 +170,51 @@ def _with_frames(measurements, table):
 
 
 def of_tables():
-    """Return rows 1, 3, 4, 9, 18, 35, 41, 45, 60, 66 and 69: arithmetic on the numbers that the thesis reports."""
+    """Return rows 1, 3, 4, 9, 18, 35, 41, 45, 60, 66 and 69: arithmetic on the numbers that the
+    thesis reports.
+    """
     measurements = []
-    for name, key in (("RMSE", "table_4_2_rmse_percent_change"), ("MAE", "table_4_3_mae_percent_change")):
+    for name, key in (
+        ("RMSE", "table_4_2_rmse_percent_change"),
+        ("MAE", "table_4_3_mae_percent_change"),
+    ):
         change = pd.Series(REPORTED[key])
         improved = int((change < 0).sum())
         sign_test = binomtest(improved, len(change), alternative="greater").pvalue
-        measurements += [measurement("1", "sum", change.sum(), "%", metric=name),
-                         measurement("1", "mean", change, "%", metric=name),
-                         measurement("1", "median", change.median(), "%", metric=name),
-                         ratio("1", "ratio", 1 + change / 100, metric=name),
-                         measurement("4", "larger", (change > 0).sum(), "sequences", metric=name),
-                         measurement("41", "improved", improved, "sequences", metric=name),
-                         measurement("41", "sign", 100 * sign_test, "%", metric=name)]
+        measurements += [
+            measurement("1", "sum", change.sum(), "%", metric=name),
+            measurement("1", "mean", change, "%", metric=name),
+            measurement("1", "median", change.median(), "%", metric=name),
+            ratio("1", "ratio", 1 + change / 100, metric=name),
+            measurement("4", "larger", (change > 0).sum(), "sequences", metric=name),
+            measurement("41", "improved", improved, "sequences", metric=name),
+            measurement("41", "sign", 100 * sign_test, "%", metric=name),
+        ]
     best = pd.DataFrame(REPORTED["table_4_1"])
     factors, classes = 2000 / best["mean_keypoints"], REPORTED["training"]["classes"]
     measurements += [
         measurement("3", "reduction", 2000 / best["mean_keypoints"].mean(), "ratio"),
         measurement("3", "reduction of each", factors, "ratio"),
         measurement("3", "three", (factors >= 3).sum(), "sequences"),
-        measurement("9", "categories", len(LABELS)), measurement("9", "outputs", classes),
-        measurement("9", "parameters", REPORTED["figure_a1_model_summary"]["rows"][-1]["params"] // classes),
+        measurement("9", "categories", len(LABELS)),
+        measurement("9", "outputs", classes),
+        measurement(
+            "9", "parameters", REPORTED["figure_a1_model_summary"]["rows"][-1]["params"] // classes
+        ),
         measurement("35", "widths", best["dilation_width"].isin(WIDTHS).sum(), "sequences"),
         measurement("60", "keypoints", best["mean_keypoints"]),
-        *(measurement(**constant) for constant in WORDS["arithmetic"])]
+        *(measurement(**constant) for constant in WORDS["arithmetic"]),
+    ]
     return [{**measurement, "data": "the thesis's numbers"} for measurement in measurements]
 
 
 def of_study(runs):
     """Return rows 2, 11, 26, 31 to 33, 35 and 38, from the runs of notebook 08."""
     masked, baseline = (compare.of_method(runs, method) for method in ("masked", "baseline"))
-    best, stability = thesis_tables.of_chosen_width(masked), thesis_tables.stability(masked, baseline)
+    best, stability = (
+        thesis_tables.of_chosen_width(masked),
+        thesis_tables.stability(masked, baseline),
+    )
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
     by_rmse, by_mae = (by_width[metric].groupby("sequence").idxmin() for metric in ("rmse", "mae"))
     rmse_ratios = by_width["rmse"].loc[by_mae].to_numpy() / by_width["rmse"].loc[by_rmse].to_numpy()
@@ -156,20 +225,38 @@ def of_study(runs):
         measurement("31", "other width", (by_rmse != by_mae).sum(), "sequences"),
         measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences"),
         ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
-        measurement("2", "same best", stability["same_best"], "%")]
+        measurement("2", "same best", stability["same_best"], "%"),
+    ]
     return _with_frames(measurements, runs) + measured(runs, "study")
 
 
 def of_ablations(runs):
-    """Return rows 14 and 39, and the rows that audit.json lists, from the runs of `ablations.measure`."""
-    null = ablations.null_distribution(compare.of_method(runs, "baseline", "thesis"),
-                                       pd.Series(REPORTED["table_4_2_rmse_percent_change"]))
+    """Return rows 14 and 39, and the rows that audit.json lists, from the runs of
+    `ablations.measure`.
+    """
+    null = ablations.null_distribution(
+        compare.of_method(runs, "baseline", "thesis"),
+        pd.Series(REPORTED["table_4_2_rmse_percent_change"]),
+    )
     spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
     measurements = [
-        *(ratio("14", "spread", factors, metric="RMSE", estimator=estimator)
-          for estimator, factors in spread.groupby("estimator")["factor"]),
-        *(measurement("39", f"null {name}", null.loc[name, "expected"], "%", metric="RMSE",
-                      low=null.loc[name, "low"], high=null.loc[name, "high"], n=ablations.STUDIES)
-          for name in ("mean", "median")),
-        measurement("39", "as low", null.loc["mean", "share_as_low"], "%", metric="RMSE")]
+        *(
+            ratio("14", "spread", factors, metric="RMSE", estimator=estimator)
+            for estimator, factors in spread.groupby("estimator")["factor"]
+        ),
+        *(
+            measurement(
+                "39",
+                f"null {name}",
+                null.loc[name, "expected"],
+                "%",
+                metric="RMSE",
+                low=null.loc[name, "low"],
+                high=null.loc[name, "high"],
+                n=ablations.STUDIES,
+            )
+            for name in ("mean", "median")
+        ),
+        measurement("39", "as low", null.loc["mean", "share_as_low"], "%", metric="RMSE"),
+    ]
     return _with_frames(measurements, runs) + measured(runs, "ablations")

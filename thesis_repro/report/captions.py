@@ -1,8 +1,11 @@
-"""The captions of all tables, figures and texts (captions.json), and the numbers of the thesis (reported.json).
+"""The captions of all tables, figures and texts (captions.json), and the numbers of the thesis
+(reported.json).
 
-An artefact is a dict with kind ("figure", "table", "text"), name (of its files), title and caption. Optional keys:
-constant: true if it shows no data. needs: the variable that a run on real frames must set to make it.
-thesis: what the thesis reports, a dict of data and two Jinja templates, text and here (for this run's numbers).
+An artefact is a dict with kind ("figure", "table", "text"), name (of its files), title and caption.
+Optional keys: constant: true if it shows no data. needs: the variable that a run on real frames
+must set to make it.
+thesis: what the thesis reports, a dict of data and two Jinja templates, text and here (for this
+run's numbers).
 """
 
 import json
@@ -11,10 +14,16 @@ from pathlib import Path
 _HERE = Path(__file__).parent
 REPORTED = json.loads((_HERE / "reported.json").read_text(encoding="utf-8"))
 _CAPTIONS = json.loads((_HERE / "captions.json").read_text(encoding="utf-8"))
-CHAPTERS = _CAPTIONS["chapters"]  # the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
+# the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
+CHAPTERS = _CAPTIONS["chapters"]
 ADDED = _CAPTIONS["added"]  # artefacts that are not in the thesis
 OF_STUDIES = _CAPTIONS["of_studies"]  # artefacts that only a study has
 OF_EVIDENCE = _CAPTIONS["of_evidence"]  # the artefact that only the evidence on real frames has
-CONSTANT = [artefact["name"] for artefacts in CHAPTERS.values() for artefact in artefacts if artefact.get("constant")]
+CONSTANT = [
+    artefact["name"]
+    for artefacts in CHAPTERS.values()
+    for artefact in artefacts
+    if artefact.get("constant")
+]
 THESIS = [artefact["name"] for artefacts in CHAPTERS.values() for artefact in artefacts]
 CARD = "thesis_repro/segmentation/weights/README.md"  # describes the model in the package

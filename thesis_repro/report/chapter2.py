@@ -1,6 +1,7 @@
 """Figures 2.2, 2.7 to 2.9, 2.11 and 2.12, drawn from the project's network and data.
 
-Cells of the notebooks draw diagrams and plots of one formula or table (2.1, 2.3 to 2.6, 3.4, 3.5, 4.1, 4.17, A.1).
+Cells of the notebooks draw diagrams and plots of one formula or table (2.1, 2.3 to 2.6, 3.4, 3.5,
+4.1, 4.17, A.1).
 """
 
 import cv2
@@ -16,77 +17,110 @@ from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 
 def figure_2_02(patch, kernel, bias, feature_map, activated, pixel):
-    """Figure 2.2 and Equation 2.1: a kernel of the trained network's first layer on a patch of its input.
+    """Figure 2.2 and Equation 2.1: a kernel of the trained network's first layer on a patch of its
+    input.
 
-    The upper panels show the patch (h, w, channels), its feature map (h, w) and the activation after normalisation and
-    ReLU (h, w). The lower panels show the sum at one pixel (row, column): the kernel (k, k, channels) times the
-    pixel's receptive field, plus the bias.
+    The upper panels show the patch (h, w, channels), its feature map (h, w) and the activation
+    after normalisation and ReLU (h, w). The lower panels show the sum at one pixel (row, column):
+    the kernel (k, k, channels) times the pixel's receptive field, plus the bias.
     """
     figure, axes = style.new_figure(2, 3, height=4.7, height_ratios=[1.35, 1])
     row, column = pixel
     reach, limit = kernel.shape[0] // 2, np.abs(feature_map).max()
-    style.show_image(axes[0, 0], patch[..., 0], f"input x, {patch.shape[0]}x{patch.shape[1]}", vmin=0, vmax=255)
+    style.show_image(
+        axes[0, 0], patch[..., 0], f"input x, {patch.shape[0]}x{patch.shape[1]}", vmin=0, vmax=255
+    )
     style.show_image(axes[0, 1], feature_map, "feature map y", cmap="PuOr", vmin=-limit, vmax=limit)
-    style.show_image(axes[0, 2], activated, f"normalised, ReLU: {activated[row, column]:.2f}", vmin=0)
-    for panel, side, unit in zip(axes[0], (2 * reach + 1, 1, 1), ("gray value", "response", "activation")):
+    style.show_image(
+        axes[0, 2], activated, f"normalised, ReLU: {activated[row, column]:.2f}", vmin=0
+    )
+    for panel, side, unit in zip(
+        axes[0], (2 * reach + 1, 1, 1), ("gray value", "response", "activation")
+    ):
         figure.colorbar(panel.images[0], ax=panel, shrink=0.85, pad=0.03, label=unit)
-        panel.add_patch(Rectangle((column - side / 2, row - side / 2), side, side, fill=False, edgecolor=RED))
-    field = patch[row - reach:row + reach + 1, column - reach:column + reach + 1]
+        panel.add_patch(
+            Rectangle((column - side / 2, row - side / 2), side, side, fill=False, edgecolor=RED)
+        )
+    field = patch[row - reach : row + reach + 1, column - reach : column + reach + 1]
     sums = (field * kernel).sum(axis=(0, 1))
     show_numbers(axes[1, 0], field[..., 0], "its receptive field x (marked)", ".0f")
     show_numbers(axes[1, 1], kernel[..., 0], "times the kernel's weights w", ".4f")
     show_numbers(axes[1, 2], (field * kernel)[..., 0], "is w x", ".2f")
     remark = "" if len(sums) == 1 else " (above: the first channel)"
-    figure.supxlabel(f"y = b + Σ w x = {bias:.2f} + {' + '.join(f'{term:.2f}' for term in sums)} = "
-                     f"{bias + sums.sum():.2f}{remark}", fontsize=9)
+    figure.supxlabel(
+        f"y = b + Σ w x = {bias:.2f} + {' + '.join(f'{term:.2f}' for term in sums)} = "
+        f"{bias + sums.sum():.2f}{remark}",
+        fontsize=9,
+    )
     return figure
 
 
-UNET_PARTS = {"InputLayer": ("input", "#999999"), "Activation": ("convolution, normalisation, ReLU", BLUE),
-              "MaxPooling2D": ("max pooling", ORANGE), "Conv2DTranspose": ("transposed convolution", GREEN),
-              "Concatenate": ("concatenation", SKY), "output": ("1x1 convolution, softmax", RED)}
+UNET_PARTS = {
+    "InputLayer": ("input", "#999999"),
+    "Activation": ("convolution, normalisation, ReLU", BLUE),
+    "MaxPooling2D": ("max pooling", ORANGE),
+    "Conv2DTranspose": ("transposed convolution", GREEN),
+    "Concatenate": ("concatenation", SKY),
+    "output": ("1x1 convolution, softmax", RED),
+}
 
 
 def figure_2_07(model):
-    """Figure 2.7: the U-Net, one box a stage. Its height shows the image size, its width the number of channels.
+    """Figure 2.7: the U-Net, one box a stage. Its height shows the image size, its width the number
+    of channels.
 
     Shapes and skip connections are read from the layers of the Keras model.
     """
     figure, axes = style.new_figure(height=4.0)
     axes.set_axis_off()
-    x, boxes, previous = 0.0, {}, None  # boxes: the left, right and middle height of each layer's box
+    # boxes: the left, right and middle height of each layer's box
+    x, boxes, previous = 0.0, {}, None
     for layer in model.layers:
         kind = "output" if layer is model.layers[-1] else type(layer).__name__
         if kind not in UNET_PARTS:
             continue
         side, channels = layer.output.shape[2:]
         scale = side / model.input_shape[2]
-        width, half, y = 0.09 + 0.045 * np.log2(channels), 0.175 + 0.525 * scale, 1.5 * np.log2(scale)
-        axes.add_patch(Rectangle((x, y - half), width, 2 * half, color=UNET_PARTS[kind][1], linewidth=0))
+        width, half, y = (
+            0.09 + 0.045 * np.log2(channels),
+            0.175 + 0.525 * scale,
+            1.5 * np.log2(scale),
+        )
+        axes.add_patch(
+            Rectangle((x, y - half), width, 2 * half, color=UNET_PARTS[kind][1], linewidth=0)
+        )
         axes.text(x + width / 2, y + half + 0.06, channels, ha="center", va="bottom", fontsize=6)
         if kind in ("InputLayer", "MaxPooling2D", "Concatenate"):
-            axes.text(x + width / 2, y - half - 0.08, f"{side}x{side}", ha="center", va="top", fontsize=7)
+            axes.text(
+                x + width / 2, y - half - 0.08, f"{side}x{side}", ha="center", va="top", fontsize=7
+            )
         if previous:
             axes.plot((previous[1], x), (previous[2], y), color="#bbbbbb", linewidth=0.8, zorder=0)
         if kind == "Concatenate":
-            _, right, level = min(boxes[tensor._keras_history.operation.name] for tensor in layer.input)
+            _, right, level = min(
+                boxes[tensor._keras_history.operation.name] for tensor in layer.input
+            )
             _arrow(axes, (right, level), (x, y), "#777777")
         previous = boxes[layer.name] = x, x + width, y
         x += width + 0.32
     axes.autoscale_view()
     handles = [Patch(color=color, label=text) for text, color in UNET_PARTS.values()]
-    handles.append(Line2D([], [], color="#777777", marker=">", markersize=5, label="skip connection"))
+    handles.append(
+        Line2D([], [], color="#777777", marker=">", markersize=5, label="skip connection")
+    )
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
 
 @rc_context({"text.parse_math": True})
 def figure_2_08(poses, title):
-    """Figure 2.8: camera poses C of a sequence from above, and the motions T between them (Equations 2.2, 2.3).
+    """Figure 2.8: camera poses C of a sequence from above, and the motions T between them
+    (Equations 2.2, 2.3).
 
     poses: a few (n, 4, 4) camera-to-world poses, metres. Short arrows show the viewing direction.
     """
-    poses = np.linalg.inv(poses[0]) @ poses  # the first camera is at the origin and looks up the page
+    # the first camera is at the origin and looks up the page
+    poses = np.linalg.inv(poses[0]) @ poses
     positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
     text_style = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": 10}
     figure, axes = style.new_figure(height=3.8)
@@ -99,9 +133,19 @@ def figure_2_08(poses, title):
         formula, length = f"$T_{{{index},{index - 1}}}$", np.linalg.norm(motion[:3, 3])
         _arrow(axes, start, end, RED, shrinkA=3, shrinkB=3, connectionstyle="arc3,rad=-0.3")
         left = (end - start)[::-1] * (-1, 1)
-        axes.annotate(formula, (start + end) / 2 + 0.15 * left, 11 * left / max(length, 1e-9), color=RED, **text_style)
-        axes.plot([], [], color=RED, label=f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°")
-    axes.set(xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)")
+        axes.annotate(
+            formula,
+            (start + end) / 2 + 0.15 * left,
+            11 * left / max(length, 1e-9),
+            color=RED,
+            **text_style,
+        )
+        axes.plot(
+            [], [], color=RED, label=f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°"
+        )
+    axes.set(
+        xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)"
+    )
     axes.set_title(title, parse_math=False)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.2)
@@ -110,21 +154,31 @@ def figure_2_08(poses, title):
 
 
 def figure_2_09(first, second, title):
-    """Figure 2.9: the 60 ORB matches of smallest descriptor distance between two frames, each (height, width)."""
+    """Figure 2.9: the 60 ORB matches of smallest descriptor distance between two frames, each
+    (height, width).
+    """
     orb = cv2.ORB_create(1000)
     points, descriptors = orb.detectAndCompute(first, None)
     second_points, second_descriptors = orb.detectAndCompute(second, None)
     matches = []
     if points and second_points:
-        matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors, second_descriptors)
+        matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(
+            descriptors, second_descriptors
+        )
     best = sorted(matches, key=lambda match: match.distance)[:60]
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
     both, offset = np.vstack([first, gap, second]), (0, first.shape[0] + gap.shape[0])
     figure, (axes,) = style.frame_panels(both)
     style.show_image(axes, both, f"{title}: the {len(best)} best of {len(matches)} ORB matches")
     lines = LineCollection(
-        [(points[match.queryIdx].pt, np.add(second_points[match.trainIdx].pt, offset)) for match in best],
-        array=[match.distance for match in best], cmap="plasma", linewidth=0.8)
+        [
+            (points[match.queryIdx].pt, np.add(second_points[match.trainIdx].pt, offset))
+            for match in best
+        ],
+        array=[match.distance for match in best],
+        cmap="plasma",
+        linewidth=0.8,
+    )
     lines.set_clim(0, max((match.distance for match in best), default=1))
     axes.add_collection(lines)
     figure.colorbar(lines, ax=axes, shrink=0.7, pad=0.01, label="bits of 256 that differ")
@@ -132,29 +186,37 @@ def figure_2_09(first, second, title):
 
 
 def figure_2_11(first, second, kept, lost, new, titles):
-    """Figure 2.11: one scene from two viewpoints, with keypoints that were found again, lost and new.
+    """Figure 2.11: one scene from two viewpoints, with keypoints that were found again, lost and
+    new.
 
-    kept: the same keypoints in the first and in the second frame, a pair of arrays. All arrays are (n, 2) pixels.
+    kept: the same keypoints in the first and in the second frame, a pair of arrays. All arrays are
+    (n, 2) pixels.
     """
     figure, axes = style.frame_panels(first, 2)
     for panel, image, title, points in zip(axes, (first, second), titles, kept, strict=True):
         style.show_image(panel, image, title)
         panel.scatter(*points.T, s=5, color=GREEN, linewidths=0, label=f"{len(points)} found again")
-    axes[0].scatter(*lost.T, s=9, color=RED, marker="x", linewidths=0.8, label=f"{len(lost)} not found again")
+    axes[0].scatter(
+        *lost.T, s=9, color=RED, marker="x", linewidths=0.8, label=f"{len(lost)} not found again"
+    )
     axes[1].scatter(*new.T, s=9, color=ORANGE, marker="^", linewidths=0, label=f"{len(new)} new")
     style.legend_below(figure, axes, 3)
     return figure
 
 
 def figure_2_12(frame, frame_keypoints, label_map, label_keypoints, titles):
-    """Figure 2.12: a frame, its Shi-Tomasi keypoints, and the Shi-Tomasi keypoints of its label map, with counts."""
+    """Figure 2.12: a frame, its Shi-Tomasi keypoints, and the Shi-Tomasi keypoints of its label
+    map, with counts.
+    """
     figure, axes = style.frame_panels(frame, 3)
     style.show_image(axes[0], frame, f"(a) {titles[0]}")
     style.show_image(axes[1], frame, f"(b) {len(frame_keypoints)} keypoints on the frame")
     axes[1].scatter(*frame_keypoints.T, **KEYPOINT)
     colors = style.label_colors(label_map, frame)
     style.show_image(axes[2], colors, f"(c) {len(label_keypoints)} keypoints on {titles[1]}")
-    dots = axes[2].scatter(*label_keypoints.T, s=7, color="white", edgecolors="black", linewidths=0.4, label="keypoint")
+    dots = axes[2].scatter(
+        *label_keypoints.T, s=7, color="white", edgecolors="black", linewidths=0.4, label="keypoint"
+    )
     style.class_legend(figure, label_map, also=[dots])
     return figure
 
@@ -165,8 +227,17 @@ def _arrow(axes, start, end, color, **options):
 
 
 def show_numbers(axes, values, title, form, colors=None):
-    """Show an array as a table of numbers, on given colors (h, w, 4) or on a color scale whose middle is zero."""
+    """Show an array as a table of numbers, on given colors (h, w, 4) or on a color scale whose
+    middle is zero.
+    """
     limit = np.abs(values).max()
-    style.show_image(axes, values if colors is None else colors, title, cmap="PuOr", vmin=-2 * limit, vmax=2 * limit)
+    style.show_image(
+        axes,
+        values if colors is None else colors,
+        title,
+        cmap="PuOr",
+        vmin=-2 * limit,
+        vmax=2 * limit,
+    )
     for (row, column), value in np.ndenumerate(values):
         axes.text(column, row, format(value, form), ha="center", va="center")

@@ -1,7 +1,8 @@
-"""Figures 4.6, 4.7 and 4.9 to 4.16: errors in metres, and keypoints. comparison.py shows ratios of errors.
+"""Figures 4.6, 4.7 and 4.9 to 4.16: errors in metres, and keypoints. comparison.py shows ratios of
+errors.
 
-`runs` is the table of `runner.run`. Lines and bars show the mean over repetitions. Bands and error bars go from the
-lowest to the highest repetition.
+`runs` is the table of `runner.run`. Lines and bars show the mean over repetitions. Bands and error
+bars go from the lowest to the highest repetition.
 """
 
 import matplotlib.pyplot as plt
@@ -12,24 +13,35 @@ from thesis_repro.report import style
 from thesis_repro.report.style import BASELINE, MASKED, PAGE_WIDTH, REDUCED, TRUTH
 from thesis_repro.study import compare, thesis_tables
 
-METHODS = {"baseline": ("all keypoints", BASELINE, "//"), "masked": ("masked, best width", MASKED, ""),
-           "reduced": ("plainly reduced", REDUCED, "\\\\")}
+METHODS = {
+    "baseline": ("all keypoints", BASELINE, "//"),
+    "masked": ("masked, best width", MASKED, ""),
+    "reduced": ("plainly reduced", REDUCED, "\\\\"),
+}
 BAND = "lowest to highest of the repetitions"
 
 
 def figure_paths(truths, rows, paths, method):
-    """Figures 4.6, 4.11, 4.12: the paths from above, and below each path its distance to the ground truth.
+    """Figures 4.6, 4.11, 4.12: the paths from above, and below each path its distance to the ground
+    truth.
 
-    truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method; repetition 0 is bold, the
-    other repetitions are faint. paths: {(sequence, run): estimated positions (n, 3)}.
+    truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method;
+    repetition 0 is bold, the other repetitions are faint. paths: {(sequence, run): estimated
+    positions (n, 3)}.
     """
     groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
     columns = min(4, len(groups))
     count = -(-len(groups) // columns)
-    figure, axes = style.new_figure(2 * count, columns, height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
-                                    squeeze=False, height_ratios=[2, 1] * count)
-    pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))  # panels of a path and of its error
-    for panel in np.ravel(pairs[len(groups):]):
+    figure, axes = style.new_figure(
+        2 * count,
+        columns,
+        height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
+        squeeze=False,
+        height_ratios=[2, 1] * count,
+    )
+    # panels of a path and of its error
+    pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))
+    for panel in np.ravel(pairs[len(groups) :]):
         panel.remove()
     errors = compare.spread(rows, "rmse")
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
@@ -37,10 +49,16 @@ def figure_paths(truths, rows, paths, method):
         along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
         above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
         for repetition, run in enumerate(runs["run"]):
-            line = {"color": METHODS[method][1], "linewidth": 0.6, "alpha": 0.45, "label": "matched points shuffled"}
+            line = {
+                "color": METHODS[method][1],
+                "linewidth": 0.6,
+                "alpha": 0.45,
+                "label": "matched points shuffled",
+            }
             if repetition == 0:
                 line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
-            estimated = paths[name, run] + (true[1] - paths[name, run][1])  # paths meet at frame 1, as for the RMSE
+            # paths meet at frame 1, as for the RMSE
+            estimated = paths[name, run] + (true[1] - paths[name, run][1])
             above.plot(estimated[:, 0], estimated[:, 2], **line)
             below.plot(along, np.linalg.norm(estimated - true, axis=1), **line)
         row = errors.loc[name]
@@ -61,13 +79,22 @@ def figure_paths(truths, rows, paths, method):
 
 
 def figure_4_07(runs):
-    """Figure 4.7: the keypoints that masks keep, as a part of the thesis's 2000, against dilation width."""
+    """Figure 4.7: the keypoints that masks keep, as a part of the thesis's 2000, against
+    dilation width.
+    """
     masked = compare.of_method(runs, "masked")
-    kept = masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack() / THESIS.max_keypoints
+    kept = (
+        masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack()
+        / THESIS.max_keypoints
+    )
     figure, axes = style.new_figure(height=4.0)
     _lines(axes, kept)
-    axes.set(xlabel="dilation width (pixels)", ylabel=f"keypoints, part of {THESIS.max_keypoints}", ylim=(0, None),
-             title="Keypoints kept by masks of increasing dilation width")
+    axes.set(
+        xlabel="dilation width (pixels)",
+        ylabel=f"keypoints, part of {THESIS.max_keypoints}",
+        ylim=(0, None),
+        title="Keypoints kept by masks of increasing dilation width",
+    )
     return figure
 
 
@@ -85,19 +112,45 @@ def figure_against_width(runs, metric):
     above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
     _lines(axes, masked.groupby(["sequence", "dilation_width"])[metric].mean().unstack())
-    axes.set(xlabel="dilation width (pixels)", ylabel=label, ylim=(0, None),
-             title=f"{metric.upper()} against dilation width, means over repetitions")
+    axes.set(
+        xlabel="dilation width (pixels)",
+        ylabel=label,
+        ylim=(0, None),
+        title=f"{metric.upper()} against dilation width, means over repetitions",
+    )
     _, panels = style.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
         errors = compare.spread(masked[masked["sequence"] == name], metric, by="dilation_width")
-        panel.fill_between(errors.index, errors["lowest"], errors["highest"], color=MASKED, alpha=0.25, linewidth=0,
-                           label=f"masked, {BAND}")
-        panel.plot(errors.index, errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1,
-                   label="masked, mean")
+        panel.fill_between(
+            errors.index,
+            errors["lowest"],
+            errors["highest"],
+            color=MASKED,
+            alpha=0.25,
+            linewidth=0,
+            label=f"masked, {BAND}",
+        )
+        panel.plot(
+            errors.index,
+            errors["mean"],
+            color=MASKED,
+            marker="o",
+            markersize=2,
+            linewidth=1.1,
+            label="masked, mean",
+        )
         row = baseline.loc[name]
-        panel.axhspan(row["lowest"], row["highest"], color=BASELINE, alpha=0.2, linewidth=0,
-                      label=f"all keypoints, {BAND}")
-        panel.axhline(row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean")
+        panel.axhspan(
+            row["lowest"],
+            row["highest"],
+            color=BASELINE,
+            alpha=0.2,
+            linewidth=0,
+            label=f"all keypoints, {BAND}",
+        )
+        panel.axhline(
+            row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean"
+        )
         panel.set_ylim(0, None)
     below.supylabel(label, fontsize=8)
     style.legend_below(below, panels, 2)
@@ -105,7 +158,9 @@ def figure_against_width(runs, metric):
 
 
 def figure_of_methods(runs, metric):
-    """Figures 4.13, 4.15: the metric with all keypoints, the best mask and plainly reduced keypoints, all sequences."""
+    """Figures 4.13, 4.15: the metric with all keypoints, the best mask and plainly reduced
+    keypoints, all sequences.
+    """
     names, tables = _spread_by_method(runs, metric)
     figure, axes = style.new_figure(height=3.2)
     for offset, (method, table) in enumerate(tables.items()):
@@ -118,7 +173,9 @@ def figure_of_methods(runs, metric):
 
 
 def figure_of_sequences(runs, metric):
-    """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel with a scale of its own for each sequence."""
+    """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel with a scale of its own
+    for each sequence.
+    """
     names, tables = _spread_by_method(runs, metric)
     figure, panels = style.small_panels(names)
     for panel, name in zip(panels, names, strict=True):
@@ -140,7 +197,9 @@ def _lines(axes, table):
 
 
 def _spread_by_method(runs, metric):
-    """Return the sequences and, for each method of the thesis, a table (mean, lowest, highest) with one row each."""
+    """Return the sequences and, for each method of the thesis, a table (mean, lowest, highest)
+    with one row each.
+    """
     tables = {}
     for method in METHODS:
         rows = compare.of_method(runs, method)
@@ -153,6 +212,17 @@ def _spread_by_method(runs, metric):
 def _bar(axes, positions, table, width, method):
     """Draw bars at the means of a table, with error bars from lowest to highest."""
     label, color, hatch = METHODS[method]
-    axes.bar(positions, table["mean"], width, label=label, color=color, hatch=hatch, edgecolor="white", linewidth=0)
+    axes.bar(
+        positions,
+        table["mean"],
+        width,
+        label=label,
+        color=color,
+        hatch=hatch,
+        edgecolor="white",
+        linewidth=0,
+    )
     errors = [table["mean"] - table["lowest"], table["highest"] - table["mean"]]
-    axes.errorbar(positions, table["mean"], yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2)
+    axes.errorbar(
+        positions, table["mean"], yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2
+    )

@@ -1,7 +1,9 @@
-"""Evidence on real frames for the repository: tables, plots and findings that contain no frame of the data.
+"""Evidence on real frames for the repository: tables, plots and findings that contain no frame of
+the data.
 
-`make evidence KITTI=...` uses all sequences of a KITTI folder and the label maps of the model in the package. It runs
-the thesis's masks, the controls of one width with both estimators, and the audit's ablations. A stopped run resumes.
+`make evidence KITTI=...` uses all sequences of a KITTI folder and the label maps of the model in
+the package. It runs the thesis's masks, the controls of one width with both estimators, and the
+audit's ablations. A stopped run resumes.
 """
 
 import os
@@ -19,16 +21,18 @@ from thesis_repro.settings import PREFIX, ROOT, read_settings
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
-FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"  # BUILD: label maps and runs
-WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)  # pixels, of masks with the thesis's estimator
+# BUILD: label maps and runs
+FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"
+# pixels, of masks with the thesis's estimator
+WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)
 SAMPLED_FRAMES = 12  # frames of each sequence in which boundaries and tracks are measured
 
 
 def write(root, folder, build, frames=None, repetitions=5, processes=1):
     """Run the missing jobs and write all tables, plots and findings into a folder.
 
-    root: the KITTI folder. build: keeps label maps and runs; folder and build are absolute paths. frames: how many
-    frames of each sequence to use, None for all.
+    root: the KITTI folder. build: keeps label maps and runs; folder and build are absolute paths.
+    frames: how many frames of each sequence to use, None for all.
     """
     stages.stage(build, results="evidence")
     labels, model = build / "labels", prediction.load_shipped()
@@ -37,50 +41,103 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
         prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
     names = [sequence.name for sequence in sequences]
     runs = _runs(root, names, build, frames, repetitions, processes)
-    ablated = ablations.measure(root, names, labels, build / "audit", frames=frames, repetitions=repetitions,
-                                 baseline_repetitions=max(10, repetitions), processes=processes)
+    ablated = ablations.measure(
+        root,
+        names,
+        labels,
+        build / "audit",
+        frames=frames,
+        repetitions=repetitions,
+        baseline_repetitions=max(10, repetitions),
+        processes=processes,
+    )
     angles = boresight.explained(runner.refined_paths(runs, root, build / "odometry", frames))
-    measurements = [*audit.of_tables(), *audit.of_ablations(ablated), *audit.of_study(runs),
-                    *audit.measured(angles, "boresight"),
-                    *audit.measured(_boundaries(sequences, labels), "boundaries"),
-                    *audit.measured(_tracks(sequences, labels), "tracks")]
-    label_masks = [masks.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH) for sequence in sequences]
+    measurements = [
+        *audit.of_tables(),
+        *audit.of_ablations(ablated),
+        *audit.of_study(runs),
+        *audit.measured(angles, "boresight"),
+        *audit.measured(_boundaries(sequences, labels), "boundaries"),
+        *audit.measured(_tracks(sequences, labels), "tracks"),
+    ]
+    label_masks = [
+        masks.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH)
+        for sequence in sequences
+    ]
     steps = pd.concat(map(failures.measure, sequences, label_masks), ignore_index=True)
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
     longrun.sweep(folder)
-    style.save_all({"comparison": comparison.figure_comparison(table),
-                    "failures": failures.figure(steps, sequences, label_masks)}, {
-        "comparison": comparison.table_comparison(table),
-        "failures": failures.table(steps), "widths": comparison.table_widths(runs),
-        "audit": audit.table(measurements)}, folder, note)
+    style.save_all(
+        {
+            "comparison": comparison.figure_comparison(table),
+            "failures": failures.figure(steps, sequences, label_masks),
+        },
+        {
+            "comparison": comparison.table_comparison(table),
+            "failures": failures.table(steps),
+            "widths": comparison.table_widths(runs),
+            "audit": audit.table(measurements),
+        },
+        folder,
+        note,
+    )
     for name, rows in {"runs": runs, "switches": ablated}.items():
         # six digits are enough: shuffling the matched points changes more
-        write_text(folder / f"{name}.csv", rows.to_csv(index=False, lineterminator="\n", float_format="%.6g"))
-    write_text(folder / "README.md", texts.render(
-        "evidence.md.j2", findings=texts.findings(runs, table, note), failures=captions.OF_EVIDENCE))
+        write_text(
+            folder / f"{name}.csv",
+            rows.to_csv(index=False, lineterminator="\n", float_format="%.6g"),
+        )
+    write_text(
+        folder / "README.md",
+        texts.render(
+            "evidence.md.j2",
+            findings=texts.findings(runs, table, note),
+            failures=captions.OF_EVIDENCE,
+        ),
+    )
 
 
 def _runs(root, names, build, frames, repetitions, processes):
-    """Return the runs of the comparison. The runs with masks decide the jobs with fewer keypoints."""
-    def run(planned):
-        return runner.run(planned, root, build / "labels", build / "odometry", frames=frames, processes=processes)
+    """Return the runs of the comparison. The runs with masks decide the jobs with fewer
+    keypoints.
+    """
 
-    planned = jobs.first_jobs(root, names, {"thesis": WIDTHS, "refined": []}, tested=jobs.CONTROL_WIDTH,
-                              repetitions=repetitions)
+    def run(planned):
+        return runner.run(
+            planned, root, build / "labels", build / "odometry", frames=frames, processes=processes
+        )
+
+    planned = jobs.first_jobs(
+        root,
+        names,
+        {"thesis": WIDTHS, "refined": []},
+        tested=jobs.CONTROL_WIDTH,
+        repetitions=repetitions,
+    )
     runs = run(planned)
-    planned += jobs.reduced_jobs(thesis_tables.best_widths(compare.of_method(runs, "masked")), repetitions)
-    planned += jobs.keypoint_control_jobs(compare.keypoints_left(runs), root, frames, repetitions,
-                                          width=jobs.CONTROL_WIDTH)
+    planned += jobs.reduced_jobs(
+        thesis_tables.best_widths(compare.of_method(runs, "masked")), repetitions
+    )
+    planned += jobs.keypoint_control_jobs(
+        compare.keypoints_left(runs), root, frames, repetitions, width=jobs.CONTROL_WIDTH
+    )
     return runner.with_boresight_correction(run(planned), root, build / "odometry", frames)
 
 
 def _boundaries(sequences, labels):
-    return pd.DataFrame([
-        {"sequence": sequence.name, "frame": index} | ablations.boundaries(
-            read_label_map(labels / sequence.name / sequence.frame_paths[index].name), sequence.size)
-        for sequence in sequences for index in range(0, len(sequence), max(1, len(sequence) // SAMPLED_FRAMES))])
+    return pd.DataFrame(
+        [
+            {"sequence": sequence.name, "frame": index}
+            | ablations.boundaries(
+                read_label_map(labels / sequence.name / sequence.frame_paths[index].name),
+                sequence.size,
+            )
+            for sequence in sequences
+            for index in range(0, len(sequence), max(1, len(sequence) // SAMPLED_FRAMES))
+        ]
+    )
 
 
 def _tracks(sequences, labels):
@@ -88,9 +145,13 @@ def _tracks(sequences, labels):
     for sequence in sequences:
         label_maps, width = labels / sequence.name, jobs.CONTROL_WIDTH
         masks_by_name = {
-            "all keypoints": None, "masks": masks.LabelMasks(label_maps, sequence, width),
-            "exact boundaries": masks.LabelMasks(label_maps, sequence, width, masks.MaskSettings("exact")),
-            "random lines": controls.masks("random-lines", Source(labels), sequence, width)}
+            "all keypoints": None,
+            "masks": masks.LabelMasks(label_maps, sequence, width),
+            "exact boundaries": masks.LabelMasks(
+                label_maps, sequence, width, masks.MaskSettings("exact")
+            ),
+            "random lines": controls.masks("random-lines", Source(labels), sequence, width),
+        }
         rows.append(ablations.tracks(sequence, masks_by_name, SAMPLED_FRAMES))
     return pd.concat(rows, ignore_index=True)
 
@@ -98,9 +159,17 @@ def _tracks(sequences, labels):
 def main():
     """Write the evidence with the settings of the environment, and return the exit status."""
     try:
-        settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})  # all frames, unless FRAMES is set
+        # all frames, unless FRAMES is set
+        settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})
         with longrun.claimed(BUILD), longrun.logged(BUILD, "tables, plots and findings") as run:
-            write(settings.kitti, FOLDER, BUILD, settings.sizes.frames, settings.sizes.repetitions, settings.jobs)
+            write(
+                settings.kitti,
+                FOLDER,
+                BUILD,
+                settings.sizes.frames,
+                settings.sizes.repetitions,
+                settings.jobs,
+            )
             run.end(f"tables, plots and findings: {FOLDER}")
     except Exception as error:
         return longrun.report_error(error)

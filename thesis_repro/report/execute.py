@@ -1,4 +1,5 @@
-"""Execution of notebooks by `make figures`: with progress bars, one line on failure, and a log file.
+"""Execution of notebooks by `make figures`: with progress bars, one line on failure, and a log
+file.
 
 The Makefile calls `jupyter nbconvert --to notebook --execute` with `Execution` as its preprocessor.
 """
@@ -21,20 +22,28 @@ from thesis_repro.settings import PREFIX
 
 
 class Execution(ExecutePreprocessor):
-    """Executes all cells of a notebook. Exits with status 1 if a cell fails and with 130 if it is interrupted."""
+    """Executes all cells of a notebook. Exits with status 1 if a cell fails and with 130 if it
+    is interrupted.
+    """
 
-    kernel_name = Unicode("python3").tag(config=True)  # the notebook may name a kernel that is not installed here
-    log_file = Unicode("execution.log").tag(config=True)  # for the output of libraries and the traceback of a failure
+    # the notebook may name a kernel that is not installed here
+    kernel_name = Unicode("python3").tag(config=True)
+    # for the output of libraries and the traceback of a failure
+    log_file = Unicode("execution.log").tag(config=True)
 
     def preprocess(self, nb, resources=None, km=None):
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the kernel ends with this program
+        # so that the kernel ends with this program
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         sys.excepthook = _print_error  # nbconvert may fail to write the executed notebook
         name, path, started = resources["metadata"]["name"], Path(self.log_file), time.monotonic()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
-            with longrun.locked(path), longrun.logged(path.parent, f"make figures, {name}", has_results=True), \
-                    open(path, "w", encoding="utf-8") as self._log:
+            with (
+                longrun.locked(path),
+                longrun.logged(path.parent, f"make figures, {name}", has_results=True),
+                open(path, "w", encoding="utf-8") as self._log,
+            ):
                 longrun.say(name)
                 try:
                     executed = super().preprocess(nb, resources, km)
@@ -48,7 +57,9 @@ class Execution(ExecutePreprocessor):
             logging.getLogger("asyncio").disabled = True  # would report the interrupted cell
             print(f"{name} was interrupted; the same command resumes it", file=sys.stderr)
             sys.exit(130)
-        sys.exit(f"{failure}\nthe traceback is in {os.path.relpath(path)}; the same command resumes")
+        sys.exit(
+            f"{failure}\nthe traceback is in {os.path.relpath(path)}; the same command resumes"
+        )
 
     def setup_kernel(self, **options):
         # compiled libraries log into the log file, not into the outputs of cells

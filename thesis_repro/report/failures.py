@@ -1,4 +1,6 @@
-"""The steps on which masks fail: how many keypoints the masks keep, and how well these determine the motion."""
+"""The steps on which masks fail: how many keypoints the masks keep, and how well these
+determine the motion.
+"""
 
 from dataclasses import replace
 
@@ -14,88 +16,153 @@ from thesis_repro.report import style
 SETTINGS = replace(THESIS, estimator="refined")
 KINDS = {"all": ("all keypoints", style.BASELINE), "masks": ("masks", style.MASKED)}
 CELLS = 4  # columns and rows into which a frame is divided
-CLEAR_DIFFERENCE = 0.15  # degrees between the rotation errors of a step with masks and with all keypoints
-BINS = (0, 100, 200, 300, 500, 10**6)  # edges for the number of keypoints that agree with the motion
-PANELS = {"agreeing": "agreeing\nkeypoints", "direction_std": "uncertainty of\ndirection (degrees)",
-          "rotation_error": "rotation error\n(degrees)"}
+# degrees between the rotation errors of a step with masks and with all keypoints
+CLEAR_DIFFERENCE = 0.15
+# edges for the number of keypoints that agree with the motion
+BINS = (0, 100, 200, 300, 500, 10**6)
+PANELS = {
+    "agreeing": "agreeing\nkeypoints",
+    "direction_std": "uncertainty of\ndirection (degrees)",
+    "rotation_error": "rotation error\n(degrees)",
+}
 
 
 def measure(sequence, masks):
-    """Return one row for each step of a kitti.Sequence and kind of keypoints ("all" or "masks"), refined estimator.
+    """Return one row for each step of a kitti.Sequence and kind of keypoints ("all" or "masks"),
+    refined estimator.
 
-    tracked: number of keypoints. agreeing: number of keypoints that agree with the motion from all keypoints (the best
-    known motion). cells: share of 4x4 cells that contain a tracked keypoint. spread_u, spread_v: standard deviations
-    of the tracked keypoints, pixels. depth_spread: upper over lower quartile of the depths of the agreeing keypoints.
-    condition, direction_std: condition of their normal equations, and uncertainty of the direction of motion, degrees.
+    tracked: number of keypoints. agreeing: number of keypoints that agree with the motion from all
+    keypoints (the best known motion). cells: share of 4x4 cells that contain a tracked keypoint.
+    spread_u, spread_v: standard deviations of the tracked keypoints, pixels. depth_spread: upper
+    over lower quartile of the depths of the agreeing keypoints.
+    condition, direction_std: condition of their normal equations, and uncertainty of the direction
+    of motion, degrees.
     rotation_error: of the estimate, degrees. flag: texts of its flags.
     """
     rows, scale = [], scales(sequence)
     for index, steps in _steps(sequence, masks, range(len(sequence))):
         reference = steps["all"].motion
-        if scale[index] <= SETTINGS.scale_gate or any(step.motion.rotation is None for step in steps.values()):
+        if scale[index] <= SETTINGS.scale_gate or any(
+            step.motion.rotation is None for step in steps.values()
+        ):
             continue
         true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
         for kind, step in steps.items():
             current, previous, agreeing = _agreeing(step, reference, sequence)
-            fit = measured(reference.rotation, reference.translation, current[agreeing], previous[agreeing],
-                           agreeing, SETTINGS.threshold)
-            cells = (step.previous // [sequence.size[1] / CELLS, sequence.size[0] / CELLS]).astype(int)
-            rows.append({
-                "sequence": sequence.name, "frame": index, "kind": kind, "tracked": len(current),
-                "agreeing": int(agreeing.sum()), "cells": len(np.unique(cells, axis=0)) / CELLS**2,
-                "spread_u": step.previous[:, 0].std(), "spread_v": step.previous[:, 1].std(),
-                "depth_spread": _depth_spread(current[agreeing], previous[agreeing], reference),
-                "condition": fit.condition, "direction_std": fit.heading_std_deg,
-                "rotation_error": metrics.angles(true[:3, :3].T @ step.motion.rotation), "flag": "; ".join(step.flags)})
+            fit = measured(
+                reference.rotation,
+                reference.translation,
+                current[agreeing],
+                previous[agreeing],
+                agreeing,
+                SETTINGS.threshold,
+            )
+            cells = (step.previous // [sequence.size[1] / CELLS, sequence.size[0] / CELLS]).astype(
+                int
+            )
+            rows.append(
+                {
+                    "sequence": sequence.name,
+                    "frame": index,
+                    "kind": kind,
+                    "tracked": len(current),
+                    "agreeing": int(agreeing.sum()),
+                    "cells": len(np.unique(cells, axis=0)) / CELLS**2,
+                    "spread_u": step.previous[:, 0].std(),
+                    "spread_v": step.previous[:, 1].std(),
+                    "depth_spread": _depth_spread(current[agreeing], previous[agreeing], reference),
+                    "condition": fit.condition,
+                    "direction_std": fit.heading_std_deg,
+                    "rotation_error": metrics.angles(true[:3, :3].T @ step.motion.rotation),
+                    "flag": "; ".join(step.flags),
+                }
+            )
     return pd.DataFrame(rows)
 
 
 def _steps(sequence, masks, indices):
     """Yield (frame index, {kind: step}) for consecutive frames of a sequence."""
-    odometries, scale = {kind: Odometry(sequence.intrinsics, SETTINGS) for kind in KINDS}, scales(sequence)
+    odometries, scale = (
+        {kind: Odometry(sequence.intrinsics, SETTINGS) for kind in KINDS},
+        scales(sequence),
+    )
     for index in indices:
         frame = sequence.frame(index)
-        yield index, {kind: odometry.step(frame, scale[index], masks[index] if kind == "masks" else None)
-                      for kind, odometry in odometries.items()}
+        yield (
+            index,
+            {
+                kind: odometry.step(frame, scale[index], masks[index] if kind == "masks" else None)
+                for kind, odometry in odometries.items()
+            },
+        )
 
 
 def _agreeing(step, motion, sequence):
-    """Return a step's normalised matched points, current and previous, and which of them agree with a motion."""
-    current, previous = (pose.normalise(points, sequence.intrinsics) for points in (step.current, step.previous))
+    """Return a step's normalised matched points, current and previous, and which of them agree
+    with a motion.
+    """
+    current, previous = (
+        pose.normalise(points, sequence.intrinsics) for points in (step.current, step.previous)
+    )
     limit = SUPPORT_THRESHOLDS * SETTINGS.threshold
     return current, previous, near(motion.rotation, motion.translation, current, previous, limit)
 
 
 def _depth_spread(current, previous, motion):
-    """Return upper over lower quartile of the depths of the matched points in front of the camera."""
+    """Return upper over lower quartile of the depths of the matched points in front of the
+    camera.
+    """
     projection = np.column_stack([motion.rotation, motion.translation])
     points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T, previous.T)
     ahead = points[2] * points[3] > 0
-    return np.divide(*np.percentile(points[2, ahead] / points[3, ahead], [75, 25])) if ahead.any() else np.nan
+    return (
+        np.divide(*np.percentile(points[2, ahead] / points[3, ahead], [75, 25]))
+        if ahead.any()
+        else np.nan
+    )
 
 
 def table(steps):
-    """Return the medians with all keypoints and with masks, by sequence and by number of agreeing keypoints."""
+    """Return the medians with all keypoints and with masks, by sequence and by number of
+    agreeing keypoints.
+    """
     wide = steps.pivot(index=["sequence", "frame"], columns="kind").reset_index(level="sequence")
     by_number = pd.cut(wide["agreeing", "masks"], BINS, right=False).map(
-        lambda bin: f"{bin.left} to {bin.right - 1} agreeing" if bin.right < BINS[-1] else f"{bin.left} or more")
+        lambda bin: (
+            f"{bin.left} to {bin.right - 1} agreeing"
+            if bin.right < BINS[-1]
+            else f"{bin.left} or more"
+        )
+    )
     rows = []
     for name, group in [*wide.groupby("sequence"), *wide.groupby(by_number, observed=True)]:
-        medians = {f"{column}, {KINDS[kind][0]}": float(f"{group[column, kind].median():.3g}")
-                   for column in steps.columns[3:-1] for kind in KINDS}
+        medians = {
+            f"{column}, {KINDS[kind][0]}": float(f"{group[column, kind].median():.3g}")
+            for column in steps.columns[3:-1]
+            for kind in KINDS
+        }
         worse = group["rotation_error", "masks"] - group["rotation_error", "all"]
-        rows.append({"steps": name, "number": len(group), **medians,
-                     f"masks worse by {CLEAR_DIFFERENCE} degrees": int((worse > CLEAR_DIFFERENCE).sum()),
-                     f"masks better by {CLEAR_DIFFERENCE} degrees": int((worse < -CLEAR_DIFFERENCE).sum()),
-                     "flagged, masks": int((group["flag", "masks"] != "").sum())})
+        rows.append(
+            {
+                "steps": name,
+                "number": len(group),
+                **medians,
+                f"masks worse by {CLEAR_DIFFERENCE} degrees": int((worse > CLEAR_DIFFERENCE).sum()),
+                f"masks better by {CLEAR_DIFFERENCE} degrees": int(
+                    (worse < -CLEAR_DIFFERENCE).sum()
+                ),
+                "flagged, masks": int((group["flag", "masks"] != "").sum()),
+            }
+        )
     return pd.DataFrame(rows)
 
 
 def figure(steps, sequences, masks):
     """Draw the worst step, and below it, frame by frame, the measures of the two worst sequences.
 
-    sequences, masks: lists of equal length. The worst sequences are those whose mean rotation error masks raise most.
-    The worst step is the one of the first of these sequences whose rotation error masks raise most.
+    sequences, masks: lists of equal length. The worst sequences are those whose mean rotation error
+    masks raise most. The worst step is the one of the first of these sequences whose rotation error
+    masks raise most.
     """
     error = steps.pivot(index=["sequence", "frame"], columns="kind", values="rotation_error")
     means = error.groupby("sequence").mean()
@@ -104,20 +171,35 @@ def figure(steps, sequences, masks):
     worst = [sequence.name for sequence in sequences].index(names[0])
     axes = plt.figure(figsize=(style.PAGE_WIDTH, 7), layout="constrained").subplot_mosaic(
         [["drawing"] * len(names), *([f"{column} {name}" for name in names] for column in PANELS)],
-        height_ratios=[2.0, 1, 1, 1])
+        height_ratios=[2.0, 1, 1, 1],
+    )
     _draw(axes["drawing"], sequences[worst], masks[worst], index)
     for name in names:
         for column, label in PANELS.items():
             panel = axes[f"{column} {name}"]
             for kind, (text, color) in KINDS.items():
                 rows = steps[(steps["sequence"] == name) & (steps["kind"] == kind)]
-                panel.plot(rows["frame"], rows[column].where(rows[column] > 0), color=color, label=text, linewidth=1)
+                panel.plot(
+                    rows["frame"],
+                    rows[column].where(rows[column] > 0),
+                    color=color,
+                    label=text,
+                    linewidth=1,
+                )
             for frame in rows.loc[rows["flag"] != "", "frame"]:
-                panel.axvspan(frame - 0.5, frame + 0.5, color=style.ORANGE, alpha=0.3, linewidth=0,
-                              label="flag: ambiguous motion")
+                panel.axvspan(
+                    frame - 0.5,
+                    frame + 0.5,
+                    color=style.ORANGE,
+                    alpha=0.3,
+                    linewidth=0,
+                    label="flag: ambiguous motion",
+                )
             panel.set_ylabel(label if name == names[0] else "")
             panel.tick_params(labelsize=7)
-            style.ratio_axis(panel.yaxis, np.concatenate([line.get_ydata() for line in panel.lines]))
+            style.ratio_axis(
+                panel.yaxis, np.concatenate([line.get_ydata() for line in panel.lines])
+            )
         axes[f"agreeing {name}"].set_title(f"sequence {name}")
         panel.set_xlabel("frame")
     style.legend_below(axes["drawing"].figure, list(axes.values()), 4)
@@ -125,20 +207,37 @@ def figure(steps, sequences, masks):
 
 
 def _draw(panel, sequence, masks, index):
-    """Draw the keypoints before a step: dropped by the mask, or kept, and whether they agree with the motion."""
+    """Draw the keypoints before a step: dropped by the mask, or kept, and whether they agree
+    with the motion.
+    """
     _, (_, steps) = _steps(sequence, masks, (index - 1, index))
     motion, mask = steps["all"].motion, masks[index - 1]
     _, _, agreeing = _agreeing(steps["masks"], motion, sequence)
     columns, rows = np.rint(steps["all"].previous).astype(int).T
     for points, color, size, label in (
-            (steps["all"].previous[mask[rows, columns] == 0], "#bbbbbb", 2, "dropped by the mask"),
-            (steps["masks"].previous[agreeing], style.GREEN, 7, "kept, agrees with the motion"),
-            (steps["masks"].previous[~agreeing], style.RED, 7, "kept, does not agree")):
-        panel.plot(*points.T, "o", color=color, markersize=size**0.5, markeredgewidth=0, label=label)
+        (steps["all"].previous[mask[rows, columns] == 0], "#bbbbbb", 2, "dropped by the mask"),
+        (steps["masks"].previous[agreeing], style.GREEN, 7, "kept, agrees with the motion"),
+        (steps["masks"].previous[~agreeing], style.RED, 7, "kept, does not agree"),
+    ):
+        panel.plot(
+            *points.T, "o", color=color, markersize=size**0.5, markeredgewidth=0, label=label
+        )
     for outline in cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]:
         panel.plot(*np.vstack([outline[:, 0], outline[:1, 0]]).T, color="black", linewidth=0.4)
     epipole = sequence.intrinsics @ motion.translation
-    panel.plot(*(epipole[:2] / epipole[2]), "+", color="black", markersize=11, label="epipole: where the car goes")
-    panel.set(xlim=(0, sequence.size[1]), ylim=(sequence.size[0], 0), aspect="equal", xticks=[], yticks=[],
-              title=f"sequence {sequence.name}, frames {index - 1} to {index}: {agreeing.sum()} of {len(agreeing)} "
-                    f"keypoints in the mask agree with the motion")
+    panel.plot(
+        *(epipole[:2] / epipole[2]),
+        "+",
+        color="black",
+        markersize=11,
+        label="epipole: where the car goes",
+    )
+    panel.set(
+        xlim=(0, sequence.size[1]),
+        ylim=(sequence.size[0], 0),
+        aspect="equal",
+        xticks=[],
+        yticks=[],
+        title=f"sequence {sequence.name}, frames {index - 1} to {index}: {agreeing.sum()} of {len(agreeing)} "
+        f"keypoints in the mask agree with the motion",
+    )

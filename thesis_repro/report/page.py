@@ -1,4 +1,5 @@
-"""The page with all tables and figures of a run or a study: index.html beside them. It needs no network or server.
+"""The page with all tables and figures of a run or a study: index.html beside them. It needs no
+network or server.
 
 `python -m thesis_repro.report.page` writes the page, and converts executed notebooks to HTML.
 """
@@ -24,8 +25,10 @@ from thesis_repro.settings import ROOT, read_settings
 PAGE = "index.html"
 EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
-OPENING = ("figure_4_05", "findings", "figure-comparison")  # ids of the artefacts at the top of a page
-PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")  # packages that affect the numbers most
+# ids of the artefacts at the top of a page
+OPENING = ("figure_4_05", "findings", "figure-comparison")
+# packages that affect the numbers most
+PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")
 
 
 def update(settings):
@@ -35,7 +38,8 @@ def update(settings):
     """
     with longrun.claimed(settings.build / "notebooks"):
         longrun.sweep(settings.build)
-        for name in captions.CONSTANT:  # copied from the default run if their notebooks were not executed
+        # copied from the default run if their notebooks were not executed
+        for name in captions.CONSTANT:
             for path in (ROOT / "figures").glob(f"{name}.*"):
                 if not (settings.figures / path.name).exists():
                     write_text(settings.figures / path.name, path.read_text(encoding="utf-8"))
@@ -59,45 +63,83 @@ def notebook_html(path, page):
 
     # nbconvert's complete pages load scripts from the network, but the basic template does not
     content, resources = HTMLExporter(
-        template_name="basic", embed_images=True, exclude_input_prompt=True, exclude_output_prompt=True,
-        exclude_anchor_links=True).from_filename(str(path))
-    return texts.render("notebook.html.j2", title=path.stem, content=Markup(content),
-                        style=Markup("\n".join(resources["inlining"]["css"])), page=os.path.relpath(page, path.parent))
+        template_name="basic",
+        embed_images=True,
+        exclude_input_prompt=True,
+        exclude_output_prompt=True,
+        exclude_anchor_links=True,
+    ).from_filename(str(path))
+    return texts.render(
+        "notebook.html.j2",
+        title=path.stem,
+        content=Markup(content),
+        style=Markup("\n".join(resources["inlining"]["css"])),
+        page=os.path.relpath(page, path.parent),
+    )
 
 
 def build(settings):
     """Return the page of a run as HTML, made from the files in its folders."""
     makers, numbers = _makers(), tables.beside_the_thesis(settings)
-    chapters = {title: [_describe(settings.figures, artefact, makers, settings, numbers) for artefact in artefacts]
-                for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()}
+    chapters = {
+        title: [
+            _describe(settings.figures, artefact, makers, settings, numbers)
+            for artefact in artefacts
+        ]
+        for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()
+    }
     executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
     return texts.render(
-        "page.html.j2", title=f"Keypoint masks, {settings.run}", settings=settings, chapters=chapters,
+        "page.html.j2",
+        title=f"Keypoint masks, {settings.run}",
+        settings=settings,
+        chapters=chapters,
         shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
-        of=len(captions.THESIS), card=captions.CARD,
-        missing=[artefact for artefact in artefacts if not artefact["there"] and not artefact["left_out"]],
-        repository=settings.figures.is_relative_to(ROOT) and os.path.relpath(ROOT, settings.figures),
-        notebooks={} if settings.figures_in_git else {  # in a clone there is no build folder to link to
-            path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures) for path in executed},
+        of=len(captions.THESIS),
+        card=captions.CARD,
+        missing=[
+            artefact for artefact in artefacts if not artefact["there"] and not artefact["left_out"]
+        ],
+        repository=settings.figures.is_relative_to(ROOT)
+        and os.path.relpath(ROOT, settings.figures),
+        # in a clone there is no build folder to link to
+        notebooks={}
+        if settings.figures_in_git
+        else {
+            path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
+            for path in executed
+        },
         evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE,
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
-        made=_made(executed, settings.figures_in_git))
+        made=_made(executed, settings.figures_in_git),
+    )
 
 
 def build_study(folder, names, **facts):
-    """Return the page of a study as HTML. names: (kind, name) of its files. facts: further values of the template."""
+    """Return the page of a study as HTML. names: (kind, name) of its files. facts: further
+    values of the template.
+    """
     artefacts = []
     for artefact, (kind, name) in itertools.product([*captions.OF_STUDIES, *captions.ADDED], names):
-        base, _, sequence = name.partition("-")  # one artefact describes the figures of all sequences
+        # one artefact describes the figures of all sequences
+        base, _, sequence = name.partition("-")
         if (kind, base) == (artefact["kind"], artefact["name"]):
             title = f"{artefact['title']} {sequence}".strip()
             artefacts.append(_describe(folder, artefact | {"name": name, "title": title}, {}))
-    return texts.render("study.html.j2", title="A study of masks", artefacts=artefacts, notebooks={}, made=_made(),
-                        **facts)
+    return texts.render(
+        "study.html.j2",
+        title="A study of masks",
+        artefacts=artefacts,
+        notebooks={},
+        made=_made(),
+        **facts,
+    )
 
 
 def _describe(folder, artefact, makers, settings=None, numbers=None):
-    """Return the values that the template needs to show a table, figure or text, or to report it as missing."""
+    """Return the values that the template needs to show a table, figure or text, or to report
+    it as missing.
+    """
     kind, name = artefact["kind"], artefact["name"]
     files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
     content, details, rows = None, None, 0
@@ -117,19 +159,38 @@ def _describe(folder, artefact, makers, settings=None, numbers=None):
         fill = texts.TEMPLATES.from_string
         thesis["text"] = fill(thesis["text"]).render(captions.REPORTED)
         thesis["here"] = name in numbers and fill(thesis["here"]).render(numbers[name])
-        thesis["embedded"] = (settings.kitti_is_embedded if thesis["data"] == "runs" else
-                              thesis["data"] == "training" and settings.cityscapes_is_embedded)
+        thesis["embedded"] = (
+            settings.kitti_is_embedded
+            if thesis["data"] == "runs"
+            else thesis["data"] == "training" and settings.cityscapes_is_embedded
+        )
     needs = artefact.get("needs")
-    given = not needs or not settings or not settings.shipped or (needs == "KITTI_SEMANTIC" and settings.kitti_semantic)
+    given = (
+        not needs
+        or not settings
+        or not settings.shipped
+        or (needs == "KITTI_SEMANTIC" and settings.kitti_semantic)
+    )
     identity = name if number or kind == "text" else f"{kind}-{name}"
     return artefact | {
-        "id": identity, "number": number, "there": there, "content": content, "details": details, "rows": rows,
-        "files": [path.name for path in files], "makers": makers.get(name, []), "thesis": thesis,
-        "opens": there and identity in OPENING, "left_out": needs if not given and not there else None}
+        "id": identity,
+        "number": number,
+        "there": there,
+        "content": content,
+        "details": details,
+        "rows": rows,
+        "files": [path.name for path in files],
+        "makers": makers.get(name, []),
+        "thesis": thesis,
+        "opens": there and identity in OPENING,
+        "left_out": needs if not given and not there else None,
+    }
 
 
 def _makers():
-    """Return {name: [notebooks]}, the notebooks whose code contains the name of a table or figure."""
+    """Return {name: [notebooks]}, the notebooks whose code contains the name of a table or
+    figure.
+    """
     makers = {}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
@@ -140,15 +201,32 @@ def _makers():
 
 
 def _made(executed=(), in_git=False):
-    """Return the packages and, for a page outside git, the machine, commit and day of the results."""
+    """Return the packages and, for a page outside git, the machine, commit and day of the
+    results.
+    """
     made = {"packages": {name: importlib.metadata.version(name) for name in PACKAGES}}
     if in_git:
         return made
-    made |= {"python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
+    made |= {
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
     with suppress(OSError, subprocess.CalledProcessError):
         made["commit"] = subprocess.run(  # --git-dir excludes a repository in a parent folder
-            ["git", f"--git-dir={ROOT / '.git'}", f"--work-tree={ROOT}", "describe", "--always", "--dirty",
-             "--exclude=*", "--abbrev=12"], capture_output=True, text=True, check=True).stdout.strip()
+            [
+                "git",
+                f"--git-dir={ROOT / '.git'}",
+                f"--work-tree={ROOT}",
+                "describe",
+                "--always",
+                "--dirty",
+                "--exclude=*",
+                "--abbrev=12",
+            ],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
     if executed:
         latest = max(path.stat().st_mtime for path in executed)
         made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"

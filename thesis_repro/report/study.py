@@ -1,5 +1,5 @@
-"""The results of a study with the user's masks: findings, figures, tables and a page. Tables are also written as
-LaTeX and figures as PDF, for use in a paper.
+"""The results of a study with the user's masks: findings, figures, tables and a page. Tables are
+also written as LaTeX and figures as PDF, for use in a paper.
 """
 
 from contextlib import suppress
@@ -18,7 +18,8 @@ from thesis_repro.study.sources import KINDS
 
 
 def write(study, runs, folder, warnings=()):
-    """Write the findings, figures, tables and page of a `series.Study` into a folder, and return the page's path.
+    """Write the findings, figures, tables and page of a `series.Study` into a folder, and return
+    the page's path.
 
     warnings: lines for the top of the page.
     """
@@ -26,7 +27,9 @@ def write(study, runs, folder, warnings=()):
     embedded = "train_images" in (stages.record(study.kitti.absolute().parent) or {})
     data = "embedded world (rendered)" if embedded else f"KITTI folder {study.kitti.name}"
     changed = {source.name: _changed(source) for source in study.sources}
-    masks = ", ".join(f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources)
+    masks = ", ".join(
+        f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources
+    )
     note = f"odometry: {data}; masks: {masks}"
     runs = runner.with_boresight_correction(runs, study.kitti, folder / "runs", study.frames)
     table = compare.comparisons(runs)
@@ -35,21 +38,37 @@ def write(study, runs, folder, warnings=()):
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf", metadata={"CreationDate": None})
-    numbers = {"comparison": comparison.table_comparison(table), "widths": comparison.table_widths(runs),
-               "errors": tables.table_errors(runs), "runs": runs.round(6)}
+    numbers = {
+        "comparison": comparison.table_comparison(table),
+        "widths": comparison.table_widths(runs),
+        "errors": tables.table_errors(runs),
+        "runs": runs.round(6),
+    }
     for name, rows in numbers.items():
         latex = rows.to_latex(index=False, escape=True, na_rep="", float_format="{:g}".format)
         write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
     names = style.save_all(figures, numbers, folder, note)
-    write_text(folder / page.PAGE, page.build_study(
-        folder, [("text", "findings"), *names], study=study, warnings=warnings, embedded=embedded, kinds=KINDS,
-        estimators=ESTIMATORS, line_width=controls.LINE_WIDTH, changed=changed,
-        widths=sorted(runs["dilation_width"].dropna().astype(int).unique())))
+    write_text(
+        folder / page.PAGE,
+        page.build_study(
+            folder,
+            [("text", "findings"), *names],
+            study=study,
+            warnings=warnings,
+            embedded=embedded,
+            kinds=KINDS,
+            estimators=ESTIMATORS,
+            line_width=controls.LINE_WIDTH,
+            changed=changed,
+            widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
+        ),
+    )
     return folder / page.PAGE
 
 
 def figure_sources(study):
-    """Draw the middle frame of the first readable sequence: each source's label map, its mask and the kept keypoints.
+    """Draw the middle frame of the first readable sequence: each source's label map, its mask and
+    the kept keypoints.
 
     The plain frame replaces a label map that is missing.
     """
@@ -60,7 +79,9 @@ def figure_sources(study):
             break
     label_maps = []
     figure, axes = style.frame_panels(frame, len(masks_by_source), 3, 1.5 * style.PAGE_WIDTH)
-    for (first, second, third), source, masks in zip(np.reshape(axes, (-1, 3)), study.sources, masks_by_source):
+    for (first, second, third), source, masks in zip(
+        np.reshape(axes, (-1, 3)), study.sources, masks_by_source
+    ):
         style.show_image(first, frame, f"{source.name}: frame {index}")
         style.show_image(second, np.zeros_like(frame), f"{source.name}: no mask")
         style.show_image(third, frame, "")
@@ -68,7 +89,9 @@ def figure_sources(study):
             mask = masks[index]
             if source.kind == "labels":
                 label_maps.append(label_map_of(masks, index))
-                style.show_image(first, style.label_colors(label_maps[-1], frame), f"{source.name}: label map")
+                style.show_image(
+                    first, style.label_colors(label_maps[-1], frame), f"{source.name}: label map"
+                )
             points = keypoints.detect(frame, THESIS, mask)
             style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
             third.set_title(f"{source.name}: {len(points)} keypoints")
@@ -79,16 +102,32 @@ def figure_sources(study):
 
 
 def figure_paths(study, name, folder):
-    """Draw one path with all keypoints and one with each source's masks, shifted as for the RMSE."""
+    """Draw one path with all keypoints and one with each source's masks, shifted as for the
+    RMSE.
+    """
     true = Sequence(study.kitti, name).subset(study.frames).poses
-    files = {job.source or compare.METHODS[job.method]: folder / series.PATHS / "kitti" / name / f"{job.name}.txt"
-             for job in study.shown_jobs(name)}
-    paths = {label: metrics.shifted(read_poses(file), true) for label, file in files.items() if file.is_file()}
+    files = {
+        job.source or compare.METHODS[job.method]: folder
+        / series.PATHS
+        / "kitti"
+        / name
+        / f"{job.name}.txt"
+        for job in study.shown_jobs(name)
+    }
+    paths = {
+        label: metrics.shifted(read_poses(file), true)
+        for label, file in files.items()
+        if file.is_file()
+    }
     return trajectories.figure(paths, true, f"sequence {name}")
 
 
 def _changed(source):
-    """Return the settings of masks from label maps that differ from the thesis's, such as "; margin 10"."""
+    """Return the settings of masks from label maps that differ from the thesis's, such as ";
+    margin 10".
+    """
     default = vars(type(source.settings)())
-    changed = [f"{name} {value}" for name, value in vars(source.settings).items() if value != default[name]]
+    changed = [
+        f"{name} {value}" for name, value in vars(source.settings).items() if value != default[name]
+    ]
     return f"; {', '.join(changed)}" if changed and source.kind == "labels" else ""

@@ -1,4 +1,6 @@
-"""The style of all figures and tables, and functions that write them as SVG or WebP, CSV and Markdown."""
+"""The style of all figures and tables, and functions that write them as SVG or WebP, CSV and
+Markdown.
+"""
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -12,37 +14,49 @@ from thesis_repro.cityscapes import LABELS, colorize
 from thesis_repro.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
-matplotlib.rcParams.update({
-    "font.size": 9,
-    "axes.titlesize": 9, "axes.labelsize": 9,
-    "legend.fontsize": 8, "legend.frameon": False,
-    "axes.spines.top": False, "axes.spines.right": False,
-    "axes.grid": True, "axes.axisbelow": True,
-    "grid.color": "#dddddd", "grid.linewidth": 0.6,
-    "lines.linewidth": 1.4,
-    "image.interpolation": "nearest",
-    "svg.fonttype": "none",
-    "text.parse_math": False,  # names of files and sequences may contain dollar signs
-    "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
-    "savefig.dpi": 160,
-})
+matplotlib.rcParams.update(
+    {
+        "font.size": 9,
+        "axes.titlesize": 9,
+        "axes.labelsize": 9,
+        "legend.fontsize": 8,
+        "legend.frameon": False,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "grid.color": "#dddddd",
+        "grid.linewidth": 0.6,
+        "lines.linewidth": 1.4,
+        "image.interpolation": "nearest",
+        "svg.fonttype": "none",
+        "text.parse_math": False,  # names of files and sequences may contain dollar signs
+        "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
+        "savefig.dpi": 160,
+    }
+)
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
-DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"  # note of figures that show no data
+# note of figures that show no data
+DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"
 KEYPOINT = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}  # style of keypoints on a frame
 EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges on a frame
 
 
 def line_style(index):
-    """Return colour and dash of the index-th line of a figure. 28 styles differ; neighbours also differ in dashes."""
+    """Return colour and dash of the index-th line of a figure. 28 styles differ; neighbours
+    also differ in dashes.
+    """
     colors, dashes = (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK), ("-", "--", "-.", ":")
     return {"color": colors[index % len(colors)], "linestyle": dashes[index % len(dashes)]}
 
 
 def label_colors(label_map, frame):
-    """Return a label map in colours, enlarged to the frame's size for display. masks.py enlarges in another way."""
+    """Return a label map in colours, enlarged to the frame's size for display. masks.py
+    enlarges in another way.
+    """
     rows = np.arange(frame.shape[0]) * label_map.shape[0] // frame.shape[0]
     columns = np.arange(frame.shape[1]) * label_map.shape[1] // frame.shape[1]
     return colorize(label_map[np.ix_(rows, columns)])
@@ -54,9 +68,13 @@ def new_figure(rows=1, columns=1, height=3.2, width=PAGE_WIDTH, **options):
 
 
 def frame_panels(frame, rows=1, columns=1, width=PAGE_WIDTH):
-    """Return a figure and a list of its axes, which have the shape of a frame and room for titles."""
+    """Return a figure and a list of its axes, which have the shape of a frame and room for
+    titles.
+    """
     height, length = frame.shape[:2]
-    figure, axes = new_figure(rows, columns, rows * (width / columns * height / length + 0.27), width, squeeze=False)
+    figure, axes = new_figure(
+        rows, columns, rows * (width / columns * height / length + 0.27), width, squeeze=False
+    )
     return figure, list(axes.flat)
 
 
@@ -70,19 +88,20 @@ def show_image(axes, image, title, **options):
 def small_panels(names, xlabel="", figure=None):
     """Return (figure, panels), one small panel for each name, at most four in a row.
 
-    xlabel: label of the lowest panel of each column. figure: a subfigure for the panels, or None for a new figure.
+    xlabel: label of the lowest panel of each column. figure: a subfigure for the panels, or None
+    for a new figure.
     """
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
     figure = figure or plt.figure(figsize=(PAGE_WIDTH, rows * 1.65 + 0.6), layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for panel in panels[len(names):]:
+    for panel in panels[len(names) :]:
         panel.remove()
     for panel, name in zip(panels, names, strict=False):
         panel.set_title(name, fontsize=8, pad=3)
         panel.tick_params(labelsize=7)
         panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    panels = panels[:len(names)]
+    panels = panels[: len(names)]
     for panel in panels[-columns:]:
         panel.set_xlabel(xlabel, fontsize=8)
     return figure, panels
@@ -90,30 +109,45 @@ def small_panels(names, xlabel="", figure=None):
 
 def legend_below(figure, panels, columns):
     """Add a legend below the figure with each label of the panels once."""
-    handles = {label: handle for panel in panels for handle, label in zip(*panel.get_legend_handles_labels())}
+    handles = {
+        label: handle
+        for panel in panels
+        for handle, label in zip(*panel.get_legend_handles_labels())
+    }
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
 def class_legend(figure, *label_maps, also=()):
-    """Add a legend of the classes in label maps below a figure, and make the figure higher. also: further handles."""
+    """Add a legend of the classes in label maps below a figure, and make the figure higher.
+    also: further handles.
+    """
     names = {}  # some Cityscapes labels share a colour
     for index in np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps])):
         names.setdefault(LABELS[index].color, []).append(LABELS[index].name)
-    handles = [Patch(color=np.array(color) / 255, label=", ".join(labels)) for color, labels in names.items()]
+    handles = [
+        Patch(color=np.array(color) / 255, label=", ".join(labels))
+        for color, labels in names.items()
+    ]
     handles += also
     figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * -(-len(handles) // 5))
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
 
 
 def ratio_axis(axis, values):
-    """Make an axis (such as axes.yaxis) logarithmic, with a few round ticks and limits around the positive values."""
+    """Make an axis (such as axes.yaxis) logarithmic, with a few round ticks and limits around
+    the positive values.
+    """
     values = np.asarray(values, float)
     values = values[np.isfinite(values) & (values > 0)]
     low, high = (values.min(), values.max()) if len(values) else (1, 1)
     margin = max((high / low) ** 0.05, 1.1 if high < 1.1 * low else 1)
     low, high = low / margin, high * margin
     # within a factor of five, ticks at equal differences are rounder than ticks at equal ratios
-    locator = MaxNLocator(5) if high < 5 * low else LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,), numticks=6)
+    locator = (
+        MaxNLocator(5)
+        if high < 5 * low
+        else LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,), numticks=6)
+    )
     axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
     axis.set_major_locator(locator)
     axis.set_major_formatter("{x:g}")
@@ -121,7 +155,8 @@ def ratio_axis(axis, values):
 
 
 def save_figure(figure, folder, name, note):
-    """Write folder/name.webp if the figure contains images, else folder/name.svg, with the data note at the foot.
+    """Write folder/name.webp if the figure contains images, else folder/name.svg, with the data
+    note at the foot.
 
     The note is also in the file's metadata.
     """
@@ -133,7 +168,15 @@ def save_figure(figure, folder, name, note):
         legend.borderaxespad = 0
         legend.set_loc("lower left")
         legend.set_bbox_to_anchor((box.x0, box.y0), transform=figure.transFigure)
-    figure.text(0.5, -0.08 / figure.get_figheight(), note, fontsize=6, color="#777777", ha="center", va="top")
+    figure.text(
+        0.5,
+        -0.08 / figure.get_figheight(),
+        note,
+        fontsize=6,
+        color="#777777",
+        ha="center",
+        va="top",
+    )
     if any(axes.images for axes in figure.axes):
         ending, other, note_in_file = ".webp", ".svg", Image.Exif()
         note_in_file[ExifTags.Base.ImageDescription] = note
@@ -142,7 +185,8 @@ def save_figure(figure, folder, name, note):
         ending, other = ".svg", ".webp"
         options = {"metadata": {"Date": None, "Creator": None, "Description": note}}
     write_figure(figure, folder / f"{name}{ending}", **options)
-    (folder / f"{name}{other}").unlink(missing_ok=True)  # an earlier run may have written the other format
+    # an earlier run may have written the other format
+    (folder / f"{name}{other}").unlink(missing_ok=True)
 
 
 def write_figure(figure, path, **options):
@@ -158,7 +202,9 @@ def save_table(table, folder, name, note):
 
 
 def save_all(figures, tables, folder, note):
-    """Write {name: figure} and {name: table}, except empty tables, and return (kind, name) of each written one."""
+    """Write {name: figure} and {name: table}, except empty tables, and return (kind, name) of
+    each written one.
+    """
     tables = {name: table for name, table in tables.items() if len(table)}
     for name, figure in figures.items():
         save_figure(figure, folder, name, note)
@@ -169,9 +215,16 @@ def save_all(figures, tables, folder, note):
 
 
 def markdown(table):
-    """Return a pandas table as Markdown, with numbers aligned to the right and missing values empty."""
+    """Return a pandas table as Markdown, with numbers aligned to the right and missing values
+    empty.
+    """
     numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
     rows = [list(table.columns), ["---:" if right else ":---" for right in numeric]]
-    rows += [["" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value) for value in row]
-             for row in table.itertuples(index=False)]
+    rows += [
+        [
+            "" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value)
+            for value in row
+        ]
+        for row in table.itertuples(index=False)
+    ]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)

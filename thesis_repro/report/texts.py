@@ -1,6 +1,8 @@
-"""Texts made from templates (templates/*.j2). Their conditions depend only on what was run and on the verdicts.
+"""Texts made from templates (templates/*.j2). Their conditions depend only on what was run and on
+the verdicts.
 
-A run, a study with the user's masks and the evidence on real frames share one template for their findings.
+A run, a study with the user's masks and the evidence on real frames share one template for their
+findings.
 """
 
 import json
@@ -19,14 +21,26 @@ from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
 DIGITS = 2  # of a ratio that is not close to 1
-ERRORS = ("rmse_m", "mae_m", "ate_se3_m", "relative_translation_percent", "relative_rotation_deg_per_100m")
-TEMPLATES = Environment(loader=FileSystemLoader(Path(__file__).parent / "templates"),
-                        autoescape=lambda name: ".html" in (name or ""), undefined=StrictUndefined, trim_blocks=True,
-                        lstrip_blocks=True)
+ERRORS = (
+    "rmse_m",
+    "mae_m",
+    "ate_se3_m",
+    "relative_translation_percent",
+    "relative_rotation_deg_per_100m",
+)
+TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    autoescape=lambda name: ".html" in (name or ""),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
 
 
 def render(template, **values):
-    """Return the text of a template in the folder templates. Repeated empty lines in Markdown become one."""
+    """Return the text of a template in the folder templates. Repeated empty lines in Markdown
+    become one.
+    """
     text = TEMPLATES.get_template(template).render(values).strip() + "\n"
     return re.sub(r"\n{3,}", "\n\n", text) if ".md" in template else text
 
@@ -38,15 +52,20 @@ def number(value):
 
 
 def ratio(row):
-    """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high, or only the ratio if low is missing."""
+    """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high, or only the ratio
+    if low is missing.
+    """
     if pd.isna(row["low"]):
         return number(row["ratio"])
-    return f"{number(row['ratio'])} ({compare.LEVEL} % CI {number(row['low'])}-{number(row['high'])})"
+    return (
+        f"{number(row['ratio'])} ({compare.LEVEL} % CI {number(row['low'])}-{number(row['high'])})"
+    )
 
 
 class _Renderer(mistune.HTMLRenderer):
     def heading(self, text, level, **attributes):
-        return super().heading(text, max(4, level + 1), **attributes)  # lower than the headings of the page
+        # lower than the headings of the page
+        return super().heading(text, max(4, level + 1), **attributes)
 
 
 def html(text):
@@ -55,8 +74,12 @@ def html(text):
 
 
 def ratio_and_far_off(row):
-    """Return `ratio` and the sequences far from the others: "3.85 (95 % CI 0.71-80.41), sequence 01 alone 95.20"."""
-    return ratio(row) + "".join(f", sequence {name} alone {number(row[name])}" for name in row["far_off"])
+    """Return `ratio` and the sequences far from the others: "3.85 (95 % CI 0.71-80.41),
+    sequence 01 alone 95.20".
+    """
+    return ratio(row) + "".join(
+        f", sequence {name} alone {number(row[name])}" for name in row["far_off"]
+    )
 
 
 TEMPLATES.filters["ratio"] = ratio_and_far_off
@@ -70,59 +93,107 @@ def findings(runs, table, data, label_maps=()):
     label_maps: the quality of the label maps, rows of `gap.label_map_quality`.
     """
     baseline, masked = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
-    pairs = table[(table["method"] == "masked") & (table["reference"] == "masked")
-                  & table["metric"].isin(compare.JUDGING_METRICS) & (table["source"] < table["reference_source"])
-                  & (table["estimator"] == compare.judging_estimator(table))]  # each pair of sources once
-    sources = [_source_values(runs, table, source) for source in compare.sources(runs) or [""]
-               if (masked["source"] == source).any()]
+    pairs = table[
+        (table["method"] == "masked")
+        & (table["reference"] == "masked")
+        & table["metric"].isin(compare.JUDGING_METRICS)
+        & (table["source"] < table["reference_source"])
+        # each pair of sources once
+        & (table["estimator"] == compare.judging_estimator(table))
+    ]
+    sources = [
+        _source_values(runs, table, source)
+        for source in compare.sources(runs) or [""]
+        if (masked["source"] == source).any()
+    ]
     spread = compare.shuffle_spread(runs).groupby("estimator")["factor"].agg(["median", "max"])
     return render(
-        "findings.md.j2", label_maps=label_maps, data=data,
-        embedded="embedded" in data.split(";")[0], frames=baseline.groupby("sequence")["frames"].first().to_dict(),
-        repetitions=baseline["repetition"].nunique(), spread=spread.reindex(list(ESTIMATORS)).dropna().T.to_dict(),
-        estimators=ESTIMATORS, methods=compare.METHODS, metrics=compare.METRICS, fewest=compare.MIN_SEQUENCES,
-        least=compare.MIN_FOR_INTERVAL, level=compare.LEVEL, far=compare.FAR_OFF, thesis_width=CONTROL_WIDTH,
-        sources=sources, against_each_other=pairs.to_dict("records"))
+        "findings.md.j2",
+        label_maps=label_maps,
+        data=data,
+        embedded="embedded" in data.split(";")[0],
+        frames=baseline.groupby("sequence")["frames"].first().to_dict(),
+        repetitions=baseline["repetition"].nunique(),
+        spread=spread.reindex(list(ESTIMATORS)).dropna().T.to_dict(),
+        estimators=ESTIMATORS,
+        methods=compare.METHODS,
+        metrics=compare.METRICS,
+        fewest=compare.MIN_SEQUENCES,
+        least=compare.MIN_FOR_INTERVAL,
+        level=compare.LEVEL,
+        far=compare.FAR_OFF,
+        thesis_width=CONTROL_WIDTH,
+        sources=sources,
+        against_each_other=pairs.to_dict("records"),
+    )
 
 
 def _source_values(runs, table, source):
     """Return the values of one source of masks for the template."""
     runs, judged = compare.of_source(runs, source), compare.primary_comparison(table, source)
     rows = table[(table["source"] == source) & (table["reference"] == "baseline") & table["tested"]]
-    judging = rows["metric"].isin(compare.JUDGING_METRICS) & (rows["estimator"] == compare.judging_estimator(table))
+    judging = rows["metric"].isin(compare.JUDGING_METRICS) & (
+        rows["estimator"] == compare.judging_estimator(table)
+    )
     controls = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS, source)
-    controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)["verdict"]
+    controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)[
+        "verdict"
+    ]
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     tested, widths = compare.tested_width(runs), masked["dilation_width"].nunique()
-    same_best = thesis_tables.stability(masked, baseline)["same_best"].mean() if widths > 1 else None
-    return {"name": source, "judged": judged.to_dict("records"), "verdict": compare.overall(judged["verdict"]),
-            "width": tested, "masked": rows[rows["method"] == "masked"].to_dict("records"),
-            "corrected": rows[judging & (rows["method"] == "corrected")].to_dict("records"),
-            "controls": controls.agg(compare.overall).to_dict(), "widths": widths,
-            "same_best": None if pd.isna(same_best) else float(same_best)}
+    same_best = (
+        thesis_tables.stability(masked, baseline)["same_best"].mean() if widths > 1 else None
+    )
+    return {
+        "name": source,
+        "judged": judged.to_dict("records"),
+        "verdict": compare.overall(judged["verdict"]),
+        "width": tested,
+        "masked": rows[rows["method"] == "masked"].to_dict("records"),
+        "corrected": rows[judging & (rows["method"] == "corrected")].to_dict("records"),
+        "controls": controls.agg(compare.overall).to_dict(),
+        "widths": widths,
+        "same_best": None if pd.isna(same_best) else float(same_best),
+    }
 
 
 # Records of commands, for JSON and for templates
 
 
 def run_record(result, sequence, alignment):
-    """Return the errors, keypoints, time and flags of an `odometry.Result`. An error that is not determined is None."""
+    """Return the errors, keypoints, time and flags of an `odometry.Result`. An error that is
+    not determined is None.
+    """
     errors = dict.fromkeys(ERRORS)
     if sequence.has_truth:
         values = metrics.errors(result.poses, sequence.poses, alignment).values()
-        errors = {name: None if value != value else value for name, value in zip(ERRORS, values, strict=True)}
+        errors = {
+            name: None if value != value else value
+            for name, value in zip(ERRORS, values, strict=True)
+        }
     detected = result.frames["detected"].dropna()  # empty if no frame has structure
     seconds = result.frames.filter(like="_seconds").sum(axis=1)
-    return {"sequence": sequence.name, "frames": len(sequence), **errors,
-            "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
-            "ms_per_frame": 1000 * float(seconds.mean()),
-            "flagged": {flag: int(count) for flag, count in result.flagged.items()}}
+    return {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        **errors,
+        "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
+        "ms_per_frame": 1000 * float(seconds.mean()),
+        "flagged": {flag: int(count) for flag, count in result.flagged.items()},
+    }
 
 
 def angles_record(rotation, table):
-    """Return `boresight.estimate` (degrees) and the table of `boresight.explained` (metres, degrees) as a dict."""
-    intervals = pd.DataFrame({"degrees": rotation.angles, "low": rotation.low, "high": rotation.high}, boresight.ANGLES)
+    """Return `boresight.estimate` (degrees) and the table of `boresight.explained` (metres,
+    degrees) as a dict.
+    """
+    intervals = pd.DataFrame(
+        {"degrees": rotation.angles, "low": rotation.low, "high": rotation.high}, boresight.ANGLES
+    )
     tables = {"angles": intervals, "sequences": table.set_index("sequence")}
     # to_json writes null for a missing number
-    records = {name: json.loads(table.to_json(orient="index", double_precision=15)) for name, table in tables.items()}
+    records = {
+        name: json.loads(table.to_json(orient="index", double_precision=15))
+        for name, table in tables.items()
+    }
     return {"angles": records["angles"], "steps": rotation.steps, "sequences": records["sequences"]}

@@ -1,4 +1,6 @@
-"""Trajectories compared with the ground truth: a table of their errors and a figure of their paths."""
+"""Trajectories compared with the ground truth: a table of their errors and a figure of their
+paths.
+"""
 
 from contextlib import suppress
 from pathlib import Path
@@ -14,26 +16,41 @@ from thesis_repro.odometry import metrics
 from thesis_repro.report.style import TRUTH, line_style, new_figure
 
 # keys of a row of `evaluate`, and their column names in a table
-COLUMNS = {"rmse_m": "RMSE m", "mae_m": "MAE m", "ate_rmse_m": "ATE m", "ate_max_m": "largest m",
-           "rpe_translation_rmse_m": "RPE m", "rpe_rotation_rmse_deg": "RPE deg", "t_rel_percent": "t_rel %",
-           "r_rel_deg_per_100m": "r_rel deg/100 m", "scale": "scale"}
+COLUMNS = {
+    "rmse_m": "RMSE m",
+    "mae_m": "MAE m",
+    "ate_rmse_m": "ATE m",
+    "ate_max_m": "largest m",
+    "rpe_translation_rmse_m": "RPE m",
+    "rpe_rotation_rmse_deg": "RPE deg",
+    "t_rel_percent": "t_rel %",
+    "r_rel_deg_per_100m": "r_rel deg/100 m",
+    "scale": "scale",
+}
 
 
 def by_sequence(paths, root, sequence=None):
-    """Return the files of trajectories, {sequence: {trajectory: file}}. A trajectory is named by its path.
+    """Return the files of trajectories, {sequence: {trajectory: file}}. A trajectory is named by
+    its path.
 
-    paths: files of one sequence, or folders with a file NN.txt or NN.tum for each sequence with ground truth in a KITTI
-    root. sequence: the only sequence to return, or None for all.
+    paths: files of one sequence, or folders with a file NN.txt or NN.tum for each sequence with
+    ground truth in a KITTI root. sequence: the only sequence to return, or None for all.
     """
     files = {}
     for path in paths:
         path_files = {sequence: path}
         if path.is_dir():
-            names = [sequence] if sequence else [file.stem for file in listed(Path(root or "", "poses"), "*.txt")]
+            names = (
+                [sequence]
+                if sequence
+                else [file.stem for file in listed(Path(root or "", "poses"), "*.txt")]
+            )
             path_files = {file.stem: file for file in listed(path, "*.t*") if file.stem in names}
         if not path_files or None in path_files:
-            raise InputError(f"{path}: name its sequence with --sequence; a folder must contain NN.txt or NN.tum for a "
-                             "sequence with ground truth in --kitti")
+            raise InputError(
+                f"{path}: name its sequence with --sequence; a folder must contain NN.txt or NN.tum for a "
+                "sequence with ground truth in --kitti"
+            )
         for name, file in path_files.items():
             files.setdefault(name, {})[str(path.with_suffix("") if path.is_file() else path)] = file
     return files
@@ -42,50 +59,79 @@ def by_sequence(paths, root, sequence=None):
 def read(file, times, frames=None):
     """Read a trajectory in KITTI's or TUM's format: (indices of its frames (n,), poses (n, 4, 4)).
 
-    times: of the ground truth, seconds. A file in KITTI's format needs one pose for each time; for TUM's format see
-    `read_tum`. frames: how many poses of a file in KITTI's format to use. Raises InputError for any other file.
+    times: of the ground truth, seconds. A file in KITTI's format needs one pose for each time; for
+    TUM's format see `read_tum`. frames: how many poses of a file in KITTI's format to use. Raises
+    InputError for any other file.
     """
-    with suppress(OSError, ValueError), open(file, encoding="utf-8") as lines:  # read_poses reports these errors
+    # read_poses reports these errors
+    with suppress(OSError, ValueError), open(file, encoding="utf-8") as lines:
         if len(next((line for line in lines if not line.startswith("#")), "").split()) == 8:
             return read_tum(file, times)
     poses = read_poses(file)[:frames]
     if len(poses) != len(times):
-        raise InputError(f"{file}: {len(poses)} poses, but the ground truth has {len(times)}; KITTI's format needs one "
-                         "for each frame (TUM's format has times and may leave frames out)")
+        raise InputError(
+            f"{file}: {len(poses)} poses, but the ground truth has {len(times)}; KITTI's format needs one "
+            "for each frame (TUM's format has times and may leave frames out)"
+        )
     return np.arange(len(poses)), poses
 
 
 def evaluate(paths, true, alignment="none", sequence=""):
     """Return the errors of each path, a list of dicts. An error that is not determined is None.
 
-    paths: {name: (frames, poses)} from `read`; true: (n, 4, 4). RMSE and MAE follow the thesis and ignore `alignment`.
-    The other errors are of the path after `metrics.align`. The RPE is from one pose of the path to the next.
+    paths: {name: (frames, poses)} from `read`; true: (n, 4, 4). RMSE and MAE follow the thesis and
+    ignore `alignment`. The other errors are of the path after `metrics.align`. The RPE is from one
+    pose of the path to the next.
     """
     rows, aligned_paths = [], aligned(paths, true, alignment)
     for name, (frames, poses) in paths.items():
         truth = true[frames]
         ate = metrics.ate(poses, truth, alignment)
-        row = {"trajectory": name, "sequence": sequence, "poses": len(poses), "frames": len(true),
-               "alignment": alignment, "rmse_m": metrics.rmse(poses, truth), "mae_m": metrics.mae(poses, truth),
-               "note": ate.pop("note"), "scale": ate.pop("scale"),
-               **{f"ate_{key}_m": value for key, value in ate.items()}}
+        row = {
+            "trajectory": name,
+            "sequence": sequence,
+            "poses": len(poses),
+            "frames": len(true),
+            "alignment": alignment,
+            "rmse_m": metrics.rmse(poses, truth),
+            "mae_m": metrics.mae(poses, truth),
+            "note": ate.pop("note"),
+            "scale": ate.pop("scale"),
+            **{f"ate_{key}_m": value for key, value in ate.items()},
+        }
         if name in aligned_paths:  # else the note of the ATE says why the path cannot be aligned
             rpe = metrics.rpe(aligned_paths[name], truth)
             segments = metrics.kitti_errors(aligned_paths[name], truth)
-            row |= {f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value for key, value in rpe.items()}
-            row |= {"t_rel_percent": segments["translation_percent"], "segments": segments["segments"],
-                    "r_rel_deg_per_100m": segments["rotation_deg_per_100m"], "note": row["note"] or segments["note"]}
+            row |= {
+                f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value
+                for key, value in rpe.items()
+            }
+            row |= {
+                "t_rel_percent": segments["translation_percent"],
+                "segments": segments["segments"],
+                "r_rel_deg_per_100m": segments["rotation_deg_per_100m"],
+                "note": row["note"] or segments["note"],
+            }
         rows.append({key: None if value != value else value for key, value in row.items()})
     return rows
 
 
 def means(rows):
-    """Yield a row like those of `evaluate` with the means of each trajectory that has several sequences."""
+    """Yield a row like those of `evaluate` with the means of each trajectory that has several
+    sequences.
+    """
     for name, errors in pd.DataFrame(rows).groupby("trajectory", sort=False):
         if len(errors) > 1:
-            mean = errors.drop(columns=["poses", "frames", "segments"], errors="ignore").mean(numeric_only=True)
-            yield {"trajectory": name, "sequence": f"mean of {len(errors)}", "poses": int(errors["poses"].sum()),
-                   **mean.to_dict(), "note": ""}
+            mean = errors.drop(columns=["poses", "frames", "segments"], errors="ignore").mean(
+                numeric_only=True
+            )
+            yield {
+                "trajectory": name,
+                "sequence": f"mean of {len(errors)}",
+                "poses": int(errors["poses"].sum()),
+                **mean.to_dict(),
+                "note": "",
+            }
 
 
 def aligned(paths, true, alignment):
@@ -99,7 +145,11 @@ def aligned(paths, true, alignment):
 
 def table(rows, alignment="none"):
     """Return the rows of `evaluate` and `means` as a table for display."""
-    columns = {key: name for key, name in COLUMNS.items() if key != "scale" or alignment in ("sim3", "scale")}
+    columns = {
+        key: name
+        for key, name in COLUMNS.items()
+        if key != "scale" or alignment in ("sim3", "scale")
+    }
     table = pd.DataFrame(rows, columns=["trajectory", "sequence", "poses", *columns])
     return table.astype(dict.fromkeys(columns, float)).rename(columns=columns)
 
@@ -107,8 +157,8 @@ def table(rows, alignment="none"):
 def figure(paths, true, title, frames=None):
     """Draw the paths from above and, if the ground truth is known, their distance from it.
 
-    paths: {name: (n, 4, 4) aligned poses}. true: (n, 4, 4), or None. frames: {name: frame indices of its poses}, or
-    None if every path has a pose for each frame.
+    paths: {name: (n, 4, 4) aligned poses}. true: (n, 4, 4), or None. frames: {name: frame indices
+    of its poses}, or None if every path has a pose for each frame.
     """
     drawing, panels = new_figure(1, 1 if true is None else 2, height=3.4, squeeze=False)
     above, error = panels[0, 0], panels[0, -1]
@@ -119,9 +169,21 @@ def figure(paths, true, title, frames=None):
             distance = np.linalg.norm(poses[:, :3, 3] - true[matched, :3, 3], axis=1)
             error.plot(metrics.travelled(true)[matched], distance, **line_style(index))
     if true is not None:
-        above.plot(true[:, 0, 3], true[:, 2, 3], color=TRUTH, linewidth=2.2, alpha=0.6, label="ground truth", zorder=1)
-        error.set(xlabel="travelled (m)", ylabel="distance from the truth (m)", title="error along the way",
-                  ylim=(0, None))
+        above.plot(
+            true[:, 0, 3],
+            true[:, 2, 3],
+            color=TRUTH,
+            linewidth=2.2,
+            alpha=0.6,
+            label="ground truth",
+            zorder=1,
+        )
+        error.set(
+            xlabel="travelled (m)",
+            ylabel="distance from the truth (m)",
+            title="error along the way",
+            ylim=(0, None),
+        )
     above.set(xlabel="x (m)", ylabel="z (m)", title=f"{title} from above")
     above.set_aspect("equal", adjustable="datalim")
     drawing.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)

@@ -1,4 +1,6 @@
-"""Videos of the odometry: kept and discarded keypoints, tracks, the mask's outline and the path so far."""
+"""Videos of the odometry: kept and discarded keypoints, tracks, the mask's outline and the path
+so far.
+"""
 
 from fractions import Fraction
 
@@ -20,10 +22,12 @@ DPI = 128  # a power of two, so that pixels convert to inches and back without r
 
 
 def draw_frame(frame, step, settings=THESIS, mask=None):
-    """Draw a step of the odometry on its frame (height, width): returns (height, width, 3) blue, green, red.
+    """Draw a step of the odometry on its frame (height, width): returns (height, width, 3) blue,
+    green, red.
 
-    The image shows detected keypoints, keypoints that the mask discards (from a second detection without the mask), the
-    mask's outline, and the tracks: inliers and outliers of the essential matrix.
+    The image shows detected keypoints, keypoints that the mask discards (from a second detection
+    without the mask), the mask's outline, and the tracks: inliers and outliers of the essential
+    matrix.
     """
     image = cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR)
     if mask is not None:
@@ -46,9 +50,11 @@ def _dots(image, points, color):
 
 
 def pictures(sequence, settings=THESIS, masks=None):
-    """Run the odometry over a kitti.Sequence and yield one picture for each frame, (h, w, 3) blue, green, red.
+    """Run the odometry over a kitti.Sequence and yield one picture for each frame, (h, w, 3) blue,
+    green, red.
 
-    The upper part is the frame. The lower part shows the path so far, the ground truth and numbers of the step.
+    The upper part is the frame. The lower part shows the path so far, the ground truth and numbers
+    of the step.
     """
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence))
     height, width = sequence.size
@@ -57,7 +63,8 @@ def pictures(sequence, settings=THESIS, masks=None):
     axes = figure.add_axes((0.08, 0.2, 0.6, 0.75), xlabel="x (m)", ylabel="z (m)")
     axes.set_aspect("equal", adjustable="datalim")
     true, metres, poses = None, scales(sequence), []
-    if sequence.has_truth:  # both paths start at the same point here; for the RMSE they meet at frame 1
+    # both paths start at the same point here; for the RMSE they meet at frame 1
+    if sequence.has_truth:
         true = sequence.poses[:, :3, 3] + odometry.pose[:3, 3] - sequence.poses[0, :3, 3]
         axes.plot(true[:, 0], true[:, 2], color=TRUTH, label="ground truth")
     (path,) = axes.plot([], [], color=BASELINE, label="estimate")
@@ -72,8 +79,10 @@ def pictures(sequence, settings=THESIS, masks=None):
         axes.autoscale_view()
         description.set_text(_describe(step, true, mask is not None))
         canvas.draw()
-        picture = np.vstack([draw_frame(frame, step, settings, mask), np.asarray(canvas.buffer_rgba())[..., 2::-1]])
-        yield picture[:len(picture) // 2 * 2, :width // 2 * 2]  # H.264 needs even sizes
+        picture = np.vstack(
+            [draw_frame(frame, step, settings, mask), np.asarray(canvas.buffer_rgba())[..., 2::-1]]
+        )
+        yield picture[: len(picture) // 2 * 2, : width // 2 * 2]  # H.264 needs even sizes
 
 
 def _describe(step, true, masked):
@@ -95,7 +104,10 @@ def write_video(path, sequence, settings=THESIS, masks=None):
     import av  # slow to import, because it loads FFmpeg's libraries
 
     rate = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 1 / FRAME_TIME
-    with atomic(path) as temporary, av.open(str(temporary), "w", options={"movflags": "+faststart"}) as video:
+    with (
+        atomic(path) as temporary,
+        av.open(str(temporary), "w", options={"movflags": "+faststart"}) as video,
+    ):
         stream = video.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
         stream.pix_fmt = "yuv420p"  # every browser can play this format
         for picture in pictures(sequence, settings, masks):

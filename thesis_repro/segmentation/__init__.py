@@ -1,13 +1,17 @@
-"""Semantic segmentation (appendix A.3 to A.7): augmentation, the U-Net, its training, label maps and their quality."""
+"""Semantic segmentation (appendix A.3 to A.7): augmentation, the U-Net, its training, label
+maps and their quality.
+"""
 
 import os
 import sys
 from contextlib import contextmanager
 
-# Variables that libraries read when they are imported, or at TensorFlow's first operation. Values of the user are kept.
+# Variables that libraries read when they are imported, or at TensorFlow's first operation. Values
+# of the user are kept.
 for _name, _value in {
-    # TensorFlow splits sums among its threads, so the rounding depends on their number. A fixed number gives the same
-    # bits on any number of cores. More threads than cores cost little; fewer would leave cores of large machines idle.
+    # TensorFlow splits sums among its threads, so the rounding depends on their number. A fixed
+    # number gives the same bits on any number of cores. More threads than cores cost little; fewer
+    # would leave cores of large machines idle.
     "TF_NUM_INTRAOP_THREADS": "8",
     "TF_CPP_MIN_LOG_LEVEL": "3",  # errors of TensorFlow are Python exceptions as well
     "TF_FORCE_GPU_ALLOW_GROWTH": "true",  # do not take all memory of a GPU at the start
@@ -21,7 +25,8 @@ GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WS
 
 @contextmanager
 def quietly():
-    """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level; errors are raised.
+    """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level;
+    errors are raised.
 
     The message that there is no GPU is hidden too.
     """

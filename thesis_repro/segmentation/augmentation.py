@@ -7,7 +7,8 @@ import numpy as np
 
 from thesis_repro.files import progress
 
-NOTHING = 255  # a pixel without a class: one-hot encoding gives zeros, like the border in the appendix
+# a pixel without a class: one-hot encoding gives zeros, like the border in the appendix
+NOTHING = 255
 
 # The library's default noise at the time of the thesis: a variance of 10 to 50 grey levels squared.
 # Today's default is about ten times as strong.
@@ -17,14 +18,22 @@ NOISE_STD = (10**0.5 / 255, 50**0.5 / 255)
 def transform_list(size, fill_mask=NOTHING):
     """Return the transforms of A.3 for images of size x size, for `albumentations.Compose`.
 
-    The appendix transforms one-hot masks of 35 float channels. All transforms resample masks by nearest neighbour, so
-    integer label maps give the same labels with one byte a pixel instead of 140. `fill_mask` is the value of pixels
-    from outside the image: NOTHING in label maps, 0 in one-hot masks.
+    The appendix transforms one-hot masks of 35 float channels. All transforms resample masks by
+    nearest neighbour, so integer label maps give the same labels with one byte a pixel instead of
+    140. `fill_mask` is the value of pixels from outside the image: NOTHING in label maps, 0 in
+    one-hot masks.
     """
     with warnings.catch_warnings(action="ignore", category=UserWarning):
         # the library warns that this transform, which the thesis uses, is now called Affine
-        shift_and_scale = A.ShiftScaleRotate(scale_limit=0.5, rotate_limit=0, shift_limit=0.1, p=1, border_mode=0,
-                                             fill=0, fill_mask=fill_mask)
+        shift_and_scale = A.ShiftScaleRotate(
+            scale_limit=0.5,
+            rotate_limit=0,
+            shift_limit=0.1,
+            p=1,
+            border_mode=0,
+            fill=0,
+            fill_mask=fill_mask,
+        )
     return [
         A.HorizontalFlip(p=0.5),
         shift_and_scale,
@@ -32,21 +41,30 @@ def transform_list(size, fill_mask=NOTHING):
         A.RandomCrop(height=size, width=size),
         A.GaussNoise(std_range=NOISE_STD, p=0.2),
         A.Perspective(p=0.5, fill=0, fill_mask=fill_mask),
-        A.OneOf([
-            A.CLAHE(p=1),
-            A.RandomBrightnessContrast(brightness_limit=0.2, contrast_limit=0, p=1),  # the former RandomBrightness
-            A.RandomGamma(p=1),
-        ], p=0.9),
-        A.OneOf([
-            A.Sharpen(p=1),
-            A.Blur(blur_limit=3, p=1),
-            A.MotionBlur(blur_limit=3, p=1),
-        ], p=0.9),
+        A.OneOf(
+            [
+                A.CLAHE(p=1),
+                # the former RandomBrightness
+                A.RandomBrightnessContrast(brightness_limit=0.2, contrast_limit=0, p=1),
+                A.RandomGamma(p=1),
+            ],
+            p=0.9,
+        ),
+        A.OneOf(
+            [
+                A.Sharpen(p=1),
+                A.Blur(blur_limit=3, p=1),
+                A.MotionBlur(blur_limit=3, p=1),
+            ],
+            p=0.9,
+        ),
     ]
 
 
 class Augmenter:
-    """Transforms whose result depends only on the image and the seed. Use one Augmenter a thread."""
+    """Transforms whose result depends only on the image and the seed. Use one Augmenter a
+    thread.
+    """
 
     def __init__(self, transforms):
         """transforms: a list of transforms or an `albumentations.Compose`."""
@@ -57,11 +75,14 @@ class Augmenter:
         return A.to_dict(self._compose)
 
     def __call__(self, image, label, seed):
-        """Augment one image (height, width[, channels]) uint8 and its label map (height, width) uint8."""
+        """Augment one image (height, width[, channels]) uint8 and its label map (height, width)
+        uint8.
+        """
         self._compose.set_random_seed(int(seed))
         result = self._compose(image=image, mask=label)
         label = result["mask"]
-        return result["image"].reshape(label.shape[:2] + image.shape[2:]), label  # some drop a single channel
+        # some drop a single channel
+        return result["image"].reshape(label.shape[:2] + image.shape[2:]), label
 
 
 def training_augmenter(size):
@@ -72,21 +93,24 @@ def training_augmenter(size):
 def validation_augmenter():
     """Return the augmenter of the validation set: only a blur, by a mistake in the appendix.
 
-    Between the two sets, A.3 draws Figure 3.1, which leaves `transform` set to the last one drawn, the blur.
-    Section 3.5.1 means `training_augmenter`.
+    Between the two sets, A.3 draws Figure 3.1, which leaves `transform` set to the last one drawn,
+    the blur. Section 3.5.1 means `training_augmenter`.
     """
     return Augmenter([A.Blur(blur_limit=3, p=1)])
 
 
 def augment_set(images, labels, augmenter, seed):
-    """Augment every image of a set once (A.3): images (n, size, size, channels) and labels (n, size, size), uint8.
+    """Augment every image of a set once (A.3): images (n, size, size, channels) and labels (n,
+    size, size), uint8.
 
-    Returns new arrays of the same shapes. Each image has a seed that depends only on `seed` and its index.
+    Returns new arrays of the same shapes. Each image has a seed that depends only on `seed` and its
+    index.
     """
     augmented_images, augmented_labels = np.empty_like(images), np.empty_like(labels)
     for index in progress(range(len(images)), "augmenting", unit="image"):
         augmented_images[index], augmented_labels[index] = augmenter(
-            images[index], labels[index], image_seed(seed, index))
+            images[index], labels[index], image_seed(seed, index)
+        )
     return augmented_images, augmented_labels
 
 
@@ -96,5 +120,7 @@ def image_seed(seed, index, epoch=0):
 
 
 def one_hot(label_maps, n_classes):
-    """Return label maps (..., height, width) one-hot encoded, float32 (..., n_classes); NOTHING becomes zeros."""
+    """Return label maps (..., height, width) one-hot encoded, float32 (..., n_classes); NOTHING
+    becomes zeros.
+    """
     return (label_maps[..., None] == np.arange(n_classes, dtype=np.uint8)).astype(np.float32)

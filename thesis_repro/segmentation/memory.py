@@ -1,7 +1,7 @@
 """Memory for training: a check that a batch fits, and a setting of the C library for freed memory.
 
-The system kills a process that runs out of memory without a message, so memory is checked before the training starts.
-On a GPU, TensorFlow itself reports a batch that does not fit.
+The system kills a process that runs out of memory without a message, so memory is checked before
+the training starts. On a GPU, TensorFlow itself reports a batch that does not fit.
 """
 
 import ctypes
@@ -15,17 +15,20 @@ import tensorflow as tf
 from thesis_repro import InputError
 
 FLOAT = 4  # bytes
-GRADIENTS = 1.4  # peak memory over the sum of all outputs; 1.5 to 1.9 were measured on U-Nets of 16 to 64 filters
+# peak memory over the sum of all outputs; 1.5 to 1.9 were measured on U-Nets of 16 to 64 filters
+GRADIENTS = 1.4
 CGROUP = Path("/sys/fs/cgroup")  # a container's memory limit and use, which psutil does not read
 # glibc's M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD, and their values in `keep_freed`
 MALLOC_OPTIONS = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 2**28}
 
 
 def keep_freed():
-    """Make the C library keep freed memory for the next batch instead of returning it to the system.
+    """Make the C library keep freed memory for the next batch instead of returning it to the
+    system.
 
-    On a CPU, TensorFlow allocates every tensor anew. By default glibc requests each large one from the system, which
-    fills it with zeros; that takes half the time of a training step. Without glibc, this function does nothing.
+    On a CPU, TensorFlow allocates every tensor anew. By default glibc requests each large one from
+    the system, which fills it with zeros; that takes half the time of a training step. Without
+    glibc, this function does nothing.
     """
     with suppress(AttributeError, OSError, TypeError):  # macOS, Windows
         for option, value in MALLOC_OPTIONS.items():
@@ -33,7 +36,9 @@ def keep_freed():
 
 
 def available():
-    """Return the bytes that this process can still allocate, on the machine or within its container's limit."""
+    """Return the bytes that this process can still allocate, on the machine or within its
+    container's limit.
+    """
     free = psutil.virtual_memory().available
     with suppress(OSError, ValueError):  # no cgroup files, or "max", which means no limit
         limit, used = (int((CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
@@ -42,8 +47,12 @@ def available():
 
 
 def needed(model, batch_size):
-    """Return the least bytes that a training step takes: the outputs of all layers, and some of their gradients."""
-    values = sum(math.prod(size for size in layer.output.shape[1:] if size) for layer in model.layers)
+    """Return the least bytes that a training step takes: the outputs of all layers, and some of
+    their gradients.
+    """
+    values = sum(
+        math.prod(size for size in layer.output.shape[1:] if size) for layer in model.layers
+    )
     return int(GRADIENTS * batch_size * FLOAT * values)
 
 
@@ -51,5 +60,7 @@ def require(model, batch_size):
     """Raise InputError if a training batch cannot fit into the available memory."""
     need, room = needed(model, batch_size), available()
     if need > room and not tf.config.list_physical_devices("GPU"):
-        raise InputError(f"batch_size={batch_size}: takes at least {need / 2**30:.1f} GiB of memory and "
-                         f"{room / 2**30:.1f} GiB are free; lower the batch size")
+        raise InputError(
+            f"batch_size={batch_size}: takes at least {need / 2**30:.1f} GiB of memory and "
+            f"{room / 2**30:.1f} GiB are free; lower the batch size"
+        )

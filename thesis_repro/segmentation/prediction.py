@@ -17,40 +17,49 @@ from thesis_repro.segmentation import memory, training
 
 SIZE = 320  # height and width of written label maps, pixels
 SHIPPED = Path(__file__).parent / "weights" / "streets.keras"
-CALL = 4  # images in one call of the network on a CPU; the activations of more images do not fit in its cache
-PART = 256  # images in one task of a worker, in whole batches: minutes for the thesis's network on two cores
+# images in one call of the network on a CPU; the activations of more images do not fit in its cache
+CALL = 4
+# images in one task of a worker, in whole batches: minutes for the thesis's network on two cores
+PART = 256
 
 
 def load_shipped():
-    """Return the model in the package, for users without a trained model; weights/README.md describes it."""
+    """Return the model in the package, for users without a trained model; weights/README.md
+    describes it.
+    """
     return training.load_model(SHIPPED)
 
 
 def predict(model, images, batch_size=16):
-    """Return label maps (n, size, size) uint8 for images (n, size, size, channels) uint8 of the model's input size.
+    """Return label maps (n, size, size) uint8 for images (n, size, size, channels) uint8 of the
+    model's input size.
 
     The class of a pixel is the most probable one. Raises InputError for images of another shape.
     """
     if images.shape[1:] != model.input_shape[1:]:
-        raise InputError(f"images of {images.shape[1:]}: the model takes {model.input_shape[1:]}; resize them first")
+        raise InputError(
+            f"images of {images.shape[1:]}: the model takes {model.input_shape[1:]}; resize them first"
+        )
     run = _compiled(model)
     labels = np.empty(images.shape[:3], np.uint8)
     for start in files.progress(range(0, len(images), batch_size), "predicting", unit="batch"):
-        labels[start:start + batch_size] = run(images[start:start + batch_size])
+        labels[start : start + batch_size] = run(images[start : start + batch_size])
     return labels
 
 
 def write_label_maps(model, paths, output_dir, batch_size=16):
-    """Write the label map of each image as output_dir/NAME.png: 320x320, 8 bit, Cityscapes ids (A.7.2).
+    """Write the label map of each image as output_dir/NAME.png: 320x320, 8 bit, Cityscapes ids
+    (A.7.2).
 
-    Images of any size are stretched to the model's input, as in the appendix. Decoding and writing run in parallel with
-    the network. A killed run resumes: complete batches are skipped, and of an incomplete batch all images are predicted
-    again, because the bits depend on the batch, but only missing files are written.
-    The folder is a stage (see stages): label maps of another model or of other images in it are deleted.
+    Images of any size are stretched to the model's input, as in the appendix. Decoding and writing
+    run in parallel with the network. A killed run resumes: complete batches are skipped, and of an
+    incomplete batch all images are predicted again, because the bits depend on the batch, but only
+    missing files are written. The folder is a stage (see stages): label maps of another model or of
+    other images in it are deleted.
 
     Returns the number of images predicted.
-    Raises InputError for an unreadable image, two images of one name, and a folder that holds files of the user or is
-    in use by another run.
+    Raises InputError for an unreadable image, two images of one name, and a folder that holds files
+    of the user or is in use by another run.
     """
     with longrun.claimed(output_dir):
         batches = _open(training.weights_digest(model), paths, output_dir, batch_size)
@@ -61,26 +70,40 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
 
 
 def _open(weights, paths, output_dir, batch_size):
-    """Make the folder of label maps a stage; return its incomplete batches of (image, label map) paths."""
+    """Make the folder of label maps a stage; return its incomplete batches of (image, label
+    map) paths.
+    """
     paths, output_dir = [Path(path).absolute() for path in paths], Path(output_dir).absolute()
     targets = [output_dir / f"{path.stem}.png" for path in paths]
     if len(set(targets)) < len(targets):
-        raise InputError(f"{paths[0].parent}: two images share a name, so their label maps would; rename one")
+        raise InputError(
+            f"{paths[0].parent}: two images share a name, so their label maps would; rename one"
+        )
     # The network's arithmetic may round differently for another batch size.
-    stages.stage(output_dir, model=weights, frames=stages.listing(paths), batch_size=batch_size, **_arithmetic())
+    stages.stage(
+        output_dir,
+        model=weights,
+        frames=stages.listing(paths),
+        batch_size=batch_size,
+        **_arithmetic(),
+    )
     pairs = list(zip(paths, targets))
-    batches = [pairs[start:start + batch_size] for start in range(0, len(pairs), batch_size)]
+    batches = [pairs[start : start + batch_size] for start in range(0, len(pairs), batch_size)]
     return [batch for batch in batches if not all(files.is_whole(target) for _, target in batch)]
 
 
 def _arithmetic():
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
     return stages.made_with("tensorflow", "keras", "opencv-python-headless") | {
-        "code": stages.code("segmentation/prediction")}
+        "code": stages.code("segmentation/prediction")
+    }
 
 
 def _write_batches(model, batches, done):
-    """Predict and write batches of (image, label map) paths; done: called with the length of each written batch."""
+    """Predict and write batches of (image, label map) paths; done: called with the length of
+    each written batch.
+    """
+
     def decode(batch):
         return np.stack([read_image(path, *model.input_shape[1:]) for path, _ in batch])
 
@@ -104,21 +127,26 @@ def _write(batch):
     pairs, labels = batch
     for (_, target), label_map in zip(pairs, labels, strict=True):
         if not files.is_whole(target):  # an existing file may have been corrected by hand
-            files.write_png(target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST))
+            files.write_png(
+                target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
+            )
     return len(pairs)
 
 
 def spread_label_maps(run, model_files, sequences, batch_size=16):
-    """Write the label maps of many sequences on many workers; processors of one kind give `write_label_maps`' bits.
+    """Write the label maps of many sequences on many workers; processors of one kind give
+    `write_label_maps`' bits.
 
-    run: function of (function, list of argument tuples), like `run` of the pools in `study.cluster`. It calls the
-    function on the workers and yields (index, returned value or reason why the worker was lost).
+    run: function of (function, list of argument tuples), like `run` of the pools in
+    `study.cluster`. It calls the function on the workers and yields (index, returned value or
+    reason why the worker was lost).
     model_files: files of one model, or of several for the mean of their probabilities (`ensemble`).
     sequences: list of (image paths, folder).
     Workers need this package and must see all files under the same paths. A stopped run resumes.
 
     Returns the number of images predicted.
-    Raises InputError in the cases of `write_label_maps`, after all other label maps have been written.
+    Raises InputError in the cases of `write_label_maps`, after all other label maps have been
+    written.
     """
     model_files = tuple(str(Path(path).absolute()) for path in model_files)
     weights, calls, missing, failures = training.weights_digest(load(model_files)), [], 0, []
@@ -128,8 +156,15 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
             held.enter_context(longrun.claimed(folder))
             batches = _open(weights, paths, folder, batch_size)
             missing += sum(map(len, batches))
-            calls += [(model_files, Path(folder).absolute(), stages.record(folder), batches[start:start + step])
-                      for start in range(0, len(batches), step)]
+            calls += [
+                (
+                    model_files,
+                    Path(folder).absolute(),
+                    stages.record(folder),
+                    batches[start : start + step],
+                )
+                for start in range(0, len(batches), step)
+            ]
         bar = held.enter_context(files.progress(None, "label maps", total, initial=total - missing))
         for index, failed in run(_write_part, calls):
             if failed:
@@ -137,30 +172,38 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
             else:
                 bar.update(sum(map(len, calls[index][-1])))
     if failures:
-        raise InputError(f"{len(failures)} of {len(calls)} parts of the label maps failed; the first: {failures[0]}")
+        raise InputError(
+            f"{len(failures)} of {len(calls)} parts of the label maps failed; the first: {failures[0]}"
+        )
     return missing
 
 
 @lru_cache(maxsize=1)
 def load(model_files):
-    """Return the model of one file, or the ensemble of several; model_files: tuple of paths. The result is cached.
+    """Return the model of one file, or the ensemble of several; model_files: tuple of paths. The
+    result is cached.
 
     Raises InputError for models of different input shapes.
     """
     models = [training.load_model(path) for path in model_files]
     for path, model in zip(model_files, models):
         if model.input_shape != models[0].input_shape:
-            raise InputError(f"{path}: takes images of {model.input_shape[1:]}, {model_files[0]} of "
-                             f"{models[0].input_shape[1:]}; an ensemble needs models of one input size")
+            raise InputError(
+                f"{path}: takes images of {model.input_shape[1:]}, {model_files[0]} of "
+                f"{models[0].input_shape[1:]}; an ensemble needs models of one input size"
+            )
     return models[0] if len(models) == 1 else ensemble(models)
 
 
 def ensemble(models):
-    """Return one model whose probabilities are the mean of those of several models with the same shapes."""
+    """Return one model whose probabilities are the mean of those of several models with the
+    same shapes.
+    """
     inputs = keras.Input(models[0].input_shape[1:])
     outputs = []
     for number, model in enumerate(models):
-        # copied, because names must be unique even if a model is given twice; the loss cannot be copied
+        # copied, because names must be unique even if a model is given twice; the loss cannot be
+        # copied
         member = keras.models.clone_model(keras.Model(model.input, model.output))
         member.set_weights(model.get_weights())
         member.name = f"member_{number}"
@@ -169,7 +212,9 @@ def ensemble(models):
 
 
 def _write_part(model_files, folder, record, batches):
-    """Write some batches of a sequence, here or on another machine; return the reason of a failure, or None."""
+    """Write some batches of a sequence, here or on another machine; return the reason of a
+    failure, or None.
+    """
     try:
         stages.check_worker(folder, record)
         model = load(model_files)
@@ -182,10 +227,11 @@ def _write_part(model_files, folder, record, batches):
 
 @lru_cache(maxsize=4)
 def _compiled(model):
-    """Return a function from uint8 images to uint8 label maps, with the bits of `model.predict` and argmax.
+    """Return a function from uint8 images to uint8 label maps, with the bits of `model.predict` and
+    argmax.
 
-    For small networks `model.predict` takes two to four times as long, because every call has a set-up and returns 35
-    probabilities a pixel.
+    For small networks `model.predict` takes two to four times as long, because every call has a
+    set-up and returns 35 probabilities a pixel.
     """
     memory.keep_freed()
     signature = tf.TensorSpec((None, *model.input_shape[1:]), tf.uint8)
@@ -197,6 +243,8 @@ def _compiled(model):
 
     def run(images):
         step = len(images) if tf.config.list_physical_devices("GPU") else CALL
-        return np.concatenate([call(images[start:start + step]).numpy() for start in range(0, len(images), step)])
+        return np.concatenate(
+            [call(images[start : start + step]).numpy() for start in range(0, len(images), step)]
+        )
 
     return run

@@ -1,4 +1,6 @@
-"""Quality of a model on a set of images: the scores of segmentation-models and those of the Cityscapes benchmark."""
+"""Quality of a model on a set of images: the scores of segmentation-models and those of the
+Cityscapes benchmark.
+"""
 
 from dataclasses import dataclass
 
@@ -18,16 +20,19 @@ EVALUATED = (7, 8, 11, 12, 13, 17, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 31, 3
 class Quality:
     """Scores of a model on a set of images."""
 
-    iou_score: float  # segmentation-models: mean over 35 classes (absent ones score 1), then over batches as in Keras
+    # segmentation-models: mean over 35 classes (absent ones score 1), then over batches as in Keras
+    iou_score: float
     f1_score: float  # the same for F1
-    mean_iou: float  # Cityscapes: from one confusion matrix over the set, mean over the classes present
+    # Cityscapes: from one confusion matrix over the set, mean over the classes present
+    mean_iou: float
     accuracy: float  # share of evaluated pixels with the right class
     classes: pd.DataFrame  # a row for each class present: id, pixels, iou, precision, recall
     confusion: np.ndarray  # (35, 35) pixels: true class, predicted class
 
 
 def quality(model, images, labels, batch_size=16):
-    """Measure a model on images (n, size, size, channels) and true label maps (n, size, size), both uint8.
+    """Measure a model on images (n, size, size, channels) and true label maps (n, size, size), both
+    uint8.
 
     Only the scores of segmentation-models depend on the batch size (Sections 3.3 and 4.1).
     Raises InputError for an empty set, and for shapes that do not fit the model.
@@ -35,8 +40,10 @@ def quality(model, images, labels, batch_size=16):
     if len(images) == 0:
         raise InputError("quality: an empty set; it needs at least one image with its label map")
     if images.shape[1:] != model.input_shape[1:] or images.shape[:3] != labels.shape:
-        raise InputError(f"quality: images {images.shape} and label maps {labels.shape}; the model takes "
-                         f"{model.input_shape[1:]} and one label map for each image")
+        raise InputError(
+            f"quality: images {images.shape} and label maps {labels.shape}; the model takes "
+            f"{model.input_shape[1:]} and one label map for each image"
+        )
     scores = training.metrics()
 
     @tf.function(reduce_retracing=True)
@@ -48,8 +55,8 @@ def quality(model, images, labels, batch_size=16):
 
     batch_scores, confusion = [], np.zeros((N_CLASSES, N_CLASSES), np.int64)
     for start in files.progress(range(0, len(images), batch_size), "measuring", unit="batch"):
-        true = labels[start:start + batch_size]
-        values, predicted = run(images[start:start + batch_size], true)
+        true = labels[start : start + batch_size]
+        values, predicted = run(images[start : start + batch_size], true)
         batch_scores.append([float(value) for value in values])
         confusion += confusion_matrix(true, predicted.numpy())
     mean_iou, accuracy, classes = cityscapes_scores(confusion)
@@ -57,17 +64,21 @@ def quality(model, images, labels, batch_size=16):
 
 
 def confusion_matrix(true, predicted):
-    """Return pixel counts by true class (rows) and predicted class (columns); pixels without a class do not count."""
+    """Return pixel counts by true class (rows) and predicted class (columns); pixels without a
+    class do not count.
+    """
     known = true < N_CLASSES
     pairs = true[known].astype(np.int64) * N_CLASSES + predicted[known]
     return np.bincount(pairs, minlength=N_CLASSES**2).reshape(N_CLASSES, N_CLASSES)
 
 
 def cityscapes_scores(confusion):
-    """Return mean IoU, pixel accuracy and a table by class, as the Cityscapes benchmark defines them.
+    """Return mean IoU, pixel accuracy and a table by class, as the Cityscapes benchmark defines
+    them.
 
-    Pixels whose true class is not evaluated are ignored. The mean is over the evaluated classes in the true label maps.
-    A pixel that is wrongly given a class that is not evaluated is an error of its true class.
+    Pixels whose true class is not evaluated are ignored. The mean is over the evaluated classes in
+    the true label maps. A pixel that is wrongly given a class that is not evaluated is an error of
+    its true class.
     Raises InputError if no pixel is evaluated.
     """
     evaluated = np.zeros_like(confusion)
@@ -75,9 +86,17 @@ def cityscapes_scores(confusion):
     right, true, predicted = np.diag(evaluated), evaluated.sum(1), evaluated.sum(0)
     present = np.flatnonzero(true)
     if not len(present):
-        raise InputError("quality: no pixel of a class that Cityscapes evaluates; are the label maps Cityscapes ids?")
-    table = pd.DataFrame({
-        "id": present, "pixels": true[present], "iou": right[present] / (true + predicted - right)[present],
-        "precision": right[present] / np.maximum(predicted[present], 1), "recall": right[present] / true[present],
-    }, index=pd.Index([LABELS[number].name for number in present], name="class"))
+        raise InputError(
+            "quality: no pixel of a class that Cityscapes evaluates; are the label maps Cityscapes ids?"
+        )
+    table = pd.DataFrame(
+        {
+            "id": present,
+            "pixels": true[present],
+            "iou": right[present] / (true + predicted - right)[present],
+            "precision": right[present] / np.maximum(predicted[present], 1),
+            "recall": right[present] / true[present],
+        },
+        index=pd.Index([LABELS[number].name for number in present], name="class"),
+    )
     return float(table["iou"].mean()), float(right.sum() / true.sum()), table

@@ -1,4 +1,6 @@
-"""Loss, metrics and input batches of the training (A.5), and the checkpoints that let a stopped training resume."""
+"""Loss, metrics and input batches of the training (A.5), and the checkpoints that let a stopped
+training resume.
+"""
 
 import io
 import json
@@ -31,9 +33,11 @@ def total_loss():
 def fused_loss(loss):
     """Return the same loss (true masks, probabilities), compiled together with its gradient.
 
-    The library's loss has many operations, and each reads and writes 35 values a pixel. The compiled loss reads and
-    writes them once, which saves time on a CPU; its sums round differently. On a GPU it is not compiled.
+    The library's loss has many operations, and each reads and writes 35 values a pixel. The
+    compiled loss reads and writes them once, which saves time on a CPU; its sums round differently.
+    On a GPU it is not compiled.
     """
+
     @tf.function(jit_compile=not tf.config.list_physical_devices("GPU"))
     def value_and_gradient(true, predicted):
         with tf.GradientTape() as tape:
@@ -46,17 +50,22 @@ def fused_loss(loss):
         value, gradient = value_and_gradient(true, predicted)
         return value, lambda upstream: (None, upstream * gradient)
 
-    compiled.__name__ = getattr(loss, "__name__", None) or loss.name  # the library's losses and Keras' own
+    # the library's losses and Keras' own
+    compiled.__name__ = getattr(loss, "__name__", None) or loss.name
     return compiled
 
 
 def metrics():
-    """Return the library's IoU and F1 scores: means over all 35 classes of a batch; absent classes score 1."""
+    """Return the library's IoU and F1 scores: means over all 35 classes of a batch; absent
+    classes score 1.
+    """
     return [sm.metrics.IOUScore(threshold=0.5), sm.metrics.FScore(threshold=0.5)]
 
 
 def strategy():
-    """Return a `tf.distribute` strategy that shares each batch between all GPUs, or the default one."""
+    """Return a `tf.distribute` strategy that shares each batch between all GPUs, or the default
+    one.
+    """
     several = len(tf.config.list_logical_devices("GPU")) > 1
     return tf.distribute.MirroredStrategy() if several else tf.distribute.get_strategy()
 
@@ -64,27 +73,38 @@ def strategy():
 class Batches:
     """The input of the network: every epoch shows each image of the sets once.
 
-    Images (n, size, size, channels) and label maps (n, size, size) stay uint8. They become floats and one-hot masks
-    only in their batch, so 5950 images of 320x320 take 1.3 GB instead of 85 GB. Unlike a `tf.data` shuffle, the order
-    depends only on (seed, epoch), so a resumed training sees the same batches.
+    Images (n, size, size, channels) and label maps (n, size, size) stay uint8. They become floats
+    and one-hot masks only in their batch, so 5950 images of 320x320 take 1.3 GB instead of 85 GB.
+    Unlike a `tf.data` shuffle, the order depends only on (seed, epoch), so a resumed training sees
+    the same batches.
     """
 
     def __init__(self, sets, batch_size, seed=None, augmenter=None):
         """sets: (images, label maps) pairs; seed: None keeps their order.
 
-        augmenter: if given, every epoch augments the first set again and uses the result instead of the second set.
-        Raises InputError for an empty set, images and label maps that do not match, and unknown label ids.
+        augmenter: if given, every epoch augments the first set again and uses the result instead of
+        the second set.
+        Raises InputError for an empty set, images and label maps that do not match, and unknown
+        label ids.
         """
         for images, labels in sets:
             if len(images) == 0 or images.ndim != 4 or images.shape[:3] != labels.shape:
-                raise InputError(f"images {images.shape} and label maps {labels.shape}; expected (n, size, size, "
-                                 "channels) and (n, size, size), n at least 1")
+                raise InputError(
+                    f"images {images.shape} and label maps {labels.shape}; expected (n, size, size, "
+                    "channels) and (n, size, size), n at least 1"
+                )
             highest = labels[labels != augmentation.NOTHING].max(initial=0)
             if highest >= N_CLASSES:
-                raise InputError(f"label id {highest} is above {N_CLASSES - 1}; label maps must hold Cityscapes ids")
+                raise InputError(
+                    f"label id {highest} is above {N_CLASSES - 1}; label maps must hold Cityscapes ids"
+                )
         self.sets, self.batch_size, self.seed, self.augmenter = sets, batch_size, seed, augmenter
         self.epoch = 0
-        self._places = [(number, index) for number, (images, _) in enumerate(sets) for index in range(len(images))]
+        self._places = [
+            (number, index)
+            for number, (images, _) in enumerate(sets)
+            for index in range(len(images))
+        ]
 
     def __len__(self):
         return -(-len(self._places) // self.batch_size)
@@ -95,30 +115,45 @@ class Batches:
         if self.seed is not None:
             order = np.random.default_rng((self.seed, epoch)).permutation(len(order))
         for start in range(0, len(order), self.batch_size):
-            pairs = [self._pair(*self._places[place], epoch) for place in order[start:start + self.batch_size]]
+            pairs = [
+                self._pair(*self._places[place], epoch)
+                for place in order[start : start + self.batch_size]
+            ]
             yield tuple(map(np.stack, zip(*pairs)))
 
     def _pair(self, number, index, epoch):
         if number and self.augmenter:
             images, labels = self.sets[0]
-            return self.augmenter(images[index], labels[index], augmentation.image_seed(self.seed, index, epoch))
+            return self.augmenter(
+                images[index], labels[index], augmentation.image_seed(self.seed, index, epoch)
+            )
         return tuple(array[index] for array in self.sets[number])
 
     def dataset(self):
-        """Return the batches as a `tf.data.Dataset` of float images and one-hot masks, prefetched during training."""
+        """Return the batches as a `tf.data.Dataset` of float images and one-hot masks,
+        prefetched during training.
+        """
         shape = self.sets[0][0].shape[1:]
-        signature = (tf.TensorSpec((None, *shape), tf.uint8), tf.TensorSpec((None, *shape[:2]), tf.uint8))
-        batches = tf.data.Dataset.from_generator(lambda: iter(self), output_signature=signature).prefetch(2)
+        signature = (
+            tf.TensorSpec((None, *shape), tf.uint8),
+            tf.TensorSpec((None, *shape[:2]), tf.uint8),
+        )
+        batches = tf.data.Dataset.from_generator(
+            lambda: iter(self), output_signature=signature
+        ).prefetch(2)
         # grey levels stay 0 to 255, because the appendix imports `normalize` but never calls it
-        batches = batches.map(lambda images, labels: (tf.cast(images, tf.float32), tf.one_hot(labels, N_CLASSES)))
+        batches = batches.map(
+            lambda images, labels: (tf.cast(images, tf.float32), tf.one_hot(labels, N_CLASSES))
+        )
         return batches.apply(tf.data.experimental.assert_cardinality(len(self)))
 
 
 def made_from(model, batches, validation):
-    """Return everything that the training of a compiled model on Batches depends on, for its stage (JSON values).
+    """Return everything that the training of a compiled model on Batches depends on, for its stage
+    (JSON values).
 
-    The number of epochs is not part of it, because a longer training begins like a shorter one. The loss is described
-    by its value for a made-up batch.
+    The number of epochs is not part of it, because a longer training begins like a shorter one. The
+    loss is described by its value for a made-up batch.
     """
     random = np.random.default_rng(0)
     true = augmentation.one_hot(random.integers(0, N_CLASSES, (2, 16, 16), np.uint8), N_CLASSES)
@@ -127,33 +162,42 @@ def made_from(model, batches, validation):
         "code": stages.code("segmentation/training"),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),
-        "optimizer": model.optimizer.get_config() | {"name": ""},  # Keras numbers the names: adam, adam_1
+        # Keras numbers the names: adam, adam_1
+        "optimizer": model.optimizer.get_config() | {"name": ""},
         "loss": float(np.asarray(model.loss(true, predicted)).mean()),
-        "pixels": [zlib.crc32(np.ascontiguousarray(array)) for pair in (*batches.sets, *validation.sets)
-                   for array in pair],
-        "batch_size": batches.batch_size, "seed": batches.seed,
+        "pixels": [
+            zlib.crc32(np.ascontiguousarray(array))
+            for pair in (*batches.sets, *validation.sets)
+            for array in pair
+        ],
+        "batch_size": batches.batch_size,
+        "seed": batches.seed,
         "fresh_augmentation": batches.augmenter.to_dict() if batches.augmenter else None,
     }
 
 
 def weights_digest(model):
     """Return a digest of a model's weights, twelve letters."""
-    return sha256(b"".join(variable.numpy().tobytes() for variable in model.variables)).hexdigest()[:12]
+    return sha256(b"".join(variable.numpy().tobytes() for variable in model.variables)).hexdigest()[
+        :12
+    ]
 
 
 class ResumableTraining(keras.callbacks.Callback):
     """A callback that resumes a killed training; the resumed training ends with the same weights.
 
-    Keras' BackupAndRestore keeps weights and optimizer, but not the counters of EarlyStopping and ModelCheckpoint.
-    After every epoch this callback writes all of them, with the history, to one checkpoint file. It must be the last
-    callback: if the process is killed before the file is written, the epoch is repeated and writes the same model
-    again. The callback also sets the epoch of the batches and shows a progress bar.
+    Keras' BackupAndRestore keeps weights and optimizer, but not the counters of EarlyStopping and
+    ModelCheckpoint. After every epoch this callback writes all of them, with the history, to one
+    checkpoint file. It must be the last callback: if the process is killed before the file is
+    written, the epoch is repeated and writes the same model again. The callback also sets the epoch
+    of the batches and shows a progress bar.
     """
 
     COUNTERS = ("wait", "best", "best_epoch", "stopped_epoch")
 
     def __init__(self, folder, model, batches, others=()):
-        """model: compiled, with a built optimizer; others: EarlyStopping and ModelCheckpoint, as given to `fit`.
+        """model: compiled, with a built optimizer; others: EarlyStopping and ModelCheckpoint, as
+        given to `fit`.
 
         Raises InputError if the folder holds a damaged checkpoint or that of another network.
         """
@@ -164,9 +208,13 @@ class ResumableTraining(keras.callbacks.Callback):
         state = stages.resume(self.folder / STATE)
         if state is not None:
             (self.rows, self._counters), arrays = state
-            if [value.shape for value in arrays.values()] != [tuple(variable.shape) for variable in self._variables]:
-                raise InputError(f"{self.folder}: holds the training of another network; delete the folder or choose "
-                                 "another one")
+            if [value.shape for value in arrays.values()] != [
+                tuple(variable.shape) for variable in self._variables
+            ]:
+                raise InputError(
+                    f"{self.folder}: holds the training of another network; delete the folder or choose "
+                    "another one"
+                )
             for variable, value in zip(self._variables, arrays.values()):
                 variable.assign(value)
 
@@ -176,20 +224,30 @@ class ResumableTraining(keras.callbacks.Callback):
         return pd.DataFrame(self.rows)
 
     def first_epoch(self, epochs):
-        """Return the epoch to resume with, for `fit`; `epochs` if early stopping has ended the training."""
-        stopped = any(counters.get("stopped_epoch") and counters["wait"] >= other.patience
-                      for other, counters in zip(self.others, self._counters))
+        """Return the epoch to resume with, for `fit`; `epochs` if early stopping has ended the
+        training.
+        """
+        stopped = any(
+            counters.get("stopped_epoch") and counters["wait"] >= other.patience
+            for other, counters in zip(self.others, self._counters)
+        )
         return epochs if stopped else min(len(self.rows), epochs)
 
     def on_train_begin(self, logs=None):
         self._open.enter_context(longrun.claimed(self.folder))
-        self.model.save = partial(_save_atomically, self.model)  # ModelCheckpoint itself writes in place
+        # ModelCheckpoint itself writes in place
+        self.model.save = partial(_save_atomically, self.model)
         self._open.callback(delattr, self.model, "save")
         for other, counters in zip(self.others, self._counters):
             vars(other).update(counters)
-        self._bar = self._open.enter_context(files.progress(
-            description="training", total=self.params["epochs"] * len(self.batches), unit="batch",
-            initial=len(self.rows) * len(self.batches)))
+        self._bar = self._open.enter_context(
+            files.progress(
+                description="training",
+                total=self.params["epochs"] * len(self.batches),
+                unit="batch",
+                initial=len(self.rows) * len(self.batches),
+            )
+        )
 
     def on_epoch_begin(self, epoch, logs=None):
         self.batches.epoch = epoch
@@ -199,12 +257,23 @@ class ResumableTraining(keras.callbacks.Callback):
 
     def on_epoch_end(self, epoch, logs=None):
         self._bar.set_postfix_str(f"epoch {epoch + 1}, loss {logs['loss']:.3f}")
-        self.rows.append({"epoch": epoch + 1} | {name: float(value) for name, value in logs.items()})
-        self._counters = [{name: float(value) for name, value in vars(other).items()
-                           if name in self.COUNTERS and value is not None} for other in self.others]
+        self.rows.append(
+            {"epoch": epoch + 1} | {name: float(value) for name, value in logs.items()}
+        )
+        self._counters = [
+            {
+                name: float(value)
+                for name, value in vars(other).items()
+                if name in self.COUNTERS and value is not None
+            }
+            for other in self.others
+        ]
         files.write_text(self.folder / HISTORY, self.history.to_csv(index=False))
-        stages.store(self.folder / STATE, [self.rows, self._counters],
-                     {f"{index}": variable.numpy() for index, variable in enumerate(self._variables)})
+        stages.store(
+            self.folder / STATE,
+            [self.rows, self._counters],
+            {f"{index}": variable.numpy() for index, variable in enumerate(self._variables)},
+        )
 
     def on_train_end(self, logs=None):
         self._open.close()
@@ -216,7 +285,9 @@ def _save_atomically(model, path, **options):
 
 
 def _check_unpacked_size(path):
-    """Raise ValueError if a model file would unpack to far more bytes than weights can be compressed to."""
+    """Raise ValueError if a model file would unpack to far more bytes than weights can be
+    compressed to.
+    """
     most, sizes, weights = 10 * Path(path).stat().st_size + 100 * 2**20, [], path
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
@@ -232,9 +303,10 @@ def _check_unpacked_size(path):
 def load_model(path):
     """Load a model saved by Keras, `.keras` or HDF5, for prediction: without loss and metrics.
 
-    Code in the file is never executed: Keras' safe mode refuses it, and all layers that are not Keras' own.
-    Raises InputError if the file is missing, truncated, no model, or holds code; if the network does not map square
-    images to the 35 classes; and if its weights are not finite.
+    Code in the file is never executed: Keras' safe mode refuses it, and all layers that are not
+    Keras' own.
+    Raises InputError if the file is missing, truncated, no model, or holds code; if the network
+    does not map square images to the 35 classes; and if its weights are not finite.
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such model; train one or name another file")
@@ -243,13 +315,24 @@ def load_model(path):
         model = keras.models.load_model(path, compile=False, safe_mode=True)
     except Exception as error:  # Keras, h5py and zipfile raise many kinds
         reason = str(error).strip().partition("\n")[0][:200] or type(error).__name__
-        raise InputError(f"{path}: not a Keras model, truncated, or holds code ({reason}); build it from Keras' own "
-                         "layers, or copy it again") from None
+        raise InputError(
+            f"{path}: not a Keras model, truncated, or holds code ({reason}); build it from Keras' own "
+            "layers, or copy it again"
+        ) from None
     inputs, outputs = getattr(model, "input_shape", ()), getattr(model, "output_shape", ())
-    square = len(inputs) == 4 and inputs[1] is not None and inputs[1] == inputs[2] and inputs[3] in (1, 3)
+    square = (
+        len(inputs) == 4
+        and inputs[1] is not None
+        and inputs[1] == inputs[2]
+        and inputs[3] in (1, 3)
+    )
     if not square or outputs != (*inputs[:3], N_CLASSES):
-        raise InputError(f"{path}: a model from {inputs} to {outputs}; expected (None, size, size, 1 or 3) to "
-                         f"(None, size, size, {N_CLASSES}), so name another model")
+        raise InputError(
+            f"{path}: a model from {inputs} to {outputs}; expected (None, size, size, 1 or 3) to "
+            f"(None, size, size, {N_CLASSES}), so name another model"
+        )
     if not all(np.isfinite(variable.numpy()).all() for variable in model.variables):
-        raise InputError(f"{path}: holds weights that are not finite, from a failed training; train again")
+        raise InputError(
+            f"{path}: holds weights that are not finite, from a failed training; train again"
+        )
     return model

@@ -11,15 +11,19 @@ def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
     """Build the U-Net with a softmax over n_classes (A.4); its layer names are those of Figure A.1.
 
     input_shape: (height, width, channels); a height or width of None accepts any size.
-    base_filters: filters of the first block, 64 in the thesis; each further encoder block has twice as many.
-    corrected_blocks: put the two convolutions of a block in a row, as intended. In the thesis both read the block's
-    input, so the output of the first one is never used and Figure A.1 lists only every second convolution.
+    base_filters: filters of the first block, 64 in the thesis; each further encoder block has twice
+    as many.
+    corrected_blocks: put the two convolutions of a block in a row, as intended. In the thesis both
+    read the block's input, so the output of the first one is never used and Figure A.1 lists only
+    every second convolution.
     Raises InputError if height or width is not a multiple of 16.
     """
     height, width, _ = input_shape
     if (height or 0) % 2**DEPTH or (width or 0) % 2**DEPTH:
-        raise InputError(f"image size {height}x{width}: the U-Net halves it {DEPTH} times, so height and width must be "
-                         f"multiples of {2**DEPTH}")
+        raise InputError(
+            f"image size {height}x{width}: the U-Net halves it {DEPTH} times, so height and width must be "
+            f"multiples of {2**DEPTH}"
+        )
     inputs = layers.Input(input_shape, name="input_2")
     x, skips = inputs, []
     for level in range(DEPTH):
@@ -29,8 +33,9 @@ def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
     x = _conv_block(x, base_filters * 2**DEPTH, 2 * DEPTH, corrected_blocks)
     for step, skip in enumerate(reversed(skips)):
         filters = base_filters * 2 ** (DEPTH - 1 - step)
-        x = layers.Conv2DTranspose(filters, 2, strides=2, padding="same",
-                                   name=_numbered("conv2d_transpose", step))(x)
+        x = layers.Conv2DTranspose(
+            filters, 2, strides=2, padding="same", name=_numbered("conv2d_transpose", step)
+        )(x)
         x = layers.Concatenate(name=_numbered("concatenate", step))([x, skip])
         x = _conv_block(x, filters, 2 * (DEPTH + 1 + step), corrected_blocks)
     outputs = layers.Conv2D(n_classes, 1, activation="softmax", name=f"conv2d_{4 * DEPTH + 2}")(x)
@@ -40,7 +45,8 @@ def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
 def _conv_block(inputs, filters, number, corrected):
     x = inputs
     for index in (number, number + 1):
-        source = x if corrected else inputs  # the thesis's mistake: the second convolution reads the block's input
+        # the thesis's mistake: the second convolution reads the block's input
+        source = x if corrected else inputs
         x = layers.Conv2D(filters, 3, padding="same", name=_numbered("conv2d", index))(source)
         x = layers.BatchNormalization(name=_numbered("batch_normalization", index))(x)
         x = layers.Activation("relu", name=_numbered("activation", index))(x)
@@ -52,16 +58,22 @@ def _numbered(name, number):
 
 
 def summary_rows(model):
-    """Return a model's rows in the format of Figure A.1: dicts of layer, output_shape, params and connected_to."""
+    """Return a model's rows in the format of Figure A.1: dicts of layer, output_shape, params
+    and connected_to.
+    """
     rows = []
     for layer in model.layers:
         kind = type(layer).__name__
         shape = f"{tuple(layer.output.shape)}"
         sources = [] if kind == "InputLayer" else layer._inbound_nodes[0].input_tensors
-        rows.append({
-            "layer": f"{layer.name} ({kind.replace('BatchNormalization', 'BatchNormal')})",
-            "output_shape": f"[{shape}]" if kind == "InputLayer" else shape,
-            "params": layer.count_params(),
-            "connected_to": " ".join(f"{tensor._keras_history.operation.name}[0][0]" for tensor in sources),
-        })
+        rows.append(
+            {
+                "layer": f"{layer.name} ({kind.replace('BatchNormalization', 'BatchNormal')})",
+                "output_shape": f"[{shape}]" if kind == "InputLayer" else shape,
+                "params": layer.count_params(),
+                "connected_to": " ".join(
+                    f"{tensor._keras_history.operation.name}[0][0]" for tensor in sources
+                ),
+            }
+        )
     return rows

@@ -1,7 +1,7 @@
 """Run independent calls in processes of this machine or on the workers of a Dask cluster.
 
-Joblib's Dask backend stops all calls as soon as one is lost. So this module uses Dask's futures: if a call is lost, the
-pool yields the reason, a string, as its result and continues.
+Joblib's Dask backend stops all calls as soon as one is lost. So this module uses Dask's futures: if
+a call is lost, the pool yields the reason, a string, as its result and continues.
 """
 
 import logging
@@ -23,7 +23,9 @@ Results = Iterator[tuple[int, Any]]
 
 
 class Pool(NamedTuple):
-    """`run(function, calls)` yields (index of the call, result) in the order in which the calls end."""
+    """`run(function, calls)` yields (index of the call, result) in the order in which the calls
+    end.
+    """
 
     size: int  # number of calls that run at the same time
     run: Callable
@@ -31,7 +33,8 @@ class Pool(NamedTuple):
 
 @contextmanager
 def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
-    """Open a pool on a Dask scheduler ("tcp://host:8786") or, without one, on `processes` processes of this machine.
+    """Open a pool on a Dask scheduler ("tcp://host:8786") or, without one, on `processes` processes
+    of this machine.
 
     Raises InputError if the scheduler does not answer or has no workers.
     """
@@ -40,24 +43,30 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
         return
     from dask.distributed import Client  # imported here because it takes a second
 
-    for name in ("distributed", "distributed.client"):  # hide warnings about workers that come and go
+    # hide warnings about workers that come and go
+    for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, ValueError, ImportError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(f"Dask scheduler {scheduler}: does not answer ({reason}); start one with 'dask scheduler' "
-                         "and give the address that it prints, tcp://host:port") from None
+        raise InputError(
+            f"Dask scheduler {scheduler}: does not answer ({reason}); start one with 'dask scheduler' "
+            "and give the address that it prints, tcp://host:port"
+        ) from None
     with client:
         if not client.nthreads():
-            raise InputError(f"Dask scheduler {scheduler}: has no workers; start some with "
-                             f"'dask worker {scheduler} --nthreads 1'")
+            raise InputError(
+                f"Dask scheduler {scheduler}: has no workers; start some with "
+                f"'dask worker {scheduler} --nthreads 1'"
+            )
         yield Pool(sum(client.nthreads().values()), partial(_on_workers, client))
 
 
 def _here(size: int, function: Callable, calls: Calls) -> Results:
-    work = joblib.Parallel(n_jobs=size, return_as="generator_unordered", initializer=longrun.end_with_parent)(
-        joblib.delayed(_numbered)(index, function, call) for index, call in enumerate(calls))
+    work = joblib.Parallel(
+        n_jobs=size, return_as="generator_unordered", initializer=longrun.end_with_parent
+    )(joblib.delayed(_numbered)(index, function, call) for index, call in enumerate(calls))
     try:
         yield from work
     except TerminatedWorkerError:
@@ -72,10 +81,21 @@ def _on_workers(client: Any, function: Callable, calls: Calls) -> Results:
     """If a worker dies, Dask restarts its call on another worker, up to three times."""
     from dask.distributed import as_completed
 
-    index = {client.submit(function, *call, pure=False): number for number, call in enumerate(calls)}
+    index = {
+        client.submit(function, *call, pure=False): number for number, call in enumerate(calls)
+    }
     for future in as_completed(list(index), loop=client.loop):
         if client.status != "running" and future.status != "finished":
-            raise InputError(f"Dask scheduler {client.scheduler.address}: no longer answers; finished runs are kept; "
-                             "start it again, then repeat the command")
-        error = future.exception() if future.status == "error" else f"the cluster reports: {future.status}"
-        yield index[future], future.result() if future.status == "finished" else str(error).splitlines()[0]
+            raise InputError(
+                f"Dask scheduler {client.scheduler.address}: no longer answers; finished runs are kept; "
+                "start it again, then repeat the command"
+            )
+        error = (
+            future.exception()
+            if future.status == "error"
+            else f"the cluster reports: {future.status}"
+        )
+        yield (
+            index[future],
+            future.result() if future.status == "finished" else str(error).splitlines()[0],
+        )

@@ -1,21 +1,25 @@
 """The one place that compares: a table of runs goes in, a table of comparisons comes out.
 
-**Runs** (`runner.run`) have one row a run: sequence, run, source, method, dilation_width, estimator, repetition,
-frames, mean_keypoints, flagged, and one column for each of METRICS.
+**Runs** (`runner.run`) have one row a run: sequence, run, source, method, dilation_width,
+estimator, repetition, frames, mean_keypoints, flagged, and one column for each of METRICS.
 
-**Comparisons** (`comparisons`) have one row for each method, reference, metric and estimator: the ratio of the
-method's error to the reference's, the interval of this ratio, a verdict, and the ratio of every sequence.
+**Comparisons** (`comparisons`) have one row for each method, reference, metric and estimator: the
+ratio of the method's error to the reference's, the interval of this ratio, a verdict, and the ratio
+of every sequence.
 
 A ratio is formed in three steps:
 
-1. For each sequence, the geometric mean of the method's errors over the repetitions is divided by that of the
-   reference. Half and double are then equally far from 1, which is not so for percentages.
+1. For each sequence, the geometric mean of the method's errors over the repetitions is divided by
+   that of the reference. Half and double are then equally far from 1, which is not so for
+   percentages.
 2. The ratio is the geometric mean of the ratios of the sequences.
-3. Its interval is a bootstrap over whole sequences with DRAWS draws. It estimates how far the ratio could be off if
-   other sequences of the same kind had been recorded. With few sequences it is too narrow.
+3. Its interval is a bootstrap over whole sequences with DRAWS draws. It estimates how far the ratio
+   could be off if other sequences of the same kind had been recorded. With few sequences it is too
+   narrow.
 
-The verdict is "lower" or "higher" if the interval excludes 1 and there are at least MIN_SEQUENCES sequences.
-Otherwise it is "no clear difference". `primary_comparison` selects the rows that answer the main question.
+The verdict is "lower" or "higher" if the interval excludes 1 and there are at least MIN_SEQUENCES
+sequences. Otherwise it is "no clear difference". `primary_comparison` selects the rows that answer
+the main question.
 """
 
 from collections.abc import Iterable
@@ -30,17 +34,34 @@ from thesis_repro.odometry.metrics import RELATIVE_LENGTH
 from thesis_repro.study.controls import MASKS
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
-# The compared errors and their names in tables. The judging metrics decide (see `primary_comparison`), because a
-# constant angle between camera and ground truth does not change them.
-JUDGING_METRICS = {"rmse_boresight_corrected": "RMSE, mounting angle removed", "rotation": "rotation error a frame"}
-SECONDARY_METRICS = {"rmse": "RMSE", "mae": "MAE", "se3": "aligned ATE",
-                     "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
-                     "rotation_deg_per_100m": f"rotation error over {RELATIVE_LENGTH:g} m",
-                     "t_rel": "KITTI's t_rel", "r_rel": "KITTI's r_rel"}
+# The compared errors and their names in tables. The judging metrics decide (see
+# `primary_comparison`), because a constant angle between camera and ground truth does not change
+# them.
+JUDGING_METRICS = {
+    "rmse_boresight_corrected": "RMSE, mounting angle removed",
+    "rotation": "rotation error a frame",
+}
+SECONDARY_METRICS = {
+    "rmse": "RMSE",
+    "mae": "MAE",
+    "se3": "aligned ATE",
+    "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
+    "rotation_deg_per_100m": f"rotation error over {RELATIVE_LENGTH:g} m",
+    "t_rel": "KITTI's t_rel",
+    "r_rel": "KITTI's r_rel",
+}
 METRICS = {**JUDGING_METRICS, **SECONDARY_METRICS}
-UNITS = {"rmse_boresight_corrected": "m", "rotation": "deg", "rmse": "m", "mae": "m", "se3": "m",
-         "translation_percent": "%", "rotation_deg_per_100m": "deg/100 m",
-         "t_rel": "%", "r_rel": "deg/100 m"}
+UNITS = {
+    "rmse_boresight_corrected": "m",
+    "rotation": "deg",
+    "rmse": "m",
+    "mae": "m",
+    "se3": "m",
+    "translation_percent": "%",
+    "rotation_deg_per_100m": "deg/100 m",
+    "t_rel": "%",
+    "r_rel": "deg/100 m",
+}
 
 METHODS = {  # in the order in which they are shown
     "baseline": "all keypoints",
@@ -59,19 +80,29 @@ METHODS = {  # in the order in which they are shown
     "fewer": "fewer keypoints",
     "spread": "keypoints spread out",
 }
-SEGMENTATION_FREE_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", "fewer", "spread")
+SEGMENTATION_FREE_CONTROLS = (
+    "other-frame",
+    "mirrored",
+    "random-lines",
+    "image-edges",
+    "fewer",
+    "spread",
+)
 
 MIN_FOR_INTERVAL = 3  # sequences
-# With fewer sequences, all ratios lie on the same side of 1 by chance in more than 5 % of cases (2 / 2**n).
+# With fewer sequences, all ratios lie on the same side of 1 by chance in more than 5 % of cases (2
+# / 2**n).
 MIN_SEQUENCES = 6
 LEVEL = 95  # percent, of all intervals
-FAR_OFF = 3  # a sequence is named beside the mean if its ratio differs from the median by more than this factor
+# a sequence is named beside the mean if its ratio differs from the median by more than this factor
+FAR_OFF = 3
 DRAWS = 10_000
 LOWER, HIGHER, NO_CLEAR_DIFFERENCE = ("lower", "higher", "no clear difference")
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
-    """Return the bootstrap interval (low, high) of the mean of one value a sequence. NaN values are left out.
+    """Return the bootstrap interval (low, high) of the mean of one value a sequence. NaN values are
+    left out.
 
     Returns (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
     """
@@ -85,18 +116,26 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
 
 
 def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
-    """Return {ratio, low, high, n, verdict}: the geometric mean of one ratio a sequence, with its bootstrap interval.
+    """Return {ratio, low, high, n, verdict}: the geometric mean of one ratio a sequence, with its
+    bootstrap interval.
 
-    The verdict is LOWER or HIGHER if there are at least MIN_SEQUENCES sequences and the interval excludes 1.
+    The verdict is LOWER or HIGHER if there are at least MIN_SEQUENCES sequences and the interval
+    excludes 1.
     """
     logarithms = np.log(np.asarray(ratios, float))
     logarithms = logarithms[np.isfinite(logarithms)]
     low, high = np.exp(mean_interval(logarithms))
     ratio = float(np.exp(logarithms.mean())) if len(logarithms) else np.nan
-    low, high = np.minimum(low, ratio), np.maximum(high, ratio)  # rounding may put the mean of equal ratios outside
+    # rounding may put the mean of equal ratios outside
+    low, high = np.minimum(low, ratio), np.maximum(high, ratio)
     verdict = LOWER if high < 1 else HIGHER if low > 1 else NO_CLEAR_DIFFERENCE
-    return {"ratio": ratio, "low": float(low), "high": float(high), "n": len(logarithms),
-            "verdict": verdict if len(logarithms) >= MIN_SEQUENCES else NO_CLEAR_DIFFERENCE}
+    return {
+        "ratio": ratio,
+        "low": float(low),
+        "high": float(high),
+        "n": len(logarithms),
+        "verdict": verdict if len(logarithms) >= MIN_SEQUENCES else NO_CLEAR_DIFFERENCE,
+    }
 
 
 def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Series:
@@ -104,6 +143,7 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
 
     metric: the column of the error. Sequences without a positive error in both tables are left out.
     """
+
     def logarithms(runs: pd.DataFrame) -> pd.Series:
         positive = runs.loc[runs[metric] > 0]
         return np.log(positive.set_index("sequence")[metric].astype(float)).groupby(level=0).mean()
@@ -112,10 +152,12 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
 
 
 def far_off(ratios: pd.Series) -> list[str]:
-    """Return the sequences whose ratio differs from the median ratio by more than the factor FAR_OFF.
+    """Return the sequences whose ratio differs from the median ratio by more than the factor
+    FAR_OFF.
 
-    On these sequences the odometry got lost with one of the two methods. The list is empty for fewer than
-    MIN_FOR_INTERVAL sequences, where the median does not show which sequence is the exception.
+    On these sequences the odometry got lost with one of the two methods. The list is empty for
+    fewer than MIN_FOR_INTERVAL sequences, where the median does not show which sequence is the
+    exception.
     """
     if len(ratios) < MIN_FOR_INTERVAL:
         return []
@@ -124,11 +166,13 @@ def far_off(ratios: pd.Series) -> list[str]:
 
 
 def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
-    """Compare every method with all keypoints, and masks with every control and with the masks of other sources.
+    """Compare every method with all keypoints, and masks with every control and with the masks of
+    other sources.
 
-    Returns a table with the columns source, method, dilation_width (pixels), keypoints (mean number); reference_source,
-    reference (the method compared with); metric, estimator; tested (whether the width is the `tested_width`); ratio,
-    low, high, n, far_off (see `far_off`), verdict; and one column for each sequence with its ratio.
+    Returns a table with the columns source, method, dilation_width (pixels), keypoints (mean
+    number); reference_source, reference (the method compared with); metric, estimator; tested
+    (whether the width is the `tested_width`); ratio, low, high, n, far_off (see `far_off`),
+    verdict; and one column for each sequence with its ratio.
     """
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
@@ -137,53 +181,108 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
         for (variant, variant_runs), (reference, reference_runs) in product(variants, variants):
             if not _is_compared(variant, reference):
                 continue
-            row = {**variant, "reference_source": reference["source"], "reference": reference["method"],
-                   "estimator": estimator}
+            row = {
+                **variant,
+                "reference_source": reference["source"],
+                "reference": reference["method"],
+                "estimator": estimator,
+            }
             for metric in metrics:
                 by_sequence = ratios(variant_runs, reference_runs, metric)
-                rows.append({**row, "metric": metric, "far_off": far_off(by_sequence),
-                             **geometric_mean(by_sequence), **by_sequence})
-    columns = ["source", "method", "dilation_width", "keypoints", "reference_source", "reference", "metric",
-               "estimator", "tested", "ratio", "low", "high", "n", "far_off", "verdict"]
+                rows.append(
+                    {
+                        **row,
+                        "metric": metric,
+                        "far_off": far_off(by_sequence),
+                        **geometric_mean(by_sequence),
+                        **by_sequence,
+                    }
+                )
+    columns = [
+        "source",
+        "method",
+        "dilation_width",
+        "keypoints",
+        "reference_source",
+        "reference",
+        "metric",
+        "estimator",
+        "tested",
+        "ratio",
+        "low",
+        "high",
+        "n",
+        "far_off",
+        "verdict",
+    ]
     return pd.DataFrame(rows, columns=[*columns, *sorted(runs["sequence"].unique())])
 
 
 def _variants(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    """Split the runs by method, source and width. Returns pairs of (the first columns of `comparisons`, runs)."""
+    """Split the runs by method, source and width. Returns pairs of (the first columns of
+    `comparisons`, runs).
+    """
     variants = []
     for method in METHODS:
-        by_width = runs[runs["method"] == method].groupby(["source", "dilation_width"], dropna=False, sort=False)
+        by_width = runs[runs["method"] == method].groupby(
+            ["source", "dilation_width"], dropna=False, sort=False
+        )
         for (source, width), rows in by_width:
             tested = pd.isna(width) or width == tested_width(of_source(runs, source))
             keypoints = rows.groupby("sequence")["mean_keypoints"].mean().mean()
-            variants.append(({"source": source, "method": method, "dilation_width": width, "keypoints": keypoints,
-                              "tested": bool(tested)}, rows))
+            variants.append(
+                (
+                    {
+                        "source": source,
+                        "method": method,
+                        "dilation_width": width,
+                        "keypoints": keypoints,
+                        "tested": bool(tested),
+                    },
+                    rows,
+                )
+            )
     return variants
 
 
 def _is_compared(variant: dict[str, Any], reference: dict[str, Any]) -> bool:
-    """Return whether `comparisons` compares a variant with a reference, which is another variant or the same."""
+    """Return whether `comparisons` compares a variant with a reference, which is another
+    variant or the same.
+    """
     if reference["method"] == "baseline":
         return True
-    if variant is reference or variant["method"] != "masked" or not (variant["tested"] and reference["tested"]):
+    if (
+        variant is reference
+        or variant["method"] != "masked"
+        or not (variant["tested"] and reference["tested"])
+    ):
         return False
     return variant["source"] == reference["source"] or reference["method"] == "masked"
 
 
 def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
-    """Return the rows of `comparisons` that answer the main question: do masks from a segmentation help?
+    """Return the rows of `comparisons` that answer the main question: do masks from a segmentation
+    help?
 
-    They compare masks of the tested width with all keypoints by JUDGING_METRICS, under the `judging_estimator`.
-    Masks help if both verdicts are LOWER. The segmentation helps if masks are also LOWER than each of
-    SEGMENTATION_FREE_CONTROLS (see `against`). source: only this source of masks; by default all of them.
+    They compare masks of the tested width with all keypoints by JUDGING_METRICS, under the
+    `judging_estimator`. Masks help if both verdicts are LOWER. The segmentation helps if masks are
+    also LOWER than each of SEGMENTATION_FREE_CONTROLS (see `against`). source: only this source of
+    masks; by default all of them.
     """
     return against(table[table["tested"]], ["baseline"], source)
 
 
-def against(table: pd.DataFrame, references: Iterable[str], source: str | None = None) -> pd.DataFrame:
-    """Return the rows of `comparisons` for masks against the given methods, chosen as in `primary_comparison`."""
-    rows = table[(table["method"] == "masked") & table["reference"].isin(list(references))
-                 & table["metric"].isin(JUDGING_METRICS)]
+def against(
+    table: pd.DataFrame, references: Iterable[str], source: str | None = None
+) -> pd.DataFrame:
+    """Return the rows of `comparisons` for masks against the given methods, chosen as in
+    `primary_comparison`.
+    """
+    rows = table[
+        (table["method"] == "masked")
+        & table["reference"].isin(list(references))
+        & table["metric"].isin(JUDGING_METRICS)
+    ]
     rows = rows if source is None else rows[rows["source"] == source]
     return rows[rows["estimator"] == judging_estimator(rows)]
 
@@ -195,16 +294,22 @@ def overall(verdicts: Iterable[str]) -> str:
 
 
 def judging_estimator(table: pd.DataFrame) -> str:
-    """Return the estimator that decides: the refined one if it was run, since shuffling changes its errors least."""
+    """Return the estimator that decides: the refined one if it was run, since shuffling changes
+    its errors least.
+    """
     return "refined" if (table["estimator"] == "refined").any() else "thesis"
 
 
 def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
-    """Measure how much shuffling the matched points before RANSAC changes the RMSE, with all keypoints.
+    """Measure how much shuffling the matched points before RANSAC changes the RMSE, with all
+    keypoints.
 
-    Returns one row for each estimator and sequence: mean, lowest, highest, factor (highest over lowest).
+    Returns one row for each estimator and sequence: mean, lowest, highest, factor (highest over
+    lowest).
     """
-    table = spread(runs[runs["method"] == "baseline"], "rmse", by=["estimator", "sequence"]).reset_index()
+    table = spread(
+        runs[runs["method"] == "baseline"], "rmse", by=["estimator", "sequence"]
+    ).reset_index()
     return table.assign(factor=table["highest"] / table["lowest"])
 
 
@@ -217,12 +322,16 @@ def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None) -> 
     estimator: by default the thesis's estimator if it was run, as for the tables of the thesis.
     """
     if estimator is None:
-        estimator = next((name for name in ESTIMATORS if (runs["estimator"] == name).any()), "thesis")
+        estimator = next(
+            (name for name in ESTIMATORS if (runs["estimator"] == name).any()), "thesis"
+        )
     return runs[(runs["method"] == method) & (runs["estimator"] == estimator)]
 
 
 def of_source(runs: pd.DataFrame, source: str) -> pd.DataFrame:
-    """Return the runs of one source of masks and the runs with all keypoints, which belong to every source."""
+    """Return the runs of one source of masks and the runs with all keypoints, which belong to
+    every source.
+    """
     return runs[runs["source"].isin([source, ""])]
 
 
@@ -232,7 +341,8 @@ def sources(runs: pd.DataFrame) -> list[str]:
 
 
 def tested_width(runs: pd.DataFrame) -> int | None:
-    """Return the dilation width (pixels) at which masks are tested: that of the controls, or the only width.
+    """Return the dilation width (pixels) at which masks are tested: that of the controls, or the
+    only width.
 
     Returns CONTROL_WIDTH if the width is not unique, and None for ready-made masks.
     """
@@ -252,7 +362,10 @@ def keypoints_left(runs: pd.DataFrame) -> pd.Series:
 
 
 def spread(rows: pd.DataFrame, column: str, by: str | list[str] = "sequence") -> pd.DataFrame:
-    """Return mean, lowest and highest of a column over the repetitions: one row for each value of `by`."""
+    """Return mean, lowest and highest of a column over the repetitions: one row for each value
+    of `by`.
+    """
     table = rows.groupby(by)[column].agg(mean="mean", lowest="min", highest="max")
-    # rounding may put the mean of equal values outside their range, which gives an error bar of negative length
+    # rounding may put the mean of equal values outside their range, which gives an error bar of
+    # negative length
     return table.assign(mean=table["mean"].clip(table["lowest"], table["highest"]))

@@ -1,7 +1,8 @@
-"""The controls: masks and settings that leave as many keypoints as the masks of the segmentation, chosen differently.
+"""The controls: masks and settings that leave as many keypoints as the masks of the segmentation,
+chosen differently.
 
-If the odometry gains as much from a control, the segmentation is not what helps. Masks are indexed by frame number, as
-in `masks`.
+If the odometry gains as much from a control, the segmentation is not what helps. Masks are indexed
+by frame number, as in `masks`.
 """
 
 from dataclasses import replace
@@ -22,14 +23,17 @@ COVERAGE_TOLERANCE = 0.002  # of the frame
 SAMPLE = 12  # frames on which the distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
 SEED = 0  # of the random lines
-# All corrections together. No error was used to choose them: a label map of 320 columns places a boundary within about
-# 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade window of 21 pixels is cut off.
+# All corrections together. No error was used to choose them: a label map of 320 columns places a
+# boundary within about 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade
+# window of 21 pixels is cut off.
 CORRECTED = MaskSettings("exact", symmetric=True, movable=2, margin=10)
 LINE_WIDTH = 10  # pixels, of lines and edges as controls of ready-made masks, which have no width
 
 
 def true_labels(kitti: Path, name: str) -> Path:
-    """Return the folder of a sequence's true label maps. Only sequences of the embedded world have one."""
+    """Return the folder of a sequence's true label maps. Only sequences of the embedded world
+    have one.
+    """
     return Path(kitti) / "sequences" / name / "labels_0"
 
 
@@ -50,14 +54,18 @@ class OtherFrame:
 
 
 class Mirrored(OtherFrame):
-    """The mask of the frame, flipped left to right: it looks like a street, but not like the street in the frame."""
+    """The mask of the frame, flipped left to right: it looks like a street, but not like the
+    street in the frame.
+    """
 
     def __getitem__(self, index: int) -> np.ndarray:
         return cv2.flip(self.masks[index], 1)
 
 
 class RandomLines(OtherFrame):
-    """Random line segments, dilated like the boundaries, that cover as many pixels as the mask of the frame."""
+    """Random line segments, dilated like the boundaries, that cover as many pixels as the mask
+    of the frame.
+    """
 
     def __getitem__(self, index: int) -> np.ndarray:
         mask = self.masks[index]
@@ -71,21 +79,35 @@ class RandomLines(OtherFrame):
         return cv2.compare(first, int(count), cv2.CMP_LT)
 
     def _first_segments(self, index: int, number: int, shape: tuple[int, ...]) -> np.ndarray:
-        """Return, for each pixel, the index of the first dilated segment that covers it; `number` if none does."""
+        """Return, for each pixel, the index of the first dilated segment that covers it;
+        `number` if none does.
+        """
         random = np.random.default_rng((SEED, index))
         height, width = shape
         start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
         length = length * height / 2
         start = np.column_stack([start_x * width, start_y * height])
-        end = start + np.column_stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]) * length[:, None]
+        end = (
+            start
+            + np.column_stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
+            * length[:, None]
+        )
         image = np.full(shape, number, np.uint16)
         for segment in range(number - 1, -1, -1):
-            cv2.line(image, start[segment].astype(int).tolist(), end[segment].astype(int).tolist(), segment)
-        return cv2.erode(image, np.ones((self.line_width,) * 2, np.uint8))  # the lowest index near a pixel
+            cv2.line(
+                image,
+                start[segment].astype(int).tolist(),
+                end[segment].astype(int).tolist(),
+                segment,
+            )
+        # the lowest index near a pixel
+        return cv2.erode(image, np.ones((self.line_width,) * 2, np.uint8))
 
 
 class ImageEdges(OtherFrame):
-    """The strongest Canny edges of the frame, dilated, that cover as many pixels as its mask. They need no network."""
+    """The strongest Canny edges of the frame, dilated, that cover as many pixels as its mask.
+    They need no network.
+    """
 
     def __getitem__(self, index: int) -> np.ndarray:
         frame, target = self.sequence.frame(index), np.count_nonzero(self.masks[index])
@@ -109,14 +131,24 @@ class ImageEdges(OtherFrame):
 
 
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-OF_MASKS = {"other-frame": OtherFrame, "mirrored": Mirrored, "random-lines": RandomLines, "image-edges": ImageEdges}
-LITERATURE = ("static", "inverse", "static-boundaries")  # as SLAM systems use a segmentation, see masks.KEEP
+OF_MASKS = {
+    "other-frame": OtherFrame,
+    "mirrored": Mirrored,
+    "random-lines": RandomLines,
+    "image-edges": ImageEdges,
+}
+# as SLAM systems use a segmentation, see masks.KEEP
+LITERATURE = ("static", "inverse", "static-boundaries")
 OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
-MASKS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)  # "fallback" is a setting of the odometry, with the same masks
+# "fallback" is a setting of the odometry, with the same masks
+MASKS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)
 
 
-def masks(method: str, source: Source, sequence: Sequence, dilation_width: int | None) -> ControlMasks:
-    """Return the masks of a sequence for a method: "masked" or one of MASKS, a control of the masks of `source`.
+def masks(
+    method: str, source: Source, sequence: Sequence, dilation_width: int | None
+) -> ControlMasks:
+    """Return the masks of a sequence for a method: "masked" or one of MASKS, a control of the masks
+    of `source`.
 
     dilation_width: pixels, for masks from label maps.
     """
@@ -126,7 +158,10 @@ def masks(method: str, source: Source, sequence: Sequence, dilation_width: int |
         return source.masks(sequence, dilation_width)
     folder, settings = source.folder, source.settings
     if method == "true-labels":
-        folder, settings = true_labels(sequence.root, sequence.name), replace(settings, ids="labels")
+        folder, settings = (
+            true_labels(sequence.root, sequence.name),
+            replace(settings, ids="labels"),
+        )
     elif method == "corrected":
         settings = replace(CORRECTED, ids=settings.ids)
     elif method in LITERATURE:
@@ -137,9 +172,11 @@ def masks(method: str, source: Source, sequence: Sequence, dilation_width: int |
 
 
 def min_distance(sequence: Sequence, number: float) -> float:
-    """Return the distance between keypoints (pixels) at which the detector finds `number` of them on average.
+    """Return the distance between keypoints (pixels) at which the detector finds `number` of them
+    on average.
 
-    It is found by bisection on SAMPLE frames of the sequence. It is never below the distance of the thesis.
+    It is found by bisection on SAMPLE frames of the sequence. It is never below the distance of the
+    thesis.
     """
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
     frames = [(sequence.frame(index), SharedKeypoints()) for index in sample]
@@ -149,7 +186,9 @@ def min_distance(sequence: Sequence, number: float) -> float:
 
     def mean_number(steps: int) -> float:
         settings = replace(THESIS, min_distance=distance(steps))
-        return float(np.mean([len(keypoints.detect(frame, settings)) for frame, keypoints in frames]))
+        return float(
+            np.mean([len(keypoints.detect(frame, settings)) for frame, keypoints in frames])
+        )
 
     low, high = 0, round(min(sequence.size) / STEP)
     counts = {low: mean_number(low)}

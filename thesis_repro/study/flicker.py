@@ -1,4 +1,6 @@
-"""How masked keypoints jump from frame to frame, which the thesis names as a cause of errors (Sections 4.2, 5.1)."""
+"""How masked keypoints jump from frame to frame, which the thesis names as a cause of errors
+(Sections 4.2, 5.1).
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,23 +20,32 @@ class View(NamedTuple):
     crop: np.ndarray
     edges: np.ndarray
     keypoints: np.ndarray
-    expected: np.ndarray | None  # keypoints of the previous frame, tracked to this one; None for the first frame
+    # keypoints of the previous frame, tracked to this one; None for the first frame
+    expected: np.ndarray | None
     jumped: int  # number of expected points without a keypoint of this frame within SAME pixels
 
 
-def follow(frames: Sequence[np.ndarray], label_maps: Sequence[np.ndarray], dilation_width: int,
-           first: int = 0) -> list[View]:
-    """Show how masked keypoints jump between consecutive frames (Figure 4.8). Returns a View of each frame.
+def follow(
+    frames: Sequence[np.ndarray],
+    label_maps: Sequence[np.ndarray],
+    dilation_width: int,
+    first: int = 0,
+) -> list[View]:
+    """Show how masked keypoints jump between consecutive frames (Figure 4.8). Returns a View of
+    each frame.
 
-    frames: (height, width) uint8 each. label_maps: one for each frame, (h, w) uint8 of any size. first: number of the
-    first frame. The window has a quarter of the frame's height. It starts where most keypoints jump between the first
-    two frames, or in the middle of the frame if none jumps. Then it follows the median motion of its keypoints.
+    frames: (height, width) uint8 each. label_maps: one for each frame, (h, w) uint8 of any size.
+    first: number of the first frame. The window has a quarter of the frame's height. It starts
+    where most keypoints jump between the first two frames, or in the middle of the frame if none
+    jumps. Then it follows the median motion of its keypoints.
     """
     size = np.array(frames[0].shape[::-1])
     half = size.min() // 8
     edge_images = [masks.edges(label_map, frames[0].shape) for label_map in label_maps]
-    points = [keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
-              for frame, edge_image in zip(frames, edge_images, strict=True)]
+    points = [
+        keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
+        for frame, edge_image in zip(frames, edge_images, strict=True)
+    ]
     tracked, followed = _track(frames[0], frames[1], points[0])
     jumping = points[0][followed & _far(tracked, points[1])]
     near = np.abs(jumping[:, None] - jumping).max(axis=-1) < half
@@ -48,16 +59,28 @@ def follow(frames: Sequence[np.ndarray], label_maps: Sequence[np.ndarray], dilat
             if len(expected):
                 center = center + np.median(expected - in_window[followed], axis=0)
         low = np.clip(np.round(center - half).astype(int), 0, size - 2 * half)
-        crop = np.s_[low[1]:low[1] + 2 * half, low[0]:low[0] + 2 * half]
+        crop = np.s_[low[1] : low[1] + 2 * half, low[0] : low[0] + 2 * half]
         in_window = _inside(points[index], low, low + 2 * half)
         expected = _inside(expected, low, low + 2 * half)
-        views.append(View(first + index, frame[crop], edge_image[crop], in_window - low,
-                          expected - low if index else None, int(_far(expected, points[index]).sum())))
+        views.append(
+            View(
+                first + index,
+                frame[crop],
+                edge_image[crop],
+                in_window - low,
+                expected - low if index else None,
+                int(_far(expected, points[index]).sum()),
+            )
+        )
     return views
 
 
-def _track(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Track keypoints (n, 2) to the next frame; returns their positions and whether tracking back agrees with them."""
+def _track(
+    before: np.ndarray, after: np.ndarray, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Track keypoints (n, 2) to the next frame; returns their positions and whether tracking
+    back agrees with them.
+    """
     if not len(corners):
         return corners, np.zeros(0, bool)
     tracked, followed = keypoints.track(before, after, corners)
@@ -76,15 +99,23 @@ def _far(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.asarray(distances.min(axis=1, initial=np.inf) > SAME)
 
 
-def found_again(first: np.ndarray, second: np.ndarray, first_mask: np.ndarray | None = None,
-                second_mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def found_again(
+    first: np.ndarray,
+    second: np.ndarray,
+    first_mask: np.ndarray | None = None,
+    second_mask: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Find the keypoints of a frame again in a later one; returns four arrays of (n, 2) pixels.
 
-    They are the positions of found keypoints in the first frame and in the second frame, the lost keypoints of the
-    first frame, and the new keypoints of the second. A keypoint is found if Lucas-Kanade tracks it to within SAME
-    pixels of a keypoint of the second frame. The masks are for the detector, (height, width) uint8.
+    They are the positions of found keypoints in the first frame and in the second frame, the lost
+    keypoints of the first frame, and the new keypoints of the second. A keypoint is found if
+    Lucas-Kanade tracks it to within SAME pixels of a keypoint of the second frame. The masks are
+    for the detector, (height, width) uint8.
     """
-    before, after = keypoints.detect(first, THESIS, first_mask), keypoints.detect(second, THESIS, second_mask)
+    before, after = (
+        keypoints.detect(first, THESIS, first_mask),
+        keypoints.detect(second, THESIS, second_mask),
+    )
     tracked, followed = _track(first, second, before)
     again = followed & ~_far(tracked, after)
     return before[again], tracked[again], before[~again], after[_far(after, tracked[again])]

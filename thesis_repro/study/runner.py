@@ -1,6 +1,8 @@
-"""Run the jobs of a study that have no result yet, here or on a cluster, and make the table of all runs.
+"""Run the jobs of a study that have no result yet, here or on a cluster, and make the table of all
+runs.
 
-Each finished run is one CSV file with one row a frame. A study that stopped or failed resumes from its checkpoints.
+Each finished run is one CSV file with one row a frame. A study that stopped or failed resumes from
+its checkpoints.
 """
 
 import hashlib
@@ -24,7 +26,8 @@ from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
 
-CHECKPOINTS = f"pass-{'[0-9a-f]' * 12}.npz"  # pattern of the file names, one for each unfinished pass
+# pattern of the file names, one for each unfinished pass
+CHECKPOINTS = f"pass-{'[0-9a-f]' * 12}.npz"
 
 
 def _result(folder: Path, job: Job) -> Path:
@@ -32,24 +35,40 @@ def _result(folder: Path, job: Job) -> Path:
     return folder / job.sequence / f"{job.name}.csv"
 
 
-def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *,
-        frames: int | None = None, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
-    """Run the jobs that have no result yet; returns the table of all runs that succeeded, one row a job.
+def run(
+    jobs: Iterable[Job],
+    kitti: Path,
+    labels: Path | Iterable[Source],
+    folder: Path,
+    *,
+    frames: int | None = None,
+    processes: int = 1,
+    scheduler: str | None = None,
+) -> pd.DataFrame:
+    """Run the jobs that have no result yet; returns the table of all runs that succeeded, one row a
+    job.
 
-    kitti: the odometry root. labels: folder with one folder of label maps a sequence, or the sources of the jobs.
+    kitti: the odometry root. labels: folder with one folder of label maps a sequence, or the
+    sources of the jobs.
     folder: for the results; results from other data, code or mask settings in it are deleted.
-    frames: number of frames of each sequence, None for all. processes: number of processes on this machine.
-    scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then do the work with the same results.
-    They need this package, and the three folders under the same paths. One thread a worker is best.
+    frames: number of frames of each sequence, None for all. processes: number of processes on this
+    machine.
+    scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then do the work with
+    the same results. They need this package, and the three folders under the same paths. One thread
+    a worker is best.
 
-    Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results of separate runs.
-    An interrupted pass resumes from its checkpoint. A job that fails is printed with its reason and does not stop
-    other jobs. The table's `attrs` say how many jobs were "made" now, "kept" from before, and "failed".
-    Raises InputError if another run is using the folder, if all jobs fail, or if the machine lacks disk space or
-    memory. Finished results are kept.
+    Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results
+    of separate runs. An interrupted pass resumes from its checkpoint. A job that fails is printed
+    with its reason and does not stop other jobs. The table's `attrs` say how many jobs were "made"
+    now, "kept" from before, and "failed".
+    Raises InputError if another run is using the folder, if all jobs fail, or if the machine lacks
+    disk space or memory. Finished results are kept.
     """
     jobs, sources = list(dict.fromkeys(jobs)), by_name(labels)
-    sequences = {name: Sequence(kitti, name).subset(frames) for name in sorted({job.sequence for job in jobs})}
+    sequences = {
+        name: Sequence(kitti, name).subset(frames)
+        for name in sorted({job.sequence for job in jobs})
+    }
     files = {job: _result(folder, job) for job in jobs}
     with longrun.claimed(folder):
         for sequence in sequences.values():
@@ -63,19 +82,31 @@ def run(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folde
     rows = []
     for job, path in files.items():
         if path.is_file():
-            table = pd.read_csv(path, keep_default_na=False, na_values={"detected": "", "tracked": ""})
+            table = pd.read_csv(
+                path, keep_default_na=False, na_values={"detected": "", "tracked": ""}
+            )
             errors = measures(table, sequences[job.sequence].poses)
             rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **errors})
     if not rows:
-        raise InputError(f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}")
+        raise InputError(
+            f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}"
+        )
     runs = pd.DataFrame(rows)
     runs.attrs = {"made": len(rows) - finished, "kept": finished, "failed": len(jobs) - len(rows)}
     return runs
 
 
-def _run_passes(jobs: list[Job], sequences: dict[str, Sequence], sources: dict[str, Source], folder: Path,
-                processes: int, scheduler: str | None) -> dict[Job, str]:
-    """Run the jobs without a result and print which of them failed; returns {job: reason} for the failed ones."""
+def _run_passes(
+    jobs: list[Job],
+    sequences: dict[str, Sequence],
+    sources: dict[str, Source],
+    folder: Path,
+    processes: int,
+    scheduler: str | None,
+) -> dict[Job, str]:
+    """Run the jobs without a result and print which of them failed; returns {job: reason} for
+    the failed ones.
+    """
     failures: dict[Job, str] = {}
     with cluster.open_pool(processes, scheduler) as pool:
         passes = _passes(jobs, sequences, folder, pool.size)
@@ -83,11 +114,22 @@ def _run_passes(jobs: list[Job], sequences: dict[str, Sequence], sources: dict[s
         calls, frames = [], []
         for pass_jobs in passes:
             sequence = sequences[pass_jobs[0].sequence]
-            calls.append((pass_jobs, sequence, sources, folder, stages.record(folder / sequence.name), threads))
+            calls.append(
+                (
+                    pass_jobs,
+                    sequence,
+                    sources,
+                    folder,
+                    stages.record(folder / sequence.name),
+                    threads,
+                )
+            )
             frames.append(len(pass_jobs) * len(sequence))
         with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
             for index, failed in pool.run(_run_pass, calls):
-                failures |= failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
+                failures |= (
+                    failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
+                )
                 bar.update(frames[index])
     by_reason: dict[tuple[str, str], list[str]] = {}
     for job, reason in failures.items():
@@ -107,41 +149,60 @@ class _MachineFault(str):
 
 def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
     """Return the sources by name. A folder becomes a single source with an empty name."""
-    return {source.name: source for source in ([Source(labels)] if isinstance(labels, Path) else labels)}
+    return {
+        source.name: source for source in ([Source(labels)] if isinstance(labels, Path) else labels)
+    }
 
 
 def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None:
     """Delete the results of a sequence that were made from other data, code or settings.
 
-    Each source has a subfolder, so a change of one source does not delete the runs of other sources.
+    Each source has a subfolder, so a change of one source does not delete the runs of other
+    sources.
     """
     if not sequence.has_truth:
-        raise InputError(f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
-                         "errors to compare; leave it out (the odometry command runs it)")
+        raise InputError(
+            f"{sequence.poses_path}: no such file; without ground truth, sequence {sequence.name} has no "
+            "errors to compare; leave it out (the odometry command runs it)"
+        )
     folder /= sequence.name
     true_labels = listed(controls.true_labels(sequence.root, sequence.name))
     records = {source.name: source.record(sequence.name) for source in sources.values()}
-    stages.stage(folder, **_versions(), sequence=stages.listing(sequence.files),
-                 true_labels=stages.listing(true_labels), **records.pop("", {}))
+    stages.stage(
+        folder,
+        **_versions(),
+        sequence=stages.listing(sequence.files),
+        true_labels=stages.listing(true_labels),
+        **records.pop("", {}),
+    )
     for source, record in records.items():
-        if stages.record(folder / source) != record:  # a checkpoint may come from the source's old masks
+        # a checkpoint may come from the source's old masks
+        if stages.record(folder / source) != record:
             for checkpoint in folder.glob(CHECKPOINTS):
                 checkpoint.unlink()
         stages.stage(folder / source, **record)
 
 
 def _versions() -> dict[str, Any]:
-    return {"code": stages.code("odometry", "study/jobs"),
-            **stages.made_with("opencv-python-headless", "numpy", "numba")}
+    return {
+        "code": stages.code("odometry", "study/jobs"),
+        **stages.made_with("opencv-python-headless", "numpy", "numba"),
+    }
 
 
-def _passes(jobs: list[Job], sequences: Mapping[str, Sequence], folder: Path, workers: int) -> list[list[Job]]:
-    """Divide the jobs without a result into passes, the longest first. A pass with a checkpoint keeps its jobs."""
+def _passes(
+    jobs: list[Job], sequences: Mapping[str, Sequence], folder: Path, workers: int
+) -> list[list[Job]]:
+    """Divide the jobs without a result into passes, the longest first. A pass with a checkpoint
+    keeps its jobs.
+    """
     passes: list[list[Job]] = []
     jobs_without_checkpoint: list[Job] = []
     for name in sequences:
         sequence_jobs = {job.name: job for job in jobs if job.sequence == name}
-        waiting = {key: job for key, job in sequence_jobs.items() if not _result(folder, job).is_file()}
+        waiting = {
+            key: job for key, job in sequence_jobs.items() if not _result(folder, job).is_file()
+        }
         for path in sorted((folder / name).glob(CHECKPOINTS)):
             try:
                 keys = stages.resume(path)[0]["job"]["runs"]
@@ -155,16 +216,21 @@ def _passes(jobs: list[Job], sequences: Mapping[str, Sequence], folder: Path, wo
                 passes.append([sequence_jobs[key] for key in keys])
                 waiting = {key: job for key, job in waiting.items() if key not in keys}
         jobs_without_checkpoint += waiting.values()
-    return sorted(passes + in_passes(jobs_without_checkpoint, sequences, workers),
-                  key=lambda pass_jobs: -len(pass_jobs) * len(sequences[pass_jobs[0].sequence]))
+    return sorted(
+        passes + in_passes(jobs_without_checkpoint, sequences, workers),
+        key=lambda pass_jobs: -len(pass_jobs) * len(sequences[pass_jobs[0].sequence]),
+    )
 
 
-def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
-             ) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
-    """Return {job: masks} over a sequence, and {job: reason} for the jobs whose masks cannot be made.
+def masks_of(
+    jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
+) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
+    """Return {job: masks} over a sequence, and {job: reason} for the jobs whose masks cannot be
+    made.
 
-    Every file is read here, because a bad file in the middle of a pass would stop the whole pass. Jobs with the same
-    masks get the same object, by which `run_many` recognises that they share work.
+    Every file is read here, because a bad file in the middle of a pass would stop the whole pass.
+    Jobs with the same masks get the same object, by which `run_many` recognises that they share
+    work.
     """
     check_file = cache(lambda source, path: sources[source].check_file(path, sequence.size))
 
@@ -188,9 +254,17 @@ def masks_of(jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Sour
     return masks_by_job, failures
 
 
-def _run_pass(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], folder: Path, record: dict, threads: int
-              ) -> dict[Job, str]:
-    """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason} for the failed ones."""
+def _run_pass(
+    jobs: list[Job],
+    sequence: Sequence,
+    sources: dict[str, Source],
+    folder: Path,
+    record: dict,
+    threads: int,
+) -> dict[Job, str]:
+    """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason}
+    for the failed ones.
+    """
     cv2.setNumThreads(1)  # the processes already use every core
     digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
     checkpoint = folder / sequence.name / f"pass-{digest}.npz"
@@ -198,12 +272,20 @@ def _run_pass(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], f
     try:
         stages.check_worker(folder / sequence.name, record, **_versions())
         # a checkpoint can be resumed only with all of its jobs
-        waiting = jobs if checkpoint.is_file() else [job for job in jobs if not _result(folder, job).is_file()]
+        waiting = (
+            jobs
+            if checkpoint.is_file()
+            else [job for job in jobs if not _result(folder, job).is_file()]
+        )
         masks_by_job, failures = masks_of(waiting, sequence, sources)
         if not masks_by_job:  # also if Dask repeats a finished pass because it lost the answer
             return failures
-        results = odometry.run_many(sequence, {job.name: (job.settings, masks) for job, masks in masks_by_job.items()},
-                                    checkpoint=checkpoint, workers=threads)
+        results = odometry.run_many(
+            sequence,
+            {job.name: (job.settings, masks) for job, masks in masks_by_job.items()},
+            checkpoint=checkpoint,
+            workers=threads,
+        )
         for job in masks_by_job:
             if not _result(folder, job).is_file():
                 write_text(_result(folder, job), results.pop(job.name).frames.to_csv(index=False))
@@ -214,49 +296,79 @@ def _run_pass(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], f
             reason = f"{type(error).__name__}: {error}"
         elif not isinstance(error, InputError):
             reason = _MachineFault(reason)
-        failures = dict.fromkeys((job for job in jobs if not _result(folder, job).is_file()), reason) | failures
+        failures = (
+            dict.fromkeys((job for job in jobs if not _result(folder, job).is_file()), reason)
+            | failures
+        )
     return failures
 
 
 def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
-    """Return the columns of a table of runs that come from a run's table of frames: errors, keypoints, flagged frames.
+    """Return the columns of a table of runs that come from a run's table of frames: errors,
+    keypoints, flagged frames.
 
-    true: poses (n, 4, 4). The errors are those of `metrics.errors` and `metrics.step_errors`; t_rel (percent) and
-    r_rel (degrees per 100 m) are those of `metrics.kitti_errors`.
+    true: poses (n, 4, 4). The errors are those of `metrics.errors` and `metrics.step_errors`; t_rel
+    (percent) and r_rel (degrees per 100 m) are those of `metrics.kitti_errors`.
     """
     poses = poses_of(frames)
     kitti = metrics.kitti_errors(poses, true)
-    return {"frames": len(frames), **metrics.errors(poses, true), **metrics.step_errors(poses, true),
-            "t_rel": kitti["translation_percent"], "r_rel": kitti["rotation_deg_per_100m"],
-            "mean_keypoints": frames["detected"].mean(),
-            "flagged": int((~frames["flag"].isin(["", "stationary"])).sum())}
+    return {
+        "frames": len(frames),
+        **metrics.errors(poses, true),
+        **metrics.step_errors(poses, true),
+        "t_rel": kitti["translation_percent"],
+        "r_rel": kitti["rotation_deg_per_100m"],
+        "mean_keypoints": frames["detected"].mean(),
+        "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
+    }
 
 
-def with_boresight_correction(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None) -> pd.DataFrame:
-    """Return the runs with a new column, rmse_boresight_corrected: the RMSE (m) with the mounting angle removed.
+def with_boresight_correction(
+    runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None
+) -> pd.DataFrame:
+    """Return the runs with a new column, rmse_boresight_corrected: the RMSE (m) with the mounting
+    angle removed.
 
-    The angle between camera and ground truth is constant over a recording day. For each sequence it is estimated from
-    refined runs with all keypoints on the *other* sequences of the same day, and it is the same for every method. It
-    is taken as 0 if there are no other sequences or if they do not determine it.
-    folder, frames: as given to `run`. The column is NaN for sequences without a refined run with all keypoints.
+    The angle between camera and ground truth is constant over a recording day. For each sequence it
+    is estimated from refined runs with all keypoints on the *other* sequences of the same day, and
+    it is the same for every method. It is taken as 0 if there are no other sequences or if they do
+    not determine it.
+    folder, frames: as given to `run`. The column is NaN for sequences without a refined run with
+    all keypoints.
     """
     references = refined_paths(runs, kitti, folder, frames)
     angles = {name: boresight.angles_of_day(name, references) for name in references}
-    corrected = {(name, run): metrics.rmse(boresight.corrected(poses, angles[name]), references[name][1])
-                 for (name, run), poses in run_poses(runs[runs["sequence"].isin(references)], folder).items()}
-    return runs.assign(rmse_boresight_corrected=[corrected.get(key, np.nan)
-                                                 for key in zip(runs["sequence"], runs["run"], strict=True)])
+    corrected = {
+        (name, run): metrics.rmse(boresight.corrected(poses, angles[name]), references[name][1])
+        for (name, run), poses in run_poses(runs[runs["sequence"].isin(references)], folder).items()
+    }
+    return runs.assign(
+        rmse_boresight_corrected=[
+            corrected.get(key, np.nan) for key in zip(runs["sequence"], runs["run"], strict=True)
+        ]
+    )
 
 
-def refined_paths(runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None
-                  ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return {sequence: (estimated, true)} poses (n, 4, 4) of refined runs with all keypoints, for `boresight`."""
-    baselines = runs[(runs["method"] == "baseline") & (runs["estimator"] == "refined") & (runs["repetition"] == 0)]
-    return {name: (poses, Sequence(kitti, name).subset(frames).poses)
-            for (name, _), poses in run_poses(baselines, folder).items()}
+def refined_paths(
+    runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return {sequence: (estimated, true)} poses (n, 4, 4) of refined runs with all keypoints,
+    for `boresight`.
+    """
+    baselines = runs[
+        (runs["method"] == "baseline")
+        & (runs["estimator"] == "refined")
+        & (runs["repetition"] == 0)
+    ]
+    return {
+        name: (poses, Sequence(kitti, name).subset(frames).poses)
+        for (name, _), poses in run_poses(baselines, folder).items()
+    }
 
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
     """Return {(sequence, run): estimated poses (n, 4, 4)} for each row of a table of runs."""
-    return {(name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
-            for name, run in zip(runs["sequence"], runs["run"], strict=True)}
+    return {
+        (name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
+        for name, run in zip(runs["sequence"], runs["run"], strict=True)
+    }

@@ -19,8 +19,9 @@ PATHS = "paths"  # folder of the estimated paths
 class Study:
     """One or several sources of masks, compared with all keypoints.
 
-    sequences: their names. widths: pixels, for masks from label maps. tested: width of the controls, None for no
-    controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames of each sequence, None for all.
+    sequences: their names. widths: pixels, for masks from label maps. tested: width of the
+    controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
+    of each sequence, None for all.
     """
 
     kitti: Path
@@ -39,76 +40,137 @@ class Study:
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
         if not 1 <= self.repetitions <= MOST_REPETITIONS:
-            raise InputError(f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}")
+            raise InputError(
+                f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}"
+            )
         sequences = self.opened()
         for sequence in sequences:
             if len(sequence) < 3:
-                raise InputError(f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more")
-        sources.check(self.sources, sequences, (*self.widths, self.tested) if self.tested else self.widths)
+                raise InputError(
+                    f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
+                )
+        sources.check(
+            self.sources, sequences, (*self.widths, self.tested) if self.tested else self.widths
+        )
 
     @property
     def shown_width(self) -> int | None:
-        """The dilation width (pixels) of the masks in figures: the tested width, or else the middle one."""
+        """The dilation width (pixels) of the masks in figures: the tested width, or else the
+        middle one.
+        """
         return self.tested or (self.widths[len(self.widths) // 2] if self.widths else None)
 
     def masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
         """Return each sequence with the masks of each source, at the `shown_width`."""
-        return [(sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
-                for sequence in self.opened()]
+        return [
+            (sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
+            for sequence in self.opened()
+        ]
 
     def shown_jobs(self, name: str) -> list[jobs.Job]:
-        """Return the runs of a sequence whose paths are drawn: all keypoints and the masks of each source."""
+        """Return the runs of a sequence whose paths are drawn: all keypoints and the masks of
+        each source.
+        """
         estimator = "refined" if "refined" in self.estimators else "thesis"
-        return [jobs.Job(name, "baseline", estimator=estimator), *(
-            jobs.Job(name, "masked", self.shown_width if source.kind == "labels" else None, estimator=estimator,
-                     source=source.name) for source in self.sources)]
+        return [
+            jobs.Job(name, "baseline", estimator=estimator),
+            *(
+                jobs.Job(
+                    name,
+                    "masked",
+                    self.shown_width if source.kind == "labels" else None,
+                    estimator=estimator,
+                    source=source.name,
+                )
+                for source in self.sources
+            ),
+        ]
 
     def write_paths(self, runs: pd.DataFrame, folder: Path) -> None:
-        """Write the ground truth and repetition 0 of every run into folder/PATHS, in KITTI's and TUM's formats."""
+        """Write the ground truth and repetition 0 of every run into folder/PATHS, in KITTI's
+        and TUM's formats.
+        """
         first_runs = runs[runs["repetition"] == 0]
         for sequence in self.opened():
             name = sequence.name
-            estimated = runner.run_poses(first_runs[first_runs["sequence"] == name], folder / "runs")
+            estimated = runner.run_poses(
+                first_runs[first_runs["sequence"] == name], folder / "runs"
+            )
             for (_, run), poses in {(name, "truth"): sequence.poses, **estimated}.items():
                 write_kitti_poses(folder / PATHS / "kitti" / name / f"{run}.txt", poses)
                 write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
     def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
-        """Return the warnings of `check.path_oddities` for one run with all keypoints of each sequence."""
-        baselines = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)].drop_duplicates("sequence")
-        return [line for (name, _), poses in runner.run_poses(baselines, folder / "runs").items()
-                for line in check.path_oddities(name, poses, Sequence(self.kitti, name).poses[:len(poses)])]
+        """Return the warnings of `check.path_oddities` for one run with all keypoints of each
+        sequence.
+        """
+        baselines = runs[
+            (runs["method"] == "baseline") & (runs["repetition"] == 0)
+        ].drop_duplicates("sequence")
+        return [
+            line
+            for (name, _), poses in runner.run_poses(baselines, folder / "runs").items()
+            for line in check.path_oddities(
+                name, poses, Sequence(self.kitti, name).poses[: len(poses)]
+            )
+        ]
 
     def first_jobs(self) -> list[jobs.Job]:
         """Return the jobs that need no other results."""
-        return jobs.first_jobs(self.kitti, self.sequences, dict.fromkeys(self.estimators, self.widths),
-                               tested=self.tested, sources=self.sources, repetitions=self.repetitions)
+        return jobs.first_jobs(
+            self.kitti,
+            self.sequences,
+            dict.fromkeys(self.estimators, self.widths),
+            tested=self.tested,
+            sources=self.sources,
+            repetitions=self.repetitions,
+        )
 
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
-        """Run the jobs whose results are not in the folder yet; returns the table of all runs, see `runner.run`.
+        """Run the jobs whose results are not in the folder yet; returns the table of all runs, see
+        `runner.run`.
 
         Raises InputError for a folder with results of another number of frames.
         """
-        run = partial(runner.run, kitti=self.kitti, labels=self.sources, folder=folder / "runs", frames=self.frames,
-                      processes=processes, scheduler=scheduler)
+        run = partial(
+            runner.run,
+            kitti=self.kitti,
+            labels=self.sources,
+            folder=folder / "runs",
+            frames=self.frames,
+            processes=processes,
+            scheduler=scheduler,
+        )
         with longrun.claimed(folder):
             stages.stage(folder, replace=False, frames=self.frames)
             study_jobs = self.first_jobs()
             runs = run(study_jobs)
             if runs["mean_keypoints"].isna().all():
-                raise InputError(f"{self.kitti}: no frame has any structure (all are black, white or of one gray); "
-                                 "check how they were written")
+                raise InputError(
+                    f"{self.kitti}: no frame has any structure (all are black, white or of one gray); "
+                    "check how they were written"
+                )
             if not (runs["method"] == "masked").any():
-                raise InputError("every run with masks failed (see above), so there is nothing to compare")
+                raise InputError(
+                    "every run with masks failed (see above), so there is nothing to compare"
+                )
             if self.tested:
                 made = runs.attrs["made"]
                 for source in self.sources:
                     keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
                     width = None if source.kind == "masks" else self.tested
-                    study_jobs += jobs.keypoint_control_jobs(keypoints, self.kitti, self.frames, self.repetitions,
-                                                             self.estimators, source.name, width)
+                    study_jobs += jobs.keypoint_control_jobs(
+                        keypoints,
+                        self.kitti,
+                        self.frames,
+                        self.repetitions,
+                        self.estimators,
+                        source.name,
+                        width,
+                    )
                 runs = run(study_jobs)
-                runs.attrs["made"] += made  # the second call counts the runs of the first one as kept
+                # the second call counts the runs of the first one as kept
+                runs.attrs["made"] += made
                 runs.attrs["kept"] -= made
             self.write_paths(runs, folder)
         return runs

@@ -1,4 +1,6 @@
-"""The sources of the masks of a study: folders of label maps or of ready-made masks, one or several."""
+"""The sources of the masks of a study: folders of label maps or of ready-made masks, one or
+several.
+"""
 
 import re
 from collections.abc import Collection, Iterable
@@ -22,9 +24,11 @@ class Source:
     """A source of masks.
 
     folder: holds one folder for each sequence or, for a single sequence, the files themselves.
-    kind: "labels" for label maps of any size, whose boundaries are dilated; "masks" for masks of the frames' size.
+    kind: "labels" for label maps of any size, whose boundaries are dilated; "masks" for masks of
+    the frames' size.
     name: used in the names of its runs; empty if there is only one source.
-    settings: how masks are made from label maps. invert: swap kept and ignored pixels of ready-made masks.
+    settings: how masks are made from label maps. invert: swap kept and ignored pixels of ready-made
+    masks.
     """
 
     folder: Path
@@ -36,7 +40,8 @@ class Source:
     def of(self, sequence: str) -> Path:
         """Return the folder with the files of one sequence."""
         subfolder = self.folder / sequence
-        has_files = any(self.folder.glob("[!.]*.png"))  # as `thesis-repro predict` and `masks` write them
+        # as `thesis-repro predict` and `masks` write them
+        has_files = any(self.folder.glob("[!.]*.png"))
         return self.folder if has_files and not subfolder.is_dir() else subfolder
 
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
@@ -51,55 +56,83 @@ class Source:
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError if a file is not a label map, or not a mask of size (height, width)."""
-        read_label_map(path, self.settings.ids == "train") if self.kind == "labels" else read_mask(path, size)
+        read_label_map(path, self.settings.ids == "train") if self.kind == "labels" else read_mask(
+            path, size
+        )
 
     def record(self, sequence: str) -> dict[str, str | None]:
         """Return the digests and settings that the results of a sequence depend on."""
         folder = self.of(sequence)
         made_from = stages.made_from(folder) if stages.record(folder) is not None else None
-        settings = {"settings": str(self.settings)} if self.kind == "labels" else {"invert": str(self.invert)}
+        settings = (
+            {"settings": str(self.settings)}
+            if self.kind == "labels"
+            else {"invert": str(self.invert)}
+        )
         return {self.kind: stages.listing(listed(folder)), "made_from": made_from, **settings}
 
 
-def named(folders: Iterable[tuple[str, Path]], names: Iterable[str], settings: MaskSettings,
-          invert: bool = False) -> tuple[Source, ...]:
-    """Return sources from (kind, folder) pairs and their names, in order. The default name is that of the folder.
+def named(
+    folders: Iterable[tuple[str, Path]],
+    names: Iterable[str],
+    settings: MaskSettings,
+    invert: bool = False,
+) -> tuple[Source, ...]:
+    """Return sources from (kind, folder) pairs and their names, in order. The default name is that
+    of the folder.
 
     settings: for all masks from label maps. invert: for all ready-made masks.
-    Raises InputError for a name that cannot be a folder's name, for equal names, and for more names than folders.
+    Raises InputError for a name that cannot be a folder's name, for equal names, and for more names
+    than folders.
     """
     folders, names = list(folders), list(names)
     sources: list[Source] = []
     if len(names) > len(folders):
-        raise InputError(f"--name {names[len(folders)]}: {len(names)} names for {len(folders)} folders of masks; give "
-                         "one --name for each --labels or --masks, in their order")
+        raise InputError(
+            f"--name {names[len(folders)]}: {len(names)} names for {len(folders)} folders of masks; give "
+            "one --name for each --labels or --masks, in their order"
+        )
     for (kind, folder), given_name in zip_longest(folders, names):
         if given_name is not None and not re.fullmatch(r"[\w+-]+", given_name):
-            raise InputError(f"--name {given_name}: a name may have letters, digits, '_', '+' and '-'")
+            raise InputError(
+                f"--name {given_name}: a name may have letters, digits, '_', '+' and '-'"
+            )
         name = given_name or re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-") or "masks"
-        if name.lower() in (source.name.lower() for source in sources):  # some file systems ignore case
-            raise InputError(f"--name: two folders of masks would be called {name!r}; give each a different --name, in "
-                             "the order of --labels and --masks")
+        # some file systems ignore case
+        if name.lower() in (source.name.lower() for source in sources):
+            raise InputError(
+                f"--name: two folders of masks would be called {name!r}; give each a different --name, in "
+                "the order of --labels and --masks"
+            )
         sources.append(Source(folder.absolute(), kind, name, settings, invert and kind == "masks"))
     return tuple(sources)
 
 
-def check(sources: Iterable[Source], sequences: Collection[Sequence], widths: Collection[int]) -> None:
-    """Raise InputError, before anything runs, if a source lacks a file for a frame or has files of the wrong kind.
+def check(
+    sources: Iterable[Source], sequences: Collection[Sequence], widths: Collection[int]
+) -> None:
+    """Raise InputError, before anything runs, if a source lacks a file for a frame or has files of
+    the wrong kind.
 
-    widths: pixels, for masks from label maps. Only the size of every mask and the first file of each sequence are
-    checked here. The runner reads all files, and a bad one stops only the runs that need it.
+    widths: pixels, for masks from label maps. Only the size of every mask and the first file of
+    each sequence are checked here. The runner reads all files, and a bad one stops only the runs
+    that need it.
     """
     for source in sources:
         kind = KINDS[source.kind]
         if not source.folder.is_dir():
-            raise InputError(f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence")
+            raise InputError(
+                f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence"
+            )
         for sequence in sequences:
             if source.of(sequence.name) == source.folder and len(sequences) > 1:
-                raise InputError(f"{source.folder}: holds the {kind} of one sequence, but {len(sequences)} are asked "
-                                 f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "
-                                 "name one with --sequences")
-            for width in widths or (1,):  # raises InputError for a width that is too large for the frames
+                raise InputError(
+                    f"{source.folder}: holds the {kind} of one sequence, but {len(sequences)} are asked "
+                    f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "
+                    "name one with --sequences"
+                )
+            # raises InputError for a width that is too large for the frames
+            for width in widths or (1,):
                 paths = source.masks(sequence, width).paths
             for path in paths if source.kind == "masks" else ():
                 check_size(path, glance(path), sequence.size, "its frame")

@@ -1,7 +1,8 @@
-"""Time every dilation width as the thesis does (Figure 4.17), and each stage from a frame's file to its pose.
+"""Time every dilation width as the thesis does (Figure 4.17), and each stage from a frame's file to
+its pose.
 
-The stages include the network, as Section 5.2.2 asks for. They are timed as in a live system: one frame after the
-other, the network on one image at a time, all cores.
+The stages include the network, as Section 5.2.2 asks for. They are timed as in a live system: one
+frame after the other, the network on one image at a time, all cores.
 """
 
 import time
@@ -38,24 +39,44 @@ def opencv_threads(count: int) -> Iterator[None]:
         cv2.setNumThreads(previous_count)
 
 
-def time_runs(jobs: Iterable[Job], kitti: Path, labels: Path | Iterable[Source], folder: Path, *, frames: int,
-              processes: int = 1) -> pd.DataFrame:
-    """Time each job as a separate run; returns a table of sequence, run, method, dilation_width and seconds.
+def time_runs(
+    jobs: Iterable[Job],
+    kitti: Path,
+    labels: Path | Iterable[Source],
+    folder: Path,
+    *,
+    frames: int,
+    processes: int = 1,
+) -> pd.DataFrame:
+    """Time each job as a separate run; returns a table of sequence, run, method, dilation_width and
+    seconds.
 
-    Only the first `frames` frames are timed, without the first two steps, which load compiled code. The jobs of a
-    sequence take turns at every frame, so that other programs slow all of them equally.
-    Call it after `runner.run`, with the same folder and label maps. Times in the folder are not measured again.
+    Only the first `frames` frames are timed, without the first two steps, which load compiled code.
+    The jobs of a sequence take turns at every frame, so that other programs slow all of them
+    equally. Call it after `runner.run`, with the same folder and label maps. Times in the folder
+    are not measured again.
     """
     jobs, sources = list(jobs), by_name(labels)
     names = sorted({job.sequence for job in jobs})
-    calls = [([job for job in jobs if job.sequence == name], Sequence(kitti, name).subset(frames), sources,
-              folder / name / f"seconds-{frames}.csv") for name in names]
+    calls = [
+        (
+            [job for job in jobs if job.sequence == name],
+            Sequence(kitti, name).subset(frames),
+            sources,
+            folder / name / f"seconds-{frames}.csv",
+        )
+        for name in names
+    ]
     with cluster.open_pool(processes) as pool:
-        tables = dict(progress(pool.run(_time_jobs, calls), "timing", total=len(calls), unit="sequence"))
+        tables = dict(
+            progress(pool.run(_time_jobs, calls), "timing", total=len(calls), unit="sequence")
+        )
     return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
 
 
-def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path) -> pd.DataFrame:
+def _time_jobs(
+    jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
+) -> pd.DataFrame:
     kept = stages.kept_table(path, dtype={"sequence": str})
     if kept is not None and {job.name for job in jobs} <= set(kept["run"]):
         return kept
@@ -68,28 +89,44 @@ def _time_jobs(jobs: list[Job], sequence: Sequence, sources: dict[str, Source], 
             frame = sequence.frame(index)
             for job, job_masks in masks_by_job.items():
                 masks.forget_edges()  # a separate run would have to find them
-                mask, mask_seconds = (None, 0.0) if job_masks is None else _timed(job_masks.__getitem__, index)
+                mask, mask_seconds = (
+                    (None, 0.0) if job_masks is None else _timed(job_masks.__getitem__, index)
+                )
                 step = odometries[job].step(frame, scales[index], mask)
                 if index > 1:
                     # Section 4.2 counts the odometry and the making of the mask, not the prediction
                     seconds[job] += mask_seconds + sum(step.seconds.values())
-    table = pd.DataFrame([{"sequence": job.sequence, "run": job.name, "method": job.method,
-                           "dilation_width": job.dilation_width, "seconds": value} for job, value in seconds.items()])
+    table = pd.DataFrame(
+        [
+            {
+                "sequence": job.sequence,
+                "run": job.name,
+                "method": job.method,
+                "dilation_width": job.dilation_width,
+                "seconds": value,
+            }
+            for job, value in seconds.items()
+        ]
+    )
     write_text(path, table.to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
 def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
-    """Time each stage of a frame, with all keypoints and with masks: a table of method, stage, milliseconds (medians).
+    """Time each stage of a frame, with all keypoints and with masks: a table of method, stage,
+    milliseconds (medians).
 
-    Stages: read (the frame's file), segmentation (resize to the model's input, network, class of every pixel), mask
-    (label map to 320x320, edges, dilation), detection, tracking, pose (essential matrix, then rotation and
-    translation). model: a Keras model of `segmentation`. width: of the masks, pixels. The methods take turns.
+    Stages: read (the frame's file), segmentation (resize to the model's input, network, class of
+    every pixel), mask (label map to 320x320, edges, dilation), detection, tracking, pose (essential
+    matrix, then rotation and translation). model: a Keras model of `segmentation`. width: of the
+    masks, pixels. The methods take turns.
     Raises InputError for a sequence with too few frames.
     """
     sequence = sequence.subset(FRAMES + WARM_UP)
     if len(sequence) < WARM_UP + 2:
-        raise InputError(f"sequence {sequence.name}: {len(sequence)} frames; timing needs {WARM_UP + 2} or more")
+        raise InputError(
+            f"sequence {sequence.name}: {len(sequence)} frames; timing needs {WARM_UP + 2} or more"
+        )
     plain, masked = "all keypoints", f"masked, width {width}"
     metres, rows = odometry.scales(sequence), []
     runs = {name: odometry.Odometry(sequence.intrinsics) for name in (plain, masked)}
@@ -101,17 +138,33 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
             for name, run in runs.items():
                 seconds = run.step(frame, metres[index], mask if name == masked else None).seconds
                 if index >= WARM_UP:
-                    network_stages = {"segmentation": segmentation, "mask": masking} if name == masked else {}
-                    rows.append({"method": name, "read": read, **network_stages, "detection": seconds["detect"],
-                                 "tracking": seconds["track"], "pose": seconds["essential"] + seconds["pose"]})
+                    network_stages = (
+                        {"segmentation": segmentation, "mask": masking} if name == masked else {}
+                    )
+                    rows.append(
+                        {
+                            "method": name,
+                            "read": read,
+                            **network_stages,
+                            "detection": seconds["detect"],
+                            "tracking": seconds["track"],
+                            "pose": seconds["essential"] + seconds["pose"],
+                        }
+                    )
     medians = 1000 * pd.DataFrame(rows).groupby("method", sort=False)[list(STAGES)].median()
-    return medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds").dropna().reset_index()
+    return (
+        medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds")
+        .dropna()
+        .reset_index()
+    )
 
 
 def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
-    """Write measured timings to a file and return them; with `keep`, return the timings of an existing file instead.
+    """Write measured timings to a file and return them; with `keep`, return the timings of an
+    existing file instead.
 
-    Figures in git keep their timings, which would otherwise change with every machine and every run.
+    Figures in git keep their timings, which would otherwise change with every machine and every
+    run.
     """
     if not (keep and path.is_file()):
         write_text(path, measured.to_csv(index=False))

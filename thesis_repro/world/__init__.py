@@ -1,4 +1,6 @@
-"""The embedded world: rendered street drives with exact poses and label maps, in the layouts of the real data."""
+"""The embedded world: rendered street drives with exact poses and label maps, in the layouts of
+the real data.
+"""
 
 from thesis_repro.world.dataset import write
 

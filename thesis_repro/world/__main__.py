@@ -8,7 +8,13 @@ from thesis_repro.settings import read_settings
 if __name__ == "__main__":
     try:
         settings = read_settings()
-        world.write(settings.world, **settings.sizes.world, seed=settings.seed, jobs=settings.jobs, only="kitti",
-                    replace=not settings.cityscapes_is_embedded)
+        world.write(
+            settings.world,
+            **settings.sizes.world,
+            seed=settings.seed,
+            jobs=settings.jobs,
+            only="kitti",
+            replace=not settings.cityscapes_is_embedded,
+        )
     except (InputError, OSError) as error:
         sys.exit(longrun.report_error(error))

@@ -1,8 +1,10 @@
-"""The embedded world: rendered street drives with exact poses and label maps, written in the two real file layouts.
+"""The embedded world: rendered street drives with exact poses and label maps, written in the two
+real file layouts.
 
-OUT/kitti has the layout of the KITTI odometry benchmark, plus sequences/NN/labels_0 with the exact label maps.
-OUT/cityscapes has the layout of Cityscapes and shows other streets than the sequences. Each picture depends only on
-the seed and its own name, so neither the number of processes nor an interruption changes a byte.
+OUT/kitti has the layout of the KITTI odometry benchmark, plus sequences/NN/labels_0 with the exact
+label maps. OUT/cityscapes has the layout of Cityscapes and shows other streets than the sequences.
+Each picture depends only on the seed and its own name, so neither the number of processes nor an
+interruption changes a byte.
 """
 
 import dataclasses
@@ -19,13 +21,17 @@ from thesis_repro.world import drives, street, textures
 SEQUENCES = tuple(drives.DRIVES)
 BASELINE = 0.537  # metres between KITTI's cameras, for P1 and P3 of the calibration file
 IMAGE_SIZE = (512, 1024)  # height and width of the training images at scale 1
-CITIES = {"train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfeld"),
-          "val": ("nebelburg", "quellheim")}
+CITIES = {
+    "train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfeld"),
+    "val": ("nebelburg", "quellheim"),
+}
 
 
 @lru_cache(maxsize=2)
 def _drive(name, frames, seed):
-    """Return a sequence's street, camera-to-world poses in it, (frames, 4, 4), and metres driven, (frames,)."""
+    """Return a sequence's street, camera-to-world poses in it, (frames, 4, 4), and metres
+    driven, (frames,).
+    """
     track, poses, driven = drives.way(name, frames, seed)
     rng = np.random.default_rng((seed, drives.STREET, int(name)))
     return street.build(rng, textures.build(seed), track, drives.DRIVES[name].style), poses, driven
@@ -45,22 +51,36 @@ def render_frame(name, index, frames=None, scale=0.5, seed=0):
 
 
 def render_image(split, index, scale=0.5, seed=0):
-    """Render training or validation image `index` ("train", "val"): image and label map, both uint8 (height, width)."""
+    """Render training or validation image `index` ("train", "val"): image and label map, both
+    uint8 (height, width).
+    """
     rng = np.random.default_rng((seed, drives.IMAGE, ("train", "val").index(split), index))
     plan = drives.DRIVES[SEQUENCES[int(rng.integers(0, len(SEQUENCES)))]]
     bend = rng.uniform(-70, 70)
-    pieces = ((float(rng.uniform(8, 40)), 0.0), (float(rng.uniform(15, 40)), bend if rng.random() < 0.6 else 0.0),
-              (300.0, 0.0))
+    pieces = (
+        (float(rng.uniform(8, 40)), 0.0),
+        (float(rng.uniform(15, 40)), bend if rng.random() < 0.6 else 0.0),
+        (300.0, 0.0),
+    )
     sky = (rng.uniform(120, 190), rng.uniform(175, 235))
     style = dataclasses.replace(
-        plan.style, leaders=(), crossing=None, sky=sky, sunny=bool(rng.random() < 0.65),
-        sun=(rng.uniform(-np.pi, np.pi), rng.uniform(0.45, 1.0)), persons=rng.uniform(0.05, 0.25),
-        traffic=rng.uniform(0.01, 0.05), trees=rng.uniform(0.1, 0.9))
+        plan.style,
+        leaders=(),
+        crossing=None,
+        sky=sky,
+        sunny=bool(rng.random() < 0.65),
+        sun=(rng.uniform(-np.pi, np.pi), rng.uniform(0.45, 1.0)),
+        persons=rng.uniform(0.05, 0.25),
+        traffic=rng.uniform(0.01, 0.05),
+        trees=rng.uniform(0.1, 0.9),
+    )
     track = drives.Track(pieces, -drives.BEHIND, drives.AHEAD)
     scenery = street.build(rng, textures.build(seed), track, style)
     x, z, heading = track.at(rng.uniform(0, 12), plan.lane * rng.uniform(-0.3, 1.2))
-    camera = drives.poses_of([(x, -rng.uniform(1.2, 1.9), z)],
-                             [(heading, 0, 0) + np.radians(rng.uniform((-14, -2.5, -1), (14, 2, 1)))])[0]
+    camera = drives.poses_of(
+        [(x, -rng.uniform(1.2, 1.9), z)],
+        [(heading, 0, 0) + np.radians(rng.uniform((-14, -2.5, -1), (14, 2, 1)))],
+    )[0]
     height, width = round(IMAGE_SIZE[0] * scale), round(IMAGE_SIZE[1] * scale)
     focal = width * rng.uniform(0.6, 1.0)
     intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
@@ -86,35 +106,62 @@ def _expose(rng, image, level, noise):
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
-def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100, validation_images=20, seed=0, jobs=-1,
-          replace=False, only=None):
+def write(
+    out,
+    *,
+    sequences=SEQUENCES,
+    frames=None,
+    scale=1.0,
+    train_images=100,
+    validation_images=20,
+    seed=0,
+    jobs=-1,
+    replace=False,
+    only=None,
+):
     """Write the embedded world to OUT/kitti and OUT/cityscapes; resumes a stopped run.
 
-    sequences: names among 00 to 10; frames: frames of each sequence, None for its whole drive (41 to 132); scale: of
-    KITTI's image size, and of 1024x512 for the training images; jobs: number of processes, -1 for one a core.
-    replace: delete an embedded world of other parameters first; other files are never deleted. A complete world of the
-    same parameters is kept.
+    sequences: names among 00 to 10; frames: frames of each sequence, None for its whole drive (41
+    to 132); scale: of KITTI's image size, and of 1024x512 for the training images; jobs: number of
+    processes, -1 for one a core.
+    replace: delete an embedded world of other parameters first; other files are never deleted. A
+    complete world of the same parameters is kept.
     only: "kitti" or "cityscapes", to write one of the two.
     Returns (number of pictures rendered, number of pictures in total).
-    Raises InputError for a folder that holds other files or is in use by another run, a world of other parameters, or
-    a bad parameter.
+    Raises InputError for a folder that holds other files or is in use by another run, a world of
+    other parameters, or a bad parameter.
     """
     out = Path(out)
-    parameters = {"sequences": list(sequences), "frames": frames, "scale": scale, "train_images": train_images,
-                  "validation_images": validation_images, "seed": seed}
+    parameters = {
+        "sequences": list(sequences),
+        "frames": frames,
+        "scale": scale,
+        "train_images": train_images,
+        "validation_images": validation_images,
+        "seed": seed,
+    }
     _check(**parameters)
     with longrun.claimed(out):
         stages.stage(out, replace=replace, code=stages.code("world"), **parameters)
-        pictures = [picture for picture in _pictures(out, **parameters)
-                    if only in (None, picture[1].relative_to(out).parts[0])]
+        pictures = [
+            picture
+            for picture in _pictures(out, **parameters)
+            if only in (None, picture[1].relative_to(out).parts[0])
+        ]
         missing = [picture for picture in pictures if not all(map(is_whole, picture[1:]))]
         workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
-        with progress(description="rendering the embedded world", total=len(missing), unit="picture") as bar:
-            bar.update(_write_pictures(missing[:1]))  # compiles the rasteriser once, for all worker processes
+        with progress(
+            description="rendering the embedded world", total=len(missing), unit="picture"
+        ) as bar:
+            # compiles the rasteriser once, for all worker processes
+            bar.update(_write_pictures(missing[:1]))
             # Ten at a time, because pictures of one sequence share its street.
-            work = (delayed(_write_pictures)(missing[k:k + 10]) for k in range(1, len(missing), 10))
-            for count in Parallel(n_jobs=workers, return_as="generator_unordered",
-                                  initializer=longrun.end_with_parent)(work):
+            work = (
+                delayed(_write_pictures)(missing[k : k + 10]) for k in range(1, len(missing), 10)
+            )
+            for count in Parallel(
+                n_jobs=workers, return_as="generator_unordered", initializer=longrun.end_with_parent
+            )(work):
                 bar.update(count)
         for name in sequences if only != "cityscapes" else ():
             if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # written last
@@ -125,7 +172,9 @@ def write(out, *, sequences=SEQUENCES, frames=None, scale=1.0, train_images=100,
 def _check(sequences, frames, scale, **numbers):
     """Raise InputError for a parameter of `write` that describes no world."""
     if not sequences or not set(sequences) <= set(SEQUENCES):
-        raise InputError(f"sequences: must be among 00 to 10, not {' '.join(map(str, sequences)) or 'none'}")
+        raise InputError(
+            f"sequences: must be among 00 to 10, not {' '.join(map(str, sequences)) or 'none'}"
+        )
     if not 0.1 <= scale <= 1:
         raise InputError(f"scale: must lie between 0.1 and 1 (KITTI's full size), not {scale!r}")
     for name, value in {"frames": 2 if frames is None else frames, **numbers}.items():
@@ -140,15 +189,20 @@ def _pictures(root, sequences, frames, scale, train_images, validation_images, s
         folder = root / "kitti" / "sequences" / name
         for index in range(frames or drives.DRIVES[name].frames):
             picture = f"{index:06d}.png"
-            yield (partial(render_frame, name, index, frames, scale, seed),
-                   folder / "image_0" / picture, folder / "labels_0" / picture)
+            yield (
+                partial(render_frame, name, index, frames, scale, seed),
+                folder / "image_0" / picture,
+                folder / "labels_0" / picture,
+            )
     for split, count in (("train", train_images), ("val", validation_images)):
         for index in range(count):
             city, number = CITIES[split][index % len(CITIES[split])], index // len(CITIES[split])
             stem = f"{city}_{number:06d}_000000"
-            yield (partial(render_image, split, index, scale, seed),
-                   root / "cityscapes" / "leftImg8bit" / split / city / f"{stem}_leftImg8bit.png",
-                   root / "cityscapes" / "gtFine" / split / city / f"{stem}_gtFine_labelIds.png")
+            yield (
+                partial(render_image, split, index, scale, seed),
+                root / "cityscapes" / "leftImg8bit" / split / city / f"{stem}_leftImg8bit.png",
+                root / "cityscapes" / "gtFine" / split / city / f"{stem}_gtFine_labelIds.png",
+            )
 
 
 def _write_pictures(pictures):
@@ -168,6 +222,10 @@ def _write_sequence_texts(root, name, frames, scale, seed):
         projection = np.c_[intrinsics, [-BASELINE * intrinsics[0, 0] * (camera % 2), 0, 0]]
         lines.append(f"P{camera}: " + " ".join(f"{value:.12e}" for value in projection.ravel()))
     write_text(folder / "calib.txt", "\n".join(lines) + "\n")
-    write_text(folder / "times.txt", "".join(f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames)))
+    write_text(
+        folder / "times.txt", "".join(f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames))
+    )
     _, poses, _ = drives.way(name, frames, seed)
-    kitti.write_kitti_poses(root / "kitti" / "poses" / f"{name}.txt", drives.relative_to_first(poses))
+    kitti.write_kitti_poses(
+        root / "kitti" / "poses" / f"{name}.txt", drives.relative_to_first(poses)
+    )

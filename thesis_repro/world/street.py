@@ -1,7 +1,7 @@
 """A street of the embedded world: the ground, the things that stand and move on it, and the light.
 
-The ground is flat, the road at y = 0 and the sidewalks a kerb higher. Cars drive on the right. A `side` is 1 on the
-right and -1 on the left, looking along the track.
+The ground is flat, the road at y = 0 and the sidewalks a kerb higher. Cars drive on the right. A
+`side` is 1 on the right and -1 on the left, looking along the track.
 """
 
 from dataclasses import dataclass, field
@@ -30,8 +30,12 @@ class Mover:
     turn: float  # radians to the right of the track's direction
 
     def at(self, frame, driven):
-        """Return the faces in the street at a frame; driven: metres that the camera has driven by then."""
-        x, z, heading = self.track.at(self.s + (driven if self.pace is None else self.pace * frame), self.d)
+        """Return the faces in the street at a frame; driven: metres that the camera has driven
+        by then.
+        """
+        x, z, heading = self.track.at(
+            self.s + (driven if self.pace is None else self.pace * frame), self.d
+        )
         return things.place(self.faces, x, z, heading + self.turn)
 
 
@@ -55,23 +59,36 @@ class Street:
         roads = [self.track, *self.crossings]
         self.middle = np.concatenate([np.stack([road.x, road.z], axis=1)[::2] for road in roads])
         self.houses = np.empty((0, 2))  # points spread over all houses, at most 3 m apart
-        self.line = self.style.half + (self.style.sidewalk or 3.0)  # |d| at which houses and gardens begin
+        # |d| at which houses and gardens begin
+        self.line = self.style.half + (self.style.sidewalk or 3.0)
 
     def view(self, pose, intrinsics, size, frame, driven=0.0):
-        """Render the image (float32, before exposure and noise) and the label map (uint8), both (height, width).
+        """Render the image (float32, before exposure and noise) and the label map (uint8), both
+        (height, width).
 
-        pose: 4x4 camera-to-world; intrinsics: 3x3, pixels; size: (height, width); frame, driven: as in `Mover.at`.
+        pose: 4x4 camera-to-world; intrinsics: 3x3, pixels; size: (height, width); frame, driven: as
+        in `Mover.at`.
         """
         moved = [mover.at(frame, driven) for mover in self.movers]
-        return raster.render(np.concatenate([*self.parts, *moved]), self.bank.packed, pose, intrinsics, size,
-                             self.environment)
+        return raster.render(
+            np.concatenate([*self.parts, *moved]),
+            self.bank.packed,
+            pose,
+            intrinsics,
+            size,
+            self.environment,
+        )
 
     def off_road(self, x, z):
-        """Return the distance of points, (n,) each, to the nearest edge of any road; negative on a road."""
+        """Return the distance of points, (n,) each, to the nearest edge of any road; negative
+        on a road.
+        """
         return _distance(x, z, self.middle) - self.style.half
 
     def free(self, x, z, margin):
-        """Return whether a point is more than `margin` metres from all roads, and outside all houses."""
+        """Return whether a point is more than `margin` metres from all roads, and outside all
+        houses.
+        """
         return self.off_road(x, z)[0] > margin and _distance(x, z, self.houses)[0] >= 2.4
 
     def put(self, faces, x, z, yaw, y=-KERB):
@@ -79,12 +96,17 @@ class Street:
         self.parts.append(things.place(faces, x, z, yaw, y))
 
     def extrude(self, profile, side, texture, label, span=None, margin=None, step=1.0, **options):
-        """Place a strip along the main road; span: (start, stop); margin: metres that it keeps from all roads."""
+        """Place a strip along the main road; span: (start, stop); margin: metres that it keeps
+        from all roads.
+        """
         start, stop = span or (self.track.s[0], self.track.s[-1])
         places = np.linspace(start, stop, max(2, round((stop - start) / step) + 1))
         off_road = None if margin is None else lambda x, z: self.off_road(x, z) > margin
-        self.parts.append(things.extrude(self.names, self.track, places, side, profile, texture, label, off_road,
-                                         **options))
+        self.parts.append(
+            things.extrude(
+                self.names, self.track, places, side, profile, texture, label, off_road, **options
+            )
+        )
 
     def along(self, step):
         """Yield places along the main road, about `step` metres apart."""
@@ -95,7 +117,9 @@ class Street:
 
 
 def build(rng, bank, track, style):
-    """Lay out a `Street` of a `Style` along a `Track`; rng: NumPy generator; bank: result of `textures.build`."""
+    """Lay out a `Street` of a `Style` along a `Track`; rng: NumPy generator; bank: result of
+    `textures.build`.
+    """
     street = Street(rng, bank, style, track)
     _lay_ground(street)
     _surround(street)
@@ -107,7 +131,9 @@ def build(rng, bank, track, style):
 
 
 def _distance(x, z, points):
-    """Return the distance of each place, (n,), to the nearest of the points (m, 2); infinity without points."""
+    """Return the distance of each place, (n,), to the nearest of the points (m, 2); infinity
+    without points.
+    """
     x, z = np.atleast_1d(x)[:, None], np.atleast_1d(z)[:, None]
     return np.sqrt(((x - points[:, 0]) ** 2 + (z - points[:, 1]) ** 2).min(axis=1, initial=np.inf))
 
@@ -118,13 +144,31 @@ def _lay_ground(street):
     street.extrude([(-half, 0), (half, 0)], 1, street.style.road, "road", step=2.0, ground=1)
     if width:
         for side in (-1, 1):
-            street.extrude([(half, 0.05), (half, -KERB), (half + width, -KERB)], side, "sidewalk", "sidewalk",
-                           margin=0.2, ground=1)
-            street.extrude([(half - 0.02, 0.01), (half + width, 0.01)], side, "asphalt", "road", ground=1)
+            street.extrude(
+                [(half, 0.05), (half, -KERB), (half + width, -KERB)],
+                side,
+                "sidewalk",
+                "sidewalk",
+                margin=0.2,
+                ground=1,
+            )
+            street.extrude(
+                [(half - 0.02, 0.01), (half + width, 0.01)], side, "asphalt", "road", ground=1
+            )
     for crossing in street.crossings:
         places = np.arange(crossing.s[0], crossing.s[-1], 2.0)
-        street.parts.append(things.extrude(street.names, crossing, places, 1, [(-half, 0.005), (half, 0.005)],
-                                           "asphalt", "road", ground=1))
+        street.parts.append(
+            things.extrude(
+                street.names,
+                crossing,
+                places,
+                1,
+                [(-half, 0.005), (half, 0.005)],
+                "asphalt",
+                "road",
+                ground=1,
+            )
+        )
 
 
 def _surround(street):
@@ -132,14 +176,40 @@ def _surround(street):
     faces, light = things.Faces(street.names), street.environment
     low, high = street.middle.min(axis=0) - BEYOND, street.middle.max(axis=0) + BEYOND
     (x, z), (width, depth) = low, high - low
-    faces.add((x, 0.06, z), (width, 0, 0), (0, 0, depth), "grass", "terrain",
-              (width / TILE["grass"][0], depth / TILE["grass"][1]), ground=1)
-    for corner, edge in (((x, z), (width, 0)), ((x, z), (0, depth)), (high, (-width, 0)), (high, (0, -depth))):
-        faces.add((corner[0], 0.1, corner[1]), (edge[0], 0, edge[1]), (0, -9, 0), "forest", "vegetation",
-                  (np.abs(edge).max() / TILE["forest"][0], 1), lit=0)
-    faces.add((-SKY_HALF, -SKY_HEIGHT, -SKY_HALF), (2 * SKY_HALF, 0, 0), (0, 0, 2 * SKY_HALF), "sky", "sky",
-              (2 * SKY_HALF / TILE["sky"][0],) * 2, lit=0,
-              gain=street.style.sky[0] / 128 / (light.ambient + raster.UNLIT * light.direct))
+    faces.add(
+        (x, 0.06, z),
+        (width, 0, 0),
+        (0, 0, depth),
+        "grass",
+        "terrain",
+        (width / TILE["grass"][0], depth / TILE["grass"][1]),
+        ground=1,
+    )
+    for corner, edge in (
+        ((x, z), (width, 0)),
+        ((x, z), (0, depth)),
+        (high, (-width, 0)),
+        (high, (0, -depth)),
+    ):
+        faces.add(
+            (corner[0], 0.1, corner[1]),
+            (edge[0], 0, edge[1]),
+            (0, -9, 0),
+            "forest",
+            "vegetation",
+            (np.abs(edge).max() / TILE["forest"][0], 1),
+            lit=0,
+        )
+    faces.add(
+        (-SKY_HALF, -SKY_HEIGHT, -SKY_HALF),
+        (2 * SKY_HALF, 0, 0),
+        (0, 0, 2 * SKY_HALF),
+        "sky",
+        "sky",
+        (2 * SKY_HALF / TILE["sky"][0],) * 2,
+        lit=0,
+        gain=street.style.sky[0] / 128 / (light.ambient + raster.UNLIT * light.direct),
+    )
     street.parts.append(faces.matrix())
 
 
@@ -153,7 +223,13 @@ def _build_up(street, side):
             _house_row(street, side, span, 0.02, 0.05, (2, 6), 0.5)
         elif zone == "gardens":
             _house_row(street, side, span, rng.uniform(2, 6), 4.0, (1, 4), 0.85)
-            _border(street, side, span, str(rng.choice(["fence", "hedge", "wall"])), rng.uniform(0.9, 1.6))
+            _border(
+                street,
+                side,
+                span,
+                str(rng.choice(["fence", "hedge", "wall"])),
+                rng.uniform(0.9, 1.6),
+            )
             _scatter(street, side, span, 1.0, 12.0, 0.1)
         elif zone == "park":
             _scatter(street, side, span, 1.0, 26.0, 0.5)
@@ -168,20 +244,32 @@ def _build_up(street, side):
 def _house_row(street, side, span, gap, setback, floors, pitched):
     """Place houses side by side where there is room.
 
-    gap: metres between houses; setback: metres behind the building line; floors: lowest number and one more than the
-    highest; pitched: share of pitched roofs.
+    gap: metres between houses; setback: metres behind the building line; floors: lowest number and
+    one more than the highest; pitched: share of pitched roofs.
     """
     rng, s = street.rng, span[0]
-    across, along = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.45, 0.45, 6), np.linspace(0.05, 0.95, 5)))
+    across, along = (
+        grid.ravel()
+        for grid in np.meshgrid(np.linspace(-0.45, 0.45, 6), np.linspace(0.05, 0.95, 5))
+    )
     while s < span[1] - 6:
         width, depth = min(rng.uniform(9, 17), span[1] - s), rng.uniform(8, 12)
-        x, z, heading = street.track.at(s + width / 2, side * (street.line + setback + rng.uniform(0, 2)))
+        x, z, heading = street.track.at(
+            s + width / 2, side * (street.line + setback + rng.uniform(0, 2))
+        )
         yaw = heading + side * np.pi / 2
-        points = np.stack([x + width * across * np.cos(yaw) + depth * along * np.sin(yaw),
-                           z - width * across * np.sin(yaw) + depth * along * np.cos(yaw)], axis=1)
+        points = np.stack(
+            [
+                x + width * across * np.cos(yaw) + depth * along * np.sin(yaw),
+                z - width * across * np.sin(yaw) + depth * along * np.cos(yaw),
+            ],
+            axis=1,
+        )
         clear = _distance(*points.T, street.houses).min() >= 0.8
         if clear and street.off_road(*points.T).min() > street.style.sidewalk - 0.5:
-            house = things.building(street.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched)
+            house = things.building(
+                street.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched
+            )
             street.put(house, x, z, yaw)
             street.houses = np.concatenate([street.houses, points])
         s += width + gap
@@ -189,20 +277,35 @@ def _house_row(street, side, span, gap, setback, floors, pitched):
 
 def _border(street, side, span, kind, height):
     """Place a fence, a hedge or a wall along the building line."""
-    texture, label, thickness = {"fence": ("picket", "fence", 0.0), "hedge": ("leaves", "vegetation", 0.7),
-                                 "wall": ("stone", "wall", 0.3)}[kind]
+    texture, label, thickness = {
+        "fence": ("picket", "fence", 0.0),
+        "hedge": ("leaves", "vegetation", 0.7),
+        "wall": ("stone", "wall", 0.3),
+    }[kind]
     near, far = street.line + 0.15, street.line + 0.15 + thickness
     profile = [(near, -KERB), (near, -KERB - height)]
     if thickness:
         profile += [(far, -KERB - height), (far, -KERB)]
-    street.extrude(profile, side, texture, label, (span[0], span[1] - 3), margin=1.0, step=2.0,
-                   lit=int(kind != "hedge"))
+    street.extrude(
+        profile,
+        side,
+        texture,
+        label,
+        (span[0], span[1] - 3),
+        margin=1.0,
+        step=2.0,
+        lit=int(kind != "hedge"),
+    )
 
 
 def _scatter(street, side, span, near, far, density):
-    """Place trees and bushes `near` to `far` metres behind the building line; density: plants for each metre."""
+    """Place trees and bushes `near` to `far` metres behind the building line; density: plants
+    for each metre.
+    """
     for _ in range(int((span[1] - span[0]) * density) + 1):
-        x, z, _ = street.track.at(street.rng.uniform(*span), side * (street.line + street.rng.uniform(near, far)))
+        x, z, _ = street.track.at(
+            street.rng.uniform(*span), side * (street.line + street.rng.uniform(near, far))
+        )
         if street.free(x, z, 2.0):
             plant = things.tree if street.rng.random() < 0.65 else things.bush
             street.put(plant(street.names, street.rng), x, z, street.rng.uniform(0, np.pi))
@@ -212,35 +315,60 @@ def _furnish(street, side):
     """Place lamps, signs, trees, persons and parked cars on one side of the main road."""
     rng, style, track = street.rng, street.style, street.track
     ahead = 0.0 if side > 0 else np.pi  # direction of the traffic on that side
-    for make, step, distance in ((things.lamp, 26.0, 0.45), (things.sign, 21.0, 0.5),
-                                 (things.tree, 9.0 / style.trees, 0.8)):
+    for make, step, distance in (
+        (things.lamp, 26.0, 0.45),
+        (things.sign, 21.0, 0.5),
+        (things.tree, 9.0 / style.trees, 0.8),
+    ):
         if make is things.tree and not style.sidewalk:
             continue
         for s in street.along(step):
-            x, z, heading = track.at(s, side * (style.half + distance + (0 if style.sidewalk else 1.2)))
+            x, z, heading = track.at(
+                s, side * (style.half + distance + (0 if style.sidewalk else 1.2))
+            )
             if street.free(x, z, 0.3):
-                street.put(make(street.names, rng), x, z, heading + ahead + rng.uniform(-0.15, 0.15))
+                street.put(
+                    make(street.names, rng), x, z, heading + ahead + rng.uniform(-0.15, 0.15)
+                )
     if not style.sidewalk:
         near = style.half + 0.7
         profile = [(near, 0), (near, -0.8), (near + 0.3, -0.8), (near + 0.3, 0.06)]
         street.extrude(profile, side, "stone", "wall", step=4.0)
         return
     for _ in range(int((track.s[-1] - track.s[0]) * style.persons)):
-        s, d = rng.uniform(track.s[0], track.s[-1]), side * (style.half + rng.uniform(0.6, style.sidewalk - 0.3))
+        s, d = (
+            rng.uniform(track.s[0], track.s[-1]),
+            side * (style.half + rng.uniform(0.6, style.sidewalk - 0.3)),
+        )
         if street.free(*track.at(s, d)[:2], 0.4):
             height = rng.uniform(1.6, 1.9)
-            faces = things.cut_out(street.names, f"person{rng.integers(0, PERSONS)}", "person", height / 2, height)
-            street.movers.append(Mover(things.place(faces, 0, 0, 0, -KERB), track, s,
-                                       float(rng.choice([0, 0.12, -0.12])), d, rng.uniform(-0.5, 0.5)))
+            faces = things.cut_out(
+                street.names, f"person{rng.integers(0, PERSONS)}", "person", height / 2, height
+            )
+            street.movers.append(
+                Mover(
+                    things.place(faces, 0, 0, 0, -KERB),
+                    track,
+                    s,
+                    float(rng.choice([0, 0.12, -0.12])),
+                    d,
+                    rng.uniform(-0.5, 0.5),
+                )
+            )
     for s in street.along(5.8):
         x, z, heading = track.at(s, side * (style.half - 1.0))
-        clear = _distance(x, z, street.middle[len(track.x[::2]):])[0] >= style.half + 3  # of a crossing
+        # of a crossing
+        clear = _distance(x, z, street.middle[len(track.x[::2]) :])[0] >= style.half + 3
         if rng.random() < style.parked[side > 0] and clear:
-            street.put(things.car(street.names, rng), x, z, heading + ahead + rng.normal(0, 0.02), 0.0)
+            street.put(
+                things.car(street.names, rng), x, z, heading + ahead + rng.normal(0, 0.02), 0.0
+            )
 
 
 def _traffic(street):
-    """Place moving cars: beside the camera on a highway; else ahead at its pace, towards it and on a crossing."""
+    """Place moving cars: beside the camera on a highway; else ahead at its pace, towards it and
+    on a crossing.
+    """
     rng, style, track = street.rng, street.style, street.track
 
     def drive(road, s, pace, d, turn=0.0):
@@ -249,7 +377,12 @@ def _traffic(street):
     if not style.sidewalk:
         for k in range(int((track.s[-1] - track.s[0]) / 28)):
             lane = (-4.6, 0.0, 4.6)[k % 3]
-            drive(track, 25.0 + 26.0 * k + rng.uniform(-6, 6) + (0 if lane else 35), rng.uniform(1.35, 1.75), lane)
+            drive(
+                track,
+                25.0 + 26.0 * k + rng.uniform(-6, 6) + (0 if lane else 35),
+                rng.uniform(1.35, 1.75),
+                lane,
+            )
         return
     for distance in style.leaders:
         drive(track, distance, None, 1.9)
@@ -258,14 +391,25 @@ def _traffic(street):
     for crossing in street.crossings:
         for k in range(14):
             side = 1 if k % 2 else -1
-            drive(crossing, -side * (12.0 + 13.0 * k + rng.uniform(-3, 3)), side * rng.uniform(0.6, 0.75), 1.7 * side,
-                  0.0 if side > 0 else np.pi)
+            drive(
+                crossing,
+                -side * (12.0 + 13.0 * k + rng.uniform(-3, 3)),
+                side * rng.uniform(0.6, 0.75),
+                1.7 * side,
+                0.0 if side > 0 else np.pi,
+            )
 
 
 def environment(style):
     """Return the light of a style as a `raster.Environment`."""
     azimuth, elevation = style.sun if style.sunny else (style.sun[0], 1.35)
-    sun = np.array([-np.cos(elevation) * np.sin(azimuth), np.sin(elevation), -np.cos(elevation) * np.cos(azimuth)])
+    sun = np.array(
+        [
+            -np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+            -np.cos(elevation) * np.cos(azimuth),
+        ]
+    )
     # Under clouds the light comes from above, so shadows are faint and lie under the things.
     ambient, direct, shadow = (0.36, 0.86, 0.36) if style.sunny else (0.70, 0.30, 0.62)
     return Environment(sun, ambient, direct, shadow, float(style.sky[1]), style.haze)

@@ -13,10 +13,11 @@ def entries(e):
 def sampson_terms(e, x, y, u, v):
     """Terms of one correspondence's Sampson distance: (algebraic, l0, l1, m0, m1).
 
-    e: nine entries of an essential matrix E. (x, y): point in the current frame. (u, v): point in the previous frame.
-    algebraic is (u, v, 1) E (x, y, 1)^T, which is 0 for an exact match (epipolar constraint). l0, l1 and m0, m1 are the
-    first two coordinates of the epipolar lines l = E (x, y, 1)^T (previous frame) and m = E^T (u, v, 1)^T (current
-    frame). The squared Sampson distance is algebraic^2 / (l0^2 + l1^2 + m0^2 + m1^2).
+    e: nine entries of an essential matrix E. (x, y): point in the current frame. (u, v): point in
+    the previous frame. algebraic is (u, v, 1) E (x, y, 1)^T, which is 0 for an exact match
+    (epipolar constraint). l0, l1 and m0, m1 are the first two coordinates of the epipolar lines l =
+    E (x, y, 1)^T (previous frame) and m = E^T (u, v, 1)^T (current frame). The squared Sampson
+    distance is algebraic^2 / (l0^2 + l1^2 + m0^2 + m1^2).
     """
     l0 = e[0] * x + e[1] * y + e[2]
     l1 = e[3] * x + e[4] * y + e[5]

@@ -1,15 +1,18 @@
 """The five-point algorithm: essential matrices from five correspondences.
 
-The steps follow Nister (2004), An efficient solution to the five-point relative pose problem, PAMI 26(6):
+The steps follow Nister (2004), An efficient solution to the five-point relative pose problem, PAMI
+26(6):
 
 1. `null_space`: five epipolar constraints leave E = x X + y Y + z Z + W with unknown x, y, z;
-2. `constraints`: the trace constraint and the determinant constraint on E are ten cubic equations in x, y, z;
+2. `constraints`: the trace constraint and the determinant constraint on E are ten cubic equations
+in x, y, z;
 3. `eliminate`: Gauss-Jordan elimination leaves three equations B(z) (x, y, 1)^T = 0;
 4. `determinant`: det B(z) is a polynomial of degree ten in z;
 5. `real_roots`: the real roots of det B(z) = 0 (a complex root gives no motion);
 6. `essential`: x, y and E for one root.
 
-`rounding.solve` runs these steps. Nister's last step, rotation and translation from E, is pose.recover_pose.
+`rounding.solve` runs these steps. Nister's last step, rotation and translation from E, is
+pose.recover_pose.
 """
 
 import math
@@ -34,15 +37,45 @@ def _signs() -> np.ndarray:
 def _products() -> tuple[np.ndarray, np.ndarray]:
     """Tables of monomial products: linear times linear (4, 4) and quadratic times linear (10, 4).
 
-    Entry [p, q] is the index of the product of monomials p and q. The cubic monomials are in Nister's order: first
-    those of degree two or more in x and y, then x, y and 1 times powers of z. So elimination leaves x, y and 1.
+    Entry [p, q] is the index of the product of monomials p and q. The cubic monomials are in
+    Nister's order: first those of degree two or more in x and y, then x, y and 1 times powers of z.
+    So elimination leaves x, y and 1.
     """
     linear = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]
-    quadratic = [(2, 0, 0), (1, 1, 0), (1, 0, 1), (1, 0, 0), (0, 2, 0), (0, 1, 1), (0, 1, 0), (0, 0, 2), (0, 0, 1),
-                 (0, 0, 0)]
-    cubic = [(3, 0, 0), (0, 3, 0), (2, 1, 0), (1, 2, 0), (2, 0, 1), (2, 0, 0), (0, 2, 1), (0, 2, 0), (1, 1, 1),
-             (1, 1, 0), (1, 0, 2), (1, 0, 1), (1, 0, 0), (0, 1, 2), (0, 1, 1), (0, 1, 0), (0, 0, 3), (0, 0, 2),
-             (0, 0, 1), (0, 0, 0)]
+    quadratic = [
+        (2, 0, 0),
+        (1, 1, 0),
+        (1, 0, 1),
+        (1, 0, 0),
+        (0, 2, 0),
+        (0, 1, 1),
+        (0, 1, 0),
+        (0, 0, 2),
+        (0, 0, 1),
+        (0, 0, 0),
+    ]
+    cubic = [
+        (3, 0, 0),
+        (0, 3, 0),
+        (2, 1, 0),
+        (1, 2, 0),
+        (2, 0, 1),
+        (2, 0, 0),
+        (0, 2, 1),
+        (0, 2, 0),
+        (1, 1, 1),
+        (1, 1, 0),
+        (1, 0, 2),
+        (1, 0, 1),
+        (1, 0, 0),
+        (0, 1, 2),
+        (0, 1, 1),
+        (0, 1, 0),
+        (0, 0, 3),
+        (0, 0, 2),
+        (0, 0, 1),
+        (0, 0, 0),
+    ]
 
     def table(lower, higher):
         return np.array([[higher.index(tuple(np.add(a, b))) for b in linear] for a in lower])
@@ -56,11 +89,12 @@ TO_QUADRATIC, TO_CUBIC = _products()
 
 @inner
 def null_space(five):
-    """Step 1: independence of five epipolar constraints (0 to 1) and the basis X, Y, Z, W (4, 9; matrices row by row).
+    """Step 1: independence of five epipolar constraints (0 to 1) and the basis X, Y, Z, W (4, 9;
+    matrices row by row).
 
-    A constraint is (u, v, 1) E (x, y, 1)^T = 0. An independence below MIN_INDEPENDENCE is returned as 0. Nister uses a
-    QR factorisation. This is Gram-Schmidt, run twice against rounding. It gives OpenCV's basis: in another basis,
-    rounding would change the solutions by other amounts.
+    A constraint is (u, v, 1) E (x, y, 1)^T = 0. An independence below MIN_INDEPENDENCE is returned
+    as 0. Nister uses a QR factorisation. This is Gram-Schmidt, run twice against rounding. It gives
+    OpenCV's basis: in another basis, rounding would change the solutions by other amounts.
     """
     rows, independence = np.empty((9, 9)), 1.0
     for k in range(9):
@@ -98,7 +132,8 @@ def null_space(five):
 def constraints(basis):
     """Step 2: ten cubic equations (10, 20) in x, y, z for E = x X + y Y + z Z + W.
 
-    Rows 0 to 8, the trace constraint: E E^T E - trace(E E^T) E / 2 = 0. Row 9, the determinant constraint: det E = 0.
+    Rows 0 to 8, the trace constraint: E E^T E - trace(E E^T) E / 2 = 0. Row 9, the determinant
+    constraint: det E = 0.
     """
     squares, minors = np.zeros((9, 10)), np.zeros((3, 10))
     for i in range(3):
@@ -106,19 +141,25 @@ def constraints(basis):
             for k in range(3):
                 for p in range(4):
                     for q in range(4):
-                        squares[3 * i + j, TO_QUADRATIC[p, q]] += basis[p, 3 * i + k] * basis[q, 3 * j + k]  # E E^T
+                        # E E^T
+                        squares[3 * i + j, TO_QUADRATIC[p, q]] += (
+                            basis[p, 3 * i + k] * basis[q, 3 * j + k]
+                        )
         for j in range(i):
             for p in range(10):
                 squares[3 * j + i, p] = squares[3 * i + j, p]
         first, second = 3 + (i + 1) % 3, 6 + (i + 2) % 3  # entries in the minors of E's first row
         for p in range(4):
             for q in range(4):
-                minors[i, TO_QUADRATIC[p, q]] += (basis[p, first] * basis[q, second]
-                                                  - basis[p, 3 + (i + 2) % 3] * basis[q, 6 + (i + 1) % 3])
+                minors[i, TO_QUADRATIC[p, q]] += (
+                    basis[p, first] * basis[q, second]
+                    - basis[p, 3 + (i + 2) % 3] * basis[q, 6 + (i + 1) % 3]
+                )
     for p in range(10):
         half = 0.5 * (squares[0, p] + squares[4, p] + squares[8, p])
         for i in range(3):
-            squares[4 * i, p] -= half  # E E^T - trace(E E^T) / 2, which times E is the trace constraint
+            # E E^T - trace(E E^T) / 2, which times E is the trace constraint
+            squares[4 * i, p] -= half
     equations = np.zeros((10, 20))
     for p in range(10):
         for q in range(4):
@@ -133,11 +174,12 @@ def constraints(basis):
 
 @inner
 def eliminate(a, b):
-    """Step 3: write B(z) to b (3, 13; given as zeros), and return False if the equations a (10, 20) are singular.
+    """Step 3: write B(z) to b (3, 13; given as zeros), and return False if the equations a (10, 20)
+    are singular.
 
-    Gauss-Jordan elimination with partial pivoting, in place. A row of B(z) is one eliminated row minus z times the
-    next one, so that only x, y and 1 are left. It holds their factors: polynomials in z of degree 3, 3 and 4, each
-    with its highest power first.
+    Gauss-Jordan elimination with partial pivoting, in place. A row of B(z) is one eliminated row
+    minus z times the next one, so that only x, y and 1 are left. It holds their factors:
+    polynomials in z of degree 3, 3 and 4, each with its highest power first.
     """
     for k in range(10):
         pivot = k
@@ -171,13 +213,18 @@ def eliminate(a, b):
 @inner
 def row_values(c, z):
     """Values at z of the three polynomials in one row c (13) of B(z)."""
-    return (((c[0] * z + c[1]) * z + c[2]) * z + c[3], ((c[4] * z + c[5]) * z + c[6]) * z + c[7],
-            (((c[8] * z + c[9]) * z + c[10]) * z + c[11]) * z + c[12])
+    return (
+        ((c[0] * z + c[1]) * z + c[2]) * z + c[3],
+        ((c[4] * z + c[5]) * z + c[6]) * z + c[7],
+        (((c[8] * z + c[9]) * z + c[10]) * z + c[11]) * z + c[12],
+    )
 
 
 @inner
 def determinant(b):
-    """Step 4: coefficients (11, highest power first) of det B(z), by expansion along the last column."""
+    """Step 4: coefficients (11, highest power first) of det B(z), by expansion along the last
+    column.
+    """
     polynomial = np.zeros(11)
     minor = np.empty(7)
     for i in range(3):
@@ -195,11 +242,13 @@ def determinant(b):
 
 @fast
 def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Step 5: solve a polynomial of degree ten (11, highest power first): (solved, real roots, places of the extrema).
+    """Step 5: solve a polynomial of degree ten (11, highest power first): (solved, real roots,
+    places of the extrema).
 
-    At most one root lies between two neighbouring extrema. The extrema are the roots of the derivative, so all
-    derivatives are solved, the lowest degree first and less precisely. The caller must look at the extrema: where the
-    polynomial is nearly 0 there, it has a double root or none.
+    At most one root lies between two neighbouring extrema. The extrema are the roots of the
+    derivative, so all derivatives are solved, the lowest degree first and less precisely. The
+    caller must look at the extrema: where the polynomial is nearly 0 there, it has a double root or
+    none.
     """
     edges, roots, bends = np.empty(12), np.empty(11), np.empty(12)
     bound, unsolved = 0.0, (False, roots[:0], edges[:0])
@@ -230,12 +279,21 @@ def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
                 if 0 < k < intervals - 1:  # root of the cubic with the same two extrema
                     part = 0.5 - math.sin(math.asin((left + right) / (left - right)) / 3)
                     start = edges[k] + part * (edges[k + 1] - edges[k])
-                elif k > 0:  # beyond the last extremum: root of the parabola with the same bend there
+                # beyond the last extremum: root of the parabola with the same bend there
+                elif k > 0:
                     start = edges[k] + math.sqrt(abs(2 * left / bends[k]))
                 elif intervals > 1:
                     start = edges[1] - math.sqrt(abs(2 * right / bends[1]))
-                roots[count] = _root_between(derivative, slopes, degree, edges[k], edges[k + 1], left < 0, start,
-                                             1e-14 if degree > 8 else 1e-6)
+                roots[count] = _root_between(
+                    derivative,
+                    slopes,
+                    degree,
+                    edges[k],
+                    edges[k + 1],
+                    left < 0,
+                    start,
+                    1e-14 if degree > 8 else 1e-6,
+                )
                 count += 1
             left = right
         for k in range(count):
@@ -245,7 +303,9 @@ def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
 
 @inner
 def value(polynomial, degree, z):
-    """Value of a polynomial at z. Even and odd powers are summed apart, so the processor runs both sums at once."""
+    """Value of a polynomial at z. Even and odd powers are summed apart, so the processor runs
+    both sums at once.
+    """
     square = z * z
     first, second = polynomial[0], polynomial[1] if degree else 0.0
     for k in range(2, degree, 2):
@@ -258,7 +318,9 @@ def value(polynomial, degree, z):
 
 @inner
 def _root_between(polynomial, slopes, degree, left, right, rising, start, precision):
-    """Root in an interval by Newton's method, with bisection where a step leaves the interval or converges slowly."""
+    """Root in an interval by Newton's method, with bisection where a step leaves the interval
+    or converges slowly.
+    """
     z = start if left < start < right else 0.5 * (left + right)
     before = right - left
     for _ in range(100):
@@ -279,10 +341,16 @@ def _root_between(polynomial, slopes, degree, left, right, rising, start, precis
 
 @inner
 def essential(normal, basis, z, matrix):
-    """Step 6: write the essential matrix (9, unit norm) of a root z, at which `normal` (3) solves B(z) normal = 0."""
+    """Step 6: write the essential matrix (9, unit norm) of a root z, at which `normal` (3)
+    solves B(z) normal = 0.
+    """
     total = 0.0
     for j in range(9):
-        matrix[j] = normal[0] * basis[0, j] + normal[1] * basis[1, j] + normal[2] * (z * basis[2, j] + basis[3, j])
+        matrix[j] = (
+            normal[0] * basis[0, j]
+            + normal[1] * basis[1, j]
+            + normal[2] * (z * basis[2, j] + basis[3, j])
+        )
         total += matrix[j] * matrix[j]
     total = np.sqrt(total)
     for j in range(9):

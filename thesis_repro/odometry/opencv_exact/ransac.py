@@ -1,14 +1,15 @@
 """cv2.findEssentialMat with RANSAC: the same bits, several times faster.
 
-OpenCV spends nearly all of its time in the five-point solver. It finds all ten complex roots of a polynomial by an
-iteration that goes on long after the roots have converged. But RANSAC keeps only one of all solutions. So this search
-solves few samples with OpenCV:
+OpenCV spends nearly all of its time in the five-point solver. It finds all ten complex roots of a
+polynomial by an iteration that goes on long after the roots have converged. But RANSAC keeps only
+one of all solutions. So this search solves few samples with OpenCV:
 
 1. Draw samples of five correspondences with OpenCV's random number generator.
-2. Solve each sample quickly with `rounding.solve`. The last digits differ from OpenCV's, but the difference is within
-   a margin. The margin gives bounds of OpenCV's number of inliers. A test in single precision rules out most solutions.
-3. Let OpenCV solve a sample if the bounds do not decide whether it beats the best one so far. Let OpenCV also solve
-   the winner.
+2. Solve each sample quickly with `rounding.solve`. The last digits differ from OpenCV's, but the
+   difference is within a margin. The margin gives bounds of OpenCV's number of inliers. A test in
+   single precision rules out most solutions.
+3. Let OpenCV solve a sample if the bounds do not decide whether it beats the best one so far. Let
+   OpenCV also solve the winner.
 4. If the winner's number of inliers is outside its bounds, let OpenCV do the whole search.
 
 The margin is a generous estimate, not a proof. The tests compare the results with OpenCV's.
@@ -27,22 +28,26 @@ from thesis_repro.odometry.opencv_exact.rounding import solve
 MAX_SAMPLES = 1000
 MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole search
 OPENCV_SEED = 2**64 - 1  # of its RANSAC's random number generator
-SCORING_BLOCK = 128  # correspondences scored between two checks whether the best can still be beaten
+# correspondences scored between two checks whether the best can still be beaten
+SCORING_BLOCK = 128
 
 
-def find_essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: float,
-                          probability: float) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability, threshold): (E, mask).
+def find_essential_matrix(
+    current: np.ndarray, previous: np.ndarray, threshold: float, probability: float
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability,
+    threshold): (E, mask).
 
-    current, previous: correspondences (N, 2), float64, normalised coordinates. E: 3x3, or OpenCV's stack of solutions
-    for N = 5, or None. mask: (N, 1) uint8, or None.
+    current, previous: correspondences (N, 2), float64, normalised coordinates. E: 3x3, or OpenCV's
+    stack of solutions for N = 5, or None. mask: (N, 1) uint8, or None.
     """
     count = len(current)
     columns = np.stack([*current.T, *previous.T])
     if count < MIN_FOR_SHORTCUT or not np.isfinite(columns).all():
         return _opencv(current, previous, threshold, probability)
     limit = np.float32(threshold * threshold)
-    # Correspondences in single precision; the last row says how much an error of the matrix may matter to each.
+    # Correspondences in single precision; the last row says how much an error of the matrix may
+    # matter to each.
     x, y, u, v = np.abs(columns)
     with np.errstate(over="ignore"):
         rough = np.vstack([columns, (1 + x + y) * (1 + u + v)]).astype(np.float32)
@@ -50,13 +55,24 @@ def find_essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: 
     def solve_exactly(sample):
         return _opencv_solution(columns, sample, threshold, probability, limit)
 
-    # The best sample so far, `winner`, has between `low` and `high` inliers. The exact number matters only when another
-    # sample comes close, or when it decides whether the search ends. Then OpenCV's `solution` is computed.
-    state, drawn, low, high, winner, solution = OPENCV_SEED, 0, SAMPLE_SIZE - 1, SAMPLE_SIZE - 1, None, None
+    # The best sample so far, `winner`, has between `low` and `high` inliers. The exact number
+    # matters only when another sample comes close, or when it decides whether the search ends. Then
+    # OpenCV's `solution` is computed.
+    state, drawn, low, high, winner, solution = (
+        OPENCV_SEED,
+        0,
+        SAMPLE_SIZE - 1,
+        SAMPLE_SIZE - 1,
+        None,
+        None,
+    )
     while True:
-        enough = MAX_SAMPLES if winner is None else _samples_needed(probability, (count - high) / count)
-        state, drawn, sample, fewest, most = _next_better(columns, rough, float(limit), np.uint64(state), drawn,
-                                                          enough, low)
+        enough = (
+            MAX_SAMPLES if winner is None else _samples_needed(probability, (count - high) / count)
+        )
+        state, drawn, sample, fewest, most = _next_better(
+            columns, rough, float(limit), np.uint64(state), drawn, enough, low
+        )
         if most > low and fewest > high:
             low, high, winner, solution = fewest, most, sample, None
             continue
@@ -75,12 +91,21 @@ def find_essential_matrix(current: np.ndarray, previous: np.ndarray, threshold: 
 
 
 def _opencv(current, previous, threshold, probability):
-    return cv2.findEssentialMat(current, previous, focal=1.0, pp=(0.0, 0.0), method=cv2.RANSAC, prob=probability,
-                                threshold=threshold)
+    return cv2.findEssentialMat(
+        current,
+        previous,
+        focal=1.0,
+        pp=(0.0, 0.0),
+        method=cv2.RANSAC,
+        prob=probability,
+        threshold=threshold,
+    )
 
 
 def _opencv_solution(columns, sample, threshold, probability, limit):
-    """OpenCV's best solution for a sample of five: number of inliers among all correspondences, matrix, mask."""
+    """OpenCV's best solution for a sample of five: number of inliers among all correspondences,
+    matrix, mask.
+    """
     five = np.ascontiguousarray(columns[:, sample].T)
     stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
     if stack is None:
@@ -88,27 +113,34 @@ def _opencv_solution(columns, sample, threshold, probability, limit):
     masks = _inlier_masks(stack.reshape(-1, 9), columns, limit)
     inliers = masks.sum(axis=1)
     best = int(inliers.argmax())  # the first one if several are equal, as in OpenCV
-    return int(inliers[best]), stack[3 * best:3 * best + 3].copy(), masks[best].reshape(-1, 1)
+    return int(inliers[best]), stack[3 * best : 3 * best + 3].copy(), masks[best].reshape(-1, 1)
 
 
 def _samples_needed(probability, outliers):
-    """Number of samples among which one is free of outliers with the given probability (`outliers`: their share)."""
+    """Number of samples among which one is free of outliers with the given probability
+    (`outliers`: their share).
+    """
     missed = 1.0 - math.pow(1.0 - outliers, SAMPLE_SIZE)
     if missed < np.finfo(float).tiny:
         return 0
     needed, missed = math.log(max(1.0 - probability, np.finfo(float).tiny)), math.log(missed)
-    return MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
+    return (
+        MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
+    )
 
 
 @fast
 def _inlier_masks(matrices, columns, limit):
-    """Inlier masks (K, N) of K matrices: 1 where the squared Sampson distance, as float32, is within the limit."""
+    """Inlier masks (K, N) of K matrices: 1 where the squared Sampson distance, as float32, is
+    within the limit.
+    """
     masks = np.empty((len(matrices), columns.shape[1]), np.uint8)
     for index in range(len(matrices)):
         matrix = epipolar.entries(matrices[index])
         for k in range(columns.shape[1]):
-            algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, columns[0, k], columns[1, k], columns[2, k],
-                                                               columns[3, k])
+            algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(
+                matrix, columns[0, k], columns[1, k], columns[2, k], columns[3, k]
+            )
             distance = algebraic * algebraic / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
             masks[index, k] = np.float32(distance) <= limit
     return masks
@@ -116,7 +148,9 @@ def _inlier_masks(matrices, columns, limit):
 
 @fast
 def draw(state, columns, sample, five):
-    """Draw a sample as OpenCV does: write its five indices and rows, and return the generator's new state."""
+    """Draw a sample as OpenCV does: write its five indices and rows, and return the generator's
+    new state.
+    """
     count, taken = columns.shape[1], 0
     while taken < SAMPLE_SIZE:
         state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
@@ -134,10 +168,11 @@ def draw(state, columns, sample, five):
 
 @fast
 def _next_better(columns, rough, limit, state, drawn, samples, best):
-    """Draw samples until one may have more than `best` inliers, or until `samples` of them are drawn.
+    """Draw samples until one may have more than `best` inliers, or until `samples` of them are
+    drawn.
 
-    Returns the generator's state, the number of samples drawn, the sample's five indices, and bounds of the number of
-    inliers of its best solution (0, 0 if no sample may be better).
+    Returns the generator's state, the number of samples drawn, the sample's five indices, and
+    bounds of the number of inliers of its best solution (0, 0 if no sample may be better).
     """
     count = columns.shape[1]
     sample = np.empty(SAMPLE_SIZE, np.int64)
@@ -161,19 +196,30 @@ def _next_better(columns, rough, limit, state, drawn, samples, best):
 
 @inner
 def _may_beat(e, margin, rough, limit, best):
-    """False if surely no matrix within the margin of e has more than `best` inliers: a test in single precision."""
+    """False if surely no matrix within the margin of e has more than `best` inliers: a test in
+    single precision.
+    """
     count, allowed = rough.shape[1], rough.shape[1] - best
     root = np.sqrt(limit)
-    # `doubt` bounds how far the margin (see _bounds_of_block) and nine roundings of 2^-24 may change `algebraic` and
-    # `root` times the root of the sum of squares. `wide` allows for the rounding of their squares.
+    # `doubt` bounds how far the margin (see _bounds_of_block) and nine roundings of 2^-24 may
+    # change `algebraic` and `root` times the root of the sum of squares. `wide` allows for the
+    # rounding of their squares.
     doubt = np.float32(4.001 * margin + 1e-6 * (1 + root))
     wide = np.float32(1.00001 * limit)
     matrix = epipolar.entries(e.astype(np.float32))
     outliers = 0
     for start in range(0, count, SCORING_BLOCK):
         stop = min(start + SCORING_BLOCK, count)
-        outliers += _surely_out(matrix, doubt, wide, rough[0, start:stop], rough[1, start:stop], rough[2, start:stop],
-                                rough[3, start:stop], rough[4, start:stop])
+        outliers += _surely_out(
+            matrix,
+            doubt,
+            wide,
+            rough[0, start:stop],
+            rough[1, start:stop],
+            rough[2, start:stop],
+            rough[3, start:stop],
+            rough[4, start:stop],
+        )
         if outliers >= allowed:
             return False
     return True
@@ -185,19 +231,30 @@ def _surely_out(matrix, doubt, limit, x, y, u, v, reach):
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
         least = max(abs(algebraic) - doubt * reach[k], np.float32(0))
-        outliers = np.int32(outliers + np.int32(least * least > limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)))
+        outliers = np.int32(
+            outliers + np.int32(least * least > limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1))
+        )
     return outliers
 
 
 @inner
 def _bounds(e, margin, columns, limit, best):
-    """Least and most inliers that any matrix within the margin of e has; (0, 0) if never more than `best`."""
+    """Least and most inliers that any matrix within the margin of e has; (0, 0) if never more
+    than `best`.
+    """
     count = columns.shape[1]
     low, high = 0, 0
     for start in range(0, count, SCORING_BLOCK):
         stop = min(start + SCORING_BLOCK, count)
-        few, many = _bounds_of_block(e, margin, columns[0, start:stop], columns[1, start:stop], columns[2, start:stop],
-                                     columns[3, start:stop], limit)
+        few, many = _bounds_of_block(
+            e,
+            margin,
+            columns[0, start:stop],
+            columns[1, start:stop],
+            columns[2, start:stop],
+            columns[3, start:stop],
+            limit,
+        )
         low += few
         high += many
         if high + count - stop <= best:
@@ -213,7 +270,8 @@ def _bounds_of_block(e, margin, x, y, u, v, limit):
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
         excess = algebraic * algebraic - limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
-        # |algebraic| and the root of the other term each change by less than `change` within the margin.
+        # |algebraic| and the root of the other term each change by less than `change` within the
+        # margin.
         change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))
         size = abs(algebraic) + root * (abs(l0) + abs(l1) + abs(m0) + abs(m1)) + change
         doubt = 2 * change * size + 1e-6 * size * size

@@ -1,8 +1,9 @@
-"""Essential matrices through five correspondences, with a margin for the rounding errors of OpenCV's solutions.
+"""Essential matrices through five correspondences, with a margin for the rounding errors of
+OpenCV's solutions.
 
-OpenCV takes the same steps with the operations in another order, so its solutions differ in the last digits. `ransac`
-needs a bound of this difference: the margin. It is a first-order error estimate from the conditioning of each step, in
-units of ROUNDING, times SAFETY_FACTOR.
+OpenCV takes the same steps with the operations in another order, so its solutions differ in the
+last digits. `ransac` needs a bound of this difference: the margin. It is a first-order error
+estimate from the conditioning of each step, in units of ROUNDING, times SAFETY_FACTOR.
 """
 
 import numpy as np
@@ -11,21 +12,29 @@ from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import five_point
 
 ROUNDING = 2.0**-52  # of a number of size 1
-# Among 200,000 solutions of real and degenerate scenes, no difference was larger than 1.4 times the estimate.
+# Among 200,000 solutions of real and degenerate scenes, no difference was larger than 1.4 times the
+# estimate.
 SAFETY_FACTOR = 3.0
-# Share of the errors of B(z) that reaches det B(z), as measured. Errors that the rows have in common cancel.
+# Share of the errors of B(z) that reaches det B(z), as measured. Errors that the rows have in
+# common cancel.
 DETERMINANT_SHARE = 0.1
 MIN_MARGIN, MAX_MARGIN = 1e-9, 1e-3  # for an essential matrix of unit norm
 
 
 @fast
 def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the previous frame).
+    """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the
+    previous frame).
 
-    Returns (sure, matrices (K, 9) of unit norm, K margins). `sure`: OpenCV finds the same K matrices, each within its
-    margin (Frobenius norm, up to sign). If not sure, K = 0.
+    Returns (sure, matrices (K, 9) of unit norm, K margins). `sure`: OpenCV finds the same K
+    matrices, each within its margin (Frobenius norm, up to sign). If not sure, K = 0.
     """
-    solutions, margins, b, b_sizes = np.empty((10, 9)), np.empty(10), np.zeros((3, 13)), np.empty((3, 13))
+    solutions, margins, b, b_sizes = (
+        np.empty((10, 9)),
+        np.empty(10),
+        np.zeros((3, 13)),
+        np.empty((3, 13)),
+    )
     unsure = False, solutions[:0], margins[:0]
     independence, basis = five_point.null_space(five)  # step 1
     if independence == 0:
@@ -44,7 +53,10 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     work, degree = np.empty((4, 3, 3)), len(polynomial) - 1
     for k in range(len(extrema)):  # a value as small as rounding: a double root or none
         error = _determinant_error(b, b_sizes, errors, extrema[k], work)
-        if not abs(five_point.value(polynomial, degree, extrema[k])) > SAFETY_FACTOR * ROUNDING * error:
+        if (
+            not abs(five_point.value(polynomial, degree, extrema[k]))
+            > SAFETY_FACTOR * ROUNDING * error
+        ):
             return unsure
     for k in range(len(roots)):
         error = _determinant_error(b, b_sizes, errors, roots[k], work)
@@ -54,15 +66,17 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
         margins[k] = MIN_MARGIN + SAFETY_FACTOR * ROUNDING * change
         if not margins[k] < MAX_MARGIN:
             return unsure
-    return True, solutions[:len(roots)], margins[:len(roots)]
+    return True, solutions[: len(roots)], margins[: len(roots)]
 
 
 @inner
 def _elimination_errors(a):
-    """Rounding errors (6, in units of ROUNDING) of the six rows that B(z) is made from, OpenCV's way included.
+    """Rounding errors (6, in units of ROUNDING) of the six rows that B(z) is made from, OpenCV's
+    way included.
 
-    a (10, 20): result of the elimination, with the triangle U of the last six unknowns. An error of one unit in the
-    equations becomes |U^-1| times the size of the result. OpenCV inverts and multiplies, which adds |U^-1| |U| |U^-1|.
+    a (10, 20): result of the elimination, with the triangle U of the last six unknowns. An error of
+    one unit in the equations becomes |U^-1| times the size of the result. OpenCV inverts and
+    multiplies, which adds |U^-1| |U| |U^-1|.
     """
     largest = 1.0
     for k in range(4, 10):
@@ -88,9 +102,11 @@ def _elimination_errors(a):
 
 @inner
 def _determinant_error(b, b_sizes, errors, z, work):
-    """Rounding error of det B(z), in units of ROUNDING (Wilkinson's bound: the sum of the sizes of all terms).
+    """Rounding error of det B(z), in units of ROUNDING (Wilkinson's bound: the sum of the sizes of
+    all terms).
 
-    Also writes to work (4, 3, 3): B(z), the sizes of its terms, its errors in units of ROUNDING, its cofactors.
+    Also writes to work (4, 3, 3): B(z), the sizes of its terms, its errors in units of ROUNDING,
+    its cofactors.
     """
     values, sizes, wrong, cofactors = work[0], work[1], work[2], work[3]
     size = abs(z)
@@ -114,10 +130,16 @@ def _determinant_error(b, b_sizes, errors, z, work):
 
 @inner
 def _best_row(cofactors):
-    """Index of the largest row of cofactors: the best conditioned normal of the plane that the rows of B(z) span."""
+    """Index of the largest row of cofactors: the best conditioned normal of the plane that the
+    rows of B(z) span.
+    """
     best, largest = 0, -1.0
     for i in range(3):
-        size = cofactors[i, 0] * cofactors[i, 0] + cofactors[i, 1] * cofactors[i, 1] + cofactors[i, 2] * cofactors[i, 2]
+        size = (
+            cofactors[i, 0] * cofactors[i, 0]
+            + cofactors[i, 1] * cofactors[i, 1]
+            + cofactors[i, 2] * cofactors[i, 2]
+        )
         if size > largest:
             best, largest = i, size
     return best
@@ -125,11 +147,13 @@ def _best_row(cofactors):
 
 @inner
 def _solution_error(b, best, z, error, polynomial, work):
-    """First-order rounding error of the essential matrix (unit norm) of a root z, in units of ROUNDING.
+    """First-order rounding error of the essential matrix (unit norm) of a root z, in units of
+    ROUNDING.
 
-    In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal to B(z). An error of z changes it; that error
-    is the error of det B(z) over the slope of det B(z). An error of B(z) changes it by the error over B(z)'s second
-    singular value, which is the norm of the cofactors over the norm of B(z).
+    In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal to B(z). An error of z
+    changes it; that error is the error of det B(z) over the slope of det B(z). An error of B(z)
+    changes it by the error over B(z)'s second singular value, which is the norm of the cofactors
+    over the norm of B(z).
     """
     values, wrong, cofactors = work[0], work[2], work[3]
     cofactor_norm, norm = 0.0, 0.0
@@ -147,10 +171,15 @@ def _solution_error(b, best, z, error, polynomial, work):
     dwz = dw * z + w
     square = x * x + y * y + w * w * (1 + z * z)
     along = (x * dx + y * dy + w * dw + w * z * dwz) / square  # the part that normalisation removes
-    speed = (dx - along * x)**2 + (dy - along * y)**2 + (dw - along * w)**2 + (dwz - along * w * z)**2
+    speed = (
+        (dx - along * x) ** 2
+        + (dy - along * y) ** 2
+        + (dw - along * w) ** 2
+        + (dwz - along * w * z) ** 2
+    )
     tilt = 0.0
     for i in range(3):
-        tilt += (abs(x) * wrong[i, 0] + abs(y) * wrong[i, 1] + abs(w) * wrong[i, 2])**2
+        tilt += (abs(x) * wrong[i, 0] + abs(y) * wrong[i, 1] + abs(w) * wrong[i, 2]) ** 2
     tilt *= norm / cofactor_norm * (1 + z * z)
     height, slope = polynomial[0], 0.0
     for k in range(1, 11):
@@ -162,5 +191,8 @@ def _solution_error(b, best, z, error, polynomial, work):
 @inner
 def _row_slopes(c, z):
     """Derivatives at z of the three polynomials in one row c (13) of B(z)."""
-    return ((3 * c[0] * z + 2 * c[1]) * z + c[2], (3 * c[4] * z + 2 * c[5]) * z + c[6],
-            ((4 * c[8] * z + 3 * c[9]) * z + 2 * c[10]) * z + c[11])
+    return (
+        (3 * c[0] * z + 2 * c[1]) * z + c[2],
+        (3 * c[4] * z + 2 * c[5]) * z + c[6],
+        ((4 * c[8] * z + 3 * c[9]) * z + 2 * c[10]) * z + c[11],
+    )

@@ -1,1 +1,3 @@
-"""The refined estimator (not in the thesis): the motion is fitted to all points near it and checked with a prior."""
+"""The refined estimator (not in the thesis): the motion is fitted to all points near it and
+checked with a prior.
+"""

@@ -1,7 +1,9 @@
-"""A motion fitted to all correspondences that agree with it. (RANSAC's motion is computed from five of them.)
+"""A motion fitted to all correspondences that agree with it. (RANSAC's motion is computed from five
+of them.)
 
-The essential matrix is E = [t]x R (Equation 2.5, without its factor). The residual of a correspondence (x, y), (u, v)
-is its signed Sampson distance: its distance, to first order, from a pair with (u, v, 1) E (x, y, 1)^T = 0.
+The essential matrix is E = [t]x R (Equation 2.5, without its factor). The residual of a
+correspondence (x, y), (u, v) is its signed Sampson distance: its distance, to first order, from a
+pair with (u, v, 1) E (x, y, 1)^T = 0.
 """
 
 from dataclasses import dataclass
@@ -19,14 +21,26 @@ MAX_ITERATIONS = 10
 REFINE_ROUNDS = 3
 SUPPORT_THRESHOLDS = 2  # a correspondence within so many thresholds supports a motion
 RESTART_SCALES = (4, 1)  # scales of the second start, in thresholds
-SAME_MOTION_COSINE = np.cos(np.radians(15.0))  # of the largest angle between the headings of one motion
+# of the largest angle between the headings of one motion
+SAME_MOTION_COSINE = np.cos(np.radians(15.0))
 LOWER_COST = 0.99  # of the first start's cost: a smaller difference may be rounding
 POINTS_PER_BLOCK = 64
-# LAPACK's gesv, which np.linalg.solve calls in compiled code; np.linalg.solve itself takes seconds to compile.
+# LAPACK's gesv, which np.linalg.solve calls in compiled code; np.linalg.solve itself takes seconds
+# to compile.
 DOUBLE = ord("d")  # here, because `ord` would be compiled too
-_solve: Any = types.ExternalFunction("numba_xgesv", types.intc(
-    types.char, types.intp, types.intp, types.CPointer(types.float64), types.intp, types.CPointer(types.int32),
-    types.CPointer(types.float64), types.intp))
+_solve: Any = types.ExternalFunction(
+    "numba_xgesv",
+    types.intc(
+        types.char,
+        types.intp,
+        types.intp,
+        types.CPointer(types.float64),
+        types.intp,
+        types.CPointer(types.int32),
+        types.CPointer(types.float64),
+        types.intp,
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -34,68 +48,120 @@ class RefinedMotion(Motion):
     """A fitted motion with its uncertainty."""
 
     support: int = 0  # number of correspondences near the motion
-    rotation_std_deg: float = 0.0  # standard deviation of the rotation in its least certain direction, degrees
-    heading_std_deg: float = 0.0  # standard deviation of the translation's direction in its least certain one, degrees
+    # standard deviation of the rotation in its least certain direction, degrees
+    rotation_std_deg: float = 0.0
+    # standard deviation of the translation's direction in its least certain one, degrees
+    heading_std_deg: float = 0.0
     condition: float = 1.0  # condition number of the normal equations
 
 
 def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smaller rotation (3x3) and translation (3, unit length, either sign) of an essential matrix.
 
-    The other rotation differs by 180 degrees about the translation (twisted pair). No car turns so far between frames.
+    The other rotation differs by 180 degrees about the translation (twisted pair). No car turns so
+    far between frames.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     return (first if np.trace(first) >= np.trace(second) else second), translation.ravel()
 
 
-def fit(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
-        inliers: np.ndarray, threshold: float) -> RefinedMotion:
-    """Motion refined from a start (see `refine`) whose unit translation may have either sign (see `measured`)."""
-    return measured(*refine(rotation, translation, current, previous, inliers, threshold), current, previous, inliers,
-                    threshold)
+def fit(
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    current: np.ndarray,
+    previous: np.ndarray,
+    inliers: np.ndarray,
+    threshold: float,
+) -> RefinedMotion:
+    """Motion refined from a start (see `refine`) whose unit translation may have either sign
+    (see `measured`).
+    """
+    return measured(
+        *refine(rotation, translation, current, previous, inliers, threshold),
+        current,
+        previous,
+        inliers,
+        threshold,
+    )
 
 
-def measured(rotation: np.ndarray, heading: np.ndarray, current: np.ndarray, previous: np.ndarray,
-             inliers: np.ndarray, threshold: float) -> RefinedMotion:
-    """The same motion with its uncertainty; the points near it vote on the sign of its heading (`cheirality_votes`)."""
+def measured(
+    rotation: np.ndarray,
+    heading: np.ndarray,
+    current: np.ndarray,
+    previous: np.ndarray,
+    inliers: np.ndarray,
+    threshold: float,
+) -> RefinedMotion:
+    """The same motion with its uncertainty; the points near it vote on the sign of its heading
+    (`cheirality_votes`).
+    """
     support = near(rotation, heading, current, previous, SUPPORT_THRESHOLDS * threshold)
     current, previous = current.compress(support, axis=0), previous.compress(support, axis=0)
     forward, backward = cheirality_votes(rotation, heading, current, previous, threshold)
-    rotation_std, heading_std, condition = _deviations(rotation, heading, current, previous, threshold / 2)
-    return RefinedMotion(rotation, heading if forward >= backward else -heading, inliers, max(forward, backward),
-                         support=len(current), rotation_std_deg=rotation_std, heading_std_deg=heading_std,
-                         condition=condition)
+    rotation_std, heading_std, condition = _deviations(
+        rotation, heading, current, previous, threshold / 2
+    )
+    return RefinedMotion(
+        rotation,
+        heading if forward >= backward else -heading,
+        inliers,
+        max(forward, backward),
+        support=len(current),
+        rotation_std_deg=rotation_std,
+        heading_std_deg=heading_std,
+        condition=condition,
+    )
 
 
-def refine(rotation: np.ndarray, translation: np.ndarray, current: np.ndarray, previous: np.ndarray,
-           inliers: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Motion (rotation 3x3, unit translation) fitted to all its inliers among normalised correspondences (N, 2).
+def refine(
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    current: np.ndarray,
+    previous: np.ndarray,
+    inliers: np.ndarray,
+    threshold: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motion (rotation 3x3, unit translation) fitted to all its inliers among normalised
+    correspondences (N, 2).
 
-    Levenberg-Marquardt over the rotation and the two angles of the translation's direction. It minimises Sampson
-    distances with Cauchy weights at half the threshold. The first fit uses `inliers` (N booleans). Two more fits use
-    the points within SUPPORT_THRESHOLDS, so the result hardly depends on which inliers RANSAC happened to choose.
+    Levenberg-Marquardt over the rotation and the two angles of the translation's direction. It
+    minimises Sampson distances with Cauchy weights at half the threshold. The first fit uses
+    `inliers` (N booleans). Two more fits use the points within SUPPORT_THRESHOLDS, so the result
+    hardly depends on which inliers RANSAC happened to choose.
 
-    The cost at this narrow scale has many minima. So a second start fits the first result to all correspondences at
-    wider scales first, and the motion with the lower cost is returned. A second result with another heading (see
-    SAME_MOTION_COSINE) is another motion and is not used. The sign of the given translation is kept, because the cost
-    does not depend on it.
+    The cost at this narrow scale has many minima. So a second start fits the first result to all
+    correspondences at wider scales first, and the motion with the lower cost is returned. A second
+    result with another heading (see SAME_MOTION_COSINE) is another motion and is not used. The sign
+    of the given translation is kept, because the cost does not depend on it.
     """
-    first = _rounds((np.ascontiguousarray(rotation), np.ascontiguousarray(translation)), current, previous, inliers,
-                    threshold)
+    first = _rounds(
+        (np.ascontiguousarray(rotation), np.ascontiguousarray(translation)),
+        current,
+        previous,
+        inliers,
+        threshold,
+    )
     second = first
     for scale in RESTART_SCALES:
         second = _minimise(*second, current, previous, scale * threshold)
     near_second = near(*second, current, previous, SUPPORT_THRESHOLDS * threshold)
     second = _rounds(second, current, previous, near_second, threshold)
-    first_cost, second_cost = (_normal_equations(*motion, current, previous, threshold / 2)[0]
-                               for motion in (first, second))
-    better = abs(second[1] @ first[1]) > SAME_MOTION_COSINE and second_cost < LOWER_COST * first_cost
+    first_cost, second_cost = (
+        _normal_equations(*motion, current, previous, threshold / 2)[0]
+        for motion in (first, second)
+    )
+    better = (
+        abs(second[1] @ first[1]) > SAME_MOTION_COSINE and second_cost < LOWER_COST * first_cost
+    )
     rotation, heading = second if better else first
     return rotation, heading if heading @ translation >= 0 else -heading
 
 
 def _rounds(motion, current, previous, support, threshold):
-    """A motion (rotation, translation) fitted to its support (N booleans), and again to the points near the result."""
+    """A motion (rotation, translation) fitted to its support (N booleans), and again to the
+    points near the result.
+    """
     for _ in range(REFINE_ROUNDS):
         if support.sum() < MIN_CORRESPONDENCES:
             break
@@ -106,17 +172,21 @@ def _rounds(motion, current, previous, support, threshold):
 
 
 def _deviations(rotation, translation, current, previous, scale):
-    """Largest standard deviations (degrees) of rotation and heading, and the condition number of the normal equations.
+    """Largest standard deviations (degrees) of rotation and heading, and the condition number of
+    the normal equations.
 
-    The covariance is the inverse of the Gauss-Newton matrix times scale^2, the variance of the residuals.
+    The covariance is the inverse of the Gauss-Newton matrix times scale^2, the variance of the
+    residuals.
     """
     hessian = _normal_equations(rotation, translation, current, previous, scale)[1]
     values, vectors = np.linalg.eigh(hessian)
     if len(current) < MIN_CORRESPONDENCES or not values[0] > 1e-12 * values[-1]:
         return np.inf, np.inf, np.inf
     covariance = scale * scale * (vectors / values) @ vectors.T
-    return *(float(np.degrees(np.sqrt(np.linalg.eigvalsh(part)[-1])))
-             for part in (covariance[:3, :3], covariance[3:, 3:])), float(values[-1] / values[0])
+    return *(
+        float(np.degrees(np.sqrt(np.linalg.eigvalsh(part)[-1])))
+        for part in (covariance[:3, :3], covariance[3:, 3:])
+    ), float(values[-1] / values[0])
 
 
 @fast
@@ -128,7 +198,9 @@ def near(r, t, current, previous, limit):
         x, y = current[index, 0], current[index, 1]
         u, v = previous[index, 0], previous[index, 1]
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(essential, x, y, u, v)
-        mask[index] = algebraic * algebraic < limit * limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        mask[index] = algebraic * algebraic < limit * limit * (
+            l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
+        )
     return mask
 
 
@@ -144,7 +216,9 @@ def _minimise(r, t, current, previous, scale):
         change = -gradient
         _solve(DOUBLE, 5, 1, damped.ctypes, 5, pivots.ctypes, change.ctypes, 5)
         r_new, t_new = _moved(r, t, change)
-        cost_new, hessian_new, gradient_new = _normal_equations(r_new, t_new, current, previous, scale)
+        cost_new, hessian_new, gradient_new = _normal_equations(
+            r_new, t_new, current, previous, scale
+        )
         if cost_new < cost:
             settled = cost - cost_new < 1e-6 * cost
             r, t, cost, hessian, gradient = r_new, t_new, cost_new, hessian_new, gradient_new
@@ -160,24 +234,35 @@ def _minimise(r, t, current, previous, scale):
 
 @fast
 def cheirality_votes(rotation, t, current, previous, parallax):
-    """Numbers of correspondences (N, 2) in front of both cameras under (rotation, t) and under (rotation, -t).
+    """Numbers of correspondences (N, 2) in front of both cameras under (rotation, t) and under
+    (rotation, -t).
 
-    Points whose rays meet at less than `parallax` (the sine of the angle) do not determine the sign, so they do not
-    vote. (pose.recover_pose leaves out points beyond 50 translations, which in a slow step are a few metres.)
+    Points whose rays meet at less than `parallax` (the sine of the angle) do not determine the
+    sign, so they do not vote. (pose.recover_pose leaves out points beyond 50 translations, which in
+    a slow step are a few metres.)
     """
     forward, backward = 0, 0
     for k in range(len(current)):
         x, y = current[k, 0], current[k, 1]
-        # Ray a in the previous camera's coordinates, and ray b; they meet where depth a + t = other b.
+        # Ray a in the previous camera's coordinates, and ray b; they meet where depth a + t = other
+        # b.
         a0 = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
         a1 = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
         a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
         b0, b1 = previous[k, 0], previous[k, 1]
         n0, n1, n2 = a1 - a2 * b1, a2 * b0 - a0, a0 * b1 - a1 * b0  # a x b
-        if n0 * n0 + n1 * n1 + n2 * n2 <= parallax * parallax * (x * x + y * y + 1) * (b0 * b0 + b1 * b1 + 1):
+        if n0 * n0 + n1 * n1 + n2 * n2 <= parallax * parallax * (x * x + y * y + 1) * (
+            b0 * b0 + b1 * b1 + 1
+        ):
             continue
-        depth = n0 * (b1 * t[2] - t[1]) + n1 * (t[0] - b0 * t[2]) + n2 * (b0 * t[1] - b1 * t[0])  # n (b x t)
-        other = n0 * (a1 * t[2] - a2 * t[1]) + n1 * (a2 * t[0] - a0 * t[2]) + n2 * (a0 * t[1] - a1 * t[0])  # n (a x t)
+        # n (b x t)
+        depth = n0 * (b1 * t[2] - t[1]) + n1 * (t[0] - b0 * t[2]) + n2 * (b0 * t[1] - b1 * t[0])
+        # n (a x t)
+        other = (
+            n0 * (a1 * t[2] - a2 * t[1])
+            + n1 * (a2 * t[0] - a0 * t[2])
+            + n2 * (a0 * t[1] - a1 * t[0])
+        )
         if depth > 0 and other > 0:
             forward += 1
         elif depth < 0 and other < 0:
@@ -187,7 +272,9 @@ def cheirality_votes(rotation, t, current, previous, parallax):
 
 @inner
 def _product(a, b, product):
-    """Write and return the product of two 3x3 matrices: np.dot is compiled once, and faster than without `product`."""
+    """Write and return the product of two 3x3 matrices: np.dot is compiled once, and faster
+    than without `product`.
+    """
     return np.dot(a, b, product)
 
 
@@ -211,7 +298,8 @@ def _normalised(v0, v1, v2):
 @inner
 def _tangents(t):
     """Two unit vectors that are perpendicular to the unit vector t and to each other."""
-    if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):  # cross product with the axis that t is farthest from
+    # cross product with the axis that t is farthest from
+    if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):
         x, y, z = 0.0, t[2], -t[1]
     elif abs(t[1]) <= abs(t[2]):
         x, y, z = -t[2], 0.0, t[0]
@@ -225,24 +313,34 @@ def _tangents(t):
 
 @inner
 def _moved(r, t, change):
-    """Motion after a change (5) of its parameters: exp([turn]x) R (Rodrigues' formula), t moved along its tangents."""
+    """Motion after a change (5) of its parameters: exp([turn]x) R (Rodrigues' formula), t moved
+    along its tangents.
+    """
     angle = np.sqrt(change[0] * change[0] + change[1] * change[1] + change[2] * change[2])
     cross, rodrigues = _skew(change), np.empty((3, 3))
     square = _product(cross, cross, np.empty((3, 3)))
-    sine, cosine = (np.sin(angle) / angle, (1 - np.cos(angle)) / (angle * angle)) if angle > 1e-12 else (1.0, 0.0)
+    sine, cosine = (
+        (np.sin(angle) / angle, (1 - np.cos(angle)) / (angle * angle))
+        if angle > 1e-12
+        else (1.0, 0.0)
+    )
     for i in range(3):
         for j in range(3):
             rodrigues[i, j] = (i == j) + sine * cross[i, j] + cosine * square[i, j]
     first, second = _tangents(t)
-    heading = _normalised(t[0] + change[3] * first[0] + change[4] * second[0],
-                          t[1] + change[3] * first[1] + change[4] * second[1],
-                          t[2] + change[3] * first[2] + change[4] * second[2])
+    heading = _normalised(
+        t[0] + change[3] * first[0] + change[4] * second[0],
+        t[1] + change[3] * first[1] + change[4] * second[1],
+        t[2] + change[3] * first[2] + change[4] * second[2],
+    )
     return _product(rodrigues, r, np.empty((3, 3))), heading
 
 
 @inner
 def _essential_and_derivatives(r, t):
-    """E = [t]x R and its five derivatives (6, 9), row by row: three [t]x [unit]x R, two [tangent]x R."""
+    """E = [t]x R and its five derivatives (6, 9), row by row: three [t]x [unit]x R, two
+    [tangent]x R.
+    """
     matrices, unit = np.empty((6, 3, 3)), np.zeros((3, 3))
     cross, (first, second) = _skew(t), _tangents(t)
     _product(cross, r, matrices[0])
@@ -258,17 +356,23 @@ def _essential_and_derivatives(r, t):
 def _normal_equations(r, t, current, previous, scale):
     """Cauchy cost of the Sampson distances, its Gauss-Newton matrix (5, 5) and its gradient (5).
 
-    With residual s and weight w = 1 / (1 + (s / scale)^2): the sums of log(1 + (s / scale)^2), of w J^T J and of w s J.
+    With residual s and weight w = 1 / (1 + (s / scale)^2): the sums of log(1 + (s / scale)^2), of w
+    J^T J and of w s J.
     """
     matrices = _essential_and_derivatives(r, t)
     essential = epipolar.entries(matrices[0])
     cost, hessian, gradient = 0.0, np.zeros((5, 5)), np.zeros(5)
-    # Points are handled in blocks, one quantity after the other, so that these loops are vectorised. The sums go point
-    # by point, so the bits are those of one loop over all points.
+    # Points are handled in blocks, one quantity after the other, so that these loops are
+    # vectorised. The sums go point by point, so the bits are those of one loop over all points.
     size = POINTS_PER_BLOCK
     x, y, u, v = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     l0, l1, m0, m1 = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
-    inverse, residual, rarity, weight = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    inverse, residual, rarity, weight = (
+        np.empty(size),
+        np.empty(size),
+        np.empty(size),
+        np.empty(size),
+    )
     jacobian = np.empty((5, size))
     for start in range(0, len(current), size):
         count = min(size, len(current) - start)
@@ -276,9 +380,12 @@ def _normal_equations(r, t, current, previous, scale):
             x[i], y[i] = current[start + i, 0], current[start + i, 1]
             u[i], v[i] = previous[start + i, 0], previous[start + i, 1]
         for i in range(count):
-            algebraic, l0[i], l1[i], m0[i], m1[i] = epipolar.sampson_terms(essential, x[i], y[i], u[i], v[i])
+            algebraic, l0[i], l1[i], m0[i], m1[i] = epipolar.sampson_terms(
+                essential, x[i], y[i], u[i], v[i]
+            )
             square = l0[i] * l0[i] + l1[i] * l1[i] + m0[i] * m0[i] + m1[i] * m1[i]
-            inverse[i] = 1 / np.sqrt(square) if square >= 1e-18 else 0.0  # a point at an epipole has no residual
+            # a point at an epipole has no residual
+            inverse[i] = 1 / np.sqrt(square) if square >= 1e-18 else 0.0
             residual[i] = algebraic * inverse[i]  # signed Sampson distance
             ratio = residual[i] / scale
             rarity[i] = 1 + ratio * ratio
@@ -287,7 +394,8 @@ def _normal_equations(r, t, current, previous, scale):
             derivative, column = epipolar.entries(matrices[1 + k]), jacobian[k]
             for i in range(count):
                 change, d0, d1, c0, c1 = epipolar.sampson_terms(derivative, x[i], y[i], u[i], v[i])
-                # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2 + m1^2
+                # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2
+                # + m1^2
                 slope = l0[i] * d0 + l1[i] * d1 + m0[i] * c0 + m1[i] * c1
                 column[i] = (change - residual[i] * inverse[i] * slope) * inverse[i]
         for i in range(count):

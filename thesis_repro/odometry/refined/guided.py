@@ -1,8 +1,9 @@
 """RANSAC among the motions near an expected motion.
 
-With few points or points far away, two motions may explain the correspondences almost equally well: a turn looks like
-a shift to the side. Which of them plain RANSAC returns is chance. This search ignores every essential matrix whose
-motion differs from the expected motion by more than given angles.
+With few points or points far away, two motions may explain the correspondences almost equally well:
+a turn looks like a shift to the side. Which of them plain RANSAC returns is chance. This search
+ignores every essential matrix whose motion differs from the expected motion by more than given
+angles.
 """
 
 import numpy as np
@@ -14,36 +15,62 @@ from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, OPENCV_SEED, 
 from thesis_repro.odometry.opencv_exact.rounding import solve
 
 
-def ransac_with_prior(current: np.ndarray, previous: np.ndarray, threshold: float, rotation: np.ndarray,
-                      translation: np.ndarray, max_rotation: float, max_heading: float
-                      ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Motion (rotation 3x3, unit translation) with most inliers near an expected motion, or None if there is none.
+def ransac_with_prior(
+    current: np.ndarray,
+    previous: np.ndarray,
+    threshold: float,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    max_rotation: float,
+    max_heading: float,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Motion (rotation 3x3, unit translation) with most inliers near an expected motion, or None if
+    there is none.
 
-    current, previous: normalised correspondences (N, 2), N >= 5. rotation, translation: the expected motion.
-    max_rotation, max_heading: largest differences in degrees of the rotation and of the translation's direction,
-    whose sign is ignored.
+    current, previous: normalised correspondences (N, 2), N >= 5. rotation, translation: the
+    expected motion.
+    max_rotation, max_heading: largest differences in degrees of the rotation and of the
+    translation's direction, whose sign is ignored.
     """
     columns = np.ascontiguousarray(np.hstack([current, previous]).T)
-    state, sample, five, solutions = OPENCV_SEED, np.empty(SAMPLE_SIZE, np.int64), np.empty((SAMPLE_SIZE, 4)), []
-    for _ in range(MAX_SAMPLES):  # in Python: `solve` within another compiled function would be compiled once more
+    state, sample, five, solutions = (
+        OPENCV_SEED,
+        np.empty(SAMPLE_SIZE, np.int64),
+        np.empty((SAMPLE_SIZE, 4)),
+        [],
+    )
+    # in Python: `solve` within another compiled function would be compiled once more
+    for _ in range(MAX_SAMPLES):
         state = draw(np.uint64(state), columns, sample, five)
         solutions.append(solve(five)[1])  # no solutions if it is not sure
     most, best_rotation, best_translation = _best(
-        np.concatenate(solutions), columns, threshold * threshold, np.ascontiguousarray(rotation),
-        np.ascontiguousarray(translation), np.cos(np.radians(min(max_rotation, 180.0))),
-        np.cos(np.radians(min(max_heading, 90.0))))
+        np.concatenate(solutions),
+        columns,
+        threshold * threshold,
+        np.ascontiguousarray(rotation),
+        np.ascontiguousarray(translation),
+        np.cos(np.radians(min(max_rotation, 180.0))),
+        np.cos(np.radians(min(max_heading, 90.0))),
+    )
     return (best_rotation, best_translation) if most else None
 
 
 @fast
-def _best(solutions, columns, limit, rotation, translation, min_rotation_cosine, min_heading_cosine):
-    """Most inliers of any motion near the expected motion, and that motion (rotation, translation)."""
+def _best(
+    solutions, columns, limit, rotation, translation, min_rotation_cosine, min_heading_cosine
+):
+    """Most inliers of any motion near the expected motion, and that motion (rotation,
+    translation).
+    """
     r, t = np.empty((3, 3)), np.empty(3)
     most, best_r, best_t = 0, np.empty((3, 3)), np.empty(3)
     for index in range(len(solutions)):
         e, is_near = epipolar.entries(solutions[index]), False
         _translation(e, t)
-        if abs(t[0] * translation[0] + t[1] * translation[1] + t[2] * translation[2]) < min_heading_cosine:
+        if (
+            abs(t[0] * translation[0] + t[1] * translation[1] + t[2] * translation[2])
+            < min_heading_cosine
+        ):
             continue
         for _ in range(2):  # t with one rotation, -t with the other
             _rotation(e, t, r)
@@ -59,9 +86,12 @@ def _best(solutions, columns, limit, rotation, translation, min_rotation_cosine,
             continue
         inliers = 0
         for k in range(columns.shape[1]):
-            algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(e, columns[0, k], columns[1, k], columns[2, k],
-                                                               columns[3, k])
-            inliers += 1 if algebraic * algebraic <= limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) else 0
+            algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(
+                e, columns[0, k], columns[1, k], columns[2, k], columns[3, k]
+            )
+            inliers += (
+                1 if algebraic * algebraic <= limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) else 0
+            )
         if inliers > most:
             most, best_r, best_t = inliers, r.copy(), t.copy()
     return most, best_r, best_t
@@ -69,7 +99,9 @@ def _best(solutions, columns, limit, rotation, translation, min_rotation_cosine,
 
 @inner
 def _translation(e, t):
-    """Write the unit translation, with either sign, of an essential matrix: it is normal to all columns."""
+    """Write the unit translation, with either sign, of an essential matrix: it is normal to all
+    columns.
+    """
     largest = -1.0
     for a in range(3):  # use the best conditioned pair of columns
         b = (a + 1) % 3
@@ -87,7 +119,8 @@ def _translation(e, t):
 def _rotation(e, t, r):
     """Write the rotation R of an essential matrix [t]x R (unit norm) for one sign of t.
 
-    Horn (1990), Recovering baseline and orientation from essential matrix: R = cof(E) - [t]x E for unit t.
+    Horn (1990), Recovering baseline and orientation from essential matrix: R = cof(E) - [t]x E for
+    unit t.
     """
     size = np.sqrt(2.0)  # the norm of [t]x R
     for i in range(3):
@@ -95,4 +128,6 @@ def _rotation(e, t, r):
         for j in range(3):
             j1, j2 = (j + 1) % 3, (j + 2) % 3
             cofactor = e[i1 + j1] * e[i2 + j2] - e[i1 + j2] * e[i2 + j1]
-            r[i, j] = size * size * cofactor - size * (t[(i + 1) % 3] * e[i2 + j] - t[(i + 2) % 3] * e[i1 + j])
+            r[i, j] = size * size * cofactor - size * (
+                t[(i + 1) % 3] * e[i2 + j] - t[(i + 2) % 3] * e[i1 + j]
+            )

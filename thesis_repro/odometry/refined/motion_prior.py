@@ -1,10 +1,11 @@
 """Consistency of a step's motion with the step before, which makes the refined estimator reliable.
 
-A camera on a car moves nearly the same way from frame to frame. KITTI's ground truth has 22,437 pairs of steps longer
-than 0.25 m. In 7 pairs the rotations differ by more than MAX_ROTATION_CHANGE (with the first rotation scaled to the
-second step's length). In 4 pairs the directions of motion differ by more than MAX_HEADING_CHANGE. A motion estimated
-from few points, far points or points along one line can differ by far more: a turn looks like a shift to the side, and
-both explain the correspondences.
+A camera on a car moves nearly the same way from frame to frame. KITTI's ground truth has 22,437
+pairs of steps longer than 0.25 m. In 7 pairs the rotations differ by more than MAX_ROTATION_CHANGE
+(with the first rotation scaled to the second step's length). In 4 pairs the directions of motion
+differ by more than MAX_HEADING_CHANGE. A motion estimated from few points, far points or points
+along one line can differ by far more: a turn looks like a shift to the side, and both explain the
+correspondences.
 """
 
 from dataclasses import replace
@@ -18,16 +19,20 @@ from thesis_repro.odometry.refined.guided import ransac_with_prior
 
 MAX_ROTATION_CHANGE, MAX_HEADING_CHANGE = 1.5, 20.0  # degrees
 MAX_FIRST_ROTATION = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
-PRIOR_FIT_THRESHOLDS = 4  # points within so many thresholds of the expected motion start the second fit
+# points within so many thresholds of the expected motion start the second fit
+PRIOR_FIT_THRESHOLDS = 4
 SAME_SUPPORT = 0.97  # a second fit with this share of the estimated motion's support is as good
-MIN_SUPPORT = 0.6  # an alternative with less than this share of the estimated motion's support is wrong
-MAX_ROTATION_STD, MAX_HEADING_STD = 0.5, 5.0  # degrees; with more, the points do not determine the motion
+# an alternative with less than this share of the estimated motion's support is wrong
+MIN_SUPPORT = 0.6
+# degrees; with more, the points do not determine the motion
+MAX_ROTATION_STD, MAX_HEADING_STD = 0.5, 5.0
 
 AMBIGUOUS, NOT_DETERMINED = "ambiguous motion", "motion not determined"  # flags
 
 
 class MotionPrior(NamedTuple):
-    """Last consistent step: `rotation` (3x3), unit `translation` and `scale` (metres). The next step should be similar.
+    """Last consistent step: `rotation` (3x3), unit `translation` and `scale` (metres). The next
+    step should be similar.
 
     Before the first step, `scale` is 0 and the camera is expected to move straight ahead.
     """
@@ -43,49 +48,77 @@ class MotionPrior(NamedTuple):
         return cv2.Rodrigues(cv2.Rodrigues(self.rotation)[0] * (scale / self.scale))[0]
 
 
-def check_consistency(motion: RefinedMotion, current: np.ndarray, previous: np.ndarray, scale: float, threshold: float,
-                      prior: MotionPrior) -> tuple[RefinedMotion, MotionPrior, str]:
-    """Return the motion to use, the prior of the next step, and a flag ("" if the refined `motion` is consistent).
+def check_consistency(
+    motion: RefinedMotion,
+    current: np.ndarray,
+    previous: np.ndarray,
+    scale: float,
+    threshold: float,
+    prior: MotionPrior,
+) -> tuple[RefinedMotion, MotionPrior, str]:
+    """Return the motion to use, the prior of the next step, and a flag ("" if the refined `motion`
+    is consistent).
 
-    current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers. scale: metres.
+    current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers.
+    scale: metres.
 
-    A consistent motion (`is_consistent`) is fitted once more, starting from the expected motion. This start does not
-    depend on RANSAC's random samples, so shuffled correspondences give nearly the same motion.
+    A consistent motion (`is_consistent`) is fitted once more, starting from the expected motion.
+    This start does not depend on RANSAC's random samples, so shuffled correspondences give nearly
+    the same motion.
 
-    If the motion is not consistent, the best consistent motion is searched for. In a static scene, the true motion has
-    nearly as much support as any other. So the consistent motion is used if its support is at least MIN_SUPPORT times
-    that of the estimated motion. If not, the camera really moved differently, and the estimated motion is used. The
-    flag is AMBIGUOUS in both cases. If the points determine no motion, the step repeats the expected motion, and the
-    flag is NOT_DETERMINED.
+    If the motion is not consistent, the best consistent motion is searched for. In a static scene,
+    the true motion has nearly as much support as any other. So the consistent motion is used if its
+    support is at least MIN_SUPPORT times that of the estimated motion. If not, the camera really
+    moved differently, and the estimated motion is used. The flag is AMBIGUOUS in both cases. If the
+    points determine no motion, the step repeats the expected motion, and the flag is
+    NOT_DETERMINED.
     """
     rotation, translation = prior.expected_rotation(scale), prior.translation
     flag = ""
     if is_consistent(motion, scale, prior):
-        near_prior = near(rotation, translation, current, previous, PRIOR_FIT_THRESHOLDS * threshold)
+        near_prior = near(
+            rotation, translation, current, previous, PRIOR_FIT_THRESHOLDS * threshold
+        )
         again = fit(rotation, translation, current, previous, near_prior, threshold)
         if is_consistent(again, scale, prior) and again.support >= SAME_SUPPORT * motion.support:
             motion = replace(again, inliers=motion.inliers)
     else:
         flag = AMBIGUOUS
-        start = ransac_with_prior(current, previous, threshold, rotation, translation, _max_rotation(prior),
-                                  MAX_HEADING_CHANGE)
+        start = ransac_with_prior(
+            current,
+            previous,
+            threshold,
+            rotation,
+            translation,
+            _max_rotation(prior),
+            MAX_HEADING_CHANGE,
+        )
         if start:
-            other = fit(*start, current, previous, near(*start, current, previous, threshold), threshold)
-            if is_consistent(other, scale, prior) and (other.support >= MIN_SUPPORT * motion.support
-                                                       or not _determined(motion)):
+            other = fit(
+                *start, current, previous, near(*start, current, previous, threshold), threshold
+            )
+            if is_consistent(other, scale, prior) and (
+                other.support >= MIN_SUPPORT * motion.support or not _determined(motion)
+            ):
                 motion = other
     if _determined(motion):
-        assert motion.rotation is not None and motion.translation is not None  # a fitted motion has both
+        # a fitted motion has both
+        assert motion.rotation is not None and motion.translation is not None
         return motion, MotionPrior(motion.rotation, motion.translation, scale), flag
     return replace(motion, rotation=rotation, translation=translation), prior, NOT_DETERMINED
 
 
 def is_consistent(motion: RefinedMotion, scale: float, prior: MotionPrior) -> bool:
-    """Whether a step of `scale` metres is determined by its points and within the limits of the expected motion."""
+    """Whether a step of `scale` metres is determined by its points and within the limits of the
+    expected motion.
+    """
     assert motion.rotation is not None and motion.translation is not None
     turned = _degrees((np.trace(prior.expected_rotation(scale).T @ motion.rotation) - 1) / 2)
-    return bool(_determined(motion) and turned <= _max_rotation(prior)
-                and _degrees(prior.translation @ motion.translation) <= MAX_HEADING_CHANGE)
+    return bool(
+        _determined(motion)
+        and turned <= _max_rotation(prior)
+        and _degrees(prior.translation @ motion.translation) <= MAX_HEADING_CHANGE
+    )
 
 
 def _max_rotation(prior):
