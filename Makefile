@@ -69,7 +69,7 @@ help:
 	@echo "make plan        estimate the time and disk space of make figures KITTI=/path, with the same settings"
 	@echo "make test        run the unit tests, and every notebook with PROFILE=smoke"
 	@echo "make torture     run the tests of kills, faults and bad input (some minutes)"
-	@echo "make lint        check style (Ruff) and types (mypy)"
+	@echo "make lint        check format and style (Ruff) and types (mypy)"
 	@echo "make lab         open the notebooks in JupyterLab with PROFILE=lab (a minute each)"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts"
@@ -196,6 +196,7 @@ torture: setup
 	@$(BIN)/python -m pytest -q -m torture
 
 lint: setup
+	@$(BIN)/ruff format --check --quiet . || { echo "run $(BIN)/ruff format ." >&2; exit 1; }
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
 
