@@ -49,10 +49,7 @@ $(foreach name,JOBS DASK_SCHEDULER $(SIZES),$(if $($(name)),$(eval export THESIS
 DATA_OPTIONS := $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI") \
                 $(if $(CITYSCAPES),--cityscapes "$$THESIS_REPRO_CITYSCAPES") \
                 $(if $(KITTI_SEMANTIC),--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC")
-# Silence the libraries, and stop their look-ups at import.
-export SM_FRAMEWORK := tf.keras
-export NO_ALBUMENTATIONS_UPDATE := 1
-export TF_CPP_MIN_LOG_LEVEL := 3
+# Silence the libraries.
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
 # Without bytecode files, each start of TensorFlow takes 20 s instead of 5 s (pip runs with --no-compile).

@@ -7,10 +7,9 @@ import subprocess
 from contextlib import contextmanager
 from pathlib import Path
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
-os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
+from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
+# isort: split
 import cv2
 import numpy as np
 import pytest

@@ -239,11 +239,8 @@ def _modules(places):
 
 
 def made_with(*packages):
-    """Return what results depend on besides data and code: package versions and TensorFlow's
-    oneDNN switch.
-    """
-    versions = {name: importlib.metadata.version(name) for name in packages}
-    return {"versions": versions, "onednn": os.environ.get("TF_ENABLE_ONEDNN_OPTS")}
+    """Return the versions of packages that results depend on."""
+    return {"versions": {name: importlib.metadata.version(name) for name in packages}}
 
 
 def listing(paths):

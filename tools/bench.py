@@ -19,8 +19,9 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
+# isort: split
 import cv2
 import numpy as np
 import pandas as pd

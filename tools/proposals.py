@@ -8,14 +8,13 @@ of each seed. Milliseconds are processor time on all cores.
 """
 
 import argparse
-import os
 import sys
 import time
 from pathlib import Path
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-os.environ.setdefault("SM_FRAMEWORK", "tf.keras")
+from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
+# isort: split
 import cv2
 import keras
 import numpy as np

@@ -7,13 +7,13 @@ which gives the model. A stopped training resumes.
 """
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
+# isort: split
 import albumentations as A
 import cv2
 import jinja2

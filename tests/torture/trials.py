@@ -14,10 +14,11 @@ from typing import NamedTuple
 import pandas as pd
 
 from thesis_repro import longrun
+from thesis_repro.segmentation import ARITHMETIC
 
 ROOT = Path(__file__).resolve().parents[2]
-# in tests/conftest.py
-SET_BY_TESTS = {"TF_CPP_MIN_LOG_LEVEL", "SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE"}
+# what thesis_repro.segmentation has set in this process
+SET_BY_TESTS = {"SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE", "TF_CPP_MIN_LOG_LEVEL", *ARITHMETIC}
 
 
 class Result(NamedTuple):

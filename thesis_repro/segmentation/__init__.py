@@ -3,16 +3,30 @@ maps and their quality.
 """
 
 import os
+import platform
 import sys
 from contextlib import contextmanager
 
-# Variables that libraries read when they are imported, or at TensorFlow's first operation. Values
-# of the user are kept.
-for _name, _value in {
+# Settings that give the same bits on every processor, together with `exact`.
+ARITHMETIC = {
     # TensorFlow splits sums among its threads, so the rounding depends on their number. A fixed
     # number gives the same bits on any number of cores. More threads than cores cost little; fewer
     # would leave cores of large machines idle.
     "TF_NUM_INTRAOP_THREADS": "8",
+}
+if platform.machine() in ("x86_64", "AMD64"):
+    ARITHMETIC |= {
+        # By default TensorFlow chooses between two libraries of kernels by the processor.
+        "TF_ENABLE_ONEDNN_OPTS": "1",
+        # By default kernels and compiled code use the widest instructions of the processor. Nearly
+        # all processors since 2015 have AVX2.
+        "ONEDNN_MAX_CPU_ISA": "AVX2",
+        "XLA_FLAGS": "--xla_cpu_max_isa=AVX2",
+    }
+# Libraries read these variables when they are imported. Values of the user are kept.
+for _name, _value in {
+    # too late for a TensorFlow that is loaded; its record then lacks them
+    **(ARITHMETIC if "tensorflow" not in sys.modules else {}),
     "TF_CPP_MIN_LOG_LEVEL": "3",  # errors of TensorFlow are Python exceptions as well
     "TF_FORCE_GPU_ALLOW_GROWTH": "true",  # do not take all memory of a GPU at the start
     "SM_FRAMEWORK": "tf.keras",  # of segmentation-models
@@ -20,7 +34,13 @@ for _name, _value in {
 }.items():
     os.environ.setdefault(_name, _value)
 
+
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
+
+
+def arithmetic():
+    """Return the settings that decide how TensorFlow rounds, for the record of results."""
+    return {name: os.environ.get(name) for name in ARITHMETIC}
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import keras
 import numpy as np
 import tensorflow as tf
 
-from thesis_repro import InputError, files, longrun, stages
+from thesis_repro import InputError, files, longrun, segmentation, stages
 from thesis_repro.cityscapes import read_image
 from thesis_repro.segmentation import memory, training
 
@@ -95,7 +95,8 @@ def _open(weights, paths, output_dir, batch_size):
 def _arithmetic():
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
     return stages.made_with("tensorflow", "keras", "opencv-python-headless") | {
-        "code": stages.code("segmentation/prediction")
+        "code": stages.code("segmentation/prediction"),
+        "arithmetic": segmentation.arithmetic(),
     }
 
 

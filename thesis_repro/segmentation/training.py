@@ -18,9 +18,9 @@ import pandas as pd
 import segmentation_models as sm
 import tensorflow as tf
 
-from thesis_repro import InputError, files, longrun, stages
+from thesis_repro import InputError, files, longrun, segmentation, stages
 from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
-from thesis_repro.segmentation import augmentation
+from thesis_repro.segmentation import augmentation, exact  # noqa: F401
 
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
 
@@ -160,6 +160,7 @@ def made_from(model, batches, validation):
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
     return {
         "code": stages.code("segmentation/training"),
+        "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),
         # Keras numbers the names: adam, adam_1

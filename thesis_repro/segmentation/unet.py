@@ -3,6 +3,7 @@
 from keras import Model, layers
 
 from thesis_repro import InputError
+from thesis_repro.segmentation import exact  # noqa: F401
 
 DEPTH = 4  # encoder blocks; each halves the image
 

@@ -1,0 +1,178 @@
+"""Measure how much another training of the same network changes what masks do (embedded world).
+
+usage: make figures && python tools/trainings.py
+
+Trains the network of the default run again with other seeds, which choose the initial weights and
+the order of the images. Every network then predicts label maps for the same drives, and masks from
+them are compared with all keypoints. Writes figures/trainings.csv: for each training a digest of
+its weights, the quality of its label maps, the ratios of errors with their intervals, and the mean
+of Table 4.2. A stopped run resumes.
+"""
+
+import sys
+
+from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
+
+# isort: split
+import keras
+import numpy as np
+import pandas as pd
+import tensorflow as tf
+
+from thesis_repro import InputError, cityscapes, files, kitti, longrun, stages
+from thesis_repro.segmentation import domain_gap, memory, prediction, quality, training
+from thesis_repro.segmentation.unet import build_unet
+from thesis_repro.settings import ROOT, read_settings
+from thesis_repro.study import compare, jobs, runner, thesis_tables
+from thesis_repro.study.sources import Source
+
+SEEDS = 0, 1, 2, 3  # the first one is the default run's
+TABLE = ROOT / "figures" / "trainings.csv"
+METRICS = (*compare.JUDGING_METRICS, "rmse")
+
+
+def train(settings, seed):
+    """Return the file of the network that notebooks 3 and 4 train if `seed` is their seed."""
+    if seed == settings.seed:
+        return files.needed(settings.build / "model" / training.MODEL, "04_training")
+    data, sizes = settings.build / "data", settings.sizes
+    arrays = {
+        name: np.load(files.needed(data / f"doubled_{name}.npy", "02_augmentation"))
+        for name in ("train_images", "train_labels", "validation_images", "validation_labels")
+    }
+    batches = training.Batches(
+        [(arrays["train_images"], arrays["train_labels"])], sizes.batch_size, seed
+    )
+    validation = training.Batches(
+        [(arrays["validation_images"], arrays["validation_labels"])], sizes.batch_size
+    )
+    keras.utils.set_random_seed(seed)
+    model = build_unet(arrays["train_images"].shape[1:], cityscapes.N_CLASSES, sizes.base_filters)
+    model.compile(
+        keras.optimizers.Adam(sizes.learning_rate), training.fused_loss(training.total_loss())
+    )
+    model.optimizer.build(model.trainable_variables)
+    folder = stages.stage(
+        settings.build / f"trainings/model_{seed}",
+        **training.made_from(model, batches, validation),
+    )
+    stop = keras.callbacks.EarlyStopping(monitor="val_loss", patience=sizes.patience)
+    best = keras.callbacks.ModelCheckpoint(
+        folder / training.MODEL, monitor="val_loss", save_best_only=True
+    )
+    resumable = training.ResumableTraining(folder, model, batches, [stop, best])
+    model.fit(
+        batches.dataset(),
+        validation_data=validation.dataset(),
+        epochs=sizes.epochs,
+        shuffle=False,
+        verbose=0,
+        initial_epoch=resumable.first_epoch(sizes.epochs),
+        callbacks=[stop, best, resumable],
+    )
+    return folder / training.MODEL
+
+
+def label_maps(settings, sequences, seed):
+    """Train, predict; return the source of masks, and {network, mean_iou} of the training."""
+    model = training.load_model(train(settings, seed))
+    folder = settings.build / f"trainings/labels_{seed}"
+    for sequence in sequences:
+        prediction.write_label_maps(model, sequence.frame_paths, folder / sequence.name)
+    images, true = cityscapes.load(domain_gap.labelled_frames(sequences), *model.input_shape[2:])
+    confusion = quality.confusion_matrix(true, prediction.predict(model, images))
+    mean_iou, *_ = quality.cityscapes_scores(confusion)
+    facts = {"network": training.weights_digest(model), "mean_iou": mean_iou}
+    return Source(folder, name=f"seed {seed}"), facts
+
+
+def run(settings, names, sources):
+    """Return the table of the runs that Table 4.2, the comparison and its verdicts need."""
+    listed = jobs.first_jobs(
+        settings.kitti,
+        names,
+        {"thesis": settings.sizes.widths, "refined": []},
+        tested=jobs.CONTROL_WIDTH,
+        sources=sources,
+        repetitions=settings.sizes.repetitions,
+    )
+    listed = [
+        job
+        for job in listed
+        if job.method in ("baseline", "masked", *compare.SEGMENTATION_FREE_CONTROLS)
+        and (job.repetition == 0 or job.dilation_width in (None, jobs.CONTROL_WIDTH))
+    ]
+    options = {"frames": settings.sizes.frames, "processes": settings.jobs}
+    folder = settings.build / "trainings/odometry"
+    runs = runner.run(listed, settings.kitti, sources, folder, **options)
+    for source in sources:
+        listed += jobs.keypoint_control_jobs(
+            compare.keypoints_left(compare.of_source(runs, source.name)),
+            settings.kitti,
+            settings.sizes.frames,
+            settings.sizes.repetitions,
+            source=source.name,
+            width=jobs.CONTROL_WIDTH,
+        )
+    return runner.run(listed, settings.kitti, sources, folder, **options)
+
+
+def rows(runs, comparison, source, facts):
+    """Yield one row for each estimator, for one training."""
+    own = compare.of_source(runs, source.name)
+    masked, baseline = (compare.of_method(own, name) for name in ("masked", "baseline"))
+    changes = thesis_tables.changes(thesis_tables.of_chosen_width(masked), baseline, "rmse")
+    table = comparison[(comparison["source"] == source.name) & comparison["tested"]]
+    for estimator in jobs.ESTIMATORS:
+        against = {
+            reference: table[
+                (table["method"] == "masked")
+                & (table["reference"] == reference)
+                & (table["estimator"] == estimator)
+            ].set_index("metric")
+            for reference in ("baseline", *compare.SEGMENTATION_FREE_CONTROLS)
+        }
+        verdicts = {
+            name: compare.overall(pairs.loc[list(compare.JUDGING_METRICS), "verdict"])
+            for name, pairs in against.items()
+        }
+        ratios = against["baseline"]
+        yield {
+            "training": source.name,
+            **facts,
+            "estimator": estimator,
+            "keypoints": ratios["keypoints"].iloc[0],
+            **{
+                f"{metric}_{end}": ratios.loc[metric, end]
+                for metric in METRICS
+                for end in ("ratio", "low", "high")
+            },
+            "verdict": verdicts.pop("baseline"),
+            "controls_beaten": sum(verdict == compare.LOWER for verdict in verdicts.values()),
+            "table_4_2_mean": changes.mean() if estimator == "thesis" else np.nan,
+            "table_4_2_improved": int((changes < 0).sum()) if estimator == "thesis" else np.nan,
+        }
+
+
+def main():
+    """Write TABLE; the settings are those of the default run."""
+    settings = read_settings()
+    tf.config.threading.set_intra_op_parallelism_threads(settings.sizes.threads)
+    memory.keep_freed()
+    names = kitti.sequences(settings.kitti)
+    sequences = [kitti.Sequence(settings.kitti, name) for name in names]
+    trained = [label_maps(settings, sequences, seed) for seed in SEEDS]
+    runs = run(settings, names, [source for source, _ in trained])
+    comparison = compare.comparisons(runs)
+    table = pd.DataFrame(
+        row for source, facts in trained for row in rows(runs, comparison, source, facts)
+    )
+    files.write_text(TABLE, table.round(4).to_csv(index=False))
+    print(table.round(3).to_string(index=False))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (InputError, OSError) as error:
+        sys.exit(longrun.report_error(error))
