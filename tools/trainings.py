@@ -20,14 +20,14 @@ import pandas as pd
 import tensorflow as tf
 
 from thesis_repro import InputError, cityscapes, files, kitti, longrun, stages
+from thesis_repro.report.trainings import TABLE
 from thesis_repro.segmentation import domain_gap, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.settings import ROOT, read_settings
+from thesis_repro.settings import read_settings
 from thesis_repro.study import compare, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source
 
 SEEDS = 0, 1, 2, 3  # the first one is the default run's
-TABLE = ROOT / "figures" / "trainings.csv"
 METRICS = (*compare.JUDGING_METRICS, "rmse")
 
 

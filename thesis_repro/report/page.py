@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from thesis_repro import longrun
 from thesis_repro.files import listed, write_text
-from thesis_repro.report import captions, tables, texts
+from thesis_repro.report import captions, tables, texts, trainings
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE = "index.html"
@@ -93,6 +93,7 @@ def build(settings):
         "page.html.j2",
         title=f"Keypoint masks, {settings.run}",
         settings=settings,
+        network=trainings.network_note(settings),
         chapters=chapters,
         shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
         of=len(captions.THESIS),
@@ -235,9 +236,12 @@ def _made(executed=(), in_git=False):
 
 def main():
     try:
-        update(read_settings())
+        settings = read_settings()
+        update(settings)
     except Exception as error:
         return longrun.report_error(error)
+    if note := trainings.network_note(settings):
+        print(note)
     return 0
 
 

@@ -5,9 +5,10 @@ The stages include the network, as Section 5.2.2 asks for. They are timed as in 
 frame after the other, the network on one image at a time, all cores.
 """
 
+import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import pandas as pd
 from thesis_repro import InputError, masks, odometry, stages
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
+from thesis_repro.settings import cores
 from thesis_repro.study import cluster
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import by_name, masks_of
@@ -160,15 +162,24 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
 
 
 def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
-    """Write measured timings to a file and return them; with `keep`, return the timings of an
-    existing file instead.
+    """Write measured timings to a file and return them, with a column for the processor; with
+    `keep`, return the timings of an existing file instead.
 
     Figures in git keep their timings, which would otherwise change with every machine and every
     run.
     """
     if not (keep and path.is_file()):
-        write_text(path, measured.to_csv(index=False))
+        write_text(path, measured.assign(processor=processor()).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
+
+
+def processor() -> str:
+    """Return the name of this machine's processor, and its number of cores in use."""
+    name = platform.processor() or platform.machine()
+    with suppress(OSError, StopIteration):  # on Linux these are only "x86_64"
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(": ", 1)[1] for line in lines if line.startswith("model name"))
+    return f"{name}, {cores()} cores"
 
 
 def _timed(function: Callable, *arguments: Any) -> tuple[Any, float]:

@@ -1,0 +1,37 @@
+"""The recorded trainings of the default run's network, which differ only in their seed.
+
+`tools/trainings.py` writes the table. It has one row for each training and estimator.
+"""
+
+import pandas as pd
+
+from thesis_repro import stages
+from thesis_repro.files import listed
+from thesis_repro.settings import ROOT
+
+TABLE = ROOT / "figures" / "trainings.csv"
+
+
+def read():
+    """Return the table; the first training is the one that `make figures` repeats."""
+    return pd.read_csv(TABLE)
+
+
+def network_note(settings):
+    """Return one line that says whether a run's network is the recorded one, to the bit; empty for
+    a run of other data or sizes.
+
+    The digest of the network's weights is in the record of its label maps.
+    """
+    folders = listed(settings.build / "labels", "*")
+    if not settings.figures_in_git or not folders:
+        return ""
+    network, recorded = stages.record(folders[0])["model"], read()["network"].iloc[0]
+    if network == recorded:
+        return f"The network of this run is the recorded one, to the bit ({network})."
+    return (
+        f"The network of this run ({network}) is not the recorded one ({recorded}), because sums "
+        "were rounded otherwise: no x86 processor with AVX2, or other values of TF_ENABLE_ONEDNN_OPTS, "
+        "ONEDNN_MAX_CPU_ISA, XLA_FLAGS or TF_NUM_INTRAOP_THREADS. Numbers differ as between the "
+        f"trainings in {TABLE.relative_to(ROOT)}."
+    )
