@@ -57,7 +57,7 @@ def test_forms_of_widths_and_frames():
     for text, frames in (("all", None), ("40", 40)):
         assert build_parser().parse_args(["evaluate", "a.txt", "--frames", text]).frames == frames
     for wrong in (
-        ["boresight", "--kitti", "a", "--frames", "some"],
+        ["evaluate", "a.txt", "--frames", "some"],
         ["study", "--kitti", "a", "--widths", "5-1"],
     ):
         with pytest.raises(SystemExit):

@@ -121,7 +121,6 @@ def odometry(options):
     from thesis_repro import check, odometry
     from thesis_repro.kitti import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
-    from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import texts
 
     changes = {
@@ -143,8 +142,6 @@ def odometry(options):
     )
     _print_oddities(sequence, [masks] if masks else [])
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
-    if options.boresight:
-        result = result.with_poses(boresight.corrected(result.poses, options.boresight))
     if options.output:
         write_kitti_poses(options.output, result.poses)
     if options.tum:
@@ -175,27 +172,6 @@ def odometry(options):
         speed=options.speed,
         length=metrics.RELATIVE_LENGTH,
     )
-
-
-def boresight(options):
-    """estimate the constant rotation between camera and ground truth, in degrees, for odometry
-    --boresight
-    """
-    from thesis_repro import kitti, odometry
-    from thesis_repro.odometry.refined import boresight
-    from thesis_repro.report import texts
-
-    paths = {}
-    names = options.sequences or kitti.sequences(options.kitti)
-    for name in dict.fromkeys(kitti.name_of(options.kitti, name) for name in names):
-        sequence = kitti.Sequence(options.kitti, name).subset(options.frames)
-        _print_oddities(sequence, [])
-        result = odometry.run(
-            sequence, replace(odometry.THESIS, estimator="refined"), description=f"sequence {name}"
-        )
-        paths[name] = result.poses, sequence.poses
-    rotation, table = boresight.estimate(list(paths.values())), boresight.explained(paths)
-    _print(options, texts.angles_record(rotation, table), "angles.txt.j2", table=table)
 
 
 def study(options):
@@ -681,13 +657,6 @@ def build_parser():
         help="maximum number of keypoints in a frame (2000)",
     )
     add(
-        "--boresight",
-        type=float,
-        nargs=3,
-        metavar=("PITCH", "YAW", "ROLL"),
-        help="rotate the path by the angles that the command boresight estimates, in degrees",
-    )
-    add(
         "--output", type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
     )
     add("--tum", type=Path, metavar="FILE", help="write the estimated poses in TUM format")
@@ -697,8 +666,6 @@ def build_parser():
         metavar="OUT.mp4",
         help="write a video of the frames, the keypoints and the path",
     )
-
-    command(boresight, "--kitti", "--sequences", "--frames", "--json", kitti=REQUIRED)
 
     sub = command(
         study, "--kitti", "--sequences", "--frames", "--invert", *MASKS, "--output", kitti=REQUIRED

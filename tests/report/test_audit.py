@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from thesis_repro.report import audit
-from thesis_repro.study import ablations
+from thesis_repro.study import ablations, compare
 
 
 def test_rows_are_numbered_and_every_measurement_has_a_row():
@@ -30,6 +30,7 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
         ("1", "mean", "MAE", -2.33),
         ("1", "median", "RMSE", -5.27),
         ("3", "reduction", "", 2.626),
+        ("3", "reduction of each", "", 2.689),
         ("4", "larger", "MAE", 7),
         ("41", "improved", "RMSE", 6),
         ("41", "sign", "RMSE", 50),
@@ -128,8 +129,25 @@ def test_other_tables_are_measured_by_sequence_with_their_number_of_frames():
     assert (row["row"], row["frames"], row["n"]) == ("32", 2, 1) and row["value"] == pytest.approx(
         4
     )
-    angles = pd.DataFrame(
-        {"sequence": ["00", "01"], "pitch": [0.1, 0.3], "rmse": [2.0, 2.0], "rmse_own": [1.0, 1.0]}
+
+
+def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
+    methods = {"baseline": 1.0, "masked": 0.5, "fewer": 2.0, "corrected": 0.8}
+    runs = made_up.runs(
+        [f"{number:02d}" for number in range(8)],
+        lambda _, method, __: methods[method],
+        {"baseline": [None], "masked": [5, 10], "fewer": [10], "corrected": [10]},
+        noise=0.3,
     )
-    values = {row["metric"]: row["value"] for row in audit.measured(angles, "boresight")}
-    assert values == pytest.approx({"": 0.2, "RMSE": 0.5})
+    table = compare.comparisons(runs)
+    compared = table[table["tested"] & (table["reference"] == "baseline")].set_index(
+        ["method", "estimator", "metric"]
+    )
+    audited = pd.DataFrame(audit.measured(runs, "study"))
+    for row, method in (("15", "masked"), ("40", "fewer"), ("50", "corrected")):
+        lines = audited[(audited["row"] == row) & (audited["metric"] == "RMSE")]
+        for line in lines[lines["quantity"].str.endswith("over all keypoints")].itertuples():
+            assert [line.value, line.low, line.high, line.n] == pytest.approx(
+                compared.loc[(method, line.estimator, "rmse"), ["ratio", "low", "high", "n"]]
+            )
+        assert len(lines) >= 2

@@ -112,7 +112,7 @@ def test_a_ratio_near_one_has_more_digits(value, text):
         (halved, ELEVEN, compare.LOWER),
         (lambda *of: 1 / halved(*of), ELEVEN, compare.HIGHER),
         (lambda *_: 1.0, ELEVEN[:6], compare.NO_CLEAR_DIFFERENCE),
-        (halved, ["00", "05"], compare.NO_CLEAR_DIFFERENCE),
+        (halved, ["00", "05"], compare.TOO_FEW),
     ],
 )
 @pytest.mark.parametrize("sources", [("",), ("net", "hand")])
@@ -128,13 +128,17 @@ def test_findings_follow_the_verdict(errors, names, verdict, sources):
     assert texts.ratio(row) in text and "made up" in text and "nan" not in text
 
 
-def test_findings_without_refined_runs_or_masks():
+def test_findings_name_only_what_was_run():
     runs = runs_of(["00", "01"], halved, repetitions=1)
     for part in (
         runs[(runs["estimator"] == "thesis") & ~runs["method"].isin(CONTROLS)],
         runs[runs["method"] == "baseline"],
+        runs.assign(se3=np.nan),
     ):
-        assert "embedded world" in texts.findings(part, compare.comparisons(part), "embedded world")
+        text = texts.findings(part, compare.comparisons(part), "embedded world")
+        assert "embedded world" in text
+        assert ("refined" in text) == (part["estimator"] == "refined").any()
+        assert compare.METRICS["se3"] not in text or part["se3"].notna().any()
 
 
 @pytest.mark.parametrize(

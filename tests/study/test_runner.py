@@ -8,6 +8,7 @@ from thesis_repro import InputError, odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, MaskSettings
 from thesis_repro.odometry import metrics
+from thesis_repro.odometry.odometry import ROTATION_COLUMNS
 from thesis_repro.study import compare, controls, runner, thesis_tables, timing
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
@@ -46,10 +47,9 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
 def test_kittis_errors_need_paths_of_100_metres(frames, t_rel):
     true = np.tile(np.eye(4), (frames, 1, 1))
     true[:, 2, 3] = np.arange(frames)
-    table = pd.DataFrame({"detected": [9.0] * frames, "flag": ""})
-    measured = runner.measures(
-        odometry.Result(true, table).with_poses(true * [1, 1, 1, 1.02]).frames, true
-    )
+    columns = np.c_[1.02 * true[:, :3, 3], true[:, :3, :3].reshape(-1, 9)]
+    table = pd.DataFrame(columns, columns=[*"xyz", *ROTATION_COLUMNS])
+    measured = runner.measures(table.assign(detected=9.0, flag=""), true)
     assert measured["t_rel"] == pytest.approx(t_rel, nan_ok=True)
     assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
 
@@ -162,19 +162,6 @@ def test_runs_are_timed_once(small_world, small_labels, finished, monkeypatch):
     assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
     again = timing.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
     pd.testing.assert_frame_equal(timed, again)
-
-
-def test_without_a_mounting_angle_the_rmse_stays(small_world, small_labels, tmp_path):
-    kitti = small_world / "kitti"
-    jobs = first_jobs(kitti, ["00", "01"], {"refined": (10,)})
-    runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=6)
-    corrected = runner.with_boresight_correction(runs, kitti, tmp_path, frames=6)[
-        "rmse_boresight_corrected"
-    ]
-    # no angle is determined on six frames, so nothing is removed
-    assert corrected.tolist() == pytest.approx(runs["rmse"].tolist())
-    thesis_runs = runner.with_boresight_correction(runs.assign(estimator="thesis"), kitti, tmp_path)
-    assert thesis_runs["rmse_boresight_corrected"].isna().all()
 
 
 def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitti):

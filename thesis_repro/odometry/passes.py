@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -71,13 +71,6 @@ class Result:
         return (
             self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
         )
-
-    def with_poses(self, poses: np.ndarray) -> "Result":
-        """Copy with other poses (n, 4, 4), also in the table of frames."""
-        columns = dict(zip("xyz", poses[:, :3, 3].T, strict=True)) | dict(
-            zip(ROTATION_COLUMNS, poses[:, :3, :3].reshape(-1, 9).T, strict=True)
-        )
-        return replace(self, poses=poses, frames=self.frames.assign(**columns))
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:

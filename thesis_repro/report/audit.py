@@ -2,7 +2,7 @@
 effect of each.
 
 audit.json holds the rows and lists which columns are measured for them. `table` joins the
-measurements to the rows. Ratios come from `study.compare`. Intervals are bootstrap intervals over
+measurements to the rows. Ratios come from `study.compare`. Intervals are those of Student's t over
 `n` values: sequences unless said otherwise.
 """
 
@@ -102,7 +102,7 @@ def measured(table, kind):
     Where audit.json gives a unit, they are means over sequences. Otherwise they are ratios to a
     reference method, or to another column ("over") of the same rows.
     kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (as
-    in `ablations`), "shares" (of pixels, one row a frame), "boresight" (`boresight.explained`).
+    in `ablations`), "shares" (of pixels, one row a frame).
     """
     measurements = []
     requested = [
@@ -194,7 +194,7 @@ def of_tables():
     factors, classes = 2000 / best["mean_keypoints"], REPORTED["training"]["classes"]
     measurements += [
         measurement("3", "reduction", 2000 / best["mean_keypoints"].mean(), "ratio"),
-        measurement("3", "reduction of each", factors, "ratio"),
+        ratio("3", "reduction of each", factors),
         measurement("3", "three", (factors >= 3).sum(), "sequences"),
         measurement("9", "categories", len(LABELS)),
         measurement("9", "outputs", classes),
@@ -209,7 +209,7 @@ def of_tables():
 
 
 def of_study(runs):
-    """Return rows 2, 11, 26, 31 to 33, 35 and 38, from the runs of notebook 08."""
+    """Return rows 2, 31, 35 and those that audit.json lists, from the runs of notebook 08."""
     masked, baseline = (compare.of_method(runs, method) for method in ("masked", "baseline"))
     best, stability = (
         thesis_tables.of_chosen_width(masked),

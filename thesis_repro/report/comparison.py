@@ -19,7 +19,7 @@ CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one wid
 
 def figure_comparison(table):
     """Draw each method's ratio to all keypoints: its sequences in grey, geometric mean and
-    bootstrap interval.
+    interval.
 
     The figure has one row of panels for each estimator. Its columns are the judging metrics and the
     thesis's RMSE.
@@ -142,7 +142,7 @@ def table_widths(runs):
     """Return the ratios of errors to all keypoints with the best, the left-out and the fixed width,
     by sequence.
 
-    The last two rows of each source have the geometric mean with its bootstrap interval, and the
+    The last two rows of each source have the geometric mean with its interval, and the
     number of sequences with a lower error.
     """
     tables = {}
@@ -166,7 +166,7 @@ def _widths(masked, baseline):
     ratios = {}
     for choice, label in CHOICES.items():
         rows = thesis_tables.of_chosen_width(masked, chosen[choice])
-        for metric in ("rmse", "rmse_boresight_corrected"):
+        for metric in ("rmse", "se3"):
             if metric in masked:
                 ratios[f"{label}: {compare.METRICS[metric]}"] = compare.ratios(
                     rows, baseline, metric

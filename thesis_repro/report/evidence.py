@@ -14,7 +14,6 @@ import pandas as pd
 from thesis_repro import kitti, longrun, masks, stages
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
-from thesis_repro.odometry.refined import boresight
 from thesis_repro.report import audit, captions, comparison, failures, style, texts
 from thesis_repro.segmentation import prediction
 from thesis_repro.settings import PREFIX, ROOT, read_settings
@@ -51,12 +50,10 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
         baseline_repetitions=max(10, repetitions),
         processes=processes,
     )
-    angles = boresight.explained(runner.refined_paths(runs, root, build / "odometry", frames))
     measurements = [
         *audit.of_tables(),
         *audit.of_ablations(ablated),
         *audit.of_study(runs),
-        *audit.measured(angles, "boresight"),
         *audit.measured(_boundaries(sequences, labels), "boundaries"),
         *audit.measured(_tracks(sequences, labels), "tracks"),
     ]
@@ -123,7 +120,7 @@ def _runs(root, names, build, frames, repetitions, processes):
     planned += jobs.keypoint_control_jobs(
         compare.keypoints_left(runs), root, frames, repetitions, width=jobs.CONTROL_WIDTH
     )
-    return runner.with_boresight_correction(run(planned), root, build / "odometry", frames)
+    return run(planned)
 
 
 def _boundaries(sequences, labels):

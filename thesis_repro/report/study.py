@@ -12,7 +12,7 @@ from thesis_repro.kitti import Sequence, read_poses
 from thesis_repro.masks import label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
-from thesis_repro.study import compare, controls, runner, series
+from thesis_repro.study import compare, controls, series
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS
 
@@ -31,7 +31,6 @@ def write(study, runs, folder, warnings=()):
         f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources
     )
     note = f"odometry: {data}; masks: {masks}"
-    runs = runner.with_boresight_correction(runs, study.kitti, folder / "runs", study.frames)
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
     figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}

@@ -40,7 +40,7 @@ def table_of_change(best, runs, metric, reported_as):
     4.1 in percent.
 
     best: the rows of each sequence's best width (`thesis_tables.of_chosen_width`). The last rows
-    have the sum of the percentages (the thesis's "aggregate"), their mean with its bootstrap
+    have the sum of the percentages (the thesis's "aggregate"), their mean with Student's t
     interval, and their median.
     """
     reported = pd.Series(

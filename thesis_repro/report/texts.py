@@ -5,7 +5,6 @@ A run, a study with the user's masks and the evidence on real frames share one t
 findings.
 """
 
-import json
 import re
 from math import ceil, log10
 from pathlib import Path
@@ -16,7 +15,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.refined import boresight
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
@@ -118,6 +116,13 @@ def findings(runs, table, data, label_maps=()):
         estimators=ESTIMATORS,
         methods=compare.METHODS,
         metrics=compare.METRICS,
+        deciding=[
+            compare.METRICS[name]
+            for name in compare.JUDGING_METRICS
+            if (table["metric"] == name).any()
+        ],
+        estimators_run=set(table["estimator"]),
+        too_few=compare.TOO_FEW,
         fewest=compare.MIN_SEQUENCES,
         least=compare.MIN_FOR_INTERVAL,
         level=compare.LEVEL,
@@ -181,19 +186,3 @@ def run_record(result, sequence, alignment):
         "ms_per_frame": 1000 * float(seconds.mean()),
         "flagged": {flag: int(count) for flag, count in result.flagged.items()},
     }
-
-
-def angles_record(rotation, table):
-    """Return `boresight.estimate` (degrees) and the table of `boresight.explained` (metres,
-    degrees) as a dict.
-    """
-    intervals = pd.DataFrame(
-        {"degrees": rotation.angles, "low": rotation.low, "high": rotation.high}, boresight.ANGLES
-    )
-    tables = {"angles": intervals, "sequences": table.set_index("sequence")}
-    # to_json writes null for a missing number
-    records = {
-        name: json.loads(table.to_json(orient="index", double_precision=15))
-        for name, table in tables.items()
-    }
-    return {"angles": records["angles"], "steps": rotation.steps, "sequences": records["sequences"]}

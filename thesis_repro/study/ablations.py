@@ -24,7 +24,6 @@ from thesis_repro.odometry.passes import Masks
 from thesis_repro.odometry.pose import normalise
 from thesis_repro.study import cluster
 from thesis_repro.study.compare import LEVEL
-from thesis_repro.study.controls import CORRECTED
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import measures
 
@@ -164,7 +163,6 @@ def runs_of(
             ),
         ),
         "symmetric": (THESIS, label_masks(MaskSettings(symmetric=True))),
-        "corrected": (THESIS, label_masks(CORRECTED)),
         # Section 5.2.2: trees and bushes
         "no-vegetation": (
             THESIS,

@@ -13,13 +13,12 @@ A ratio is formed in three steps:
    that of the reference. Half and double are then equally far from 1, which is not so for
    percentages.
 2. The ratio is the geometric mean of the ratios of the sequences.
-3. Its interval is a bootstrap over whole sequences with DRAWS draws. It estimates how far the ratio
-   could be off if other sequences of the same kind had been recorded. With few sequences it is too
-   narrow.
+3. Its interval is Student's t on the logarithms of the sequences' ratios. It estimates how far the
+   ratio could be off if other sequences of the same kind had been recorded.
 
-The verdict is "lower" or "higher" if the interval excludes 1 and there are at least MIN_SEQUENCES
-sequences. Otherwise it is "no clear difference". `primary_comparison` selects the rows that answer
-the main question.
+The verdict is "lower" or "higher" if the interval excludes 1, and otherwise "no clear difference".
+With fewer than MIN_SEQUENCES sequences it is "too few sequences to tell". `primary_comparison`
+selects the rows that answer the main question.
 """
 
 from collections.abc import Iterable
@@ -29,6 +28,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy.special import stdtrit
 
 from thesis_repro.odometry.metrics import RELATIVE_LENGTH
 from thesis_repro.study.controls import MASKS
@@ -37,14 +37,10 @@ from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 # The compared errors and their names in tables. The judging metrics decide (see
 # `primary_comparison`), because a constant angle between camera and ground truth does not change
 # them.
-JUDGING_METRICS = {
-    "rmse_boresight_corrected": "RMSE, mounting angle removed",
-    "rotation": "rotation error a frame",
-}
+JUDGING_METRICS = {"se3": "aligned ATE", "rotation": "rotation error a frame"}
 SECONDARY_METRICS = {
     "rmse": "RMSE",
     "mae": "MAE",
-    "se3": "aligned ATE",
     "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
     "rotation_deg_per_100m": f"rotation error over {RELATIVE_LENGTH:g} m",
     "t_rel": "KITTI's t_rel",
@@ -52,11 +48,10 @@ SECONDARY_METRICS = {
 }
 METRICS = {**JUDGING_METRICS, **SECONDARY_METRICS}
 UNITS = {
-    "rmse_boresight_corrected": "m",
+    "se3": "m",
     "rotation": "deg",
     "rmse": "m",
     "mae": "m",
-    "se3": "m",
     "translation_percent": "%",
     "rotation_deg_per_100m": "deg/100 m",
     "t_rel": "%",
@@ -96,12 +91,16 @@ MIN_SEQUENCES = 6
 LEVEL = 95  # percent, of all intervals
 # a sequence is named beside the mean if its ratio differs from the median by more than this factor
 FAR_OFF = 3
-DRAWS = 10_000
-LOWER, HIGHER, NO_CLEAR_DIFFERENCE = ("lower", "higher", "no clear difference")
+LOWER, HIGHER, NO_CLEAR_DIFFERENCE, TOO_FEW = (
+    "lower",
+    "higher",
+    "no clear difference",
+    "too few sequences to tell",
+)
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
-    """Return the bootstrap interval (low, high) of the mean of one value a sequence. NaN values are
+    """Return Student's t interval (low, high) of the mean of one value a sequence. NaN values are
     left out.
 
     Returns (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
@@ -110,31 +109,29 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
     numbers = numbers[~np.isnan(numbers)]
     if len(numbers) < MIN_FOR_INTERVAL:
         return np.nan, np.nan
-    draws = np.random.default_rng(0).integers(0, len(numbers), (DRAWS, len(numbers)))
-    low, high = np.percentile(numbers[draws].mean(axis=1), [(100 - LEVEL) / 2, (100 + LEVEL) / 2])
-    return float(low), float(high)
+    standard_error = numbers.std(ddof=1) / np.sqrt(len(numbers))
+    reach = standard_error * stdtrit(len(numbers) - 1, (100 + LEVEL) / 200)
+    return float(numbers.mean() - reach), float(numbers.mean() + reach)
 
 
 def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
     """Return {ratio, low, high, n, verdict}: the geometric mean of one ratio a sequence, with its
-    bootstrap interval.
+    interval (`mean_interval` of the logarithms).
 
-    The verdict is LOWER or HIGHER if there are at least MIN_SEQUENCES sequences and the interval
-    excludes 1.
+    The verdict is LOWER or HIGHER if the interval excludes 1, and TOO_FEW for fewer than
+    MIN_SEQUENCES sequences.
     """
     logarithms = np.log(np.asarray(ratios, float))
     logarithms = logarithms[np.isfinite(logarithms)]
-    low, high = np.exp(mean_interval(logarithms))
-    ratio = float(np.exp(logarithms.mean())) if len(logarithms) else np.nan
-    # rounding may put the mean of equal ratios outside
-    low, high = np.minimum(low, ratio), np.maximum(high, ratio)
+    mean = logarithms.mean() if len(logarithms) else np.nan
+    ratio, low, high = np.exp([mean, *mean_interval(logarithms)]).tolist()
     verdict = LOWER if high < 1 else HIGHER if low > 1 else NO_CLEAR_DIFFERENCE
     return {
         "ratio": ratio,
-        "low": float(low),
-        "high": float(high),
+        "low": low,
+        "high": high,
         "n": len(logarithms),
-        "verdict": verdict if len(logarithms) >= MIN_SEQUENCES else NO_CLEAR_DIFFERENCE,
+        "verdict": verdict if len(logarithms) >= MIN_SEQUENCES else TOO_FEW,
     }
 
 
@@ -172,7 +169,8 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
     Returns a table with the columns source, method, dilation_width (pixels), keypoints (mean
     number); reference_source, reference (the method compared with); metric, estimator; tested
     (whether the width is the `tested_width`); ratio, low, high, n, far_off (see `far_off`),
-    verdict; and one column for each sequence with its ratio.
+    verdict; and one column for each sequence with its ratio. An error that no sequence has with
+    both methods has no row.
     """
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
@@ -189,6 +187,8 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
             }
             for metric in metrics:
                 by_sequence = ratios(variant_runs, reference_runs, metric)
+                if by_sequence.empty:
+                    continue
                 rows.append(
                     {
                         **row,
@@ -288,14 +288,18 @@ def against(
 
 
 def overall(verdicts: Iterable[str]) -> str:
-    """Return the verdict of several metrics together: LOWER or HIGHER if all of them agree."""
-    distinct = set(verdicts)
+    """Return the verdict of several metrics together: LOWER or HIGHER if all of them agree, TOO_FEW
+    if one of them has too few sequences.
+    """
+    distinct = set(verdicts) or {TOO_FEW}
+    if TOO_FEW in distinct:
+        return TOO_FEW
     return distinct.pop() if len(distinct) == 1 else NO_CLEAR_DIFFERENCE
 
 
 def judging_estimator(table: pd.DataFrame) -> str:
-    """Return the estimator that decides: the refined one if it was run, since shuffling changes
-    its errors least.
+    """Return the estimator that decides: the refined one if it has errors, since shuffling changes
+    them least.
     """
     return "refined" if (table["estimator"] == "refined").any() else "thesis"
 

@@ -21,7 +21,6 @@ from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
-from thesis_repro.odometry.refined import boresight
 from thesis_repro.study import cluster, controls
 from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
@@ -320,49 +319,6 @@ def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
         "r_rel": kitti["rotation_deg_per_100m"],
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
-    }
-
-
-def with_boresight_correction(
-    runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None
-) -> pd.DataFrame:
-    """Return the runs with a new column, rmse_boresight_corrected: the RMSE (m) with the mounting
-    angle removed.
-
-    The angle between camera and ground truth is constant over a recording day. For each sequence it
-    is estimated from refined runs with all keypoints on the *other* sequences of the same day, and
-    it is the same for every method. It is taken as 0 if there are no other sequences or if they do
-    not determine it.
-    folder, frames: as given to `run`. The column is NaN for sequences without a refined run with
-    all keypoints.
-    """
-    references = refined_paths(runs, kitti, folder, frames)
-    angles = {name: boresight.angles_of_day(name, references) for name in references}
-    corrected = {
-        (name, run): metrics.rmse(boresight.corrected(poses, angles[name]), references[name][1])
-        for (name, run), poses in run_poses(runs[runs["sequence"].isin(references)], folder).items()
-    }
-    return runs.assign(
-        rmse_boresight_corrected=[
-            corrected.get(key, np.nan) for key in zip(runs["sequence"], runs["run"], strict=True)
-        ]
-    )
-
-
-def refined_paths(
-    runs: pd.DataFrame, kitti: Path, folder: Path, frames: int | None = None
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return {sequence: (estimated, true)} poses (n, 4, 4) of refined runs with all keypoints,
-    for `boresight`.
-    """
-    baselines = runs[
-        (runs["method"] == "baseline")
-        & (runs["estimator"] == "refined")
-        & (runs["repetition"] == 0)
-    ]
-    return {
-        name: (poses, Sequence(kitti, name).subset(frames).poses)
-        for (name, _), poses in run_poses(baselines, folder).items()
     }
 
 
