@@ -13,7 +13,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from thesis_repro import InputError, longrun, one_line
+from thesis_repro import InputError, console, one_line
 from thesis_repro.settings import PROFILES, SEED, frames, number, scheduler_address, widths
 
 # options that name an output file: its content, and the endings that its name may have (none given:
@@ -34,7 +34,7 @@ def synthesize(options):
     """write the embedded world, a rendered street, in the folder layouts of KITTI and Cityscapes"""
     from thesis_repro import world
 
-    with longrun.logged(options.out, options.command_line) as run:
+    with console.logged(options.out, options.command_line) as run:
         new, total = world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
         run.end(
             f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
@@ -80,7 +80,7 @@ def predict(options):
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction
     model_files = options.model or [prediction.SHIPPED]
-    with longrun.logged(options.folder, options.command_line) as run:
+    with console.logged(options.folder, options.command_line) as run:
         if options.dask:
             with cluster.open_pool(1, options.dask) as pool:
                 new = prediction.spread_label_maps(pool.run, model_files, sequences)
@@ -119,10 +119,10 @@ def masks(options):
 def odometry(options):
     """run the visual odometry on one sequence and print its errors, number of keypoints and time"""
     from thesis_repro import check, odometry
-    from thesis_repro.kitti import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
     from thesis_repro.odometry.refined import boresight
     from thesis_repro.report import texts
+    from thesis_repro.trajectories import write_kitti_poses, write_tum
 
     changes = {
         field.name: vars(options)[field.name]
@@ -150,7 +150,7 @@ def odometry(options):
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
-        longrun.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
+        console.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
     record = texts.run_record(result, sequence, settings.alignment)
     if options.video:
         from thesis_repro.report import video
@@ -202,7 +202,7 @@ def study(options):
     """compare your own label maps or masks with all keypoints and with controls, in tables,
     figures and a page
     """
-    from thesis_repro import kitti
+    from thesis_repro import kitti, results
     from thesis_repro.settings import ALL_WIDTHS, cores
     from thesis_repro.study import series, sources
 
@@ -237,12 +237,12 @@ def study(options):
     # this import takes seconds, so the input is checked first
     from thesis_repro.report import study
 
-    with longrun.logged(folder, options.command_line) as run, longrun.claimed(folder):
+    with console.logged(folder, options.command_line) as run, results.claimed(folder):
         warnings = [
             line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)
         ]
         summary = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += longrun.warn(planned.path_oddities(summary, folder))
+        warnings += console.warn(planned.path_oddities(summary, folder))
         counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
         failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
         run.end(f"{len(summary):,} runs{failed}; open {page} in a browser", counts["kept"])
@@ -270,7 +270,7 @@ def evaluate(options):
             name: trajectories.read(file, times, options.frames) for name, file in files.items()
         }
         for name, (matched, poses) in paths.items():
-            longrun.warn(check.path_oddities(name, poses, truth[matched]))
+            console.warn(check.path_oddities(name, poses, truth[matched]))
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
         drawing = trajectories.figure(
@@ -324,9 +324,9 @@ def _print_oddities(sequence, mask_sets):
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             line, mask_warnings = check.mask_oddities(masks, sequence)
-            longrun.remark(line)
+            console.remark(line)
             warnings += mask_warnings
-    return longrun.warn(warnings)
+    return console.warn(warnings)
 
 
 def _image_folders(root):
@@ -422,7 +422,7 @@ def _print(options, record, template, **values):
     print(text, file=sys.stderr if any(map(is_stdout, outputs.values())) else None)
     for name, path in outputs.items():
         if not is_stream(path):
-            longrun.remark(f"{path}: {OUTPUT_FILES[name][0]}")
+            console.remark(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 # The parser
@@ -800,8 +800,8 @@ def main(arguments=None):
         ["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)]
     )
     try:
-        with longrun.stoppable():
-            longrun.need_addresses(4 if options.function is predict else 2)
+        with console.stoppable():
+            console.need_addresses(4 if options.function is predict else 2)
             code = options.function(options) or 0
             sys.stdout.flush()
             return code
@@ -809,7 +809,7 @@ def main(arguments=None):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except Exception as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     except KeyboardInterrupt as stop:
         with suppress(OSError):  # the terminal may be gone
             print("stopped; run the same command again to resume", file=sys.stderr)

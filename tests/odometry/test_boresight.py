@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from thesis_repro import InputError
 from thesis_repro.cli import main
-from thesis_repro.kitti import read_poses
 from thesis_repro.odometry.refined import boresight
 from thesis_repro.odometry.refined.boresight import corrected, rotation
+from thesis_repro.trajectories import read_poses
 
 KNOWN = np.array([0.4, -0.6, 0.3])  # pitch, yaw, roll in degrees
 

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from waiting import wait_for
 
-from thesis_repro import InputError, longrun
+from thesis_repro import InputError, console, files
 from thesis_repro.kitti import Sequence
 from thesis_repro.study import cluster, runner
 from thesis_repro.study.jobs import first_jobs
@@ -182,7 +182,7 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(
 ):
     jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
-    record = runner.stages.record(tmp_path / "00")
+    record = runner.results.record(tmp_path / "00")
     inputs = Sequence(kitti, "00"), runner.by_name(small_labels)
     elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record, 1)
     (tmp_path / "00" / "baseline-0.csv").unlink()
@@ -216,7 +216,7 @@ def test_label_maps_of_workers_have_the_bits_of_one_process(
         return {
             path.relative_to(folder): path.read_bytes()
             for path in folder.rglob("*.*")
-            if path.name not in (longrun.LOG, longrun.LIST)
+            if path.name not in (console.LOG, files.LIST)
         }
 
     assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)

@@ -11,7 +11,7 @@ import sys
 
 import pandas as pd
 
-from thesis_repro import kitti, longrun, masks, stages
+from thesis_repro import console, kitti, masks, results
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
@@ -34,7 +34,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
     root: the KITTI folder. build: keeps label maps and runs; folder and build are absolute paths.
     frames: how many frames of each sequence to use, None for all.
     """
-    stages.stage(build, results="evidence")
+    results.stage(build, results="evidence")
     labels, model = build / "labels", prediction.load_shipped()
     sequences = [kitti.Sequence(root, name).subset(frames) for name in kitti.sequences(root)]
     for sequence in sequences:
@@ -68,7 +68,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
-    longrun.sweep(folder)
+    results.sweep(folder)
     style.save_all(
         {
             "comparison": comparison.figure_comparison(table),
@@ -161,7 +161,7 @@ def main():
     try:
         # all frames, unless FRAMES is set
         settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})
-        with longrun.claimed(BUILD), longrun.logged(BUILD, "tables, plots and findings") as run:
+        with results.claimed(BUILD), console.logged(BUILD, "tables, plots and findings") as run:
             write(
                 settings.kitti,
                 FOLDER,
@@ -172,7 +172,7 @@ def main():
             )
             run.end(f"tables, plots and findings: {FOLDER}")
     except Exception as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     return 0
 
 

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 
 from markupsafe import Markup
 
-from thesis_repro import longrun
+from thesis_repro import console, results
 from thesis_repro.files import listed, write_text
 from thesis_repro.report import captions, tables, texts
 from thesis_repro.settings import ROOT, read_settings
@@ -36,15 +36,15 @@ def update(settings):
 
     Deletes temporary files of killed runs. Raises InputError if another run uses the folder.
     """
-    with longrun.claimed(settings.build / "notebooks"):
-        longrun.sweep(settings.build)
+    with results.claimed(settings.build / "notebooks"):
+        results.sweep(settings.build)
         # copied from the default run if their notebooks were not executed
         for name in captions.CONSTANT:
             for path in (ROOT / "figures").glob(f"{name}.*"):
                 if not (settings.figures / path.name).exists():
                     write_text(settings.figures / path.name, path.read_text(encoding="utf-8"))
         if settings.figures.is_dir():
-            longrun.sweep(settings.figures)
+            results.sweep(settings.figures)
         page = settings.figures / PAGE
         for path in _executed(settings):
             html = path.with_suffix(".html")
@@ -237,7 +237,7 @@ def main():
     try:
         update(read_settings())
     except Exception as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     return 0
 
 

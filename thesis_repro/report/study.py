@@ -6,15 +6,16 @@ from contextlib import suppress
 
 import numpy as np
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, results
 from thesis_repro.files import write_text
-from thesis_repro.kitti import Sequence, read_poses
+from thesis_repro.kitti import Sequence
 from thesis_repro.masks import label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
 from thesis_repro.study import compare, controls, runner, series
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS
+from thesis_repro.trajectories import read_poses
 
 
 def write(study, runs, folder, warnings=()):
@@ -24,7 +25,7 @@ def write(study, runs, folder, warnings=()):
     warnings: lines for the top of the page.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
-    embedded = "train_images" in (stages.record(study.kitti.absolute().parent) or {})
+    embedded = "train_images" in (results.record(study.kitti.absolute().parent) or {})
     data = "embedded world (rendered)" if embedded else f"KITTI folder {study.kitti.name}"
     changed = {source.name: _changed(source) for source in study.sources}
     masks = ", ".join(

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, longrun, odometry, stages
+from thesis_repro import InputError, console, odometry, results
 from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
@@ -70,11 +70,11 @@ def run(
         for name in sorted({job.sequence for job in jobs})
     }
     files = {job: _result(folder, job) for job in jobs}
-    with longrun.claimed(folder):
+    with results.claimed(folder):
         for sequence in sequences.values():
             _stage(folder, sequence, sources)
         for job, path in files.items():
-            table = stages.kept_table(path, len(sequences[job.sequence]))
+            table = results.kept_table(path, len(sequences[job.sequence]))
             if table is None or not np.isfinite(poses_of(table)).all():
                 path.unlink(missing_ok=True)  # missing results are made again
         finished = sum(path.is_file() for path in files.values())
@@ -120,7 +120,7 @@ def _run_passes(
                     sequence,
                     sources,
                     folder,
-                    stages.record(folder / sequence.name),
+                    results.record(folder / sequence.name),
                     threads,
                 )
             )
@@ -136,7 +136,7 @@ def _run_passes(
         by_reason.setdefault((job.sequence, reason), []).append(job.name)
     for (name, reason), runs in by_reason.items():
         more = f" and {len(runs) - 3} more" * (len(runs) > 3)
-        longrun.say(f"sequence {name}, {', '.join(runs[:3])}{more}: failed: {reason}", warning=True)
+        console.say(f"sequence {name}, {', '.join(runs[:3])}{more}: failed: {reason}", warning=True)
     for reason in failures.values():
         if isinstance(reason, _MachineFault):  # a study without these runs could mislead
             raise InputError(reason)
@@ -168,25 +168,25 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
     folder /= sequence.name
     true_labels = listed(controls.true_labels(sequence.root, sequence.name))
     records = {source.name: source.record(sequence.name) for source in sources.values()}
-    stages.stage(
+    results.stage(
         folder,
         **_versions(),
-        sequence=stages.listing(sequence.files),
-        true_labels=stages.listing(true_labels),
+        sequence=results.listing(sequence.files),
+        true_labels=results.listing(true_labels),
         **records.pop("", {}),
     )
     for source, record in records.items():
         # a checkpoint may come from the source's old masks
-        if stages.record(folder / source) != record:
+        if results.record(folder / source) != record:
             for checkpoint in folder.glob(CHECKPOINTS):
                 checkpoint.unlink()
-        stages.stage(folder / source, **record)
+        results.stage(folder / source, **record)
 
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": stages.code("odometry", "study/jobs"),
-        **stages.made_with("opencv-python-headless", "numpy", "numba"),
+        "code": results.code("odometry", "study/jobs"),
+        **results.made_with("opencv-python-headless", "numpy", "numba"),
     }
 
 
@@ -205,7 +205,7 @@ def _passes(
         }
         for path in sorted((folder / name).glob(CHECKPOINTS)):
             try:
-                keys = stages.resume(path)[0]["job"]["runs"]
+                keys = results.resume(path)[0]["job"]["runs"]
             except InputError:  # a damaged checkpoint is deleted below
                 keys = []
             if not sequence_jobs.keys() >= set(keys):
@@ -270,7 +270,7 @@ def _run_pass(
     checkpoint = folder / sequence.name / f"pass-{digest}.npz"
     failures: dict[Job, str] = {}
     try:
-        stages.check_worker(folder / sequence.name, record, **_versions())
+        results.check_worker(folder / sequence.name, record, **_versions())
         # a checkpoint can be resumed only with all of its jobs
         waiting = (
             jobs
@@ -280,7 +280,7 @@ def _run_pass(
         masks_by_job, failures = masks_of(waiting, sequence, sources)
         if not masks_by_job:  # also if Dask repeats a finished pass because it lost the answer
             return failures
-        results = odometry.run_many(
+        run_results = odometry.run_many(
             sequence,
             {job.name: (job.settings, masks) for job, masks in masks_by_job.items()},
             checkpoint=checkpoint,
@@ -288,10 +288,12 @@ def _run_pass(
         )
         for job in masks_by_job:
             if not _result(folder, job).is_file():
-                write_text(_result(folder, job), results.pop(job.name).frames.to_csv(index=False))
+                write_text(
+                    _result(folder, job), run_results.pop(job.name).frames.to_csv(index=False)
+                )
         checkpoint.unlink(missing_ok=True)
     except Exception as error:  # report any error as the reason, and let other passes run
-        reason = longrun.explain(error)
+        reason = console.explain(error)
         if reason is None:
             reason = f"{type(error).__name__}: {error}"
         elif not isinstance(error, InputError):

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro import InputError, check, longrun, stages
-from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
+from thesis_repro import InputError, check, results
+from thesis_repro.kitti import Sequence
 from thesis_repro.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
+from thesis_repro.trajectories import write_kitti_poses, write_tum
 
 PATHS = "paths"  # folder of the estimated paths
 
@@ -141,8 +142,8 @@ class Study:
             processes=processes,
             scheduler=scheduler,
         )
-        with longrun.claimed(folder):
-            stages.stage(folder, replace=False, frames=self.frames)
+        with results.claimed(folder):
+            results.stage(folder, replace=False, frames=self.frames)
             study_jobs = self.first_jobs()
             runs = run(study_jobs)
             if runs["mean_keypoints"].isna().all():

@@ -9,7 +9,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TypeAlias
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, results
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import glance, listed
 from thesis_repro.kitti import Sequence, check_size
@@ -63,13 +63,13 @@ class Source:
     def record(self, sequence: str) -> dict[str, str | None]:
         """Return the digests and settings that the results of a sequence depend on."""
         folder = self.of(sequence)
-        made_from = stages.made_from(folder) if stages.record(folder) is not None else None
+        made_from = results.made_from(folder) if results.record(folder) is not None else None
         settings = (
             {"settings": str(self.settings)}
             if self.kind == "labels"
             else {"invert": str(self.invert)}
         )
-        return {self.kind: stages.listing(listed(folder)), "made_from": made_from, **settings}
+        return {self.kind: results.listing(listed(folder)), "made_from": made_from, **settings}
 
 
 def named(

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry, stages
+from thesis_repro import InputError, masks, odometry, results
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.study import cluster
@@ -77,7 +77,7 @@ def time_runs(
 def _time_jobs(
     jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
 ) -> pd.DataFrame:
-    kept = stages.kept_table(path, dtype={"sequence": str})
+    kept = results.kept_table(path, dtype={"sequence": str})
     if kept is not None and {job.name for job in jobs} <= set(kept["run"]):
         return kept
     scales = odometry.scales(sequence)

@@ -1,5 +1,5 @@
-"""Long runs: locks on folders, the log, the summary at the end, and one-line errors for a lack of
-space or memory.
+"""What a run says and how it ends: the log, the summary, signals, and one-line errors for a lack
+of space or memory.
 
 This module imports only the standard library, so it still works if there is too little memory for
 other packages.
@@ -7,12 +7,9 @@ other packages.
 
 import ctypes
 import errno
-import fcntl
 import logging
 import os
-import re
 import resource
-import secrets
 import signal
 import sys
 import time
@@ -24,10 +21,7 @@ from pathlib import Path
 from thesis_repro import InputError, one_line
 
 LOG = "log.txt"
-RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
-LIST = "written.log"  # beside the record: the files that were written there, see `files.atomic`
-# matches the names that `temporary` returns
-TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")
+RECORD = "made-from.json"  # in every folder of results, see `results.stage`
 # what a user can do about a system error, by its number
 ROOM, ACCESS = (
     "make room on its disk, or name a folder on another",
@@ -136,69 +130,6 @@ def report_error(error):
         raise error
     print(f"error: {one_line(line)}", file=sys.stderr)
     return 1
-
-
-def temporary(path):
-    """Return a temporary path beside `path`, with a random name that nobody can predict."""
-    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
-
-
-def sweep(folder):
-    """Delete the temporary files of killed runs in and below a folder. The caller must hold its
-    lock.
-    """
-    for path in Path(folder).rglob(".*"):
-        if TEMPORARY.fullmatch(path.name):
-            path.unlink(missing_ok=True)
-
-
-_held = set()  # device and inode of each path that this process has locked
-
-
-@contextmanager
-def claimed(folder):
-    """Create a folder if needed, and lock it until the block ends. Raises InputError if another
-    process has locked it.
-
-    Folders that were created here and are still empty at the end are removed.
-    """
-    folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; name a folder for the results")
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with locked(folder):
-            yield
-    finally:
-        with suppress(OSError):
-            for path in new:
-                path.rmdir()
-
-
-@contextmanager
-def locked(path):
-    """Lock an existing folder or file until the block ends. The same process may lock it again
-    within the block.
-    """
-    status = os.stat(path)
-    key = status.st_dev, status.st_ino
-    if key in _held:
-        yield
-        return
-    descriptor = os.open(path, os.O_RDONLY)  # the lock ends with the process, even if it is killed
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{path}: another run uses it; wait, or name another folder") from None
-        except OSError:
-            pass  # the file system has no locks
-        _held.add(key)
-        yield
-    finally:
-        _held.discard(key)
-        os.close(descriptor)
 
 
 # The log
