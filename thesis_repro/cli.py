@@ -22,7 +22,7 @@ OUTPUT_FILES = {
     "output": ("poses in KITTI format", ()),
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
-    "video": ("video", (".mp4",)),
+    "video": ("video", (".webm",)),
 }
 
 
@@ -129,7 +129,7 @@ def odometry(options):
         for field in fields(odometry.OdometrySettings)
         if vars(options).get(field.name) is not None
     }
-    settings = replace(odometry.PRESETS[options.pyslam], **changes)
+    settings = replace(odometry.THESIS, **changes)
     sequence = _sequence(options)
     masks = _masks(options, sequence)
     _check_outputs(
@@ -151,7 +151,7 @@ def odometry(options):
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
         console.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
-    record = texts.run_record(result, sequence, settings.alignment)
+    record = texts.run_record(result, sequence)
     if options.video:
         from thesis_repro.report import video
 
@@ -160,11 +160,7 @@ def odometry(options):
         from thesis_repro.report import style, trajectories
 
         truth = sequence.poses if sequence.has_truth else None
-        poses = (
-            result.poses
-            if truth is None
-            else metrics.shifted(result.poses, truth, settings.alignment)
-        )
+        poses = result.poses if truth is None else metrics.shifted(result.poses, truth)
         drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
         style.write_figure(drawing, options.plot)
     _print(
@@ -653,12 +649,6 @@ def build_parser():
         help="dilation width, in pixels, of masks from label maps",
     )
     add(
-        "--pyslam",
-        choices=("2021", "2024"),
-        default="2021",
-        help="the thesis's PySLAM (2021) or a later one (2021)",
-    )
-    add(
         "--estimator",
         metavar="thesis|inliers|refined",
         help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
@@ -694,7 +684,7 @@ def build_parser():
     add(
         "--video",
         type=Path,
-        metavar="OUT.mp4",
+        metavar="OUT.webm",
         help="write a video of the frames, the keypoints and the path",
     )
 

@@ -202,11 +202,7 @@ class Odometry:
                 step.flags.append(motion.problem)
             elif _by_chance(motion.inliers):
                 step.flags.append("no agreement")
-            elif (
-                step.scale <= settings.scale_gate
-                or settings.shift_gate
-                and _mean_shift(step) < settings.shift_gate
-            ):
+            elif step.scale <= settings.scale_gate:
                 step.flags.append("stationary")
             else:
                 if settings.estimator == "refined":
@@ -270,8 +266,7 @@ class Odometry:
     def _moved(self, motion, scale):
         moved, rotation = np.eye(4), self.pose[:3, :3]
         moved[:3, :3] = rotation @ motion.rotation
-        heading = moved[:3, :3] if self.settings.rotate_first else rotation
-        moved[:3, 3] = self.pose[:3, 3] + scale * (heading @ motion.translation)
+        moved[:3, 3] = self.pose[:3, 3] + scale * (rotation @ motion.translation)
         return moved
 
     def _check(self, frame, scale, mask):
@@ -341,13 +336,10 @@ MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
 def _implausible(step):
     """Flags of a motion that a car cannot make. The pose is moved nevertheless."""
     turn = np.degrees(np.arccos(np.clip((np.trace(step.motion.rotation) - 1) / 2, -1, 1)))
-    return ["still picture"] * bool(_mean_shift(step) < MAX_NOISE_SHIFT) + [
-        "too large a turn"
-    ] * bool(turn > MAX_TURN)
-
-
-def _mean_shift(step):
-    return np.linalg.norm(step.current - step.previous, axis=1).mean()
+    shift = np.linalg.norm(step.current - step.previous, axis=1).mean()
+    return ["still picture"] * bool(shift < MAX_NOISE_SHIFT) + ["too large a turn"] * bool(
+        turn > MAX_TURN
+    )
 
 
 @lru_cache

@@ -1,4 +1,4 @@
-"""Settings of the odometry: the thesis's, a later PySLAM's, and alternatives."""
+"""Settings of the odometry: the thesis's and alternatives."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,6 @@ CHOICES = {
     "mask_mode": ("detect", "filter"),
     "essential_method": tuple(pose.ESSENTIAL_METHODS),
     "estimator": ("thesis", "inliers", "refined"),
-    "alignment": ("position", "pose"),
 }
 
 
@@ -43,9 +42,6 @@ class OdometrySettings:
     motion, or if the motion differs too much from the previous step's (refined.motion_prior).
     Without masks it does nothing.
     scale_gate: metres; a shorter step does not move the pose.
-    shift_gate: pixels; a step with a smaller mean shift of its points does not move the pose.
-    rotate_first: rotate the pose before moving it.
-    alignment: how RMSE and MAE align the estimate with the ground truth, see metrics.rmse.
     """
 
     detector: str = "shi-tomasi"
@@ -63,9 +59,6 @@ class OdometrySettings:
     estimator: str = "thesis"
     fallback: bool = False
     scale_gate: float = 0.1
-    shift_gate: float = 0.0
-    rotate_first: bool = False
-    alignment: str = "position"
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
@@ -84,7 +77,6 @@ class OdometrySettings:
             ("levels", 0, 10),
             ("shuffle_seed", 0, 2**32 - 1),
             ("scale_gate", 0, math.inf),
-            ("shift_gate", 0, math.inf),
         ):
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -98,7 +90,3 @@ class OdometrySettings:
 
 
 THESIS = OdometrySettings()
-PYSLAM_2024 = OdometrySettings(
-    threshold=0.0004, rotate_first=True, shift_gate=1.5, scale_gate=0.015, alignment="pose"
-)
-PRESETS = {"2021": THESIS, "2024": PYSLAM_2024}
