@@ -233,6 +233,25 @@ def warn(lines):
     return lines
 
 
+@contextmanager
+def quiet():
+    """Hide what libraries' own code prints on standard output and error within the block."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    originals = os.dup(1), os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(null, stream)
+        yield
+    finally:
+        sys.stdout.flush()
+        for stream, original in enumerate(originals, 1):
+            os.dup2(original, stream)
+        for descriptor in (*originals, null):
+            os.close(descriptor)
+
+
 # The end of a process
 
 

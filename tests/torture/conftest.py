@@ -31,7 +31,7 @@ def words(small_world, small_labels, small_model):
     which output it is.
     """
     kitti = small_world / "kitti"
-    options = {".txt": "--output", ".png": "--plot", ".mp4": "--video"}
+    options = {".txt": "--output", ".png": "--plot", ".webm": "--video"}
 
     def command(name, output="out"):
         if name.startswith("odometry"):
@@ -41,8 +41,8 @@ def words(small_world, small_labels, small_model):
                 kitti,
                 "--sequence",
                 "00",
-                options[name[-4:]],
-                f"{output}{name[-4:]}",
+                options[Path(name).suffix],
+                f"{output}{Path(name).suffix}",
             )
         return {
             "synthesize": thesis("synthesize", output, "--profile", "smoke"),
