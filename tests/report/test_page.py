@@ -198,7 +198,7 @@ def test_missing_artefacts_are_listed_unless_their_data_were_not_given(run, tmp_
         "table_3_2.csv",
         "figure_3_05.svg",
         "findings.md",
-        "domain_gap.svg",
+        "domain_gap.csv",
     ):
         (run.settings.figures / name).unlink()
     shown = read(run)
