@@ -209,7 +209,7 @@ bench: setup
 
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.report.evidence
+	@$(BIN)/python tools/evidence.py
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)

@@ -6,10 +6,8 @@ network or server.
 
 import importlib.metadata
 import itertools
-import json
 import os
 import platform
-import re
 import subprocess
 import sys
 from contextlib import suppress
@@ -80,12 +78,9 @@ def notebook_html(path, page):
 
 def build(settings):
     """Return the page of a run as HTML, made from the files in its folders."""
-    makers, numbers = _makers(), tables.beside_the_thesis(settings)
+    numbers = tables.beside_the_thesis(settings)
     chapters = {
-        title: [
-            _describe(settings.figures, artefact, makers, settings, numbers)
-            for artefact in artefacts
-        ]
+        title: [_describe(settings.figures, artefact, settings, numbers) for artefact in artefacts]
         for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()
     }
     executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
@@ -125,7 +120,7 @@ def build_study(folder, names, **facts):
         base, _, sequence = name.partition("-")
         if (kind, base) == (artefact["kind"], artefact["name"]):
             title = f"{artefact['title']} {sequence}".strip()
-            artefacts.append(_describe(folder, artefact | {"name": name, "title": title}, {}))
+            artefacts.append(_describe(folder, artefact | {"name": name, "title": title}))
     return texts.render(
         "study.html.j2",
         title="A study of masks",
@@ -136,7 +131,7 @@ def build_study(folder, names, **facts):
     )
 
 
-def _describe(folder, artefact, makers, settings=None, numbers=None):
+def _describe(folder, artefact, settings=None, numbers=None):
     """Return the values that the template needs to show a table, figure or text, or to report
     it as missing.
     """
@@ -180,24 +175,13 @@ def _describe(folder, artefact, makers, settings=None, numbers=None):
         "details": details,
         "rows": rows,
         "files": [path.name for path in files],
-        "makers": makers.get(name, []),
+        "makers": [
+            notebook for notebook, names in captions.MADE_BY.items() if settings and name in names
+        ],
         "thesis": thesis,
         "opens": there and identity in OPENING,
         "left_out": needs if not given and not there else None,
     }
-
-
-def _makers():
-    """Return {name: [notebooks]}, the notebooks whose code contains the name of a table or
-    figure.
-    """
-    makers = {}
-    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-        code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-        for name in sorted(set(re.findall(r'"(\w+)(?:\.\w+)?"', code))):
-            makers.setdefault(name, []).append(path.stem)
-    return makers
 
 
 def _made(executed=(), in_git=False):

@@ -8,14 +8,16 @@ audit's ablations. A stopped run resumes.
 
 import os
 import sys
+from pathlib import Path
 
+import failures
 import pandas as pd
 
 from thesis_repro import console, kitti, masks, results
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
 from thesis_repro.odometry.refined import boresight
-from thesis_repro.report import audit, captions, comparison, failures, style, texts
+from thesis_repro.report import audit, comparison, style, texts
 from thesis_repro.segmentation import prediction
 from thesis_repro.settings import PREFIX, ROOT, read_settings
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
@@ -26,6 +28,8 @@ FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"
 # pixels, of masks with the thesis's estimator
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)
 SAMPLED_FRAMES = 12  # frames of each sequence in which boundaries and tracks are measured
+
+texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
 
 
 def write(root, folder, build, frames=None, repetitions=5, processes=1):
@@ -91,11 +95,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
         )
     write_text(
         folder / "README.md",
-        texts.render(
-            "evidence.md.j2",
-            findings=texts.findings(runs, table, note),
-            failures=captions.OF_EVIDENCE,
-        ),
+        texts.render("evidence.md.j2", findings=texts.findings(runs, table, note)),
     )
 
 
