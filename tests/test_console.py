@@ -115,10 +115,11 @@ def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
     with pytest.raises(InputError), console.logged(tmp_path / "out", "thesis-repro study") as run:
         results.stage(tmp_path / "out", size=3)
         warnings.warn("odd", stacklevel=1)
-        console.say("sequence 00 failed", warning=True)
+        console.log.warning("sequence 00 failed")
         run.end("3 runs")
         raise InputError("bad")
-    assert capsys.readouterr().out.startswith("sequence 00 failed\n3 runs\n")
+    printed = capsys.readouterr()
+    assert printed.out.startswith("3 runs\n") and printed.err == "warning: sequence 00 failed\n"
     lines = (tmp_path / "out" / console.LOG).read_text().splitlines()
     assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
     assert any("WARNING" in line and "odd" in line for line in lines)

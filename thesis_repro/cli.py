@@ -150,7 +150,8 @@ def odometry(options):
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
-        console.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
+        for line in check.path_oddities(sequence.name, result.poses, sequence.poses):
+            console.log.warning(line)
     record = texts.run_record(result, sequence)
     if options.video:
         from thesis_repro.report import video
@@ -238,7 +239,9 @@ def study(options):
             line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)
         ]
         summary = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += console.warn(planned.path_oddities(summary, folder))
+        for line in planned.path_oddities(summary, folder):
+            console.log.warning(line)
+            warnings.append(line)
         counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
         failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
         run.end(f"{len(summary):,} runs{failed}; open {page} in a browser", counts["kept"])
@@ -266,7 +269,8 @@ def evaluate(options):
             name: trajectories.read(file, times, options.frames) for name, file in files.items()
         }
         for name, (matched, poses) in paths.items():
-            console.warn(check.path_oddities(name, poses, truth[matched]))
+            for line in check.path_oddities(name, poses, truth[matched]):
+                console.log.warning(line)
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
         drawing = trajectories.figure(
@@ -320,9 +324,11 @@ def _print_oddities(sequence, mask_sets):
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             line, mask_warnings = check.mask_oddities(masks, sequence)
-            console.remark(line)
+            console.log.info(line)
             warnings += mask_warnings
-    return console.warn(warnings)
+    for line in warnings:
+        console.log.warning(line)
+    return warnings
 
 
 def _image_folders(root):
@@ -418,7 +424,7 @@ def _print(options, record, template, **values):
     print(text, file=sys.stderr if any(map(is_stdout, outputs.values())) else None)
     for name, path in outputs.items():
         if not is_stream(path):
-            console.remark(f"{path}: {OUTPUT_FILES[name][0]}")
+            console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 # The parser

@@ -55,10 +55,20 @@ NO_MEMORY_TEXTS = (
     "can't start new thread",
 )
 
-_log = logging.getLogger("thesis_repro")
-_log.addHandler(logging.NullHandler())
-_log.setLevel(logging.INFO)
-_log.propagate = False
+
+class _Printer(logging.Handler):
+    """Prints messages and warnings on standard error, where they do not mix with results."""
+
+    def emit(self, record):
+        if record.levelno < logging.ERROR and not hasattr(record, "printed"):
+            prefix = "warning: " if record.levelno == logging.WARNING else ""
+            print(prefix + one_line(record.getMessage()), file=sys.stderr, flush=True)
+
+
+log = logging.getLogger("thesis_repro")
+log.addHandler(_Printer())
+log.setLevel(logging.INFO)
+log.propagate = False
 
 
 def explain(error):
@@ -171,33 +181,33 @@ class _LogFile(MemoryHandler):
         """
         seconds = timedelta(seconds=round(time.monotonic() - self.started))
         reused_text = f"from an earlier run: {reused:,}; " if reused else ""
-        say(
-            f"{text}\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}"
-        )
+        text += f"\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}"
+        print(text, flush=True)
+        for line in text.splitlines():
+            log.info(line, extra={"printed": True})
 
 
 @contextmanager
 def logged(folder, title, has_results=False):
-    """Log into a folder what `say`, `remark` and `warn` print, Python's warnings, and the error
-    that ends the block.
+    """Log into a folder what `log` prints, Python's warnings, and the error that ends the block.
 
     Yields the `_LogFile`. title: the first line. has_results: write the log at once, not only when
     results appear.
     """
     handler = _LogFile(Path(folder), has_results)
-    loggers = _log, logging.getLogger("py.warnings")
+    loggers = log, logging.getLogger("py.warnings")
     for logger in loggers:
         logger.addHandler(handler)
     logging.captureWarnings(True)
-    _log.info(title)
+    log.info(title, extra={"printed": True})
     try:
         yield handler
     except Exception as error:
         reason = explain(error)
-        _log.error(reason or type(error).__name__, exc_info=reason is None)
+        log.error(reason or type(error).__name__, exc_info=reason is None)
         raise
     except BaseException as error:
-        _log.error("stopped: %r", error)
+        log.error("stopped: %r", error)
         raise
     finally:
         logging.captureWarnings(False)
@@ -205,32 +215,6 @@ def logged(folder, title, has_results=False):
             logger.removeHandler(handler)
         with suppress(OSError):
             handler.target.close()
-
-
-def say(text, warning=False):
-    """Print a text and log it."""
-    print(text, flush=True)
-    note(text, logging.WARNING if warning else logging.INFO)
-
-
-def note(text, level=logging.ERROR):
-    """Log each line of a text."""
-    for line in text.splitlines():
-        _log.log(level, line)
-
-
-def remark(text):
-    """Print a line on standard error, where it does not mix with results, and log it."""
-    print(one_line(text), file=sys.stderr, flush=True)
-    note(text, logging.INFO)
-
-
-def warn(lines):
-    """Print warnings on standard error, log them, and return them."""
-    for line in lines:
-        print(f"warning: {one_line(line)}", file=sys.stderr, flush=True)
-        note(line, logging.WARNING)
-    return lines
 
 
 @contextmanager

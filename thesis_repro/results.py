@@ -94,7 +94,7 @@ def _delete_results(folder, changed):
                 )
             results.append(path)
     if results:
-        console.say(f"{folder}: deleting {len(results):,} files, made with another {changed}")
+        console.log.info(f"{folder}: deleting {len(results):,} files, made with another {changed}")
     # the folder's record goes last, so that a killed deletion can be repeated
     for path in (
         *results,
@@ -220,7 +220,7 @@ def kept_table(path, rows=None, **options):
         )
         if numeric and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
             return table
-    console.say(f"{path}: is damaged and will be made again", warning=True)
+    console.log.warning(f"{path}: is damaged and will be made again")
     return None
 
 

@@ -44,15 +44,15 @@ class Execution(ExecutePreprocessor):
                 console.logged(path.parent, f"make figures, {name}", has_results=True),
                 open(path, "w", encoding="utf-8") as self._log,
             ):
-                console.say(name)
+                console.log.info(name)
                 try:
                     executed = super().preprocess(nb, resources, km)
-                    console.say(f"{name}: done in {time.monotonic() - started:.0f} s")
+                    console.log.info(f"{name}: done in {time.monotonic() - started:.0f} s")
                     return executed
                 except Exception as error:
                     self._log.write(strip_ansi(traceback.format_exc()))
                     failure = f"{name} failed: {_reason(error)}"
-                    console.note(failure)
+                    console.log.error(failure)
         except KeyboardInterrupt:
             logging.getLogger("asyncio").disabled = True  # would report the interrupted cell
             print(f"{name} was interrupted; the same command resumes it", file=sys.stderr)

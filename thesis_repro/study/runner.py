@@ -136,7 +136,7 @@ def _run_passes(
         by_reason.setdefault((job.sequence, reason), []).append(job.name)
     for (name, reason), runs in by_reason.items():
         more = f" and {len(runs) - 3} more" * (len(runs) > 3)
-        console.say(f"sequence {name}, {', '.join(runs[:3])}{more}: failed: {reason}", warning=True)
+        console.log.warning(f"sequence {name}, {', '.join(runs[:3])}{more}: failed: {reason}")
     for reason in failures.values():
         if isinstance(reason, _MachineFault):  # a study without these runs could mislead
             raise InputError(reason)
