@@ -227,7 +227,7 @@ def study(options):
     if options.plan:
         from thesis_repro.study import plan
 
-        _print(options, plan.of_study(planned), "plan.txt.j2")
+        _print(options, plan.of_study(planned, options.folder), "plan.txt.j2")
         return 0
     folder = options.folder.absolute()
     _check_outputs(options, options.kitti, *(source.folder for source in planned.sources))
@@ -291,17 +291,17 @@ def evaluate(options):
 
 
 def plan(options):
-    """estimate the time and disk space of make figures on this machine, training included
-    (takes a minute)
+    """estimate the time and disk space of make figures on this machine, without training (takes a
+    minute)
     """
-    from thesis_repro import cityscapes
     from thesis_repro.settings import read_settings
     from thesis_repro.study import plan
 
-    # the sizes of the thesis, unless make's PROFILE, EPOCHS and so on change them
-    sizes = read_settings({"THESIS_REPRO_PROFILE": "thesis"} | os.environ).sizes
-    images = len(cityscapes.pairs(options.cityscapes, "train")) if options.cityscapes else 0
-    _print(options, plan.of_thesis(options.kitti, sizes, images), "plan.txt.j2")
+    # the sizes of the thesis, unless make's PROFILE, FRAMES and so on change them
+    settings = read_settings(
+        {"THESIS_REPRO_PROFILE": "thesis"} | os.environ | {"THESIS_REPRO_KITTI": str(options.kitti)}
+    )
+    _print(options, plan.of_thesis(options.kitti, settings.sizes, settings.build), "plan.txt.j2")
 
 
 # Helpers of several commands
@@ -786,7 +786,7 @@ def build_parser():
         help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
     )
 
-    command(plan, "--kitti", "--cityscapes", kitti=REQUIRED)
+    command(plan, "--kitti", kitti=REQUIRED)
     return parser
 
 

@@ -30,7 +30,7 @@ from thesis_repro.study.sources import Source
 CHECKPOINTS = f"pass-{'[0-9a-f]' * 12}.npz"
 
 
-def _result(folder: Path, job: Job) -> Path:
+def result_file(folder: Path, job: Job) -> Path:
     """Return the result file of a job, which is written when the job is done."""
     return folder / job.sequence / f"{job.name}.csv"
 
@@ -69,7 +69,7 @@ def run(
         name: Sequence(kitti, name).subset(frames)
         for name in sorted({job.sequence for job in jobs})
     }
-    files = {job: _result(folder, job) for job in jobs}
+    files = {job: result_file(folder, job) for job in jobs}
     with results.claimed(folder):
         for sequence in sequences.values():
             _stage(folder, sequence, sources)
@@ -201,7 +201,7 @@ def _passes(
     for name in sequences:
         sequence_jobs = {job.name: job for job in jobs if job.sequence == name}
         waiting = {
-            key: job for key, job in sequence_jobs.items() if not _result(folder, job).is_file()
+            key: job for key, job in sequence_jobs.items() if not result_file(folder, job).is_file()
         }
         for path in sorted((folder / name).glob(CHECKPOINTS)):
             try:
@@ -275,7 +275,7 @@ def _run_pass(
         waiting = (
             jobs
             if checkpoint.is_file()
-            else [job for job in jobs if not _result(folder, job).is_file()]
+            else [job for job in jobs if not result_file(folder, job).is_file()]
         )
         masks_by_job, failures = masks_of(waiting, sequence, sources)
         if not masks_by_job:  # also if Dask repeats a finished pass because it lost the answer
@@ -287,9 +287,9 @@ def _run_pass(
             workers=threads,
         )
         for job in masks_by_job:
-            if not _result(folder, job).is_file():
+            if not result_file(folder, job).is_file():
                 write_text(
-                    _result(folder, job), run_results.pop(job.name).frames.to_csv(index=False)
+                    result_file(folder, job), run_results.pop(job.name).frames.to_csv(index=False)
                 )
         checkpoint.unlink(missing_ok=True)
     except Exception as error:  # report any error as the reason, and let other passes run
@@ -299,7 +299,7 @@ def _run_pass(
         elif not isinstance(error, InputError):
             reason = _MachineFault(reason)
         failures = (
-            dict.fromkeys((job for job in jobs if not _result(folder, job).is_file()), reason)
+            dict.fromkeys((job for job in jobs if not result_file(folder, job).is_file()), reason)
             | failures
         )
     return failures
