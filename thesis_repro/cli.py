@@ -14,7 +14,14 @@ from importlib.metadata import version
 from pathlib import Path
 
 from thesis_repro import InputError, console, one_line
-from thesis_repro.settings import PROFILES, SEED, frames, number, scheduler_address, widths
+from thesis_repro.settings import (
+    PROFILES,
+    SEED,
+    number,
+    read_frames,
+    read_widths,
+    scheduler_address,
+)
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
@@ -62,7 +69,7 @@ def predict(options):
     images or sequences
     """
     from thesis_repro.segmentation import quietly
-    from thesis_repro.study import cluster
+    from thesis_repro.study import workers
 
     images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
     names = [folder.resolve().name for folder, _ in images]
@@ -82,7 +89,7 @@ def predict(options):
     model_files = options.model or [prediction.SHIPPED]
     with console.logged(options.folder, options.command_line) as run:
         if options.dask:
-            with cluster.open_pool(1, options.dask) as pool:
+            with workers.open_pool(1, options.dask) as pool:
                 new = prediction.spread_label_maps(pool.run, model_files, sequences)
         else:
             model = prediction.load(tuple(model_files))
@@ -201,7 +208,8 @@ def study(options):
     """
     from thesis_repro import kitti, results
     from thesis_repro.settings import ALL_WIDTHS, cores
-    from thesis_repro.study import series, sources
+    from thesis_repro.study import sources
+    from thesis_repro.study.study import Study
 
     if not options.sources:
         raise InputError(
@@ -211,7 +219,7 @@ def study(options):
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
-    planned = series.Study(
+    planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
         sources.named(
@@ -367,7 +375,9 @@ def _mask_settings(options, has_labels=True):
         options.ids,
     )
     if not has_labels and settings != MaskSettings():
-        raise InputError(f"{', '.join(MASKS)}: need --labels DIR, label maps to make masks from")
+        raise InputError(
+            f"{', '.join(MASK_OPTIONS)}: need --labels DIR, label maps to make masks from"
+        )
     return settings
 
 
@@ -472,7 +482,7 @@ SHARED = {
         help="00 to 21, or without --kitti a folder with your own frames",
     ),
     "--frames": dict(
-        type=_setting(frames),
+        type=_setting(read_frames),
         metavar="N|all",
         help="use the first N frames of a sequence, >= 5 (all)",
     ),
@@ -502,8 +512,8 @@ SHARED = {
     ),
 }
 SEQUENCE, REQUIRED = ("--kitti", "--sequence", "--camera", "--frames"), {"required": True}
-WIDTHS = dict(type=_setting(widths), nargs="+", action="extend", metavar="W")
-MASKS = {
+WIDTHS = dict(type=_setting(read_widths), nargs="+", action="extend", metavar="W")
+MASK_OPTIONS = {
     "--boundaries": dict(
         metavar="canny|exact",
         default="canny",
@@ -560,8 +570,8 @@ def build_parser():
     )
 
     def command(function, *shared, **changes):
-        """Add the parser of a command with options of SHARED and MASKS. changes: arguments that
-        differ, by option.
+        """Add the parser of a command with options of SHARED and MASK_OPTIONS. changes: arguments
+        that differ, by option.
         """
         name = function.__name__.replace("_", "-")
         sub = commands.add_parser(
@@ -579,8 +589,10 @@ def build_parser():
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
         for name in shared:
-            group = mask_options if name in MASKS else sub
-            group.add_argument(name, **(SHARED | MASKS)[name] | changes.get(name.strip("-"), {}))
+            group = mask_options if name in MASK_OPTIONS else sub
+            group.add_argument(
+                name, **(SHARED | MASK_OPTIONS)[name] | changes.get(name.strip("-"), {})
+            )
         return sub
 
     add = command(synthesize).add_argument
@@ -622,7 +634,7 @@ def build_parser():
         help="trained model (.keras, .hdf5); the outputs of several are averaged (the model in the package)",
     )
 
-    add = command(masks, *SEQUENCE, *MASKS, "--output").add_argument
+    add = command(masks, *SEQUENCE, *MASK_OPTIONS, "--output").add_argument
     add("--labels", type=Path, required=True, metavar="DIR", help="a label map for each frame")
     add(
         "--dilation",
@@ -631,7 +643,7 @@ def build_parser():
         help="in pixels, such as 5,10 or 1-15; several get a subfolder each",
     )
 
-    sub = command(odometry, *SEQUENCE, *MASKS, "--invert", "--plot", "--json")
+    sub = command(odometry, *SEQUENCE, *MASK_OPTIONS, "--invert", "--plot", "--json")
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
     add(
         "--speed",
@@ -697,7 +709,14 @@ def build_parser():
     command(boresight, "--kitti", "--sequences", "--frames", "--json", kitti=REQUIRED)
 
     sub = command(
-        study, "--kitti", "--sequences", "--frames", "--invert", *MASKS, "--output", kitti=REQUIRED
+        study,
+        "--kitti",
+        "--sequences",
+        "--frames",
+        "--invert",
+        *MASK_OPTIONS,
+        "--output",
+        kitti=REQUIRED,
     )
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
     for kind, content in (

@@ -15,8 +15,9 @@ from waiting import wait_for
 
 from thesis_repro import InputError, console, files
 from thesis_repro.kitti import Sequence
-from thesis_repro.study import cluster, runner
+from thesis_repro.study import runner
 from thesis_repro.study.jobs import first_jobs
+from thesis_repro.study.workers import open_pool
 
 pytestmark = pytest.mark.slow
 
@@ -168,11 +169,11 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
 
 
 def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT", 1)
+    monkeypatch.setattr("thesis_repro.study.workers.TIMEOUT", 1)
     # without workers, none, no address
     for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
         with pytest.raises(InputError, match=address) as error:
-            with cluster.open_pool(1, address):
+            with open_pool(1, address):
                 pass
         assert "\n" not in str(error.value)
 

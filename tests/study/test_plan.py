@@ -6,8 +6,9 @@ import pytest
 
 from thesis_repro.cli import main
 from thesis_repro.settings import PROFILES
-from thesis_repro.study import plan, runner, series
+from thesis_repro.study import plan, runner
 from thesis_repro.study.sources import Source
+from thesis_repro.study.study import Study
 
 pytestmark = pytest.mark.slow
 
@@ -34,9 +35,7 @@ def test_the_plan_includes_every_notebook(small_world, monkeypatch, tmp_path):
 
 
 def test_a_study_takes_about_as_long_as_planned(small_world, small_labels, tmp_path):
-    study = series.Study(
-        small_world / "kitti", ("00",), (Source(small_labels, name="net"),), (5, 10)
-    )
+    study = Study(small_world / "kitti", ("00",), (Source(small_labels, name="net"),), (5, 10))
     planned = plan.of_study(study, tmp_path)
     assert planned["steps"][0][1:3] == (3, "runs")
     started = time.process_time()

@@ -41,7 +41,7 @@ class Step:
     updated: bool = False  # whether this step moved the pose
     flags: list[str] = field(default_factory=list)
     # previous and current, if a fallback is possible
-    frames: tuple[np.ndarray, np.ndarray] | None = None
+    images: tuple[np.ndarray, np.ndarray] | None = None
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
@@ -129,7 +129,7 @@ class Odometry:
             self.gap = step.scale
             return step
         if self.settings.fallback and mask is not None and self.previous is not None:
-            step.frames = self.previous, frame
+            step.images = self.previous, frame
         started, self.gap = time.perf_counter(), 0.0
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
@@ -194,9 +194,9 @@ class Odometry:
         odometry/__init__.py).
         """
         settings = self.settings
-        if step.frames is not None and step.scale > settings.scale_gate and self._in_doubt(step):
+        if step.images is not None and step.scale > settings.scale_gate and self._in_doubt(step):
             self._use_all_keypoints(step)
-        step.frames, motion = None, step.motion
+        step.images, motion = None, step.motion
         if step.points:
             if motion.rotation is None:
                 step.flags.append(motion.problem)
@@ -234,7 +234,7 @@ class Odometry:
         return not is_consistent(motion, step.scale, self.prior)
 
     def _use_all_keypoints(self, step):
-        previous_frame, frame = step.frames
+        previous_frame, frame = step.images
         points = keypoints.detect(previous_frame, self.settings)
         if len(points):
             current, was_tracked = keypoints.track(

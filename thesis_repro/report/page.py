@@ -163,7 +163,7 @@ def _describe(folder, artefact, settings=None, numbers=None):
     given = (
         not needs
         or not settings
-        or not settings.shipped
+        or not settings.uses_shipped_model
         or (needs == "KITTI_SEMANTIC" and settings.kitti_semantic)
     )
     identity = name if number or kind == "text" else f"{kind}-{name}"

@@ -8,18 +8,18 @@ import numpy as np
 
 from thesis_repro import InputError, results
 from thesis_repro.files import write_text
-from thesis_repro.kitti import Sequence
 from thesis_repro.masks import label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
-from thesis_repro.study import compare, controls, runner, series
+from thesis_repro.study import compare, controls, runner
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS
+from thesis_repro.study.study import PATHS
 from thesis_repro.trajectories import read_poses
 
 
 def write(study, runs, folder, warnings=()):
-    """Write the findings, figures, tables and page of a `series.Study` into a folder, and return
+    """Write the findings, figures, tables and page of a `Study` into a folder, and return
     the page's path.
 
     warnings: lines for the top of the page.
@@ -106,10 +106,10 @@ def figure_paths(study, name, folder):
     """Draw one path with all keypoints and one with each source's masks, shifted as for the
     RMSE.
     """
-    true = Sequence(study.kitti, name).subset(study.frames).poses
+    (true,) = (sequence.poses for sequence in study.opened if sequence.name == name)
     files = {
         job.source or compare.METHODS[job.method]: folder
-        / series.PATHS
+        / PATHS
         / "kitti"
         / name
         / f"{job.name}.txt"

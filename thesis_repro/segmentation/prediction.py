@@ -138,7 +138,7 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
     `write_label_maps`' bits.
 
     run: function of (function, list of argument tuples), like `run` of the pools in
-    `study.cluster`. It calls the function on the workers and yields (index, returned value or
+    `study.workers`. It calls the function on the workers and yields (index, returned value or
     reason why the worker was lost).
     model_files: files of one model, or of several for the mean of their probabilities (`ensemble`).
     sequences: list of (image paths, folder).

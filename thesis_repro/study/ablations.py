@@ -22,7 +22,7 @@ from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.odometry.pose import normalise
-from thesis_repro.study import cluster
+from thesis_repro.study import workers
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.controls import CORRECTED
 from thesis_repro.study.jobs import CONTROL_WIDTH
@@ -83,7 +83,7 @@ def measure(
     metres after an alignment with scale).
     """
     calls = [(kitti, name, labels / name, folder / name, frames, options) for name in names]
-    with cluster.open_pool(processes) as pool:
+    with workers.open_pool(processes) as pool:
         tables = dict(
             progress(pool.run(_measure, calls), "ablations", total=len(calls), unit="sequence")
         )

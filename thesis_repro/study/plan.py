@@ -18,8 +18,8 @@ import numpy as np
 from thesis_repro import InputError, kitti, odometry
 from thesis_repro.settings import Profile, cores
 from thesis_repro.study import ablations, compare, jobs, runner
-from thesis_repro.study.series import Study
 from thesis_repro.study.sources import Source
+from thesis_repro.study.study import Study
 
 # frames of two timed runs: their difference leaves out the cost of starting a run
 SHORT, LONG = 3, 9
@@ -33,7 +33,7 @@ def of_study(study: Study, folder: Path) -> dict[str, Any]:
     """Return the plan of the runs of a study with your own masks that are not in its folder yet,
     see `_plan`.
     """
-    sequences = {sequence.name: sequence for sequence in study.opened()}
+    sequences = {sequence.name: sequence for sequence in study.opened}
     frames = {name: len(sequence) for name, sequence in sequences.items()}
     # the keypoint controls of each source are planned when the masked runs are done
     later = (

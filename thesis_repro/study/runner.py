@@ -22,7 +22,7 @@ from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
 from thesis_repro.odometry.refined import boresight
-from thesis_repro.study import cluster, controls
+from thesis_repro.study import controls, workers
 from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
 
@@ -38,7 +38,7 @@ def result_file(folder: Path, job: Job) -> Path:
 def run(
     jobs: Iterable[Job],
     kitti: Path,
-    labels: Path | Iterable[Source],
+    sources: Path | Iterable[Source],
     folder: Path,
     *,
     frames: int | None = None,
@@ -48,7 +48,7 @@ def run(
     """Run the jobs that have no result yet; returns the table of all runs that succeeded, one row a
     job.
 
-    kitti: the odometry root. labels: folder with one folder of label maps a sequence, or the
+    kitti: the odometry root. sources: folder with one folder of label maps a sequence, or the
     sources of the jobs.
     folder: for the results; results from other data, code or mask settings in it are deleted.
     frames: number of frames of each sequence, None for all. processes: number of processes on this
@@ -64,7 +64,7 @@ def run(
     Raises InputError if another run is using the folder, if all jobs fail, or if the machine lacks
     disk space or memory. Finished results are kept.
     """
-    jobs, sources = list(dict.fromkeys(jobs)), by_name(labels)
+    jobs, sources_by_name = list(dict.fromkeys(jobs)), by_name(sources)
     sequences = {
         name: Sequence(kitti, name).subset(frames)
         for name in sorted({job.sequence for job in jobs})
@@ -72,13 +72,13 @@ def run(
     files = {job: result_file(folder, job) for job in jobs}
     with results.claimed(folder):
         for sequence in sequences.values():
-            _stage(folder, sequence, sources)
+            _stage(folder, sequence, sources_by_name)
         for job, path in files.items():
             table = results.kept_table(path, len(sequences[job.sequence]))
             if table is None or not np.isfinite(poses_of(table)).all():
                 path.unlink(missing_ok=True)  # missing results are made again
         finished = sum(path.is_file() for path in files.values())
-        failures = _run_passes(jobs, sequences, sources, folder, processes, scheduler)
+        failures = _run_passes(jobs, sequences, sources_by_name, folder, processes, scheduler)
     rows = []
     for job, path in files.items():
         if path.is_file():
@@ -108,7 +108,7 @@ def _run_passes(
     the failed ones.
     """
     failures: dict[Job, str] = {}
-    with cluster.open_pool(processes, scheduler) as pool:
+    with workers.open_pool(processes, scheduler) as pool:
         passes = _passes(jobs, sequences, folder, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
         calls, frames = [], []
@@ -147,10 +147,11 @@ class _MachineFault(str):
     """The reason of a failure that the machine caused, such as a full disk."""
 
 
-def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
+def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
     """Return the sources by name. A folder becomes a single source with an empty name."""
     return {
-        source.name: source for source in ([Source(labels)] if isinstance(labels, Path) else labels)
+        source.name: source
+        for source in ([Source(sources)] if isinstance(sources, Path) else sources)
     }
 
 

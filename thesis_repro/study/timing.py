@@ -18,7 +18,7 @@ import pandas as pd
 from thesis_repro import InputError, masks, odometry, results
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
-from thesis_repro.study import cluster
+from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import by_name, masks_of
 from thesis_repro.study.sources import Source
@@ -67,7 +67,7 @@ def time_runs(
         )
         for name in names
     ]
-    with cluster.open_pool(processes) as pool:
+    with workers.open_pool(processes) as pool:
         tables = dict(
             progress(pool.run(_time_jobs, calls), "timing", total=len(calls), unit="sequence")
         )
