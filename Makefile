@@ -63,7 +63,7 @@ help:
 	@echo "                 KITTI_SEMANTIC=/path           also test the label maps on KITTI's street scenes"
 	@echo "                 PROFILE=smoke|lab|demo|thesis  size of the run (demo); single sizes: IMAGE_SIZE BASE_FILTERS"
 	@echo "                 BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS; number of processes: JOBS"
-	@echo "make plan        estimate the time and disk space of make figures KITTI=/path, with the same settings"
+	@echo "make plan        estimate the time and disk space of make figures KITTI=/path, with the same settings, without training"
 	@echo "make test        run the unit tests, and every notebook with PROFILE=smoke"
 	@echo "make torture     run the tests of kills, faults and bad input (some minutes)"
 	@echo "make lint        check format and style (Ruff) and types (mypy)"
@@ -180,7 +180,7 @@ endif
 endif
 
 plan: setup
-	@$(BIN)/python -m thesis_repro plan $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI") $(if $(CITYSCAPES),--cityscapes "$$THESIS_REPRO_CITYSCAPES")
+	@$(BIN)/python -m thesis_repro plan $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI")
 
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS)
@@ -206,7 +206,7 @@ bench: setup
 
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
-	@$(BIN)/python -m thesis_repro.report.evidence
+	@$(BIN)/python tools/evidence.py
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)

@@ -110,14 +110,14 @@ def small_labels(small_world, tmp_path_factory):
     """Exact label maps of the small world, 320x320, one folder a sequence, laid out as notebook
     5 does.
     """
-    from thesis_repro import stages
+    from thesis_repro import results
 
     with _shared_folder(tmp_path_factory, "small_labels") as root:
         for path in (
             small_world.glob("kitti/sequences/*/labels_0/*.png") if not root.exists() else ()
         ):
             folder = root / path.parent.parent.name
-            stages.stage(folder, model="none")
+            results.stage(folder, model="none")
             label_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             cv2.imwrite(
                 str(folder / path.name),

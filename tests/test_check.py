@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, check, files, stages
+from thesis_repro import InputError, check, files, results
 from thesis_repro.check import check_cityscapes, check_kitti, mask_oddities, oddities, path_oddities
 from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
@@ -196,7 +196,7 @@ def test_implausible_masks_are_one_line_with_the_option(
 
 def test_masks_of_other_frames_and_other_names_of_files(tiny_kitti, tmp_path):
     sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
-    stages.stage(folder, frames=stages.listing(sequence.frame_paths))
+    results.stage(folder, frames=results.listing(sequence.frame_paths))
     for path in sequence.frame_paths:
         files.write_png(folder / f"{path.name}.png", HALF)
     made = MaskFolder(folder, sequence)

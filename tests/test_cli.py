@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from thesis_repro.cli import build_parser, main
-from thesis_repro.kitti import read_poses
+from thesis_repro.trajectories import read_poses
 
 
 def run(command, *options):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thesis_repro import InputError, files, longrun
+from thesis_repro import InputError, console, files
 from thesis_repro.files import (
     atomic,
     check_output,
@@ -118,7 +118,7 @@ def test_output_to_links_pipes_and_streams(tmp_path, capsysbinary):
 def test_output_into_a_folder_of_results_is_refused(tmp_path):
     check_output(tmp_path / "a" / "b.txt")
     check_output(tmp_path / "-")
-    (tmp_path / longrun.RECORD).touch()
+    (tmp_path / console.RECORD).touch()
     with pytest.raises(InputError, match="b.txt: "):
         check_output(tmp_path / "a" / "b.txt")
 

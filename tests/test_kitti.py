@@ -6,7 +6,8 @@ import pytest
 from evo.tools import file_interface
 
 from thesis_repro import InputError, odometry
-from thesis_repro.kitti import Sequence, name_of, sequences, true_path, with_frames, write_tum
+from thesis_repro.kitti import Sequence, name_of, sequences, true_path, with_frames
+from thesis_repro.trajectories import write_tum
 
 
 def test_reads_a_sequence(tiny_kitti):

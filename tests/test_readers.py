@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from thesis_repro import InputError, files, kitti
+from thesis_repro import InputError, files, kitti, trajectories
 from thesis_repro.settings import LIMITS, PROFILES, SIZES, read_settings
 
 # the same examples in every run, and no time limits
@@ -55,7 +55,7 @@ def read(function, path, text, *arguments):
 
 @given(TEXTS | st.binary() | st.lists(WORDS, min_size=12, max_size=12).map(" ".join))
 def test_any_text_as_poses(path, text):
-    poses = read(kitti.read_poses, path, text)
+    poses = read(trajectories.read_poses, path, text)
     if poses is not None:
         rotations = poses[:, :3, :3]
         assert poses.shape[1:] == (4, 4) and len(poses) and np.isfinite(poses).all()
@@ -68,7 +68,7 @@ def test_any_text_as_poses(path, text):
 
 @given(TEXTS | st.binary())
 def test_any_text_as_times(path, text):
-    times = read(kitti.read_times, path, text)
+    times = read(trajectories.read_times, path, text)
     if times is not None:
         assert (
             times.ndim == 1
@@ -122,8 +122,8 @@ def test_written_trajectories_are_read_back_to_the_bit(path, motions):
     poses = np.tile(np.eye(4), (len(motions), 1, 1))
     for pose, motion in zip(poses, np.array(motions)):
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(motion[:3])[0], motion[3:]
-    kitti.write_kitti_poses(path, poses)
-    assert np.array_equal(kitti.read_poses(path), poses)
+    trajectories.write_kitti_poses(path, poses)
+    assert np.array_equal(trajectories.read_poses(path), poses)
 
 
 @given(

@@ -10,7 +10,7 @@ def test_the_default_run():
     assert (
         settings.kitti_is_embedded
         and settings.kitti == settings.world / "kitti"
-        and not settings.shipped
+        and not settings.uses_shipped_model
     )
     sizes = PROFILES["thesis"]
     assert (sizes.image_size, sizes.base_filters, sizes.batch_size) == (320, 64, 16)
@@ -75,10 +75,10 @@ def test_changed_sizes_are_part_of_the_name():
 
 def test_real_frames_alone_use_the_shipped_model(tmp_path):
     settings = read_settings({"THESIS_REPRO_KITTI": str(tmp_path)})
-    assert settings.shipped and "embedded" not in settings.data_note
+    assert settings.uses_shipped_model and "embedded" not in settings.data_note
     assert not read_settings(
         {"THESIS_REPRO_KITTI": str(tmp_path), "THESIS_REPRO_CITYSCAPES": str(tmp_path)}
-    ).shipped
+    ).uses_shipped_model
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
 """A reproduction of a thesis on keypoint masks from semantic segmentation for monocular visual
 odometry.
 
-The main names: Sequence, keypoint_mask, Odometry, OdometrySettings, THESIS, run, build_unet and
-InputError. Names are imported on first use, so TensorFlow is loaded only for build_unet.
+The main names: Sequence, keypoint_mask, LabelMasks, Odometry, OdometrySettings, THESIS, run,
+build_unet and InputError. Names are imported on first use, so TensorFlow is loaded only for
+build_unet.
 """
 
 from importlib import import_module
@@ -10,6 +11,7 @@ from importlib import import_module
 _HOMES = {
     "Sequence": "kitti",
     "keypoint_mask": "masks",
+    "LabelMasks": "masks",
     "Odometry": "odometry",
     "OdometrySettings": "odometry",
     "THESIS": "odometry",

@@ -14,7 +14,16 @@ import joblib
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, cityscapes, files, kitti, masks, one_line, stages
+from thesis_repro import (
+    InputError,
+    cityscapes,
+    files,
+    kitti,
+    masks,
+    one_line,
+    results,
+    trajectories,
+)
 from thesis_repro.settings import read_settings
 
 
@@ -34,8 +43,8 @@ class _Problems(list):
     def call_for_each(self, function, items, description):
         """Call a function for every item in threads; reading and decoding release Python's lock."""
         calls = (joblib.delayed(self.call)(function, item) for item in items)
-        results = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(calls)
-        for _ in files.progress(results, description, total=len(items), unit="file"):
+        done = joblib.Parallel(n_jobs=-1, prefer="threads", return_as="generator")(calls)
+        for _ in files.progress(done, description, total=len(items), unit="file"):
             pass
 
 
@@ -80,9 +89,9 @@ def _check_sequence(root, name, needs_truth, deep):
     matrix = problems.call(kitti.read_intrinsics, folder / "calib.txt", frame_folder.name)
     poses, times, rows = Path(root) / "poses" / f"{name}.txt", folder / "times.txt", {}
     if needs_truth:
-        rows[poses] = problems.call(kitti.read_poses, poses)
+        rows[poses] = problems.call(trajectories.read_poses, poses)
     if times.is_file():
-        rows[times] = problems.call(kitti.read_times, times)
+        rows[times] = problems.call(trajectories.read_times, times)
     counts = {path: len(values) for path, values in rows.items() if values is not None}
     missing = kitti.missing_frames(
         paths, max([count for count in counts.values() if count > len(paths)], default=None)
@@ -239,7 +248,7 @@ def oddities(sequence):
     sizes = pd.Series({path: path.stat().st_size for path in sequence.frame_paths})
     # compressed frames seldom have equal sizes
     candidates = sizes.index[sizes.duplicated(keep=False)]
-    copies = candidates[pd.Series(stages.contents(candidates), dtype=object).duplicated()]
+    copies = candidates[pd.Series(results.contents(candidates), dtype=object).duplicated()]
     if len(copies):
         lines.append(
             f"{prefix}{len(copies)} frames are copies of other frames, first {copies[0].name}; remove them"
@@ -300,10 +309,10 @@ def mask_oddities(source, sequence):
             f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest
         )
         faults = _label_faults(label_maps, np.flatnonzero(shares), sequence, source.settings)
-    record = stages.record(folder) or {}
+    record = results.record(folder) or {}
     present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)
     # A study may use only the first frames.
-    digests = [stages.listing(paths) for paths in (sequence.frame_paths, frames, frames[:present])]
+    digests = [results.listing(paths) for paths in (sequence.frame_paths, frames, frames[:present])]
     if record.get("frames", digests[0]) not in digests:
         faults.append("were made from other frames")
     elif "frames" not in record and present not in (1, len(sequence), len(frames)):
@@ -370,7 +379,7 @@ def main(path):
                 if root
                 else []
             )
-        digest = stages.listing(used_files)
+        digest = results.listing(used_files)
     if digest and path.is_file() and path.read_text(encoding="utf-8") == digest:
         return 0
     if not report(kitti_root, cityscapes_root, settings.kitti_semantic):

@@ -13,8 +13,15 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from thesis_repro import InputError, longrun, one_line
-from thesis_repro.settings import PROFILES, SEED, frames, number, scheduler_address, widths
+from thesis_repro import InputError, console, one_line
+from thesis_repro.settings import (
+    PROFILES,
+    SEED,
+    number,
+    read_frames,
+    read_widths,
+    scheduler_address,
+)
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
@@ -22,7 +29,7 @@ OUTPUT_FILES = {
     "output": ("poses in KITTI format", ()),
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
-    "video": ("video", (".mp4",)),
+    "video": ("video", (".webm",)),
 }
 
 
@@ -34,7 +41,7 @@ def synthesize(options):
     """write the embedded world, a rendered street, in the folder layouts of KITTI and Cityscapes"""
     from thesis_repro import world
 
-    with longrun.logged(options.out, options.command_line) as run:
+    with console.logged(options.out, options.command_line) as run:
         new, total = world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
         run.end(
             f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
@@ -62,7 +69,7 @@ def predict(options):
     images or sequences
     """
     from thesis_repro.segmentation import quietly
-    from thesis_repro.study import cluster
+    from thesis_repro.study import workers
 
     images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
     names = [folder.resolve().name for folder, _ in images]
@@ -80,9 +87,9 @@ def predict(options):
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction
     model_files = options.model or [prediction.SHIPPED]
-    with longrun.logged(options.folder, options.command_line) as run:
+    with console.logged(options.folder, options.command_line) as run:
         if options.dask:
-            with cluster.open_pool(1, options.dask) as pool:
+            with workers.open_pool(1, options.dask) as pool:
                 new = prediction.spread_label_maps(pool.run, model_files, sequences)
         else:
             model = prediction.load(tuple(model_files))
@@ -119,16 +126,16 @@ def masks(options):
 def odometry(options):
     """run the visual odometry on one sequence and print its errors, number of keypoints and time"""
     from thesis_repro import check, odometry
-    from thesis_repro.kitti import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
     from thesis_repro.report import texts
+    from thesis_repro.trajectories import write_kitti_poses, write_tum
 
     changes = {
         field.name: vars(options)[field.name]
         for field in fields(odometry.OdometrySettings)
         if vars(options).get(field.name) is not None
     }
-    settings = replace(odometry.PRESETS[options.pyslam], **changes)
+    settings = replace(odometry.THESIS, **changes)
     sequence = _sequence(options)
     masks = _masks(options, sequence)
     _check_outputs(
@@ -147,8 +154,9 @@ def odometry(options):
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
-        longrun.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
-    record = texts.run_record(result, sequence, settings.alignment)
+        for line in check.path_oddities(sequence.name, result.poses, sequence.poses):
+            console.log.warning(line)
+    record = texts.run_record(result, sequence)
     if options.video:
         from thesis_repro.report import video
 
@@ -157,11 +165,7 @@ def odometry(options):
         from thesis_repro.report import style, trajectories
 
         truth = sequence.poses if sequence.has_truth else None
-        poses = (
-            result.poses
-            if truth is None
-            else metrics.shifted(result.poses, truth, settings.alignment)
-        )
+        poses = result.poses if truth is None else metrics.shifted(result.poses, truth)
         drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
         style.write_figure(drawing, options.plot)
     _print(
@@ -178,9 +182,10 @@ def study(options):
     """compare your own label maps or masks with all keypoints and with controls, in tables,
     figures and a page
     """
-    from thesis_repro import kitti
+    from thesis_repro import kitti, results
     from thesis_repro.settings import ALL_WIDTHS, cores
-    from thesis_repro.study import series, sources
+    from thesis_repro.study import sources
+    from thesis_repro.study.study import Study
 
     if not options.sources:
         raise InputError(
@@ -190,7 +195,7 @@ def study(options):
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
-    planned = series.Study(
+    planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
         sources.named(
@@ -206,19 +211,21 @@ def study(options):
     if options.plan:
         from thesis_repro.study import plan
 
-        _print(options, plan.of_study(planned), "plan.txt.j2")
+        _print(options, plan.of_study(planned, options.folder), "plan.txt.j2")
         return 0
     folder = options.folder.absolute()
     _check_outputs(options, options.kitti, *(source.folder for source in planned.sources))
     # this import takes seconds, so the input is checked first
     from thesis_repro.report import study
 
-    with longrun.logged(folder, options.command_line) as run, longrun.claimed(folder):
+    with console.logged(folder, options.command_line) as run, results.claimed(folder):
         warnings = [
             line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)
         ]
         summary = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += longrun.warn(planned.path_oddities(summary, folder))
+        for line in planned.path_oddities(summary, folder):
+            console.log.warning(line)
+            warnings.append(line)
         counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
         failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
         run.end(f"{len(summary):,} runs{failed}; open {page} in a browser", counts["kept"])
@@ -246,7 +253,8 @@ def evaluate(options):
             name: trajectories.read(file, times, options.frames) for name, file in files.items()
         }
         for name, (matched, poses) in paths.items():
-            longrun.warn(check.path_oddities(name, poses, truth[matched]))
+            for line in check.path_oddities(name, poses, truth[matched]):
+                console.log.warning(line)
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
         drawing = trajectories.figure(
@@ -267,17 +275,17 @@ def evaluate(options):
 
 
 def plan(options):
-    """estimate the time and disk space of make figures on this machine, training included
-    (takes a minute)
+    """estimate the time and disk space of make figures on this machine, without training (takes a
+    minute)
     """
-    from thesis_repro import cityscapes
     from thesis_repro.settings import read_settings
     from thesis_repro.study import plan
 
-    # the sizes of the thesis, unless make's PROFILE, EPOCHS and so on change them
-    sizes = read_settings({"THESIS_REPRO_PROFILE": "thesis"} | os.environ).sizes
-    images = len(cityscapes.pairs(options.cityscapes, "train")) if options.cityscapes else 0
-    _print(options, plan.of_thesis(options.kitti, sizes, images), "plan.txt.j2")
+    # the sizes of the thesis, unless make's PROFILE, FRAMES and so on change them
+    settings = read_settings(
+        {"THESIS_REPRO_PROFILE": "thesis"} | os.environ | {"THESIS_REPRO_KITTI": str(options.kitti)}
+    )
+    _print(options, plan.of_thesis(options.kitti, settings.sizes, settings.build), "plan.txt.j2")
 
 
 # Helpers of several commands
@@ -300,9 +308,11 @@ def _print_oddities(sequence, mask_sets):
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             line, mask_warnings = check.mask_oddities(masks, sequence)
-            longrun.remark(line)
+            console.log.info(line)
             warnings += mask_warnings
-    return longrun.warn(warnings)
+    for line in warnings:
+        console.log.warning(line)
+    return warnings
 
 
 def _image_folders(root):
@@ -341,7 +351,9 @@ def _mask_settings(options, has_labels=True):
         options.ids,
     )
     if not has_labels and settings != MaskSettings():
-        raise InputError(f"{', '.join(MASKS)}: need --labels DIR, label maps to make masks from")
+        raise InputError(
+            f"{', '.join(MASK_OPTIONS)}: need --labels DIR, label maps to make masks from"
+        )
     return settings
 
 
@@ -398,7 +410,7 @@ def _print(options, record, template, **values):
     print(text, file=sys.stderr if any(map(is_stdout, outputs.values())) else None)
     for name, path in outputs.items():
         if not is_stream(path):
-            longrun.remark(f"{path}: {OUTPUT_FILES[name][0]}")
+            console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 # The parser
@@ -446,7 +458,7 @@ SHARED = {
         help="00 to 21, or without --kitti a folder with your own frames",
     ),
     "--frames": dict(
-        type=_setting(frames),
+        type=_setting(read_frames),
         metavar="N|all",
         help="use the first N frames of a sequence, >= 5 (all)",
     ),
@@ -476,8 +488,8 @@ SHARED = {
     ),
 }
 SEQUENCE, REQUIRED = ("--kitti", "--sequence", "--camera", "--frames"), {"required": True}
-WIDTHS = dict(type=_setting(widths), nargs="+", action="extend", metavar="W")
-MASKS = {
+WIDTHS = dict(type=_setting(read_widths), nargs="+", action="extend", metavar="W")
+MASK_OPTIONS = {
     "--boundaries": dict(
         metavar="canny|exact",
         default="canny",
@@ -534,8 +546,8 @@ def build_parser():
     )
 
     def command(function, *shared, **changes):
-        """Add the parser of a command with options of SHARED and MASKS. changes: arguments that
-        differ, by option.
+        """Add the parser of a command with options of SHARED and MASK_OPTIONS. changes: arguments
+        that differ, by option.
         """
         name = function.__name__.replace("_", "-")
         sub = commands.add_parser(
@@ -553,8 +565,10 @@ def build_parser():
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
         for name in shared:
-            group = mask_options if name in MASKS else sub
-            group.add_argument(name, **(SHARED | MASKS)[name] | changes.get(name.strip("-"), {}))
+            group = mask_options if name in MASK_OPTIONS else sub
+            group.add_argument(
+                name, **(SHARED | MASK_OPTIONS)[name] | changes.get(name.strip("-"), {})
+            )
         return sub
 
     add = command(synthesize).add_argument
@@ -596,7 +610,7 @@ def build_parser():
         help="trained model (.keras, .hdf5); the outputs of several are averaged (the model in the package)",
     )
 
-    add = command(masks, *SEQUENCE, *MASKS, "--output").add_argument
+    add = command(masks, *SEQUENCE, *MASK_OPTIONS, "--output").add_argument
     add("--labels", type=Path, required=True, metavar="DIR", help="a label map for each frame")
     add(
         "--dilation",
@@ -605,7 +619,7 @@ def build_parser():
         help="in pixels, such as 5,10 or 1-15; several get a subfolder each",
     )
 
-    sub = command(odometry, *SEQUENCE, *MASKS, "--invert", "--plot", "--json")
+    sub = command(odometry, *SEQUENCE, *MASK_OPTIONS, "--invert", "--plot", "--json")
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
     add(
         "--speed",
@@ -627,12 +641,6 @@ def build_parser():
         type=int,
         metavar="W",
         help="dilation width, in pixels, of masks from label maps",
-    )
-    add(
-        "--pyslam",
-        choices=("2021", "2024"),
-        default="2021",
-        help="the thesis's PySLAM (2021) or a later one (2021)",
     )
     add(
         "--estimator",
@@ -663,12 +671,19 @@ def build_parser():
     add(
         "--video",
         type=Path,
-        metavar="OUT.mp4",
+        metavar="OUT.webm",
         help="write a video of the frames, the keypoints and the path",
     )
 
     sub = command(
-        study, "--kitti", "--sequences", "--frames", "--invert", *MASKS, "--output", kitti=REQUIRED
+        study,
+        "--kitti",
+        "--sequences",
+        "--frames",
+        "--invert",
+        *MASK_OPTIONS,
+        "--output",
+        kitti=REQUIRED,
     )
     add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
     for kind, content in (
@@ -757,7 +772,7 @@ def build_parser():
         help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
     )
 
-    command(plan, "--kitti", "--cityscapes", kitti=REQUIRED)
+    command(plan, "--kitti", kitti=REQUIRED)
     return parser
 
 
@@ -767,8 +782,8 @@ def main(arguments=None):
         ["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)]
     )
     try:
-        with longrun.stoppable():
-            longrun.need_addresses(4 if options.function is predict else 2)
+        with console.stoppable():
+            console.need_addresses(4 if options.function is predict else 2)
             code = options.function(options) or 0
             sys.stdout.flush()
             return code
@@ -776,7 +791,7 @@ def main(arguments=None):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except Exception as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     except KeyboardInterrupt as stop:
         with suppress(OSError):  # the terminal may be gone
             print("stopped; run the same command again to resume", file=sys.stderr)

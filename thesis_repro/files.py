@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import stat
 import struct
 import sys
@@ -17,8 +18,13 @@ from PIL import Image, ImageOps
 from tqdm import tqdm
 from tqdm.utils import ObjectWrapper
 
-from thesis_repro import InputError, longrun
+from thesis_repro import InputError, console
 
+LIST = (
+    "written.log"  # in a folder of results: the files that were written there, see `files.atomic`
+)
+# matches the names that `temporary_path` returns
+TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")
 BAR_DELAY = 1  # seconds before a progress bar appears
 # the last bytes of a complete file
 END_MARKS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
@@ -183,7 +189,7 @@ def atomic(path):
     raises an error.
 
     A symbolic link is kept and its target is replaced. A file in a folder of results is added to
-    the list of files written there (see `stages.stage`). A stream (see `is_stream`) gets the bytes
+    the list of files written there (see `results.stage`). A stream (see `is_stream`) gets the bytes
     when the block ends.
     """
     path = Path(path)
@@ -199,7 +205,7 @@ def atomic(path):
         return
     target = path.resolve() if path.is_symlink() else path
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = longrun.temporary(target)
+    temporary = temporary_path(target)
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_WRONLY, 0o666))
         yield temporary
@@ -208,7 +214,7 @@ def atomic(path):
             _add_to_list(target, file)
         os.replace(temporary, target)
     except Exception as error:
-        number, name = longrun.number_of(error), getattr(error, "filename", None)
+        number, name = console.number_of(error), getattr(error, "filename", None)
         if number is None or name not in (None, str(temporary), temporary):
             raise
         # instead of the temporary name or none
@@ -217,17 +223,22 @@ def atomic(path):
         temporary.unlink(missing_ok=True)
 
 
+def temporary_path(path):
+    """Return a temporary path beside `path`, with a random name that nobody can predict."""
+    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
+
+
 def _add_to_list(path, file):
     """Add a file that is about to be renamed to `path` to the list of its folder of results, if
     there is one.
     """
     folder = next(
-        (folder for folder in path.absolute().parents if (folder / longrun.RECORD).exists()), None
+        (folder for folder in path.absolute().parents if (folder / console.RECORD).exists()), None
     )
-    if folder is not None and path.name != longrun.RECORD:
+    if folder is not None and path.name != console.RECORD:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         # short appends do not mix
-        with open(folder / longrun.LIST, "a", encoding="utf-8") as written:
+        with open(folder / LIST, "a", encoding="utf-8") as written:
             written.write(f"{digest} {json.dumps(str(path.absolute().relative_to(folder)))}\n")
 
 
@@ -256,7 +267,7 @@ def check_output(path):
         raise InputError(
             f"{path}: cannot be written; name a file in a folder that you may write to"
         )
-    if any((folder / longrun.RECORD).exists() for folder in path.parents):
+    if any((folder / console.RECORD).exists() for folder in path.parents):
         raise InputError(
             f"{path}: is in a folder of results, with which it could be deleted; name a file elsewhere"
         )

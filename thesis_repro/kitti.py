@@ -1,8 +1,5 @@
-"""KITTI odometry: frames, camera, times and ground truth of a sequence; reads and writes
-trajectory files.
-"""
+"""KITTI odometry: frames, camera, times and ground truth of a sequence."""
 
-import warnings
 from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
@@ -14,7 +11,8 @@ from statistics import median_low
 import numpy as np
 
 from thesis_repro import InputError
-from thesis_repro.files import images, numbers_of, read_gray, write_text
+from thesis_repro.files import images, numbers_of, read_gray
+from thesis_repro.trajectories import read_poses, read_times
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
 # distortion.
@@ -40,8 +38,6 @@ IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
 MAX_MISSING_NAMED = 10_000  # frames
 MAX_SPEED = 10_000  # metres a second
-MAX_POSITION = 1e9  # metres
-ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
@@ -308,19 +304,6 @@ def check_size(
         )
 
 
-def _read_numbers(path, columns):
-    try:
-        with open(path, encoding="utf-8") as file, warnings.catch_warnings(action="ignore"):
-            rows = np.loadtxt(file, np.float64, comments=None, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
-        ) from None
-    if not rows.size or rows.shape[1] != columns or not np.isfinite(rows).all():
-        raise InputError(f"{path}: must hold {columns} finite numbers a line, one line a frame")
-    return rows
-
-
 def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     """Camera matrix (Equation 2.4), (3, 3), pixels: the first three columns of P0, or of P1 to P3
     for another camera.
@@ -370,79 +353,3 @@ def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[in
             f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} do not fit frames of "
             f"{width}x{height} pixels"
         )
-
-
-def read_times(path: str | Path) -> np.ndarray:
-    """Times of the frames, (n,), seconds, one a line. Raises InputError unless they increase."""
-    times = _read_numbers(path, 1)[:, 0]
-    steps_back = np.flatnonzero(np.diff(times) <= 0)
-    if len(steps_back):
-        raise InputError(
-            f"{path}, line {steps_back[0] + 2}: time does not increase; mend or remove the file"
-        )
-    return times
-
-
-def read_poses(path: str | Path) -> np.ndarray:
-    """Camera-to-world poses, (n, 4, 4), metres, from 12 numbers a line: the first three rows of
-    each pose.
-
-    Raises InputError if a line is not a right-handed rotation and a position.
-    """
-    rows = _read_numbers(path, 12)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
-    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        is_rotation = (errors <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
-    bad_lines = np.flatnonzero(~is_rotation | (np.abs(positions).max(axis=1) > MAX_POSITION))
-    if len(bad_lines):
-        raise InputError(
-            f"{path}, line {bad_lines[0] + 1}: must be a right-handed rotation and a position in metres"
-        )
-    return poses
-
-
-def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
-    """Write poses (n, 4, 4) in KITTI's format: 12 numbers a line, row by row, with all digits."""
-    _write_rows(path, np.asarray(poses)[:, :3].reshape(-1, 12))
-
-
-def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
-    """Write poses (n, 4, 4) and times (n,), seconds, in TUM's format: time, position,
-    quaternion (x, y, z, w).
-    """
-    # takes 0.4 s to load, and every command loads this module
-    from scipy.spatial.transform import Rotation
-
-    quaternions = Rotation.from_matrix(np.asarray(poses)[:, :3, :3]).as_quat(canonical=True)
-    _write_rows(path, np.column_stack([times, np.asarray(poses)[:, :3, 3], quaternions]))
-
-
-def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Read a file in TUM's format and match its poses to the frames' times (n,), seconds, with evo.
-
-    Returns the indices of the matched frames, (m,), and their poses, (m, 4, 4). Raises InputError
-    if m is below two.
-    """
-    from evo import EvoException  # takes 0.4 s to load
-    from evo.core.sync import matching_time_indices
-    from evo.tools import file_interface
-
-    try:
-        trajectory = file_interface.read_tum_trajectory_file(path)
-    except EvoException as error:
-        raise InputError(f"{path}: {error}") from None
-    numbers, nearest = matching_time_indices(times, trajectory.timestamps)
-    poses = np.array(trajectory.poses_se3)[nearest]
-    if len(poses) < 2 or not np.isfinite(poses).all():
-        raise InputError(
-            f"{path}: {len(poses)} poses at the frames' times, {times[0]:g} to {times[-1]:g} s; at least "
-            "two finite poses are needed"
-        )
-    return np.array(numbers), poses
-
-
-def _write_rows(path, rows):
-    write_text(path, "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in rows))

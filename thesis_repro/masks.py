@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thesis_repro import InputError, longrun, stages
+from thesis_repro import InputError, results
 from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import is_whole, listed, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence, check_size
@@ -274,19 +274,19 @@ def forget_edges() -> None:
 def write_masks(masks: LabelMasks, folder: str | Path) -> None:
     """Write the mask of every frame as a PNG with the frame's name (A.8). `MaskFolder` reads them.
 
-    The folder is a stage (see stages): a stopped run resumes, and masks made from other label maps
+    The folder is a stage (see results): a stopped run resumes, and masks made from other label maps
     or settings are deleted.
     """
-    with longrun.claimed(folder):
-        folder = stages.stage(
+    with results.claimed(folder):
+        folder = results.stage(
             folder,
-            labels=stages.listing(masks.paths),
+            labels=results.listing(masks.paths),
             size=masks.size,
             **asdict(masks.settings),
             dilation_width=masks.dilation_width,
-            frames=stages.listing(masks.frame_paths),
-            code=stages.code("masks"),
-            **stages.made_with("opencv-python-headless"),
+            frames=results.listing(masks.frame_paths),
+            code=results.code("masks"),
+            **results.made_with("opencv-python-headless"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
             if not is_whole(folder / path.name):

@@ -168,7 +168,7 @@ class Settings:
     seed: int = SEED
 
     @property
-    def shipped(self):
+    def uses_shipped_model(self):
         """Whether the shipped model makes the label maps: there are real frames, but no real
         images to train on.
         """
@@ -189,7 +189,7 @@ class Settings:
         )
         labels = (
             "label maps: by the model in the package, no training"
-            if self.shipped
+            if self.uses_shipped_model
             else "training: embedded world (rendered)"
             if self.cityscapes_is_embedded
             else "training: the user's Cityscapes folder"
@@ -231,7 +231,7 @@ def read_settings(environment=None):
     for name, folder in folders.items():
         if not folder.is_dir():
             raise InputError(f"{name}={values[name]}: no such folder")
-    readers = {"WIDTHS": widths, "FRAMES": frames}
+    readers = {"WIDTHS": read_widths, "FRAMES": read_frames}
     sizes = replace(
         PROFILES[profile],
         **{
@@ -301,14 +301,14 @@ def number(name, text):
     return value
 
 
-def frames(text):
+def read_frames(text):
     """Return the number of frames in a text, or None for "all". Raises InputError for a bad
     number.
     """
     return None if text == "all" else number("FRAMES", text)
 
 
-def widths(text):
+def read_widths(text):
     """Return the dilation widths, pixels, in a text such as "1-3,10", sorted. Raises InputError
     for another text.
     """

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, longrun, masks, odometry
+from thesis_repro import InputError, console, masks, odometry
 from thesis_repro.files import write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
@@ -258,7 +258,7 @@ def main(arguments=None):
     try:
         table = measure(Sequence(options.kitti, options.sequence).subset(options.frames))
     except InputError as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     write_text(options.output, table.to_json(orient="records", indent=1) + "\n")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, OpenCV {cv2.__version__}")
     print(table.to_string(index=False, float_format="{:.3g}".format))

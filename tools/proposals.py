@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 import segmentation_models as sm
 
-from thesis_repro import InputError, cityscapes, longrun
+from thesis_repro import InputError, cityscapes, console
 from thesis_repro.report.style import markdown
 from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
@@ -182,7 +182,7 @@ def main(arguments=None):
                 f"{root.name}, {options.seconds:g} s a network\n\n{markdown(compare(root, options.seconds))}"
             )
     except InputError as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     return 0
 
 

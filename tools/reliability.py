@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, longrun, odometry, stages
+from thesis_repro import InputError, console, odometry, results
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, MaskSettings
@@ -65,7 +65,7 @@ def trial(sequence, settings, masks, keypoints=KEYPOINTS, shuffles=SHUFFLES):
         for count in keypoints
         for shuffle in range(shuffles)
     }
-    results = odometry.run_many(sequence, runs)
+    run_results = odometry.run_many(sequence, runs)
     moving = odometry.scales(sequence) > MOVING
     return pd.DataFrame(
         [
@@ -75,7 +75,7 @@ def trial(sequence, settings, masks, keypoints=KEYPOINTS, shuffles=SHUFFLES):
                 "rmse": metrics.rmse(result.poses, sequence.poses),
                 **count_steps(result, sequence, moving),
             }
-            for (count, shuffle), result in results.items()
+            for (count, shuffle), result in run_results.items()
         ]
     )
 
@@ -120,10 +120,10 @@ def measure(options):
     """Return all trials as one DataFrame; trials whose file is already in the output folder are
     not run again.
     """
-    folder = stages.stage(
+    folder = results.stage(
         options.output,
-        code=stages.code("odometry"),
-        tool=stages.content(Path(__file__)),
+        code=results.code("odometry"),
+        tool=results.content(Path(__file__)),
         kitti=str(options.kitti),
         labels=str(options.labels),
         keypoints=options.keypoints,
@@ -183,7 +183,7 @@ def main(arguments=None):
     try:
         table = failures(measure(options))
     except InputError as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     write_text(options.output / "failures.csv", table.to_csv(index=False))
     print(table.round(2).to_string(index=False))
     print(table[["runs", "steps", "over", "wrong", "unflagged"]].sum().to_string())

@@ -22,7 +22,7 @@ import numpy as np
 import tensorflow as tf
 from keras import ops
 
-from thesis_repro import InputError, cityscapes, files, longrun, stages
+from thesis_repro import InputError, cityscapes, console, files, results
 from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.world import dataset as world
@@ -207,17 +207,17 @@ def train(camvid, kitti_semantic, folder, common=COMMON, last=LAST, steps=EPOCH)
     model.compile(optimizer, training.fused_loss(weighted_loss(class_weights(all_sources))))
     optimizer.build(model.trainable_variables)
     made_from = {
-        "code": stages.code("segmentation/unet"),
-        "tool": stages.content(Path(__file__)),
+        "code": results.code("segmentation/unet"),
+        "tool": results.content(Path(__file__)),
         "phases": [common, last],
         "steps": steps,
-        "images": stages.listing([pair.image for pair in pairs]),
+        "images": results.listing([pair.image for pair in pairs]),
     }
 
     def fit(name, sources, phase, rate):
         batches = Views(sources, phase, steps)
         resumable = training.ResumableTraining(
-            stages.stage(folder / name, **made_from), model, batches
+            results.stage(folder / name, **made_from), model, batches
         )
         model.fit(
             batches.dataset(),
@@ -319,7 +319,7 @@ def main(arguments=None):
             ),
         )
     except InputError as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     print(f"written: {file}, and its card beside it")
     return 0
 

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from thesis_repro import InputError, cityscapes, files, kitti, longrun, stages
+from thesis_repro import InputError, cityscapes, console, files, kitti, results
 from thesis_repro.report.trainings import TABLE
 from thesis_repro.segmentation import domain_gap, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
@@ -52,7 +52,7 @@ def train(settings, seed):
         keras.optimizers.Adam(sizes.learning_rate), training.fused_loss(training.total_loss())
     )
     model.optimizer.build(model.trainable_variables)
-    folder = stages.stage(
+    folder = results.stage(
         settings.build / f"trainings/model_{seed}",
         **training.made_from(model, batches, validation),
     )
@@ -163,6 +163,7 @@ def main():
     sequences = [kitti.Sequence(settings.kitti, name) for name in names]
     trained = [label_maps(settings, sequences, seed) for seed in SEEDS]
     runs = run(settings, names, [source for source, _ in trained])
+    files.write_text(settings.build / "trainings/runs.csv", runs.to_csv(index=False))
     comparison = compare.comparisons(runs)
     table = pd.DataFrame(
         row for source, facts in trained for row in rows(runs, comparison, source, facts)
@@ -175,4 +176,4 @@ if __name__ == "__main__":
     try:
         main()
     except (InputError, OSError) as error:
-        sys.exit(longrun.report_error(error))
+        sys.exit(console.report_error(error))

@@ -34,15 +34,6 @@ def test_rmse_and_mae_by_hand():
     assert metrics.percent_change(3.0, 4.0) == pytest.approx(-25.0)
 
 
-def test_pose_alignment_removes_the_rotation_of_the_first_pose():
-    true = ahead(3)
-    turn = np.array([[0, 0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    estimated = turn @ true
-    # (1, 0, 0) for (0, 0, 1) on one of two
-    assert metrics.rmse(estimated, true, "position") == pytest.approx(1.0)
-    assert metrics.rmse(estimated, true, "pose") == pytest.approx(0.0, abs=1e-12)
-
-
 def test_paths_of_different_or_no_length_are_refused():
     for estimated, true in ((ahead(3), ahead(2)), (ahead(1), ahead(1))):
         with pytest.raises(InputError):

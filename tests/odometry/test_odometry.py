@@ -11,7 +11,7 @@ from street import Street, Stripes
 from thesis_repro import InputError, odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import MaskFolder
-from thesis_repro.odometry import PYSLAM_2024, THESIS, Odometry, keypoints, metrics, pose
+from thesis_repro.odometry import THESIS, Odometry, keypoints, metrics, pose
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {
@@ -57,15 +57,6 @@ def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, sequence, erro
             metrics.mae(result.poses, kitti.poses),
         ) == pytest.approx(errors[run], abs=5e-7)
         assert result.flagged.empty
-
-
-@pytest.mark.real
-def test_agrees_with_the_later_pyslam(kitti_real):
-    kitti = Sequence(kitti_real, "06")
-    result = odometry.run(kitti, PYSLAM_2024)
-    assert metrics.rmse(result.poses, kitti.poses, PYSLAM_2024.alignment) == pytest.approx(
-        0.267954, abs=5e-7
-    )
 
 
 @pytest.fixture(scope="module")
@@ -370,28 +361,11 @@ def test_inliers_of_shuffled_points_are_in_their_order(drive):
     np.testing.assert_array_equal(step.inliers, distances < THESIS.threshold)
 
 
-@pytest.mark.parametrize(
-    "choice",
-    [{"essential_method": "usac"}, {"essential_method": "usac-magsac"}, {"detector": "orb"}],
-)
-def test_other_estimators_and_detectors_follow_the_drive(drive, choice):
+def test_another_detector_follows_the_drive(drive):
     few = Changed(drive, frames=5)
-    result = odometry.run(few, replace(THESIS, **choice))
+    result = odometry.run(few, replace(THESIS, detector="orb"))
     assert metrics.rmse(result.poses, few.poses) < 0.1
     assert np.abs(result.poses - odometry.run(few).poses).max() > 1e-9
-
-
-def test_the_later_pyslam_rotates_first_and_checks_the_shift_of_points(drive):
-    few = Changed(drive, frames=4)
-    assert odometry.run(few, PYSLAM_2024).frames["updated"][1:].all()
-    gated = odometry.run(few, replace(PYSLAM_2024, shift_gate=50.0)).frames
-    assert (gated["flag"][1:] == "stationary").all()
-    start = Changed(drive, frames=2)
-    late, early = odometry.run(start, replace(THESIS, rotate_first=True)), odometry.run(start)
-    expected = early.poses[0][:3, 3] + early.frames["scale"][1] * (
-        late.poses[1][:3, :3] @ (early.poses[1][:3, 3] / early.frames["scale"][1])
-    )
-    np.testing.assert_allclose(late.poses[1][:3, 3], expected, atol=1e-12)
 
 
 # Many runs in one pass
@@ -488,7 +462,7 @@ def test_an_exception_in_a_thread_stops_the_pass(drive, monkeypatch):
     "setting, value",
     [
         ("estimator", "best"),
-        ("essential_method", "lmeds"),
+        ("detector", "fast"),
         ("max_keypoints", -1),
         ("threshold", 0.0),
     ],

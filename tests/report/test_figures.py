@@ -9,8 +9,7 @@ from drawn import problems
 from matplotlib.text import Text
 
 from thesis_repro.cityscapes import ID, LABELS
-from thesis_repro.report import chapter2, frames, style, trajectories
-from thesis_repro.study import flicker
+from thesis_repro.report import chapter2, flicker, frames, style, trajectories
 
 
 def texts(figure):

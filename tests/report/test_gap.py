@@ -4,7 +4,7 @@ import pandas as pd
 
 from thesis_repro.report import gap, style
 
-OWN, SHIPPED, EXACT = "the model of this run", "the model in the package", "exact label maps"
+OWN, SHIPPED = "the model of this run", "the model in the package"
 VALIDATION, STREETS = "validation images", "KITTI's street scenes"
 
 
@@ -19,7 +19,7 @@ class Gap:
             (SHIPPED, STREETS, 7, 2, 0.4, 0.7),
         ],
         columns=["model", "domain", "images", "classes", "mean_iou", "sky_recall"],
-    ).assign(accuracy=0.7, dark=0.1, dark_wrong=0.4, lit_wrong=0.2)
+    ).assign(accuracy=0.7)
     classes = pd.DataFrame(
         [
             {
@@ -34,17 +34,15 @@ class Gap:
             for name, number, iou in (("road", 7, 0.8), ("sky", 23, 0.7))[: row.classes]
         ]
     )
-    flicker = pd.Series({OWN: 0.05, SHIPPED: 0.03, EXACT: 0.01})
 
 
-def test_the_table_and_the_figure_show_each_model_and_domain():
+def test_the_table_shows_each_model_and_domain():
     table = gap.table(Gap).set_index("measure")
     assert list(table) == [
         f"{OWN}: {VALIDATION}",
         f"{OWN}: {STREETS}",
         f"{SHIPPED}: {VALIDATION}",
         f"{SHIPPED}: {STREETS}",
-        EXACT,
     ]
     scores = table[f"{OWN}: {VALIDATION}"]
     assert scores[["images", "classes present", "mean IoU over these", "IoU: sky"]].tolist() == [
@@ -53,17 +51,8 @@ def test_the_table_and_the_figure_show_each_model_and_domain():
         0.6,
         0.7,
     ]
-    assert scores["dark ground taken for something else (%)"] == 40
     assert pd.isna(table.loc["IoU: sky", f"{OWN}: {STREETS}"])
-    assert table.loc["pixels that flicker (%)"].dropna().tolist() == [5, 3, 1]
     assert table.index.is_unique
-    figure = gap.figure(Gap)
-    assert [axes.get_title() for axes in figure.axes] == [OWN, SHIPPED]
-    assert sorted(bar.get_height() for bar in figure.axes[0].patches if bar.get_height() > 0) == [
-        0.7,
-        0.8,
-        0.8,
-    ]
 
 
 def test_the_quality_of_label_maps_is_recorded(tmp_path):

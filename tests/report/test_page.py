@@ -198,7 +198,7 @@ def test_missing_artefacts_are_listed_unless_their_data_were_not_given(run, tmp_
         "table_3_2.csv",
         "figure_3_05.svg",
         "findings.md",
-        "domain_gap.svg",
+        "domain_gap.csv",
     ):
         (run.settings.figures / name).unlink()
     shown = read(run)
@@ -220,6 +220,14 @@ def test_missing_artefacts_are_listed_unless_their_data_were_not_given(run, tmp_
     assert "KITTI_SEMANTIC=/path" not in page.build(
         replace(on_real_frames, kitti_semantic=tmp_path)
     )
+
+
+def test_each_artefact_is_written_by_the_notebooks_that_are_named():
+    written = {name for names in captions.MADE_BY.values() for name in names}
+    assert written == {artefact["name"] for artefact in ARTEFACTS}
+    for notebook, names in captions.MADE_BY.items():
+        code = (ROOT / "notebooks" / f"{notebook}.ipynb").read_text()
+        assert [name for name in names if f'\\"{name}' not in code] == []
 
 
 def test_links_are_relative_and_exist_and_no_folder_of_the_machine_is_named(run):

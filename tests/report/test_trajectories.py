@@ -12,9 +12,9 @@ from paths import winding
 
 from thesis_repro import InputError
 from thesis_repro.cli import main
-from thesis_repro.kitti import write_kitti_poses, write_tum
 from thesis_repro.odometry import metrics
 from thesis_repro.report import trajectories
+from thesis_repro.trajectories import write_kitti_poses, write_tum
 
 EVO = {
     "none": [],

@@ -7,7 +7,7 @@ import keras
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, cityscapes, files, stages
+from thesis_repro import InputError, cityscapes, files, results
 from thesis_repro.segmentation import prediction, training
 from thesis_repro.segmentation.unet import build_unet
 
@@ -124,7 +124,7 @@ def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(
         assert contents(folder) == contents(tmp_path / "alone" / folder.name) and len(
             contents(folder)
         ) == len(paths)
-    assert stages.record(sequences[0][1]) == stages.record(tmp_path / "alone" / "00")
+    assert results.record(sequences[0][1]) == results.record(tmp_path / "alone" / "00")
 
     removed = sequences[0][1] / frames[3].name
     removed.unlink()

@@ -13,10 +13,11 @@ import pandas as pd
 import pytest
 from waiting import wait_for
 
-from thesis_repro import InputError, longrun
+from thesis_repro import InputError, console, files
 from thesis_repro.kitti import Sequence
-from thesis_repro.study import cluster, runner
+from thesis_repro.study import runner
 from thesis_repro.study.jobs import first_jobs
+from thesis_repro.study.workers import open_pool
 
 pytestmark = pytest.mark.slow
 
@@ -168,11 +169,11 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
 
 
 def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT", 1)
+    monkeypatch.setattr("thesis_repro.study.workers.TIMEOUT", 1)
     # without workers, none, no address
     for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
         with pytest.raises(InputError, match=address) as error:
-            with cluster.open_pool(1, address):
+            with open_pool(1, address):
                 pass
         assert "\n" not in str(error.value)
 
@@ -182,7 +183,7 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(
 ):
     jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
     runner.run(jobs, kitti, small_labels, tmp_path)
-    record = runner.stages.record(tmp_path / "00")
+    record = runner.results.record(tmp_path / "00")
     inputs = Sequence(kitti, "00"), runner.by_name(small_labels)
     elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record, 1)
     (tmp_path / "00" / "baseline-0.csv").unlink()
@@ -216,7 +217,7 @@ def test_label_maps_of_workers_have_the_bits_of_one_process(
         return {
             path.relative_to(folder): path.read_bytes()
             for path in folder.rglob("*.*")
-            if path.name not in (longrun.LOG, longrun.LIST)
+            if path.name not in (console.LOG, files.LIST)
         }
 
     assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)

@@ -6,25 +6,27 @@ import pytest
 
 from thesis_repro.cli import main
 from thesis_repro.settings import PROFILES
-from thesis_repro.study import plan, runner, series
+from thesis_repro.study import plan, runner
 from thesis_repro.study.sources import Source
+from thesis_repro.study.study import Study
 
 pytestmark = pytest.mark.slow
 
 
-def test_the_plan_includes_every_notebook(small_world, monkeypatch):
+def test_the_plan_includes_every_notebook(small_world, monkeypatch, tmp_path):
     # thesis runs, refined runs, and 11 controls with two estimators
     first = 16 * 5 + 2 * 5 + 11 * 2 * 5
     runs = first + 5 * 5
-    monkeypatch.setattr(plan, "_seconds_a_frame", lambda run: 0.1)
+    monkeypatch.setattr(plan, "_seconds", lambda run: (0, 0.1))
     monkeypatch.setattr(plan, "cores", lambda: 2)
-    planned = plan.of_thesis(small_world / "kitti", PROFILES["thesis"])
+    passes = 4  # of each of the two sequences, for two cores
+    planned = plan.of_thesis(small_world / "kitti", PROFILES["thesis"], tmp_path)
     seconds = {name: seconds for name, _, _, seconds in planned["steps"]}
     assert seconds == pytest.approx(
         {
             "05: label maps": 2.4,
             "07: one sequence": 12 * plan.RUNS_IN_07 * 0.1,
-            "08: odometry": 24 * runs / first * 0.1,
+            "08: odometry": 24 * runs / first * 0.1 * passes,
             "08: timing of every width": 24 * 16 * 0.1,
             "09: ablations": 2.4,
         }
@@ -33,14 +35,13 @@ def test_the_plan_includes_every_notebook(small_world, monkeypatch):
 
 
 def test_a_study_takes_about_as_long_as_planned(small_world, small_labels, tmp_path):
-    study = series.Study(
-        small_world / "kitti", ("00",), (Source(small_labels, name="net"),), (5, 10)
-    )
-    planned = plan.of_study(study)
+    study = Study(small_world / "kitti", ("00",), (Source(small_labels, name="net"),), (5, 10))
+    planned = plan.of_study(study, tmp_path)
     assert planned["steps"][0][1:3] == (3, "runs")
     started = time.process_time()
-    runner.run(study.first_jobs(), study.kitti, study.sources, tmp_path)
+    runner.run(study.first_jobs(), study.kitti, study.sources, tmp_path / "runs")
     assert 1 / 3 < planned["seconds"] / (time.process_time() - started) < 3
+    assert plan.of_study(study, tmp_path)["steps"][0][1:] == (0, "runs", 0)  # all is done
 
 
 def test_the_command_prints_a_table(small_world, small_labels, tiny_kitti, tmp_path, capsys):

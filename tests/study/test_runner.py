@@ -120,7 +120,7 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
         jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5
     )
     assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
-    printed = capsys.readouterr().out
+    printed = capsys.readouterr().err
     assert (
         f"sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: {broken}: "
         in printed

@@ -14,14 +14,14 @@ from trials import thesis
 TRAINING = f"""
 import sys
 sys.path.insert(0, {str(Path(__file__).parents[1] / "segmentation")!r})
-from thesis_repro import longrun, stages
+from thesis_repro import 
 from thesis_repro.segmentation import training
 import test_training
 try:
-    folder = stages.stage(sys.argv[1], **training.made_from(*test_training.prepared()))
+    folder = results.stage(sys.argv[1], **training.made_from(*test_training.prepared()))
     test_training.train(folder, 3, pause=0.1)
 except Exception as error:
-    sys.exit(longrun.report_error(error))
+    sys.exit(console.report_error(error))
 """
 
 
@@ -31,7 +31,7 @@ def words(small_world, small_labels, small_model):
     which output it is.
     """
     kitti = small_world / "kitti"
-    options = {".txt": "--output", ".png": "--plot", ".mp4": "--video"}
+    options = {".txt": "--output", ".png": "--plot", ".webm": "--video"}
 
     def command(name, output="out"):
         if name.startswith("odometry"):
@@ -41,8 +41,8 @@ def words(small_world, small_labels, small_model):
                 kitti,
                 "--sequence",
                 "00",
-                options[name[-4:]],
-                f"{output}{name[-4:]}",
+                options[Path(name).suffix],
+                f"{output}{Path(name).suffix}",
             )
         return {
             "synthesize": thesis("synthesize", output, "--profile", "smoke"),

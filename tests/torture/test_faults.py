@@ -42,7 +42,7 @@ def disk(tmp_path):
     "name, kilobytes",
     [
         ("odometry.txt", 0),
-        long("odometry.mp4", 0),
+        long("odometry.webm", 0),
         long("synthesize", 300),
         long("training", 40),
         long("predict", 24),

@@ -51,7 +51,7 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
             "--plot",
             out / "%d.svg",
             "--video",
-            out / "%03d é.mp4",
+            out / "%03d é.webm",
         ],
         ["masks", *where, "--labels", labels, "--dilation", 3, "--output", out / "masks\n&"],
         [
@@ -101,7 +101,7 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
         "p'$_$.txt",
         "%s\n.tum",
         "%d.svg",
-        "%03d é.mp4",
+        "%03d é.webm",
         "masks\n&",
         "q<script>.txt",
         "$_$.png",

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from thesis_repro import longrun
+from thesis_repro import console, files
 from thesis_repro.segmentation import ARITHMETIC
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,7 +102,7 @@ def snapshot(where):
     ):
         with suppress(FileNotFoundError):
             status = path.lstat()
-            if path.name != longrun.LOG:
+            if path.name != console.LOG:
                 versions[path.relative_to(where)] = (
                     None if path.is_dir() else (status.st_size, status.st_mtime_ns)
                 )
@@ -139,7 +139,7 @@ def contents(folder):
     return {
         str(path.relative_to(folder)): sha256(_content(path)).hexdigest()
         for path in Path(folder).rglob("*")
-        if path.is_file() and path.name not in (longrun.LOG, longrun.LIST)
+        if path.is_file() and path.name not in (console.LOG, files.LIST)
     }
 
 
@@ -164,4 +164,4 @@ def resumes(words, name, where, output="out"):
 
 
 def no_temporary_files(where):
-    assert [str(path) for path in snapshot(where) if longrun.TEMPORARY.fullmatch(path.name)] == []
+    assert [str(path) for path in snapshot(where) if files.TEMPORARY.fullmatch(path.name)] == []

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, cityscapes, kitti, longrun
+from thesis_repro import InputError, cityscapes, files, kitti
 from thesis_repro.cityscapes import ID
 from thesis_repro.world import dataset, drives, raster, street, textures
 from thesis_repro.world.things import Faces
@@ -36,7 +36,7 @@ def contents(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != longrun.LIST
+        if path.is_file() and path.name != files.LIST
     }  # the list's order depends on the run
 
 

@@ -36,11 +36,9 @@ previous motion, with this step's length|
 
 from thesis_repro.odometry.odometry import Odometry, Step
 from thesis_repro.odometry.passes import Result, run, run_many, scales, start_pose
-from thesis_repro.odometry.settings import PRESETS, PYSLAM_2024, THESIS, OdometrySettings
+from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 __all__ = [
-    "PRESETS",
-    "PYSLAM_2024",
     "THESIS",
     "Odometry",
     "OdometrySettings",

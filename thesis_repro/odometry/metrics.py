@@ -16,19 +16,18 @@ from scipy.spatial.transform import Rotation
 from thesis_repro import InputError
 
 
-def rmse(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
+def rmse(estimated: np.ndarray, true: np.ndarray) -> float:
     """Root mean square error (Equation 3.5), metres, over frames 1 to n-1 of two paths, (n, 4, 4)
     each.
 
-    alignment: "position" shifts the estimate so that the positions of frame 1 agree, as in PySLAM
-    of 2021. "pose" also rotates it so that the rotations of frame 1 agree, as in later versions.
+    The estimate is shifted so that the positions of frame 1 agree, as in PySLAM of 2021.
     """
-    return float(np.sqrt((_differences(estimated, true, alignment) ** 2).sum(axis=1).mean()))
+    return float(np.sqrt((_differences(estimated, true) ** 2).sum(axis=1).mean()))
 
 
-def mae(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> float:
+def mae(estimated: np.ndarray, true: np.ndarray) -> float:
     """Mean absolute error (Equation 3.6), metres, over x, y, z and frames. Aligned as in `rmse`."""
-    return float(np.abs(_differences(estimated, true, alignment)).mean())
+    return float(np.abs(_differences(estimated, true)).mean())
 
 
 def percent_change(value: Any, benchmark: Any) -> Any:
@@ -38,22 +37,18 @@ def percent_change(value: Any, benchmark: Any) -> Any:
     return (value - benchmark) / benchmark * 100
 
 
-def shifted(estimated: np.ndarray, true: np.ndarray, alignment: str = "position") -> np.ndarray:
-    """Estimated path (n, 4, 4), aligned with the true path at frame 1 as in `rmse`."""
+def shifted(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Estimated path (n, 4, 4), shifted as in `rmse`."""
     estimated, true = checked(estimated, true)
     motion = np.eye(4)
-    if alignment == "pose":
-        motion[:3, :3] = true[1, :3, :3] @ estimated[1, :3, :3].T
-    motion[:3, 3] = true[1, :3, 3] - motion[:3, :3] @ estimated[1, :3, 3]
+    motion[:3, 3] = true[1, :3, 3] - estimated[1, :3, 3]
     return motion @ estimated
 
 
-def _differences(estimated, true, alignment):
+def _differences(estimated, true):
     """Position differences of the aligned paths (see `rmse`) from frame 1 on, (n - 1, 3)."""
     estimated, true = checked(estimated, true)
     positions = estimated[1:, :3, 3] - estimated[1, :3, 3]
-    if alignment == "pose":
-        positions = positions @ (true[1, :3, :3] @ estimated[1, :3, :3].T).T
     return positions - (true[1:, :3, 3] - true[1, :3, 3])
 
 
@@ -196,17 +191,15 @@ def relative_errors(
     }
 
 
-def errors(
-    estimated: np.ndarray, true: np.ndarray, alignment: str = "position"
-) -> dict[str, float]:
-    """Errors of one run: rmse and mae (metres; alignment as in `rmse`), se3 (RMSE in metres after
+def errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Errors of one run: rmse and mae (metres), se3 (RMSE in metres after
     the best rotation and shift), and the two errors of `relative_errors`. NaN if the path is too
     short or too straight.
     """
     relative = relative_errors(estimated, true)
     return {
-        "rmse": rmse(estimated, true, alignment),
-        "mae": mae(estimated, true, alignment),
+        "rmse": rmse(estimated, true),
+        "mae": mae(estimated, true),
         "se3": ate(estimated, true, "se3")["rmse"],
         **{name: relative[name] for name in ("translation_percent", "rotation_deg_per_100m")},
     }

@@ -41,7 +41,7 @@ class Step:
     updated: bool = False  # whether this step moved the pose
     flags: list[str] = field(default_factory=list)
     # previous and current, if a fallback is possible
-    frames: tuple[np.ndarray, np.ndarray] | None = None
+    images: tuple[np.ndarray, np.ndarray] | None = None
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
@@ -129,7 +129,7 @@ class Odometry:
             self.gap = step.scale
             return step
         if self.settings.fallback and mask is not None and self.previous is not None:
-            step.frames = self.previous, frame
+            step.images = self.previous, frame
         started, self.gap = time.perf_counter(), 0.0
         tracked = keypoints.NO_POINTS
         if self.previous is not None and len(self.points):
@@ -194,19 +194,15 @@ class Odometry:
         odometry/__init__.py).
         """
         settings = self.settings
-        if step.frames is not None and step.scale > settings.scale_gate and self._in_doubt(step):
+        if step.images is not None and step.scale > settings.scale_gate and self._in_doubt(step):
             self._use_all_keypoints(step)
-        step.frames, motion = None, step.motion
+        step.images, motion = None, step.motion
         if step.points:
             if motion.rotation is None:
                 step.flags.append(motion.problem)
             elif _by_chance(motion.inliers):
                 step.flags.append("no agreement")
-            elif (
-                step.scale <= settings.scale_gate
-                or settings.shift_gate
-                and _mean_shift(step) < settings.shift_gate
-            ):
+            elif step.scale <= settings.scale_gate:
                 step.flags.append("stationary")
             else:
                 if settings.estimator == "refined":
@@ -238,7 +234,7 @@ class Odometry:
         return not is_consistent(motion, step.scale, self.prior)
 
     def _use_all_keypoints(self, step):
-        previous_frame, frame = step.frames
+        previous_frame, frame = step.images
         points = keypoints.detect(previous_frame, self.settings)
         if len(points):
             current, was_tracked = keypoints.track(
@@ -270,8 +266,7 @@ class Odometry:
     def _moved(self, motion, scale):
         moved, rotation = np.eye(4), self.pose[:3, :3]
         moved[:3, :3] = rotation @ motion.rotation
-        heading = moved[:3, :3] if self.settings.rotate_first else rotation
-        moved[:3, 3] = self.pose[:3, 3] + scale * (heading @ motion.translation)
+        moved[:3, 3] = self.pose[:3, 3] + scale * (rotation @ motion.translation)
         return moved
 
     def _check(self, frame, scale, mask):
@@ -323,7 +318,7 @@ def _essential(step, settings, intrinsics):
     current, previous = (
         pose.normalise(points, intrinsics)[order] for points in (step.current, step.previous)
     )
-    result = pose.essential_matrix(current, previous, settings.threshold, settings.essential_method)
+    result = pose.essential_matrix(current, previous, settings.threshold)
     return Essential(current, previous, order, *result, time.perf_counter() - started)
 
 
@@ -341,13 +336,10 @@ MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
 def _implausible(step):
     """Flags of a motion that a car cannot make. The pose is moved nevertheless."""
     turn = np.degrees(np.arccos(np.clip((np.trace(step.motion.rotation) - 1) / 2, -1, 1)))
-    return ["still picture"] * bool(_mean_shift(step) < MAX_NOISE_SHIFT) + [
-        "too large a turn"
-    ] * bool(turn > MAX_TURN)
-
-
-def _mean_shift(step):
-    return np.linalg.norm(step.current - step.previous, axis=1).mean()
+    shift = np.linalg.norm(step.current - step.previous, axis=1).mean()
+    return ["still picture"] * bool(shift < MAX_NOISE_SHIFT) + ["too large a turn"] * bool(
+        turn > MAX_TURN
+    )
 
 
 @lru_cache

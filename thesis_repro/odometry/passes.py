@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, results
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
@@ -37,7 +37,7 @@ KEYPOINT_SETTINGS = (
     "redetect_below",
     "fallback",
 )
-ESSENTIAL_SETTINGS = ("essential_method", "threshold", "shuffle_seed")
+ESSENTIAL_SETTINGS = ("threshold", "shuffle_seed")
 SHARED_TIMES = ("detect_seconds", "track_seconds")  # measured for all runs of a pass together
 DTYPES = {
     "frame": int,
@@ -286,7 +286,7 @@ def _store(
     if last.previous is not None:
         arrays["previous"] = last.previous
     flags = {name: member.flags for name, member in members.items()}
-    stages.store(checkpoint, {"job": job, "done": done, "gap": last.gap, "flags": flags}, arrays)
+    results.store(checkpoint, {"job": job, "done": done, "gap": last.gap, "flags": flags}, arrays)
 
 
 def _resume(
@@ -296,7 +296,7 @@ def _resume(
     frames, 0 without one.
     """
     try:
-        stored = stages.resume(checkpoint) if checkpoint else None
+        stored = results.resume(checkpoint) if checkpoint else None
     except InputError:  # a damaged file: start from the first frame
         stored = None
     if stored is None or stored[0].get("job") != job:

@@ -20,8 +20,6 @@ MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farthe
 LIMIT_MARGIN = 1e-7
 MIN_CORRESPONDENCES = 5
 
-ESSENTIAL_METHODS = {"ransac": cv2.RANSAC, "usac": cv2.USAC_DEFAULT, "usac-magsac": cv2.USAC_MAGSAC}
-
 
 @dataclass(frozen=True)
 class Motion:
@@ -49,7 +47,7 @@ def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def essential_matrix(
-    current: np.ndarray, previous: np.ndarray, threshold: float, method: str = "ransac"
+    current: np.ndarray, previous: np.ndarray, threshold: float
 ) -> tuple[np.ndarray | None, np.ndarray, str]:
     """Essential matrix of normalised correspondences (N, 2). Returns (matrix, inliers, problem).
 
@@ -59,23 +57,7 @@ def essential_matrix(
     no_inliers = np.zeros(len(current), bool)
     if len(current) < MIN_CORRESPONDENCES:
         return None, no_inliers, "fewer than five correspondences"
-    try:
-        if method == "ransac":
-            matrix, inliers = ransac.find_essential_matrix(
-                current, previous, threshold, PROBABILITY
-            )
-        else:
-            matrix, inliers = cv2.findEssentialMat(
-                current,
-                previous,
-                focal=1.0,
-                pp=(0.0, 0.0),
-                method=ESSENTIAL_METHODS[method],
-                prob=PROBABILITY,
-                threshold=threshold,
-            )
-    except cv2.error:  # the USAC estimators raise on degenerate points
-        matrix = None
+    matrix, inliers = ransac.find_essential_matrix(current, previous, threshold, PROBABILITY)
     if matrix is None or inliers is None or not np.isfinite(matrix).all():
         return None, no_inliers, "no essential matrix"
     if matrix.shape != (3, 3):

@@ -1,17 +1,14 @@
-"""Settings of the odometry: the thesis's, a later PySLAM's, and alternatives."""
+"""Settings of the odometry: the thesis's and alternatives."""
 
 import math
 from dataclasses import dataclass
 
 from thesis_repro import InputError
-from thesis_repro.odometry import pose
 
 CHOICES = {
     "detector": ("shi-tomasi", "orb"),
     "mask_mode": ("detect", "filter"),
-    "essential_method": tuple(pose.ESSENTIAL_METHODS),
     "estimator": ("thesis", "inliers", "refined"),
-    "alignment": ("position", "pose"),
 }
 
 
@@ -29,9 +26,8 @@ class OdometrySettings:
     "filter" drops keypoints outside the mask.
     redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all
     of them.
-    essential_method: how the essential matrix is estimated: "ransac", or OpenCV's "usac" or
-    "usac-magsac".
-    threshold: largest distance of an inlier in this estimation, in normalised image coordinates.
+    threshold: largest distance of an inlier of the essential matrix, in normalised image
+    coordinates.
     shuffle_seed: seed with which the matched points are shuffled before RANSAC; None: not shuffled.
     RANSAC's own seed is fixed.
     estimator: how the motion follows from the essential matrix, which allows four motions.
@@ -43,9 +39,6 @@ class OdometrySettings:
     motion, or if the motion differs too much from the previous step's (refined.motion_prior).
     Without masks it does nothing.
     scale_gate: metres; a shorter step does not move the pose.
-    shift_gate: pixels; a step with a smaller mean shift of its points does not move the pose.
-    rotate_first: rotate the pose before moving it.
-    alignment: how RMSE and MAE align the estimate with the ground truth, see metrics.rmse.
     """
 
     detector: str = "shi-tomasi"
@@ -57,15 +50,11 @@ class OdometrySettings:
     block_size: int = 5
     window: int = 21
     levels: int = 3
-    essential_method: str = "ransac"
     threshold: float = 0.0003
     shuffle_seed: int | None = None
     estimator: str = "thesis"
     fallback: bool = False
     scale_gate: float = 0.1
-    shift_gate: float = 0.0
-    rotate_first: bool = False
-    alignment: str = "position"
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
@@ -84,7 +73,6 @@ class OdometrySettings:
             ("levels", 0, 10),
             ("shuffle_seed", 0, 2**32 - 1),
             ("scale_gate", 0, math.inf),
-            ("shift_gate", 0, math.inf),
         ):
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -98,7 +86,3 @@ class OdometrySettings:
 
 
 THESIS = OdometrySettings()
-PYSLAM_2024 = OdometrySettings(
-    threshold=0.0004, rotate_first=True, shift_gate=1.5, scale_gate=0.015, alignment="pose"
-)
-PRESETS = {"2021": THESIS, "2024": PYSLAM_2024}

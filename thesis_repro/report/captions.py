@@ -18,7 +18,7 @@ _CAPTIONS = json.loads((_HERE / "captions.json").read_text(encoding="utf-8"))
 CHAPTERS = _CAPTIONS["chapters"]
 ADDED = _CAPTIONS["added"]  # artefacts that are not in the thesis
 OF_STUDIES = _CAPTIONS["of_studies"]  # artefacts that only a study has
-OF_EVIDENCE = _CAPTIONS["of_evidence"]  # the artefact that only the evidence on real frames has
+MADE_BY = _CAPTIONS["made_by"]  # {notebook: names of the artefacts that it writes}
 CONSTANT = [
     artefact["name"]
     for artefacts in CHAPTERS.values()

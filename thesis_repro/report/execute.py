@@ -17,7 +17,7 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import ExecutePreprocessor
 from traitlets import Unicode
 
-from thesis_repro import longrun
+from thesis_repro import console, results
 from thesis_repro.settings import PREFIX
 
 
@@ -40,19 +40,19 @@ class Execution(ExecutePreprocessor):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
             with (
-                longrun.locked(path),
-                longrun.logged(path.parent, f"make figures, {name}", has_results=True),
+                results.locked(path),
+                console.logged(path.parent, f"make figures, {name}", has_results=True),
                 open(path, "w", encoding="utf-8") as self._log,
             ):
-                longrun.say(name)
+                console.log.info(name)
                 try:
                     executed = super().preprocess(nb, resources, km)
-                    longrun.say(f"{name}: done in {time.monotonic() - started:.0f} s")
+                    console.log.info(f"{name}: done in {time.monotonic() - started:.0f} s")
                     return executed
                 except Exception as error:
                     self._log.write(strip_ansi(traceback.format_exc()))
                     failure = f"{name} failed: {_reason(error)}"
-                    longrun.note(failure)
+                    console.log.error(failure)
         except KeyboardInterrupt:
             logging.getLogger("asyncio").disabled = True  # would report the interrupted cell
             print(f"{name} was interrupted; the same command resumes it", file=sys.stderr)
@@ -70,7 +70,7 @@ class Execution(ExecutePreprocessor):
 
 
 def _print_error(kind, error, _traceback):
-    print(longrun.explain(error) or f"{kind.__name__}: {error}", file=sys.stderr)
+    print(console.explain(error) or f"{kind.__name__}: {error}", file=sys.stderr)
 
 
 def _reason(error):
@@ -80,4 +80,4 @@ def _reason(error):
     name, text = type(error).__name__, str(error)
     if isinstance(error, CellExecutionError):
         name, text = error.ename, error.evalue
-    return f"{name}: {text}".splitlines()[0] + longrun.remedy(text)
+    return f"{name}: {text}".splitlines()[0] + console.remedy(text)

@@ -6,10 +6,8 @@ network or server.
 
 import importlib.metadata
 import itertools
-import json
 import os
 import platform
-import re
 import subprocess
 import sys
 from contextlib import suppress
@@ -17,7 +15,7 @@ from datetime import UTC, datetime
 
 from markupsafe import Markup
 
-from thesis_repro import longrun
+from thesis_repro import console, results
 from thesis_repro.files import listed, write_text
 from thesis_repro.report import captions, tables, texts, trainings
 from thesis_repro.settings import ROOT, read_settings
@@ -36,15 +34,15 @@ def update(settings):
 
     Deletes temporary files of killed runs. Raises InputError if another run uses the folder.
     """
-    with longrun.claimed(settings.build / "notebooks"):
-        longrun.sweep(settings.build)
+    with results.claimed(settings.build / "notebooks"):
+        results.sweep(settings.build)
         # copied from the default run if their notebooks were not executed
         for name in captions.CONSTANT:
             for path in (ROOT / "figures").glob(f"{name}.*"):
                 if not (settings.figures / path.name).exists():
                     write_text(settings.figures / path.name, path.read_text(encoding="utf-8"))
         if settings.figures.is_dir():
-            longrun.sweep(settings.figures)
+            results.sweep(settings.figures)
         page = settings.figures / PAGE
         for path in _executed(settings):
             html = path.with_suffix(".html")
@@ -80,12 +78,9 @@ def notebook_html(path, page):
 
 def build(settings):
     """Return the page of a run as HTML, made from the files in its folders."""
-    makers, numbers = _makers(), tables.beside_the_thesis(settings)
+    numbers = tables.beside_the_thesis(settings)
     chapters = {
-        title: [
-            _describe(settings.figures, artefact, makers, settings, numbers)
-            for artefact in artefacts
-        ]
+        title: [_describe(settings.figures, artefact, settings, numbers) for artefact in artefacts]
         for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()
     }
     executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
@@ -126,7 +121,7 @@ def build_study(folder, names, **facts):
         base, _, sequence = name.partition("-")
         if (kind, base) == (artefact["kind"], artefact["name"]):
             title = f"{artefact['title']} {sequence}".strip()
-            artefacts.append(_describe(folder, artefact | {"name": name, "title": title}, {}))
+            artefacts.append(_describe(folder, artefact | {"name": name, "title": title}))
     return texts.render(
         "study.html.j2",
         title="A study of masks",
@@ -137,7 +132,7 @@ def build_study(folder, names, **facts):
     )
 
 
-def _describe(folder, artefact, makers, settings=None, numbers=None):
+def _describe(folder, artefact, settings=None, numbers=None):
     """Return the values that the template needs to show a table, figure or text, or to report
     it as missing.
     """
@@ -169,7 +164,7 @@ def _describe(folder, artefact, makers, settings=None, numbers=None):
     given = (
         not needs
         or not settings
-        or not settings.shipped
+        or not settings.uses_shipped_model
         or (needs == "KITTI_SEMANTIC" and settings.kitti_semantic)
     )
     identity = name if number or kind == "text" else f"{kind}-{name}"
@@ -181,24 +176,13 @@ def _describe(folder, artefact, makers, settings=None, numbers=None):
         "details": details,
         "rows": rows,
         "files": [path.name for path in files],
-        "makers": makers.get(name, []),
+        "makers": [
+            notebook for notebook, names in captions.MADE_BY.items() if settings and name in names
+        ],
         "thesis": thesis,
         "opens": there and identity in OPENING,
         "left_out": needs if not given and not there else None,
     }
-
-
-def _makers():
-    """Return {name: [notebooks]}, the notebooks whose code contains the name of a table or
-    figure.
-    """
-    makers = {}
-    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-        code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-        for name in sorted(set(re.findall(r'"(\w+)(?:\.\w+)?"', code))):
-            makers.setdefault(name, []).append(path.stem)
-    return makers
 
 
 def _made(executed=(), in_git=False):
@@ -239,7 +223,7 @@ def main():
         settings = read_settings()
         update(settings)
     except Exception as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     if note := trainings.network_note(settings):
         print(note)
     return 0

@@ -6,25 +6,26 @@ from contextlib import suppress
 
 import numpy as np
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, results
 from thesis_repro.files import write_text
-from thesis_repro.kitti import Sequence, read_poses
 from thesis_repro.masks import label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
-from thesis_repro.study import compare, controls, series
+from thesis_repro.study import compare, controls
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS
+from thesis_repro.study.study import PATHS
+from thesis_repro.trajectories import read_poses
 
 
 def write(study, runs, folder, warnings=()):
-    """Write the findings, figures, tables and page of a `series.Study` into a folder, and return
+    """Write the findings, figures, tables and page of a `Study` into a folder, and return
     the page's path.
 
     warnings: lines for the top of the page.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
-    embedded = "train_images" in (stages.record(study.kitti.absolute().parent) or {})
+    embedded = "train_images" in (results.record(study.kitti.absolute().parent) or {})
     data = "embedded world (rendered)" if embedded else f"KITTI folder {study.kitti.name}"
     changed = {source.name: _changed(source) for source in study.sources}
     masks = ", ".join(
@@ -104,10 +105,10 @@ def figure_paths(study, name, folder):
     """Draw one path with all keypoints and one with each source's masks, shifted as for the
     RMSE.
     """
-    true = Sequence(study.kitti, name).subset(study.frames).poses
+    (true,) = (sequence.poses for sequence in study.opened if sequence.name == name)
     files = {
         job.source or compare.METHODS[job.method]: folder
-        / series.PATHS
+        / PATHS
         / "kitti"
         / name
         / f"{job.name}.txt"

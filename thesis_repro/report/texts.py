@@ -165,13 +165,13 @@ def _source_values(runs, table, source):
 # Records of commands, for JSON and for templates
 
 
-def run_record(result, sequence, alignment):
+def run_record(result, sequence):
     """Return the errors, keypoints, time and flags of an `odometry.Result`. An error that is
     not determined is None.
     """
     errors = dict.fromkeys(ERRORS)
     if sequence.has_truth:
-        values = metrics.errors(result.poses, sequence.poses, alignment).values()
+        values = metrics.errors(result.poses, sequence.poses).values()
         errors = {
             name: None if value != value else value
             for name, value in zip(ERRORS, values, strict=True)

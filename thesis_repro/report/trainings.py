@@ -5,7 +5,7 @@
 
 import pandas as pd
 
-from thesis_repro import stages
+from thesis_repro import results
 from thesis_repro.files import listed
 from thesis_repro.settings import ROOT
 
@@ -26,7 +26,7 @@ def network_note(settings):
     folders = listed(settings.build / "labels", "*")
     if not settings.figures_in_git or not folders:
         return ""
-    network, recorded = stages.record(folders[0])["model"], read()["network"].iloc[0]
+    network, recorded = results.record(folders[0])["model"], read()["network"].iloc[0]
     if network == recorded:
         return f"The network of this run is the recorded one, to the bit ({network})."
     return (

@@ -11,9 +11,9 @@ from evo import EvoException
 
 from thesis_repro import InputError
 from thesis_repro.files import listed
-from thesis_repro.kitti import read_poses, read_tum
 from thesis_repro.odometry import metrics
 from thesis_repro.report.style import TRUTH, line_style, new_figure
+from thesis_repro.trajectories import read_poses, read_tum
 
 # keys of a row of `evaluate`, and their column names in a table
 COLUMNS = {

@@ -7,6 +7,8 @@ import platform
 import sys
 from contextlib import contextmanager
 
+from thesis_repro import console
+
 # Settings that give the same bits on every processor, together with `exact`.
 ARITHMETIC = {
     # TensorFlow splits sums among its threads, so the rounding depends on their number. A fixed
@@ -50,19 +52,7 @@ def quietly():
 
     The message that there is no GPU is hidden too.
     """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    originals = os.dup(1), os.dup(2)
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        for stream in (1, 2):
-            os.dup2(null, stream)
+    with console.quiet():
         yield
         if not any(map(os.path.exists, GPUS)):
             sys.modules["tensorflow"].config.list_physical_devices()
-    finally:
-        sys.stdout.flush()
-        for stream, original in enumerate(originals, 1):
-            os.dup2(original, stream)
-        for descriptor in (*originals, null):
-            os.close(descriptor)

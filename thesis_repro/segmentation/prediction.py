@@ -11,7 +11,7 @@ import keras
 import numpy as np
 import tensorflow as tf
 
-from thesis_repro import InputError, files, longrun, segmentation, stages
+from thesis_repro import InputError, console, files, results, segmentation
 from thesis_repro.cityscapes import read_image
 from thesis_repro.segmentation import memory, training
 
@@ -54,14 +54,14 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     Images of any size are stretched to the model's input, as in the appendix. Decoding and writing
     run in parallel with the network. A killed run resumes: complete batches are skipped, and of an
     incomplete batch all images are predicted again, because the bits depend on the batch, but only
-    missing files are written. The folder is a stage (see stages): label maps of another model or of
-    other images in it are deleted.
+    missing files are written. The folder is a stage (see results): label maps of another model or
+    of other images in it are deleted.
 
     Returns the number of images predicted.
     Raises InputError for an unreadable image, two images of one name, and a folder that holds files
     of the user or is in use by another run.
     """
-    with longrun.claimed(output_dir):
+    with results.claimed(output_dir):
         batches = _open(training.weights_digest(model), paths, output_dir, batch_size)
         missing = sum(map(len, batches))
         with files.progress(None, "label maps", len(paths), initial=len(paths) - missing) as bar:
@@ -80,10 +80,10 @@ def _open(weights, paths, output_dir, batch_size):
             f"{paths[0].parent}: two images share a name, so their label maps would; rename one"
         )
     # The network's arithmetic may round differently for another batch size.
-    stages.stage(
+    results.stage(
         output_dir,
         model=weights,
-        frames=stages.listing(paths),
+        frames=results.listing(paths),
         batch_size=batch_size,
         **_arithmetic(),
     )
@@ -94,8 +94,8 @@ def _open(weights, paths, output_dir, batch_size):
 
 def _arithmetic():
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
-    return stages.made_with("tensorflow", "keras", "opencv-python-headless") | {
-        "code": stages.code("segmentation/prediction"),
+    return results.made_with("tensorflow", "keras", "opencv-python-headless") | {
+        "code": results.code("segmentation/prediction"),
         "arithmetic": segmentation.arithmetic(),
     }
 
@@ -139,7 +139,7 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
     `write_label_maps`' bits.
 
     run: function of (function, list of argument tuples), like `run` of the pools in
-    `study.cluster`. It calls the function on the workers and yields (index, returned value or
+    `study.workers`. It calls the function on the workers and yields (index, returned value or
     reason why the worker was lost).
     model_files: files of one model, or of several for the mean of their probabilities (`ensemble`).
     sequences: list of (image paths, folder).
@@ -154,14 +154,14 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
     total, step = sum(len(paths) for paths, _ in sequences), max(1, PART // batch_size)
     with ExitStack() as held:
         for paths, folder in sequences:
-            held.enter_context(longrun.claimed(folder))
+            held.enter_context(results.claimed(folder))
             batches = _open(weights, paths, folder, batch_size)
             missing += sum(map(len, batches))
             calls += [
                 (
                     model_files,
                     Path(folder).absolute(),
-                    stages.record(folder),
+                    results.record(folder),
                     batches[start : start + step],
                 )
                 for start in range(0, len(batches), step)
@@ -217,12 +217,12 @@ def _write_part(model_files, folder, record, batches):
     failure, or None.
     """
     try:
-        stages.check_worker(folder, record)
+        results.check_worker(folder, record)
         model = load(model_files)
-        stages.check_worker(folder, record, model=training.weights_digest(model), **_arithmetic())
+        results.check_worker(folder, record, model=training.weights_digest(model), **_arithmetic())
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # the other parts continue, and the caller reports the reason
-        return longrun.explain(error) or f"{type(error).__name__}: {error}"
+        return console.explain(error) or f"{type(error).__name__}: {error}"
     return None
 
 

@@ -18,7 +18,7 @@ import pandas as pd
 import segmentation_models as sm
 import tensorflow as tf
 
-from thesis_repro import InputError, files, longrun, segmentation, stages
+from thesis_repro import InputError, files, results, segmentation
 from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
 from thesis_repro.segmentation import augmentation, exact  # noqa: F401
 
@@ -159,7 +159,7 @@ def made_from(model, batches, validation):
     true = augmentation.one_hot(random.integers(0, N_CLASSES, (2, 16, 16), np.uint8), N_CLASSES)
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
     return {
-        "code": stages.code("segmentation/training"),
+        "code": results.code("segmentation/training"),
         "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),
@@ -206,7 +206,7 @@ class ResumableTraining(keras.callbacks.Callback):
         self.folder, self.batches, self.others = Path(folder), batches, others
         self.rows, self._counters, self._open = [], [], ExitStack()
         self._variables = model.variables + model.optimizer.variables
-        state = stages.resume(self.folder / STATE)
+        state = results.resume(self.folder / STATE)
         if state is not None:
             (self.rows, self._counters), arrays = state
             if [value.shape for value in arrays.values()] != [
@@ -235,7 +235,7 @@ class ResumableTraining(keras.callbacks.Callback):
         return epochs if stopped else min(len(self.rows), epochs)
 
     def on_train_begin(self, logs=None):
-        self._open.enter_context(longrun.claimed(self.folder))
+        self._open.enter_context(results.claimed(self.folder))
         # ModelCheckpoint itself writes in place
         self.model.save = partial(_save_atomically, self.model)
         self._open.callback(delattr, self.model, "save")
@@ -270,7 +270,7 @@ class ResumableTraining(keras.callbacks.Callback):
             for other in self.others
         ]
         files.write_text(self.folder / HISTORY, self.history.to_csv(index=False))
-        stages.store(
+        results.store(
             self.folder / STATE,
             [self.rows, self._counters],
             {f"{index}": variable.numpy() for index, variable in enumerate(self._variables)},

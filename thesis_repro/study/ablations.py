@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import masks, odometry, stages
+from thesis_repro import masks, odometry, results
 from thesis_repro.cityscapes import ID, read_label_map
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
@@ -22,7 +22,7 @@ from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.odometry.pose import normalise
-from thesis_repro.study import cluster
+from thesis_repro.study import workers
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import measures
@@ -82,7 +82,7 @@ def measure(
     metres after an alignment with scale).
     """
     calls = [(kitti, name, labels / name, folder / name, frames, options) for name in names]
-    with cluster.open_pool(processes) as pool:
+    with workers.open_pool(processes) as pool:
         tables = dict(
             progress(pool.run(_measure, calls), "ablations", total=len(calls), unit="sequence")
         )
@@ -93,27 +93,29 @@ def _measure(
     kitti: Path, name: str, labels: Path, folder: Path, frames: int | None, options: dict[str, Any]
 ) -> pd.DataFrame:
     sequence = Sequence(kitti, name).subset(frames)
-    stages.stage(
+    results.stage(
         folder,
         options=options,
-        code=stages.code("study/ablations"),
-        **stages.made_with("opencv-python-headless", "numpy", "numba"),
-        sequence=stages.listing(sequence.files),
-        labels=stages.listing([labels / path.name for path in sequence.frame_paths]),
-        model=stages.made_from(labels),
+        code=results.code("study/ablations"),
+        **results.made_with("opencv-python-headless", "numpy", "numba"),
+        sequence=results.listing(sequence.files),
+        labels=results.listing([labels / path.name for path in sequence.frame_paths]),
+        model=results.made_from(labels),
     )
     path = folder / "runs.csv"
-    if stages.kept_table(path) is None:
+    if results.kept_table(path) is None:
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **options)
-        results = odometry.run_many(
+        run_results = odometry.run_many(
             sequence, {" ".join(map(str, key)): run for key, run in runs.items()}
         )
         rows = [
             {"method": method, "estimator": estimator, "repetition": repetition}
             | measures(result.frames, sequence.poses)
             | {"sim3": metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]}
-            for (method, estimator, repetition), result in zip(runs, results.values(), strict=True)
+            for (method, estimator, repetition), result in zip(
+                runs, run_results.values(), strict=True
+            )
         ]
         write_text(path, pd.DataFrame(rows).assign(sequence=name).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})

@@ -1,12 +1,13 @@
-"""Estimate how long runs take on this machine: the code is timed on a few frames and the times are
-multiplied.
+"""Estimate how long the missing runs take on this machine: the code is timed on a few frames and
+the times are multiplied.
 
 Times are for one core. On a busy machine they can be wrong by a third.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from thesis_repro import InputError, cityscapes, kitti, odometry
+from thesis_repro import InputError, kitti, odometry
 from thesis_repro.settings import Profile, cores
 from thesis_repro.study import ablations, compare, jobs, runner
-from thesis_repro.study.series import Study
+from thesis_repro.study.sources import Source
+from thesis_repro.study.study import Study
 
 # frames of two timed runs: their difference leaves out the cost of starting a run
 SHORT, LONG = 3, 9
@@ -27,34 +29,33 @@ NOTEBOOK_SECONDS = 16
 RUNS_IN_07 = 7  # cost of notebook 7, in runs with all keypoints over its sequence
 
 
-def of_study(study: Study) -> dict[str, Any]:
-    """Return the plan of a study with your own masks, see `_plan`."""
-    frames = {sequence.name: len(sequence) for sequence in study.opened()}
-    name, total, first_jobs = _longest(frames), sum(frames.values()), study.first_jobs()
-    timed_jobs = [job for job in first_jobs if job.sequence == name]
-    # the keypoint controls of each source cannot be timed before the masked runs are done
-    later_runs = (
+def of_study(study: Study, folder: Path) -> dict[str, Any]:
+    """Return the plan of the runs of a study with your own masks that are not in its folder yet,
+    see `_plan`.
+    """
+    sequences = {sequence.name: sequence for sequence in study.opened}
+    frames = {name: len(sequence) for name, sequence in sequences.items()}
+    # the keypoint controls of each source are planned when the masked runs are done
+    later = (
         study.repetitions * len(study.estimators) * len(study.sources) * len(jobs.KEYPOINT_CONTROLS)
     )
-    runs = len(first_jobs) // len(frames) + (later_runs if study.tested else 0)  # of a sequence
-    cost = _seconds_a_frame(
-        lambda count, folder: runner.run(
-            timed_jobs, study.kitti, study.sources, folder, frames=count
-        )
+    step, run_frames = _odometry(
+        "odometry",
+        study.first_jobs(),
+        later if study.tested else 0,
+        sequences,
+        study.kitti,
+        study.sources,
+        folder / "runs",
     )
-    return _plan(
-        [("odometry", runs * len(frames), "runs", total * runs * cost / len(timed_jobs))],
-        frames,
-        name,
-        total * runs * ROW_BYTES,
-    )
+    return _plan([step], frames, run_frames * ROW_BYTES)
 
 
-def of_thesis(root: Path, sizes: Profile, training_images: int = 0) -> dict[str, Any]:
-    """Return the plan of the notebooks on a KITTI folder, see `_plan`.
+def of_thesis(root: Path, sizes: Profile, folder: Path) -> dict[str, Any]:
+    """Return the plan of the notebooks on a KITTI folder with the model in the package, see
+    `_plan`.
 
-    training_images: number of them before the split and the augmentation; 0 if the model in the
-    package is used.
+    folder: build folder of the run. Its finished runs of the odometry are not planned again.
     Raises InputError if no sequence is long enough to be timed.
     """
     from thesis_repro.segmentation import quietly
@@ -63,50 +64,49 @@ def of_thesis(root: Path, sizes: Profile, training_images: int = 0) -> dict[str,
         # imported here because TensorFlow takes seconds to load
         from thesis_repro.segmentation import prediction
 
-    frames = {
-        name: len(kitti.Sequence(root, name).subset(sizes.frames)) for name in kitti.sequences(root)
+    sequences = {
+        name: kitti.Sequence(root, name).subset(sizes.frames) for name in kitti.sequences(root)
     }
-    name, total, steps = _longest(frames), sum(frames.values()), []
+    frames = {name: len(sequence) for name, sequence in sequences.items()}
+    name, total = _longest(frames), sum(frames.values())
     timed_frames = sum(min(count, sizes.timed_frames) for count in frames.values())
-    model, sequence = prediction.load_shipped(), kitti.Sequence(root, name)
-    timed_jobs = jobs.first_jobs(
+    model, sequence = prediction.load_shipped(), sequences[name]
+    planned = jobs.first_jobs(
         root,
-        [name],
+        frames,
         {"thesis": sizes.widths, "refined": []},
         tested=jobs.CONTROL_WIDTH,
         repetitions=sizes.repetitions,
     )
-    # runs of a sequence; the reduced run and the keypoint controls cannot be timed yet
-    runs = (
-        len(timed_jobs)
-        + (1 + len(jobs.KEYPOINT_CONTROLS) * len(jobs.ESTIMATORS)) * sizes.repetitions
-    )
+    # the reduced run and the keypoint controls are planned when the masked runs are done
+    later = (1 + len(jobs.KEYPOINT_CONTROLS) * len(jobs.ESTIMATORS)) * sizes.repetitions
 
     def predict(count: int, folder: Path) -> None:
         prediction.write_label_maps(model, sequence.subset(count).frame_paths, folder / name)
 
-    with TemporaryDirectory() as folder:
-        labels = Path(folder)
-        predict(LONG, labels)
-        label_map = _seconds_a_frame(predict)
-        all_jobs = _seconds_a_frame(
-            lambda count, folder: runner.run(timed_jobs, root, labels, folder, frames=count)
+    with TemporaryDirectory() as labels:
+        predict(LONG, Path(labels))
+        _, label_map = _seconds(predict)
+        odometry_step, run_frames = _odometry(
+            "08: odometry",
+            planned,
+            later,
+            sequences,
+            root,
+            [Source(Path(labels))],
+            folder / "odometry",
         )
-        one_run = _seconds_a_frame(lambda count, _: odometry.run(sequence.subset(count)))
-        all_ablations = _seconds_a_frame(
-            lambda count, folder: ablations.measure(root, [name], labels, folder, frames=count)
+        _, one_run = _seconds(lambda count, _: odometry.run(sequence.subset(count)))
+        _, all_ablations = _seconds(
+            lambda count, folder: ablations.measure(
+                root, [name], Path(labels), folder, frames=count
+            )
         )
-    if training_images:
-        label_map, training = _network_seconds(sizes)
-        # original and augmented ones
-        images = 2 * min(training_images, sizes.training_images or training_images)
-        seconds = images * sizes.epochs * (0.8 * training + 0.2 * label_map)
-        steps.append(("04: training", sizes.epochs, "epochs", seconds))
-    notebooks, in_07 = 9 if training_images else 6, frames[min(frames)]
-    steps += [
+    in_07 = min(frames.values())
+    steps = [
         ("05: label maps", total, "frames", total * label_map),
         ("07: one sequence", in_07, "frames", in_07 * RUNS_IN_07 * one_run),
-        ("08: odometry", runs * len(frames), "runs", total * runs * all_jobs / len(timed_jobs)),
+        odometry_step,
         (
             "08: timing of every width",
             timed_frames,
@@ -116,26 +116,66 @@ def of_thesis(root: Path, sizes: Profile, training_images: int = 0) -> dict[str,
         ("09: ablations", total, "frames", total * all_ablations),
     ]
     return _plan(
-        steps,
-        frames,
-        name,
-        total * (LABEL_MAP_BYTES + runs * ROW_BYTES),
-        notebooks * NOTEBOOK_SECONDS,
+        steps, frames, total * LABEL_MAP_BYTES + run_frames * ROW_BYTES, 6 * NOTEBOOK_SECONDS
     )
+
+
+def _odometry(
+    name: str,
+    planned: list[jobs.Job],
+    later: int,
+    sequences: dict[str, kitti.Sequence],
+    root: Path,
+    sources: Iterable[Source],
+    folder: Path,
+) -> tuple[tuple[str, int, str, float], int]:
+    """Return the step (see `_plan`) of the runs without a result in a folder, and their frames.
+
+    later: number of further runs of each sequence, such as controls whose settings follow from
+    other runs. The passes of the longest sequence are timed one by one, divided as for all cores,
+    because the runs of a pass share work.
+    """
+    timed = _longest({name: len(sequence) for name, sequence in sequences.items()})
+    passes = jobs.in_passes(planned, sequences, cores())
+    times = [
+        _seconds(partial(_run_pass, pass_jobs, root, sources))
+        for pass_jobs in passes
+        if pass_jobs[0].sequence == timed
+    ]
+    start, frame = np.sum(times, axis=0) / sum(job.sequence == timed for job in planned)
+    seconds, runs, run_frames = 0.0, 0, 0
+    for sequence in sequences.values():
+        results = [
+            runner.result_file(folder, job).is_file()
+            for job in planned
+            if job.sequence == sequence.name
+        ]
+        controls = ("reduced", *jobs.KEYPOINT_CONTROLS)
+        done = sum(
+            path.name.startswith(controls) for path in (folder / sequence.name).rglob("*.csv")
+        )
+        left = results.count(False) + max(0, later - done)
+        runs, run_frames = runs + left, run_frames + left * len(sequence)
+        seconds += left * (start + len(sequence) * frame)
+    return (name, runs, "runs", seconds), run_frames
+
+
+def _run_pass(
+    pass_jobs: list[jobs.Job], root: Path, sources: Iterable[Source], frames: int, folder: Path
+) -> None:
+    runner.run(pass_jobs, root, sources, folder, frames=frames)
 
 
 def _plan(
     steps: list[tuple[str, int, str, float]],
     frames: dict[str, int],
-    timed: str,
     disk: float,
     once: float = 0,
 ) -> dict[str, Any]:
     """Return a plan as a record for the template plan.txt.j2.
 
-    steps: (name, number, unit, seconds on one core). frames: by sequence. timed: name of the timed
-    sequence.
-    disk: bytes. once: seconds that more cores do not shorten.
+    steps: (name, number, unit, seconds on one core). frames: by sequence. disk: bytes. once:
+    seconds that more cores do not shorten.
     """
     seconds = sum(step[-1] for step in steps)
     return {
@@ -146,7 +186,7 @@ def _plan(
         "on_all_cores": once + seconds / cores(),
         "sequences": len(frames),
         "frames": sum(frames.values()),
-        "timed": timed,
+        "timed": _longest(frames),
         "timed_frames": LONG,
         "disk": disk,
         "fewest": compare.MIN_SEQUENCES,
@@ -163,10 +203,8 @@ def _longest(frames: dict[str, int]) -> str:
     return name
 
 
-def _seconds_a_frame(run: Callable[[int, Path], Any]) -> float:
-    """Return the CPU seconds of run(frames, folder) for each frame, without the cost of
-    starting a run.
-    """
+def _seconds(run: Callable[[int, Path], Any]) -> tuple[float, float]:
+    """Return the CPU seconds of run(frames, folder): of its start, and of each frame."""
     seconds = []
     for count in (SHORT, SHORT, LONG):  # the first run loads compiled code
         with (
@@ -177,31 +215,5 @@ def _seconds_a_frame(run: Callable[[int, Path], Any]) -> float:
             started = time.process_time()
             run(count, Path(folder))
             seconds.append(time.process_time() - started)
-    return max(seconds[2] - seconds[1], 0) / (LONG - SHORT)
-
-
-def _network_seconds(sizes: Profile) -> tuple[float, float]:
-    """Return the CPU seconds, for each image, of a prediction and of a training step of a new
-    network.
-    """
-    import keras
-
-    from thesis_repro.segmentation import prediction, training
-    from thesis_repro.segmentation.unet import build_unet
-
-    model = build_unet(
-        (sizes.image_size, sizes.image_size, 1), cityscapes.N_CLASSES, sizes.base_filters
-    )
-    model.compile(
-        keras.optimizers.Adam(),
-        training.fused_loss(training.total_loss()),
-        metrics=training.metrics(),
-    )
-    images = np.zeros((LONG, *model.input_shape[1:]), np.uint8)
-    one_hot = np.zeros((LONG, *model.output_shape[1:]), np.float32)
-    return (
-        _seconds_a_frame(lambda count, _: prediction.predict(model, images[:count])),
-        _seconds_a_frame(
-            lambda count, _: model.fit(images[:count].astype(np.float32), one_hot[:count], SHORT)
-        ),
-    )
+    frame = max(seconds[2] - seconds[1], 0) / (LONG - SHORT)
+    return max(seconds[1] - SHORT * frame, 0), frame

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, longrun, odometry, stages
+from thesis_repro import InputError, console, odometry, results
 from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
-from thesis_repro.study import cluster, controls
+from thesis_repro.study import controls, workers
 from thesis_repro.study.jobs import Job, in_passes
 from thesis_repro.study.sources import Source
 
@@ -29,7 +29,7 @@ from thesis_repro.study.sources import Source
 CHECKPOINTS = f"pass-{'[0-9a-f]' * 12}.npz"
 
 
-def _result(folder: Path, job: Job) -> Path:
+def result_file(folder: Path, job: Job) -> Path:
     """Return the result file of a job, which is written when the job is done."""
     return folder / job.sequence / f"{job.name}.csv"
 
@@ -37,7 +37,7 @@ def _result(folder: Path, job: Job) -> Path:
 def run(
     jobs: Iterable[Job],
     kitti: Path,
-    labels: Path | Iterable[Source],
+    sources: Path | Iterable[Source],
     folder: Path,
     *,
     frames: int | None = None,
@@ -47,7 +47,7 @@ def run(
     """Run the jobs that have no result yet; returns the table of all runs that succeeded, one row a
     job.
 
-    kitti: the odometry root. labels: folder with one folder of label maps a sequence, or the
+    kitti: the odometry root. sources: folder with one folder of label maps a sequence, or the
     sources of the jobs.
     folder: for the results; results from other data, code or mask settings in it are deleted.
     frames: number of frames of each sequence, None for all. processes: number of processes on this
@@ -63,21 +63,21 @@ def run(
     Raises InputError if another run is using the folder, if all jobs fail, or if the machine lacks
     disk space or memory. Finished results are kept.
     """
-    jobs, sources = list(dict.fromkeys(jobs)), by_name(labels)
+    jobs, sources_by_name = list(dict.fromkeys(jobs)), by_name(sources)
     sequences = {
         name: Sequence(kitti, name).subset(frames)
         for name in sorted({job.sequence for job in jobs})
     }
-    files = {job: _result(folder, job) for job in jobs}
-    with longrun.claimed(folder):
+    files = {job: result_file(folder, job) for job in jobs}
+    with results.claimed(folder):
         for sequence in sequences.values():
-            _stage(folder, sequence, sources)
+            _stage(folder, sequence, sources_by_name)
         for job, path in files.items():
-            table = stages.kept_table(path, len(sequences[job.sequence]))
+            table = results.kept_table(path, len(sequences[job.sequence]))
             if table is None or not np.isfinite(poses_of(table)).all():
                 path.unlink(missing_ok=True)  # missing results are made again
         finished = sum(path.is_file() for path in files.values())
-        failures = _run_passes(jobs, sequences, sources, folder, processes, scheduler)
+        failures = _run_passes(jobs, sequences, sources_by_name, folder, processes, scheduler)
     rows = []
     for job, path in files.items():
         if path.is_file():
@@ -107,7 +107,7 @@ def _run_passes(
     the failed ones.
     """
     failures: dict[Job, str] = {}
-    with cluster.open_pool(processes, scheduler) as pool:
+    with workers.open_pool(processes, scheduler) as pool:
         passes = _passes(jobs, sequences, folder, pool.size)
         threads = -(-pool.size // max(1, len(passes)))
         calls, frames = [], []
@@ -119,7 +119,7 @@ def _run_passes(
                     sequence,
                     sources,
                     folder,
-                    stages.record(folder / sequence.name),
+                    results.record(folder / sequence.name),
                     threads,
                 )
             )
@@ -135,7 +135,7 @@ def _run_passes(
         by_reason.setdefault((job.sequence, reason), []).append(job.name)
     for (name, reason), runs in by_reason.items():
         more = f" and {len(runs) - 3} more" * (len(runs) > 3)
-        longrun.say(f"sequence {name}, {', '.join(runs[:3])}{more}: failed: {reason}", warning=True)
+        console.log.warning(f"sequence {name}, {', '.join(runs[:3])}{more}: failed: {reason}")
     for reason in failures.values():
         if isinstance(reason, _MachineFault):  # a study without these runs could mislead
             raise InputError(reason)
@@ -146,10 +146,11 @@ class _MachineFault(str):
     """The reason of a failure that the machine caused, such as a full disk."""
 
 
-def by_name(labels: Path | Iterable[Source]) -> dict[str, Source]:
+def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
     """Return the sources by name. A folder becomes a single source with an empty name."""
     return {
-        source.name: source for source in ([Source(labels)] if isinstance(labels, Path) else labels)
+        source.name: source
+        for source in ([Source(sources)] if isinstance(sources, Path) else sources)
     }
 
 
@@ -167,25 +168,25 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
     folder /= sequence.name
     true_labels = listed(controls.true_labels(sequence.root, sequence.name))
     records = {source.name: source.record(sequence.name) for source in sources.values()}
-    stages.stage(
+    results.stage(
         folder,
         **_versions(),
-        sequence=stages.listing(sequence.files),
-        true_labels=stages.listing(true_labels),
+        sequence=results.listing(sequence.files),
+        true_labels=results.listing(true_labels),
         **records.pop("", {}),
     )
     for source, record in records.items():
         # a checkpoint may come from the source's old masks
-        if stages.record(folder / source) != record:
+        if results.record(folder / source) != record:
             for checkpoint in folder.glob(CHECKPOINTS):
                 checkpoint.unlink()
-        stages.stage(folder / source, **record)
+        results.stage(folder / source, **record)
 
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": stages.code("odometry", "study/jobs"),
-        **stages.made_with("opencv-python-headless", "numpy", "numba"),
+        "code": results.code("odometry", "study/jobs"),
+        **results.made_with("opencv-python-headless", "numpy", "numba"),
     }
 
 
@@ -200,11 +201,11 @@ def _passes(
     for name in sequences:
         sequence_jobs = {job.name: job for job in jobs if job.sequence == name}
         waiting = {
-            key: job for key, job in sequence_jobs.items() if not _result(folder, job).is_file()
+            key: job for key, job in sequence_jobs.items() if not result_file(folder, job).is_file()
         }
         for path in sorted((folder / name).glob(CHECKPOINTS)):
             try:
-                keys = stages.resume(path)[0]["job"]["runs"]
+                keys = results.resume(path)[0]["job"]["runs"]
             except InputError:  # a damaged checkpoint is deleted below
                 keys = []
             if not sequence_jobs.keys() >= set(keys):
@@ -269,34 +270,36 @@ def _run_pass(
     checkpoint = folder / sequence.name / f"pass-{digest}.npz"
     failures: dict[Job, str] = {}
     try:
-        stages.check_worker(folder / sequence.name, record, **_versions())
+        results.check_worker(folder / sequence.name, record, **_versions())
         # a checkpoint can be resumed only with all of its jobs
         waiting = (
             jobs
             if checkpoint.is_file()
-            else [job for job in jobs if not _result(folder, job).is_file()]
+            else [job for job in jobs if not result_file(folder, job).is_file()]
         )
         masks_by_job, failures = masks_of(waiting, sequence, sources)
         if not masks_by_job:  # also if Dask repeats a finished pass because it lost the answer
             return failures
-        results = odometry.run_many(
+        run_results = odometry.run_many(
             sequence,
             {job.name: (job.settings, masks) for job, masks in masks_by_job.items()},
             checkpoint=checkpoint,
             workers=threads,
         )
         for job in masks_by_job:
-            if not _result(folder, job).is_file():
-                write_text(_result(folder, job), results.pop(job.name).frames.to_csv(index=False))
+            if not result_file(folder, job).is_file():
+                write_text(
+                    result_file(folder, job), run_results.pop(job.name).frames.to_csv(index=False)
+                )
         checkpoint.unlink(missing_ok=True)
     except Exception as error:  # report any error as the reason, and let other passes run
-        reason = longrun.explain(error)
+        reason = console.explain(error)
         if reason is None:
             reason = f"{type(error).__name__}: {error}"
         elif not isinstance(error, InputError):
             reason = _MachineFault(reason)
         failures = (
-            dict.fromkeys((job for job in jobs if not _result(folder, job).is_file()), reason)
+            dict.fromkeys((job for job in jobs if not result_file(folder, job).is_file()), reason)
             | failures
         )
     return failures

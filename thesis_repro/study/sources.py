@@ -9,7 +9,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TypeAlias
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, results
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import glance, listed
 from thesis_repro.kitti import Sequence, check_size
@@ -37,7 +37,7 @@ class Source:
     settings: MaskSettings = MaskSettings()
     invert: bool = False
 
-    def of(self, sequence: str) -> Path:
+    def folder_of(self, sequence: str) -> Path:
         """Return the folder with the files of one sequence."""
         subfolder = self.folder / sequence
         # as `thesis-repro predict` and `masks` write them
@@ -50,9 +50,9 @@ class Source:
         Raises InputError if a frame has no file.
         """
         if self.kind == "masks":
-            return MaskFolder(self.of(sequence.name), sequence, self.invert)
+            return MaskFolder(self.folder_of(sequence.name), sequence, self.invert)
         assert dilation_width is not None  # masks from label maps need a width
-        return LabelMasks(self.of(sequence.name), sequence, dilation_width, self.settings)
+        return LabelMasks(self.folder_of(sequence.name), sequence, dilation_width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError if a file is not a label map, or not a mask of size (height, width)."""
@@ -62,14 +62,14 @@ class Source:
 
     def record(self, sequence: str) -> dict[str, str | None]:
         """Return the digests and settings that the results of a sequence depend on."""
-        folder = self.of(sequence)
-        made_from = stages.made_from(folder) if stages.record(folder) is not None else None
+        folder = self.folder_of(sequence)
+        made_from = results.made_from(folder) if results.record(folder) is not None else None
         settings = (
             {"settings": str(self.settings)}
             if self.kind == "labels"
             else {"invert": str(self.invert)}
         )
-        return {self.kind: stages.listing(listed(folder)), "made_from": made_from, **settings}
+        return {self.kind: results.listing(listed(folder)), "made_from": made_from, **settings}
 
 
 def named(
@@ -125,7 +125,7 @@ def check(
                 f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence"
             )
         for sequence in sequences:
-            if source.of(sequence.name) == source.folder and len(sequences) > 1:
+            if source.folder_of(sequence.name) == source.folder and len(sequences) > 1:
                 raise InputError(
                     f"{source.folder}: holds the {kind} of one sequence, but {len(sequences)} are asked "
                     f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "

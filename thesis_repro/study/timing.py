@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry, stages
+from thesis_repro import InputError, masks, odometry, results
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.settings import cores
-from thesis_repro.study import cluster
+from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import by_name, masks_of
 from thesis_repro.study.sources import Source
@@ -69,7 +69,7 @@ def time_runs(
         )
         for name in names
     ]
-    with cluster.open_pool(processes) as pool:
+    with workers.open_pool(processes) as pool:
         tables = dict(
             progress(pool.run(_time_jobs, calls), "timing", total=len(calls), unit="sequence")
         )
@@ -79,7 +79,7 @@ def time_runs(
 def _time_jobs(
     jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
 ) -> pd.DataFrame:
-    kept = stages.kept_table(path, dtype={"sequence": str})
+    kept = results.kept_table(path, dtype={"sequence": str})
     if kept is not None and {job.name for job in jobs} <= set(kept["run"]):
         return kept
     scales = odometry.scales(sequence)

@@ -2,7 +2,7 @@
 
 import sys
 
-from thesis_repro import InputError, longrun, world
+from thesis_repro import InputError, console, world
 from thesis_repro.settings import read_settings
 
 if __name__ == "__main__":
@@ -17,4 +17,4 @@ if __name__ == "__main__":
             replace=not settings.cityscapes_is_embedded,
         )
     except (InputError, OSError) as error:
-        sys.exit(longrun.report_error(error))
+        sys.exit(console.report_error(error))

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
 
-from thesis_repro import InputError, kitti, longrun, stages
+from thesis_repro import InputError, console, kitti, results, trajectories
 from thesis_repro.files import is_whole, progress, write_png, write_text
 from thesis_repro.world import drives, street, textures
 
@@ -141,8 +141,8 @@ def write(
         "seed": seed,
     }
     _check(**parameters)
-    with longrun.claimed(out):
-        stages.stage(out, replace=replace, code=stages.code("world"), **parameters)
+    with results.claimed(out):
+        results.stage(out, replace=replace, code=results.code("world"), **parameters)
         pictures = [
             picture
             for picture in _pictures(out, **parameters)
@@ -160,7 +160,7 @@ def write(
                 delayed(_write_pictures)(missing[k : k + 10]) for k in range(1, len(missing), 10)
             )
             for count in Parallel(
-                n_jobs=workers, return_as="generator_unordered", initializer=longrun.end_with_parent
+                n_jobs=workers, return_as="generator_unordered", initializer=console.end_with_parent
             )(work):
                 bar.update(count)
         for name in sequences if only != "cityscapes" else ():
@@ -226,6 +226,6 @@ def _write_sequence_texts(root, name, frames, scale, seed):
         folder / "times.txt", "".join(f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames))
     )
     _, poses, _ = drives.way(name, frames, seed)
-    kitti.write_kitti_poses(
+    trajectories.write_kitti_poses(
         root / "kitti" / "poses" / f"{name}.txt", drives.relative_to_first(poses)
     )

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from thesis_repro import InputError, longrun
+from thesis_repro import InputError, console
 from thesis_repro.settings import scheduler_address
 
 TIMEOUT = 8  # seconds that a scheduler has to answer
@@ -65,12 +65,12 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
 
 def _here(size: int, function: Callable, calls: Calls) -> Results:
     work = joblib.Parallel(
-        n_jobs=size, return_as="generator_unordered", initializer=longrun.end_with_parent
+        n_jobs=size, return_as="generator_unordered", initializer=console.end_with_parent
     )(joblib.delayed(_numbered)(index, function, call) for index, call in enumerate(calls))
     try:
         yield from work
     except TerminatedWorkerError:
-        raise InputError(longrun.WORKER_KILLED) from None
+        raise InputError(console.WORKER_KILLED) from None
 
 
 def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:

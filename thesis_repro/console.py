@@ -1,5 +1,5 @@
-"""Long runs: locks on folders, the log, the summary at the end, and one-line errors for a lack of
-space or memory.
+"""What a run says and how it ends: the log, the summary, signals, and one-line errors for a lack
+of space or memory.
 
 This module imports only the standard library, so it still works if there is too little memory for
 other packages.
@@ -7,12 +7,9 @@ other packages.
 
 import ctypes
 import errno
-import fcntl
 import logging
 import os
-import re
 import resource
-import secrets
 import signal
 import sys
 import time
@@ -24,10 +21,7 @@ from pathlib import Path
 from thesis_repro import InputError, one_line
 
 LOG = "log.txt"
-RECORD = "made-from.json"  # in every folder of results, see `stages.stage`
-LIST = "written.log"  # beside the record: the files that were written there, see `files.atomic`
-# matches the names that `temporary` returns
-TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")
+RECORD = "made-from.json"  # in every folder of results, see `results.stage`
 # what a user can do about a system error, by its number
 ROOM, ACCESS = (
     "make room on its disk, or name a folder on another",
@@ -61,10 +55,20 @@ NO_MEMORY_TEXTS = (
     "can't start new thread",
 )
 
-_log = logging.getLogger("thesis_repro")
-_log.addHandler(logging.NullHandler())
-_log.setLevel(logging.INFO)
-_log.propagate = False
+
+class _Printer(logging.Handler):
+    """Prints messages and warnings on standard error, where they do not mix with results."""
+
+    def emit(self, record):
+        if record.levelno < logging.ERROR and not hasattr(record, "printed"):
+            prefix = "warning: " if record.levelno == logging.WARNING else ""
+            print(prefix + one_line(record.getMessage()), file=sys.stderr, flush=True)
+
+
+log = logging.getLogger("thesis_repro")
+log.addHandler(_Printer())
+log.setLevel(logging.INFO)
+log.propagate = False
 
 
 def explain(error):
@@ -138,69 +142,6 @@ def report_error(error):
     return 1
 
 
-def temporary(path):
-    """Return a temporary path beside `path`, with a random name that nobody can predict."""
-    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
-
-
-def sweep(folder):
-    """Delete the temporary files of killed runs in and below a folder. The caller must hold its
-    lock.
-    """
-    for path in Path(folder).rglob(".*"):
-        if TEMPORARY.fullmatch(path.name):
-            path.unlink(missing_ok=True)
-
-
-_held = set()  # device and inode of each path that this process has locked
-
-
-@contextmanager
-def claimed(folder):
-    """Create a folder if needed, and lock it until the block ends. Raises InputError if another
-    process has locked it.
-
-    Folders that were created here and are still empty at the end are removed.
-    """
-    folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; name a folder for the results")
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with locked(folder):
-            yield
-    finally:
-        with suppress(OSError):
-            for path in new:
-                path.rmdir()
-
-
-@contextmanager
-def locked(path):
-    """Lock an existing folder or file until the block ends. The same process may lock it again
-    within the block.
-    """
-    status = os.stat(path)
-    key = status.st_dev, status.st_ino
-    if key in _held:
-        yield
-        return
-    descriptor = os.open(path, os.O_RDONLY)  # the lock ends with the process, even if it is killed
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{path}: another run uses it; wait, or name another folder") from None
-        except OSError:
-            pass  # the file system has no locks
-        _held.add(key)
-        yield
-    finally:
-        _held.discard(key)
-        os.close(descriptor)
-
-
 # The log
 
 
@@ -240,33 +181,33 @@ class _LogFile(MemoryHandler):
         """
         seconds = timedelta(seconds=round(time.monotonic() - self.started))
         reused_text = f"from an earlier run: {reused:,}; " if reused else ""
-        say(
-            f"{text}\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}"
-        )
+        text += f"\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}"
+        print(text, flush=True)
+        for line in text.splitlines():
+            log.info(line, extra={"printed": True})
 
 
 @contextmanager
 def logged(folder, title, has_results=False):
-    """Log into a folder what `say`, `remark` and `warn` print, Python's warnings, and the error
-    that ends the block.
+    """Log into a folder what `log` prints, Python's warnings, and the error that ends the block.
 
     Yields the `_LogFile`. title: the first line. has_results: write the log at once, not only when
     results appear.
     """
     handler = _LogFile(Path(folder), has_results)
-    loggers = _log, logging.getLogger("py.warnings")
+    loggers = log, logging.getLogger("py.warnings")
     for logger in loggers:
         logger.addHandler(handler)
     logging.captureWarnings(True)
-    _log.info(title)
+    log.info(title, extra={"printed": True})
     try:
         yield handler
     except Exception as error:
         reason = explain(error)
-        _log.error(reason or type(error).__name__, exc_info=reason is None)
+        log.error(reason or type(error).__name__, exc_info=reason is None)
         raise
     except BaseException as error:
-        _log.error("stopped: %r", error)
+        log.error("stopped: %r", error)
         raise
     finally:
         logging.captureWarnings(False)
@@ -276,30 +217,23 @@ def logged(folder, title, has_results=False):
             handler.target.close()
 
 
-def say(text, warning=False):
-    """Print a text and log it."""
-    print(text, flush=True)
-    note(text, logging.WARNING if warning else logging.INFO)
-
-
-def note(text, level=logging.ERROR):
-    """Log each line of a text."""
-    for line in text.splitlines():
-        _log.log(level, line)
-
-
-def remark(text):
-    """Print a line on standard error, where it does not mix with results, and log it."""
-    print(one_line(text), file=sys.stderr, flush=True)
-    note(text, logging.INFO)
-
-
-def warn(lines):
-    """Print warnings on standard error, log them, and return them."""
-    for line in lines:
-        print(f"warning: {one_line(line)}", file=sys.stderr, flush=True)
-        note(line, logging.WARNING)
-    return lines
+@contextmanager
+def quiet():
+    """Hide what libraries' own code prints on standard output and error within the block."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    originals = os.dup(1), os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(null, stream)
+        yield
+    finally:
+        sys.stdout.flush()
+        for stream, original in enumerate(originals, 1):
+            os.dup2(original, stream)
+        for descriptor in (*originals, null):
+            os.close(descriptor)
 
 
 # The end of a process

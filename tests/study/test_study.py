@@ -11,12 +11,14 @@ import pandas as pd
 import pytest
 from evo.tools import file_interface
 
+from thesis_repro import InputError
 from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, write_masks
 from thesis_repro.report import study as report
-from thesis_repro.study import compare, runner, series
+from thesis_repro.study import compare, runner
 from thesis_repro.study.sources import Source
+from thesis_repro.study.study import Study
 
 FRAMES = 6
 
@@ -34,7 +36,7 @@ def masks(small_world, small_labels, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def study(small_world, small_labels, masks):
-    planned = series.Study(
+    planned = Study(
         small_world / "kitti",
         ("00", "01"),
         (Source(small_labels, name="net"), Source(masks, "masks", "by-hand")),
@@ -184,7 +186,7 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
 
 
 def test_a_single_sequence_may_have_plain_folders(small_world, small_labels, masks, tmp_path):
-    single = series.Study(
+    single = Study(
         small_world / "kitti",
         ("00",),
         (Source(small_labels / "00", name="a"), Source(masks / "00", "masks", "b")),
@@ -196,7 +198,7 @@ def test_a_single_sequence_may_have_plain_folders(small_world, small_labels, mas
 
 def test_results_of_another_length_are_kept(done, study):
     before = files(done[0])
-    with pytest.raises(series.InputError, match="other settings"):
+    with pytest.raises(InputError, match="other settings"):
         replace(study, frames=5).run(done[0])
     assert files(done[0]) == before
 
@@ -251,8 +253,8 @@ def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_lab
     shutil.copytree(small_labels / "00", tmp_path / "labels" / "00")
     damaged = tmp_path / "labels" / "00" / "000002.png"
     damaged.write_bytes(damaged.read_bytes()[:-20])
-    study = series.Study(
+    study = Study(
         small_world / "kitti", ("00",), (Source(tmp_path / "labels", name="net"),), (5,), frames=5
     )
-    with pytest.raises(series.InputError, match="every run with masks failed"):
+    with pytest.raises(InputError, match="every run with masks failed"):
         study.run(tmp_path / "out")

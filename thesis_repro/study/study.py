@@ -1,16 +1,17 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro import InputError, check, longrun, stages
-from thesis_repro.kitti import Sequence, write_kitti_poses, write_tum
+from thesis_repro import InputError, check, results
+from thesis_repro.kitti import Sequence
 from thesis_repro.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
+from thesis_repro.trajectories import write_kitti_poses, write_tum
 
 PATHS = "paths"  # folder of the estimated paths
 
@@ -33,8 +34,9 @@ class Study:
     repetitions: int = 1
     frames: int | None = None
 
+    @cached_property
     def opened(self) -> list[Sequence]:
-        """Return the sequences, cut to `frames` frames."""
+        """The sequences, cut to `frames` frames."""
         return [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
 
     def check(self) -> None:
@@ -43,7 +45,7 @@ class Study:
             raise InputError(
                 f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}"
             )
-        sequences = self.opened()
+        sequences = self.opened
         for sequence in sequences:
             if len(sequence) < 3:
                 raise InputError(
@@ -64,7 +66,7 @@ class Study:
         """Return each sequence with the masks of each source, at the `shown_width`."""
         return [
             (sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
-            for sequence in self.opened()
+            for sequence in self.opened
         ]
 
     def shown_jobs(self, name: str) -> list[jobs.Job]:
@@ -91,7 +93,7 @@ class Study:
         and TUM's formats.
         """
         first_runs = runs[runs["repetition"] == 0]
-        for sequence in self.opened():
+        for sequence in self.opened:
             name = sequence.name
             estimated = runner.run_poses(
                 first_runs[first_runs["sequence"] == name], folder / "runs"
@@ -107,12 +109,11 @@ class Study:
         baselines = runs[
             (runs["method"] == "baseline") & (runs["repetition"] == 0)
         ].drop_duplicates("sequence")
+        true = {sequence.name: sequence.poses for sequence in self.opened}
         return [
             line
             for (name, _), poses in runner.run_poses(baselines, folder / "runs").items()
-            for line in check.path_oddities(
-                name, poses, Sequence(self.kitti, name).poses[: len(poses)]
-            )
+            for line in check.path_oddities(name, poses, true[name])
         ]
 
     def first_jobs(self) -> list[jobs.Job]:
@@ -135,14 +136,14 @@ class Study:
         run = partial(
             runner.run,
             kitti=self.kitti,
-            labels=self.sources,
+            sources=self.sources,
             folder=folder / "runs",
             frames=self.frames,
             processes=processes,
             scheduler=scheduler,
         )
-        with longrun.claimed(folder):
-            stages.stage(folder, replace=False, frames=self.frames)
+        with results.claimed(folder):
+            results.stage(folder, replace=False, frames=self.frames)
             study_jobs = self.first_jobs()
             runs = run(study_jobs)
             if runs["mean_keypoints"].isna().all():

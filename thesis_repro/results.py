@@ -1,12 +1,14 @@
-"""Stages, checkpoints and digests: which inputs results were made from, and how a stopped job
+"""Folders of results: which inputs they were made from, who works in them, and how a stopped job
 resumes.
 
 A *stage* is a folder of results with a record of their inputs and a list of the files written there
-(`stage`). A *checkpoint* is one file from which a long job resumes (`store`, `resume`). A *digest*
-stands for the content of an input and has twelve hexadecimal digits.
+(`stage`). Its lock keeps other runs out (`claimed`). A *checkpoint* is one file from which a long
+job resumes (`store`, `resume`). A *digest* stands for the content of an input and has twelve
+hexadecimal digits.
 """
 
 import ast
+import fcntl
 import hashlib
 import importlib.metadata
 import json
@@ -25,9 +27,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, longrun
-from thesis_repro.files import atomic, progress, write_text
-from thesis_repro.longrun import LIST, LOG, RECORD
+from thesis_repro import InputError, console
+from thesis_repro.console import LOG, RECORD
+from thesis_repro.files import LIST, TEMPORARY, atomic, progress, write_text
 
 _PACKAGE = Path(__file__).parent
 
@@ -42,11 +44,11 @@ def stage(folder, *, replace=True, **inputs):
     list of files written there or was changed since.
     """
     folder = Path(folder)
-    with longrun.claimed(folder):
+    with claimed(folder):
         inputs, earlier = json.loads(json.dumps(inputs, default=str)), record(folder)
         names = [path.name for path in folder.iterdir()]
         if earlier is None and not all(
-            name in (LOG, LIST) or longrun.TEMPORARY.fullmatch(name) for name in names
+            name in (LOG, LIST) or TEMPORARY.fullmatch(name) for name in names
         ):
             raise InputError(
                 f"{folder}: holds files that this project did not make; choose an empty or new folder"
@@ -65,7 +67,7 @@ def stage(folder, *, replace=True, **inputs):
                     "choose another folder"
                 )
             _delete_results(folder, changed)
-        longrun.sweep(folder)
+        sweep(folder)
         if earlier != inputs:
             write_text(folder / RECORD, json.dumps(inputs, indent=1, sort_keys=True))
     return folder
@@ -84,7 +86,7 @@ def _delete_results(folder, changed):
     for path in (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()):
         if path.name in (RECORD, LIST):
             records.append(path)
-        elif path.name != LOG and not longrun.TEMPORARY.fullmatch(path.name):
+        elif path.name != LOG and not TEMPORARY.fullmatch(path.name):
             if path.is_symlink() or path not in written or _sha256(path) not in written[path]:
                 raise InputError(
                     f"{folder}: cannot delete its results, made with another {changed}: {path} was not "
@@ -92,7 +94,7 @@ def _delete_results(folder, changed):
                 )
             results.append(path)
     if results:
-        longrun.say(f"{folder}: deleting {len(results):,} files, made with another {changed}")
+        console.log.info(f"{folder}: deleting {len(results):,} files, made with another {changed}")
     # the folder's record goes last, so that a killed deletion can be repeated
     for path in (
         *results,
@@ -140,6 +142,64 @@ def check_worker(folder, made_from, **here):
         )
 
 
+def sweep(folder):
+    """Delete the temporary files of killed runs in and below a folder. The caller must hold its
+    lock.
+    """
+    for path in Path(folder).rglob(".*"):
+        if TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+_held = set()  # device and inode of each path that this process has locked
+
+
+@contextmanager
+def claimed(folder):
+    """Create a folder if needed, and lock it until the block ends. Raises InputError if another
+    process has locked it.
+
+    Folders that were created here and are still empty at the end are removed.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; name a folder for the results")
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(folder):
+            yield
+    finally:
+        with suppress(OSError):
+            for path in new:
+                path.rmdir()
+
+
+@contextmanager
+def locked(path):
+    """Lock an existing folder or file until the block ends. The same process may lock it again
+    within the block.
+    """
+    status = os.stat(path)
+    key = status.st_dev, status.st_ino
+    if key in _held:
+        yield
+        return
+    descriptor = os.open(path, os.O_RDONLY)  # the lock ends with the process, even if it is killed
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{path}: another run uses it; wait, or name another folder") from None
+        except OSError:
+            pass  # the file system has no locks
+        _held.add(key)
+        yield
+    finally:
+        _held.discard(key)
+        os.close(descriptor)
+
+
 TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
 
 
@@ -160,7 +220,7 @@ def kept_table(path, rows=None, **options):
         )
         if numeric and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
             return table
-    longrun.say(f"{path}: is damaged and will be made again", warning=True)
+    console.log.warning(f"{path}: is damaged and will be made again")
     return None
 
 

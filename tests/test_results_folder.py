@@ -4,40 +4,40 @@ import shutil
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, files, stages
+from thesis_repro import InputError, files, results
 
 
 def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
-    folder = stages.stage(tmp_path / "a", data="one", size=3)
+    folder = results.stage(tmp_path / "a", data="one", size=3)
     files.write_text(folder / "result", "kept")
     assert (
-        stages.stage(tmp_path / "a", size=3, data="one") == folder and (folder / "result").exists()
+        results.stage(tmp_path / "a", size=3, data="one") == folder and (folder / "result").exists()
     )
-    before = stages.made_from(folder)
-    stages.stage(tmp_path / "a", data="other", size=3)
-    assert not (folder / "result").exists() and stages.made_from(folder) != before
+    before = results.made_from(folder)
+    results.stage(tmp_path / "a", data="other", size=3)
+    assert not (folder / "result").exists() and results.made_from(folder) != before
     with pytest.raises(InputError, match="a: .*size"):
-        stages.stage(folder, replace=False, data="other", size=4)
-    assert stages.record(folder) == {"data": "other", "size": 3}
+        results.stage(folder, replace=False, data="other", size=4)
+    assert results.record(folder) == {"data": "other", "size": 3}
 
 
 def test_a_folder_with_other_files_is_refused_and_kept(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(InputError, match=str(tmp_path)):
-        stages.stage(tmp_path, data="one")
+        results.stage(tmp_path, data="one")
     with pytest.raises(InputError, match="letter.txt: "):
-        stages.stage(tmp_path / "letter.txt", data="one")
+        results.stage(tmp_path / "letter.txt", data="one")
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
-    (tmp_path / stages.RECORD).write_text("[1, 2")  # a damaged record
+    (tmp_path / results.RECORD).write_text("[1, 2")  # a damaged record
     with pytest.raises(InputError, match="made-from.json: "):
-        stages.stage(tmp_path, data="one")
+        results.stage(tmp_path, data="one")
 
 
 def test_a_checkpoint_is_read_back_and_holds_no_code(tmp_path):
     file = tmp_path / "state.npz"
-    assert stages.resume(file) is None
-    stages.store(file, {"epoch": 3}, {"0": np.eye(2), "job": np.arange(3)})
-    job, arrays = stages.resume(file)
+    assert results.resume(file) is None
+    results.store(file, {"epoch": 3}, {"0": np.eye(2), "job": np.arange(3)})
+    job, arrays = results.resume(file)
     assert (
         job == {"epoch": 3}
         and np.array_equal(arrays["0"], np.eye(2))
@@ -45,15 +45,15 @@ def test_a_checkpoint_is_read_back_and_holds_no_code(tmp_path):
     )
     np.savez(file, job="{}", **{"array 0": np.array([object()])})  # a pickle
     with pytest.raises(InputError, match="state.npz: "):
-        stages.resume(file)
-    stages.store(file, {}, {"0": np.zeros(1000)})
+        results.resume(file)
+    results.store(file, {}, {"0": np.zeros(1000)})
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(InputError, match="state.npz: "):
-        stages.resume(file)
+        results.resume(file)
 
 
 def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monkeypatch):
-    monkeypatch.setattr(stages, "_PACKAGE", tmp_path / "package")
+    monkeypatch.setattr(results, "_PACKAGE", tmp_path / "package")
     plain = {
         "__init__": "",
         "room____init__": "",
@@ -69,8 +69,8 @@ def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monke
             files.write_text(
                 tmp_path / "package" / f"{name.replace('__', '/', name != '__init__')}.py", text
             )
-        stages.code.cache_clear()
-        return stages.code(place)
+        results.code.cache_clear()
+        return results.code(place)
 
     first = version()
     assert version(house='# why\ndef f():\n    """What."""\n    return 1\n') == first
@@ -80,12 +80,12 @@ def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monke
     assert version("room/table", house="def f():\n    return 2\n") != version("room/table")
     with pytest.raises(ImportError, match="attic"):
         version("attic")
-    stages.code.cache_clear()
+    results.code.cache_clear()
 
 
 def test_modules_that_a_run_depends_on():
-    paths = stages._modules(["odometry", "study/jobs"])
-    names = {str(path.relative_to(stages._PACKAGE).with_suffix("")) for path in paths}
+    paths = results._modules(["odometry", "study/jobs"])
+    names = {str(path.relative_to(results._PACKAGE).with_suffix("")) for path in paths}
     assert {
         "kitti",
         "masks",
@@ -102,40 +102,40 @@ def test_modules_that_a_run_depends_on():
 
 def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeypatch):
     monkeypatch.setenv("THESIS_REPRO_BUILD", str(tmp_path / "build"))
-    monkeypatch.setattr(stages, "SETTLED", -1)
+    monkeypatch.setattr(results, "SETTLED", -1)
     paths = [tmp_path / "a", tmp_path / "b"]
     for path in paths:
         path.write_text("12")
-    first = stages.listing(paths)
+    first = results.listing(paths)
     (tmp_path / "elsewhere").mkdir()
-    assert stages.listing([shutil.copy(path, tmp_path / "elsewhere") for path in paths]) == first
+    assert results.listing([shutil.copy(path, tmp_path / "elsewhere") for path in paths]) == first
     date = paths[1].stat().st_mtime_ns
     paths[1].write_text("21")  # the same length and date
     os.utime(paths[1], ns=(date, date))
-    changed = stages.listing(paths)
+    changed = results.listing(paths)
     assert changed != first
-    monkeypatch.setattr(stages, "_sha256", None)  # nothing may be read
-    assert stages.listing(paths) == changed
+    monkeypatch.setattr(results, "_sha256", None)  # nothing may be read
+    assert results.listing(paths) == changed
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="pipe: "):
-        stages.listing([tmp_path / "pipe"])
+        results.listing([tmp_path / "pipe"])
 
 
 @pytest.mark.parametrize("named", ["notes.txt", "in/.env.1", "in/result", "link"])
 def test_changed_and_foreign_files_are_not_deleted(tmp_path, capsys, named):
-    folder = stages.stage(tmp_path / "a", size=3)
+    folder = results.stage(tmp_path / "a", size=3)
     files.write_text(folder / "in" / "result", "result")
     if named == "link":
         (folder / named).symlink_to("/nowhere")
     else:
         (folder / named).write_text("by hand")
     before = {path: path.is_file() and path.read_text() for path in folder.rglob("*")}
-    stages.stage(folder, size=3)
+    results.stage(folder, size=3)
     with pytest.raises(InputError, match=named):
-        stages.stage(folder, size=4)
+        results.stage(folder, size=4)
     assert {path: path.is_file() and path.read_text() for path in folder.rglob("*")} == before
     (folder / named).unlink()
-    stages.stage(folder, size=4)
+    results.stage(folder, size=4)
     assert not (folder / "in" / "result").exists()
     assert (str(folder) in capsys.readouterr().out) == (named != "in/result")
 
@@ -146,5 +146,5 @@ def test_changed_and_foreign_files_are_not_deleted(tmp_path, capsys, named):
 def test_a_damaged_table_is_not_kept(tmp_path, text):
     for content, whole in (("frame,x\n0,1.0\n1,2.0\n", True), (text, False)):
         (tmp_path / "a.csv").write_text(content)
-        assert (stages.kept_table(tmp_path / "a.csv", rows=2) is not None) == whole
-    assert stages.kept_table(tmp_path / "b.csv") is None
+        assert (results.kept_table(tmp_path / "a.csv", rows=2) is not None) == whole
+    assert results.kept_table(tmp_path / "b.csv") is None

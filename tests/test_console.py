@@ -8,54 +8,54 @@ import warnings
 
 import pytest
 
-from thesis_repro import InputError, files, longrun, stages
+from thesis_repro import InputError, console, files, results
 
 
 def test_a_folder_is_locked_by_one_process(tmp_path):
     folder = tmp_path / "out"
-    with longrun.claimed(folder), longrun.claimed(folder):  # one process may lock it twice
-        stages.stage(folder, size=3)
+    with results.claimed(folder), results.claimed(folder):  # one process may lock it twice
+        results.stage(folder, size=3)
         other = os.open(folder, os.O_RDONLY)  # as in another process
         with pytest.raises(BlockingIOError):
             fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
     fcntl.flock(other, fcntl.LOCK_EX)
-    for attempt in (lambda: longrun.claimed(folder).__enter__(), lambda: stages.stage(folder)):
+    for attempt in (lambda: results.claimed(folder).__enter__(), lambda: results.stage(folder)):
         with pytest.raises(InputError, match="out: "):
             attempt()
     os.close(other)
-    assert not longrun._held
+    assert not results._held
 
 
 def test_a_failed_run_leaves_no_empty_folders(tmp_path):
-    with pytest.raises(ZeroDivisionError), longrun.claimed(tmp_path / "a" / "b"):
+    with pytest.raises(ZeroDivisionError), results.claimed(tmp_path / "a" / "b"):
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="file: "), longrun.claimed(tmp_path / "file"):
+    with pytest.raises(InputError, match="file: "), results.claimed(tmp_path / "file"):
         pass
 
 
 def test_temporary_files_of_a_killed_run_are_deleted(tmp_path):
-    folder = stages.stage(tmp_path / "out", size=3)
+    folder = results.stage(tmp_path / "out", size=3)
     (folder / "in").mkdir()
-    temporary, hidden = longrun.temporary(folder / "in" / "a.png"), folder / "in" / ".hidden"
+    temporary, hidden = files.temporary_path(folder / "in" / "a.png"), folder / "in" / ".hidden"
     temporary.touch()
     hidden.touch()
-    stages.stage(folder, size=3)
+    results.stage(folder, size=3)
     assert not temporary.exists() and hidden.exists()
     # a run that was killed while it wrote its record
     other = tmp_path / "other"
     other.mkdir()
-    longrun.temporary(other / stages.RECORD).touch()
-    assert [path.name for path in stages.stage(other, size=3).iterdir()] == [stages.RECORD]
+    files.temporary_path(other / results.RECORD).touch()
+    assert [path.name for path in results.stage(other, size=3).iterdir()] == [results.RECORD]
 
 
 def test_results_are_deleted_before_their_records_and_the_log_is_kept(tmp_path, monkeypatch):
-    folder, gone = stages.stage(tmp_path / "out", size=3), []
-    stages.stage(folder / "in", size=3)
+    folder, gone = results.stage(tmp_path / "out", size=3), []
+    results.stage(folder / "in", size=3)
     for path in (folder / "result", folder / "in" / "result"):
         files.write_text(path, "")
-    (folder / longrun.LOG).touch()
+    (folder / console.LOG).touch()
     unlink = type(folder).unlink
 
     def noted(path, **options):
@@ -63,11 +63,11 @@ def test_results_are_deleted_before_their_records_and_the_log_is_kept(tmp_path, 
         unlink(path, **options)
 
     monkeypatch.setattr(type(folder), "unlink", noted)
-    stages.stage(folder, size=4)
+    results.stage(folder, size=4)
     gone = [name for name in gone if not name.startswith(".")]
-    assert gone.count("result") == gone.count(stages.RECORD) == 2 and gone[-1] == stages.RECORD
-    assert gone.index("result") < gone.index(stages.RECORD)
-    assert {path.name for path in folder.iterdir()} == {stages.RECORD, longrun.LOG}
+    assert gone.count("result") == gone.count(results.RECORD) == 2 and gone[-1] == results.RECORD
+    assert gone.index("result") < gone.index(results.RECORD)
+    assert {path.name for path in folder.iterdir()} == {results.RECORD, console.LOG}
 
 
 def chained(inner, outer):
@@ -95,11 +95,11 @@ def chained(inner, outer):
     ],
 )
 def test_errors_of_the_machine_are_one_line(error, says, capsys):
-    assert longrun.report_error(error) == 1
+    assert console.report_error(error) == 1
     line = capsys.readouterr().err
     assert line.startswith("error: ") and says in line and line.count("\n") == 1
     with pytest.raises(ZeroDivisionError):  # unexpected errors are raised
-        longrun.report_error(ZeroDivisionError("1/0"))
+        console.report_error(ZeroDivisionError("1/0"))
 
 
 @pytest.mark.parametrize("named", [False, True])
@@ -112,15 +112,16 @@ def test_a_full_disk_names_the_file_and_not_the_temporary_file(tmp_path, named):
 
 def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
     warnings.simplefilter("always")  # pytest restores the filters
-    with pytest.raises(InputError), longrun.logged(tmp_path / "out", "thesis-repro study") as run:
-        stages.stage(tmp_path / "out", size=3)
+    with pytest.raises(InputError), console.logged(tmp_path / "out", "thesis-repro study") as run:
+        results.stage(tmp_path / "out", size=3)
         warnings.warn("odd", stacklevel=1)
-        longrun.say("sequence 00 failed", warning=True)
+        console.log.warning("sequence 00 failed")
         run.end("3 runs")
         raise InputError("bad")
-    assert capsys.readouterr().out.startswith("sequence 00 failed\n3 runs\n")
-    lines = (tmp_path / "out" / longrun.LOG).read_text().splitlines()
+    printed = capsys.readouterr()
+    assert printed.out.startswith("3 runs\n") and printed.err == "warning: sequence 00 failed\n"
+    lines = (tmp_path / "out" / console.LOG).read_text().splitlines()
     assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
     assert any("WARNING" in line and "odd" in line for line in lines)
     handlers = logging.getLogger("thesis_repro").handlers
-    assert not any(isinstance(handler, longrun._LogFile) for handler in handlers)
+    assert not any(isinstance(handler, console._LogFile) for handler in handlers)

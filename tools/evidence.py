@@ -8,13 +8,15 @@ audit's ablations. A stopped run resumes.
 
 import os
 import sys
+from pathlib import Path
 
+import failures
 import pandas as pd
 
-from thesis_repro import kitti, longrun, masks, stages
+from thesis_repro import console, kitti, masks, results
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
-from thesis_repro.report import audit, captions, comparison, failures, style, texts
+from thesis_repro.report import audit, comparison, style, texts
 from thesis_repro.segmentation import prediction
 from thesis_repro.settings import PREFIX, ROOT, read_settings
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
@@ -26,6 +28,8 @@ FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)
 SAMPLED_FRAMES = 12  # frames of each sequence in which boundaries and tracks are measured
 
+texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
+
 
 def write(root, folder, build, frames=None, repetitions=5, processes=1):
     """Run the missing jobs and write all tables, plots and findings into a folder.
@@ -33,7 +37,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
     root: the KITTI folder. build: keeps label maps and runs; folder and build are absolute paths.
     frames: how many frames of each sequence to use, None for all.
     """
-    stages.stage(build, results="evidence")
+    results.stage(build, results="evidence")
     labels, model = build / "labels", prediction.load_shipped()
     sequences = [kitti.Sequence(root, name).subset(frames) for name in kitti.sequences(root)]
     for sequence in sequences:
@@ -65,7 +69,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     table = compare.comparisons(runs)
-    longrun.sweep(folder)
+    results.sweep(folder)
     style.save_all(
         {
             "comparison": comparison.figure_comparison(table),
@@ -88,11 +92,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
         )
     write_text(
         folder / "README.md",
-        texts.render(
-            "evidence.md.j2",
-            findings=texts.findings(runs, table, note),
-            failures=captions.OF_EVIDENCE,
-        ),
+        texts.render("evidence.md.j2", findings=texts.findings(runs, table, note)),
     )
 
 
@@ -158,7 +158,7 @@ def main():
     try:
         # all frames, unless FRAMES is set
         settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})
-        with longrun.claimed(BUILD), longrun.logged(BUILD, "tables, plots and findings") as run:
+        with results.claimed(BUILD), console.logged(BUILD, "tables, plots and findings") as run:
             write(
                 settings.kitti,
                 FOLDER,
@@ -169,7 +169,7 @@ def main():
             )
             run.end(f"tables, plots and findings: {FOLDER}")
     except Exception as error:
-        return longrun.report_error(error)
+        return console.report_error(error)
     return 0
 
 
