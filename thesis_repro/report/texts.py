@@ -84,11 +84,12 @@ TEMPLATES.filters["ratio"] = ratio_and_far_off
 TEMPLATES.filters["number"] = number
 
 
-def findings(runs, table, data, label_maps=()):
+def findings(runs, table, data, label_maps=(), trainings=()):
     """Return the findings of a run, a study or the evidence as Markdown.
 
     table: `compare.comparisons` of the runs. data: one line with the origin of the data.
     label_maps: the quality of the label maps, rows of `gap.label_map_quality`.
+    trainings: what other trainings of the network give, from `trainings.summary`.
     """
     baseline, masked = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
     pairs = table[
@@ -108,6 +109,8 @@ def findings(runs, table, data, label_maps=()):
     return render(
         "findings.md.j2",
         label_maps=label_maps,
+        trainings=trainings,
+        deciding_metrics=list(compare.JUDGING_METRICS),
         data=data,
         embedded="embedded" in data.split(";")[0],
         frames=baseline.groupby("sequence")["frames"].first().to_dict(),

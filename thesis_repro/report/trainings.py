@@ -17,6 +17,25 @@ def read():
     return pd.read_csv(TABLE)
 
 
+def summary():
+    """Return what the trainings give, one dict for each estimator.
+
+    verdicts: of each training. ranges: {column: (lowest, highest)} over the trainings, for columns
+    that the estimator has.
+    """
+    return [
+        {
+            "estimator": estimator,
+            "verdicts": rows["verdict"].tolist(),
+            "ranges": {
+                name: (rows[name].min(), rows[name].max())
+                for name in rows.select_dtypes("number").dropna(axis="columns")
+            },
+        }
+        for estimator, rows in read().groupby("estimator", sort=False)
+    ]
+
+
 def network_note(settings):
     """Return one line that says whether a run's network is the recorded one, to the bit; empty for
     a run of other data or sizes.
