@@ -93,7 +93,7 @@ def _of_embedded_world():
             "mean IoU": mean_iou,
             "mean IoU from": where,
             "odometry": RENDERED,
-            "sequences": str(row["sequences"]),
+            "sequences": f"{row['sequences']} drives",
             "over": ALL_KEYPOINTS,
             **{label: row[label] for label in compare.JUDGING_METRICS.values() if label in row},
         }
@@ -128,6 +128,6 @@ def figure(table):
         panel.axhline(1, color="black", linewidth=0.8)
         panel.set(title=label, xlabel="mean IoU of the label maps", xlim=(0.25, 1.05))
         style.ratio_axis(panel.yaxis, np.append(numbers.to_numpy().ravel(), 1))
-    panels[0, 0].set_ylabel("ratio to all keypoints (below 1: lower)")
+    panels[0, 0].set_ylabel("ratio to all keypoints\n(below 1: lower)")
     style.legend_below(drawing, list(panels[0]), 1)
     return drawing
