@@ -12,7 +12,8 @@ from thesis_repro.settings import ROOT
 from thesis_repro.study import compare
 
 REAL, RENDERED = "real frames", "embedded world (rendered)"
-ALL_KEYPOINTS, PACKAGE = compare.METHODS["baseline"], "the model in the package"
+ALL_KEYPOINTS, EXACT = compare.METHODS["baseline"], compare.METHODS["true-labels"]
+PACKAGE = "the model in the package"
 # Mean IoU that the data at hand cannot give, by name of the folder of label maps.
 MEASURED_ELSEWHERE = {
     "labels_espnetv2": (
@@ -67,8 +68,11 @@ def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
 
 def _on_card():
     """Return the mean IoU of the model in the package on KITTI's pairs held out, from its card."""
-    card = (ROOT / captions.CARD).read_text(encoding="utf-8")
-    found = re.search(r"\*\*Quality on (KITTI's .*?)\*\*.*?mean IoU \*\*([\d.]+)\*\*", card, re.S)
+    found = re.search(
+        r"\*\*Quality on (KITTI's .*?)\*\*.*?mean IoU \*\*([\d.]+)\*\*",
+        (ROOT / captions.CARD).read_text(encoding="utf-8"),
+        re.S,
+    )
     return float(found[2]), f"{found[1]}, 11 classes, from gray (model card)"
 
 
@@ -82,10 +86,10 @@ def _of_embedded_world():
     trained = float(
         quality.loc["mean IoU over these", "the model of this run: the odometry's frames"]
     )
-    exact = compare.METHODS["true-labels"]
+    masked = ratios[ratios.index.str.startswith(compare.METHODS["masked"])].iloc[0]
     sources = {
-        "a network trained for minutes": (trained, "its own frames, 12 classes", _masked(ratios)),
-        exact: (1.0, "exact", ratios.loc[exact]),
+        "a network trained for minutes": (trained, "its own frames, 12 classes", masked),
+        EXACT: (1.0, "exact", ratios.loc[EXACT]),
     }
     return [
         {
@@ -101,10 +105,6 @@ def _of_embedded_world():
     ]
 
 
-def _masked(ratios):
-    return ratios[ratios.index.str.startswith(compare.METHODS["masked"])].iloc[0]
-
-
 def figure(table):
     """Draw the ratios to all keypoints over the mean IoU, one panel a judging metric, from
     `table`.
@@ -116,15 +116,16 @@ def figure(table):
         numbers = rows[label].str.extract(RATIO).astype(float)
         for number, (index, row) in enumerate(rows.iterrows()):
             ratio, low, high = numbers.loc[index]
-            real = row["odometry"] == REAL
-            look = {
-                "color": style.line_style(number)["color"],
-                "marker": "o" if real else "s",
-                "markerfacecolor": None if real else "white",
-                "label": f"{row['label maps']}; {row['odometry']}: {row['sequences']}",
-            }
-            panel.plot([row["mean IoU"]] * 2, [low, high], color=look["color"], linewidth=1.6)
-            panel.plot(row["mean IoU"], ratio, linestyle="none", markersize=6, **look)
+            color = style.line_style(number)["color"]
+            panel.plot([row["mean IoU"]] * 2, [low, high], color=color, linewidth=1.6)
+            panel.plot(
+                row["mean IoU"],
+                ratio,
+                "o" if row["odometry"] == REAL else "s",
+                color=color,
+                markerfacecolor=color if row["odometry"] == REAL else "white",
+                label=f"{row['label maps']}; {row['odometry']}: {row['sequences']}",
+            )
         panel.axhline(1, color="black", linewidth=0.8)
         panel.set(title=label, xlabel="mean IoU of the label maps", xlim=(0.25, 1.05))
         style.ratio_axis(panel.yaxis, np.append(numbers.to_numpy().ravel(), 1))
