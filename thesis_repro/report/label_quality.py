@@ -4,7 +4,6 @@ evidence on real frames.
 
 import re
 
-import numpy as np
 import pandas as pd
 
 from thesis_repro.report import captions, style, texts
@@ -51,7 +50,7 @@ def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
         for metric in compare.JUDGING_METRICS
         if metric in rows and metric in reference
     }
-    mean_iou, where = quality.get(name, (np.nan, "not known"))
+    mean_iou, where = quality.get(name, (float("nan"), "not known"))
     return {
         "label maps": name,
         "mean IoU": mean_iou,
@@ -128,7 +127,7 @@ def figure(table):
             )
         panel.axhline(1, color="black", linewidth=0.8)
         panel.set(title=label, xlabel="mean IoU of the label maps", xlim=(0.25, 1.05))
-        style.ratio_axis(panel.yaxis, np.append(numbers.to_numpy().ravel(), 1))
+        style.ratio_axis(panel.yaxis, [1, *numbers.to_numpy().ravel()])
     panels[0, 0].set_ylabel("ratio to all keypoints\n(below 1: lower)")
     style.legend_below(drawing, list(panels[0]), 1)
     return drawing
