@@ -10,7 +10,7 @@ BIN := .venv/bin
 
 # Refuse a misspelled setting, for which the default would silently be used.
 SIZES := IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
-KNOWN := KITTI CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON GPU $(SIZES)
+KNOWN := KITTI LABELS CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON GPU $(SIZES)
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
@@ -22,9 +22,9 @@ ifneq (,$(EMPTY))
 $(error $(firstword $(EMPTY))= is empty; give it a value, or leave it out)
 endif
 ifneq (,$(filter evidence,$(MAKECMDGOALS)))
-UNUSED := $(filter-out KITTI FRAMES REPETITIONS JOBS PYTHON,$(filter $(KNOWN),$(GIVEN)))
+UNUSED := $(filter-out KITTI LABELS FRAMES REPETITIONS JOBS PYTHON,$(filter $(KNOWN),$(GIVEN)))
 ifneq (,$(UNUSED))
-$(error $(firstword $(UNUSED)): make evidence takes only KITTI, FRAMES, REPETITIONS and JOBS)
+$(error $(firstword $(UNUSED)): make evidence takes only KITTI, LABELS, FRAMES, REPETITIONS and JOBS)
 endif
 endif
 # Take settings from the package's THESIS_REPRO_ variables, too.
@@ -69,7 +69,7 @@ help:
 	@echo "make lint        check format and style (Ruff) and types (mypy)"
 	@echo "make lab         open the notebooks in JupyterLab with PROFILE=lab (a minute each)"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
-	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts"
+	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts; LABELS=/path adds label maps"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train a model like the shipped one into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path"
 	@echo "make setup       only install the pinned packages into .venv; GPU=1 adds CUDA for an NVIDIA GPU"
@@ -206,7 +206,7 @@ bench: setup
 
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
-	@$(BIN)/python tools/evidence.py
+	@$(BIN)/python tools/evidence.py $(if $(LABELS),"$(LABELS)")
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)

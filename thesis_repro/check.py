@@ -22,7 +22,6 @@ from thesis_repro import (
     masks,
     one_line,
     results,
-    trajectories,
 )
 from thesis_repro.settings import read_settings
 
@@ -79,19 +78,20 @@ def _check_sequence(root, name, needs_truth, deep):
 
     Unlike kitti.Sequence, this lists all problems, not only the first.
     """
-    folder, problems = Path(root) / "sequences" / name, _Problems()
+    folder, poses, problems = *kitti.locate(root, name)[1:], _Problems()
     frame_folder = kitti.images_of(folder)
     paths = problems.call(files.images, frame_folder)
     if not paths:
         return f"sequence {name}: no frames", problems or [
             f"{frame_folder}: holds no PNG or JPEG frames"
         ]
-    matrix = problems.call(kitti.read_intrinsics, folder / "calib.txt", frame_folder.name)
-    poses, times, rows = Path(root) / "poses" / f"{name}.txt", folder / "times.txt", {}
+    (calibration, times), rows = kitti.texts_of(folder, frame_folder), {}
+    camera = kitti.camera_of(frame_folder)
+    matrix = problems.call(kitti.read_intrinsics, calibration, camera)
     if needs_truth:
-        rows[poses] = problems.call(trajectories.read_poses, poses)
+        rows[poses] = problems.call(kitti.truth_of, poses)
     if times.is_file():
-        rows[times] = problems.call(trajectories.read_times, times)
+        rows[times] = problems.call(kitti.times_of, times)
     counts = {path: len(values) for path, values in rows.items() if values is not None}
     missing = kitti.missing_frames(
         paths, max([count for count in counts.values() if count > len(paths)], default=None)
@@ -103,7 +103,7 @@ def _check_sequence(root, name, needs_truth, deep):
             problems.call(kitti.check_count, path, count, paths)
     size = problems.call(files.glance, paths[0])
     if size and matrix is not None:
-        problems.call(kitti.check_camera, folder / "calib.txt", matrix, paths[0], size)
+        problems.call(kitti.check_camera, calibration, matrix, paths[0], size)
 
     def check_frame(path):
         decode = deep or path in (paths[0], paths[-1])
@@ -114,10 +114,10 @@ def _check_sequence(root, name, needs_truth, deep):
     notes = {
         f"{len(paths)} of {len(paths) + len(missing)} frames": bool(missing),
         f"{len(paths)} frames{f' of {size[1]}x{size[0]}' if size else ''}": not missing,
-        f"in {frame_folder.name}": frame_folder.name != kitti.IMAGE_FOLDERS[0],
+        f"in {camera}": camera != kitti.IMAGE_FOLDERS[0],
         f"an excerpt of {complete}": complete != len(paths),
         "no ground truth, so step lengths follow from --speed, or are 1 m": not needs_truth,
-        f"no times.txt, so {1 / kitti.FRAME_TIME:g} frames a second": not times.is_file(),
+        f"no {times.name}, so {1 / kitti.FRAME_TIME:g} frames a second": not times.is_file(),
     }
     return f"sequence {name}: {'; '.join(note for note, holds in notes.items() if holds)}", problems
 

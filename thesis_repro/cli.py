@@ -125,7 +125,7 @@ def masks(options):
 
 def odometry(options):
     """run the visual odometry on one sequence and print its errors, number of keypoints and time"""
-    from thesis_repro import check, odometry
+    from thesis_repro import check, kitti, odometry
     from thesis_repro.odometry import metrics
     from thesis_repro.report import texts
     from thesis_repro.trajectories import write_kitti_poses, write_tum
@@ -141,8 +141,7 @@ def odometry(options):
     _check_outputs(
         options,
         sequence.poses_path,
-        sequence.folder / "calib.txt",
-        sequence.folder / "times.txt",
+        *kitti.texts_of(sequence.folder, sequence.frame_paths[0].parent),
         sequence.frame_paths[0].parent,
         options.masks,
         options.labels,
@@ -323,11 +322,8 @@ def _image_folders(root):
     """
     from thesis_repro import files, kitti
 
-    inside = (
-        [root / "sequences" / name for name in kitti.with_frames(root)]
-        if (root / "sequences").is_dir()
-        else []
-    )
+    parent = kitti.folder_of(root)
+    inside = [parent / name for name in kitti.with_frames(root)] if parent.is_dir() else []
     for folder in inside or [root]:
         image_folder = kitti.images_of(folder)
         paths = files.images(image_folder)
@@ -451,11 +447,15 @@ def _setting(read):
 
 # options of several commands
 SHARED = {
-    "--kitti": dict(type=Path, metavar="ROOT", help="KITTI folder, with sequences/ and poses/"),
+    "--kitti": dict(
+        type=Path,
+        metavar="ROOT",
+        help="KITTI folder, with sequences/ and poses/, or with raw drives",
+    ),
     "--sequence": dict(
         required=True,
         metavar="NN",
-        help="00 to 21, or without --kitti a folder with your own frames",
+        help="00 to 21, or without --kitti a raw drive of KITTI or a folder with your own frames",
     ),
     "--frames": dict(
         type=_setting(read_frames),
@@ -463,7 +463,8 @@ SHARED = {
         help="use the first N frames of a sequence, >= 5 (all)",
     ),
     "--camera": dict(
-        metavar="image_N", help="folder of the frames (image_0, or else image_2, read as gray)"
+        metavar="image_N",
+        help="folder of the frames (image_0, or else image_2, read as gray; in a raw drive image_00, ...)",
     ),
     "--cityscapes": dict(
         type=Path, metavar="ROOT", help="Cityscapes folder (leftImg8bit/, gtFine/ or train/, ...)"

@@ -1,4 +1,4 @@
-"""KITTI odometry: frames, camera, times and ground truth of a sequence."""
+"""KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
 from collections import namedtuple
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from statistics import median_low
 
 import numpy as np
 
-from thesis_repro import InputError
+from thesis_repro import InputError, kitti_raw
 from thesis_repro.files import images, numbers_of, read_gray
 from thesis_repro.trajectories import read_poses, read_times
 
@@ -48,13 +48,11 @@ def sequences(root: str | Path) -> list[str]:
     00 to 10 are listed even without a file of poses, so that `Sequence` reports the missing file.
     """
     names = [
-        name
-        for name in with_frames(root)
-        if name in FRAME_COUNTS or (Path(root) / "poses" / f"{name}.txt").is_file()
+        name for name in with_frames(root) if name in FRAME_COUNTS or locate(root, name)[2].exists()
     ]
     if not names:
         raise InputError(
-            f"{Path(root) / 'sequences'}: no sequence holds frames (image_0 or image_2) and ground truth"
+            f"{folder_of(root)}: no sequence holds frames (image_0 or image_2) and ground truth"
         )
     return names
 
@@ -65,30 +63,41 @@ def with_frames(root: str | Path) -> list[str]:
 
     Raises InputError if the folder has another layout.
     """
-    root = Path(root)
-    if not (root / "sequences").is_dir():
+    if not folder_of(root).is_dir():
         raise InputError(
-            f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt"
+            f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt, or raw drives"
         )
     return sorted(
         folder.name
-        for folder in (root / "sequences").iterdir()
-        if folder.is_dir() and (images_of(folder).name in IMAGE_FOLDERS or images(folder))
+        for folder in folder_of(root).iterdir()
+        if folder.is_dir() and (images_of(folder) != folder or images(folder))
     )
+
+
+def folder_of(root: str | Path) -> Path:
+    """Folder of a root's sequences: the root itself if it holds raw drives, else root/sequences,
+    which may hold raw drives as well.
+    """
+    root = Path(root)
+    holds_drives = not (root / "sequences").is_dir() and any(
+        map(kitti_raw.is_drive, root.glob("*"))
+    )
+    return root if holds_drives else root / "sequences"
 
 
 def images_of(folder: str | Path, camera: str | None = None) -> Path:
     """Folder of a sequence's frames. Raises InputError if the camera is unknown or the folder is
     missing.
 
-    The default is the first of IMAGE_FOLDERS that exists. If none exists, it is the sequence's
-    folder itself.
+    The default is the first of IMAGE_FOLDERS that exists, or of a raw drive's. If none exists, it
+    is the sequence's folder itself.
     """
-    if camera is not None and camera not in IMAGE_FOLDERS:
-        raise InputError(
-            f"camera {camera!r}: unknown; choose one of {', '.join(sorted(IMAGE_FOLDERS))}"
-        )
-    candidates = [Path(folder) / name for name in ([camera] if camera else IMAGE_FOLDERS)]
+    cameras, inner = IMAGE_FOLDERS, ""
+    if kitti_raw.is_drive(folder):
+        cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
+    if camera is not None and camera not in cameras:
+        raise InputError(f"camera {camera!r}: unknown; choose one of {', '.join(sorted(cameras))}")
+    candidates = [Path(folder) / name / inner for name in ([camera] if camera else cameras)]
     frame_folder = next(
         (path for path in candidates if path.is_dir()), candidates[0] if camera else Path(folder)
     )
@@ -97,9 +106,21 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     return frame_folder
 
 
+def camera_of(frame_folder: Path) -> str:
+    """Name of the camera that took the frames in a folder, such as "image_0" or "image_02"."""
+    return (frame_folder.parent if frame_folder.name == kitti_raw.FRAMES else frame_folder).name
+
+
+def texts_of(folder: Path, frame_folder: Path) -> tuple[Path, Path]:
+    """Files of the calibration and of the times of a sequence, given the folder of its frames."""
+    if kitti_raw.is_drive(folder):
+        return kitti_raw.calibration(folder), frame_folder.parent / kitti_raw.TIMES
+    return folder / "calib.txt", folder / "times.txt"
+
+
 class Sequence:
     """One odometry sequence in the official layout: sequences/NN/image_0, calib.txt, times.txt and
-    poses/NN.txt.
+    poses/NN.txt; or one raw drive (see kitti_raw).
 
     Frames are PNG or JPEG files, numbered without gaps. Colour frames are read as gray. Without
     times.txt, `times` assumes ten frames a second, as in KITTI. Without a file of poses,
@@ -117,27 +138,27 @@ class Sequence:
     ) -> None:
         """root: folder that holds sequences and poses. name: the sequence, "06" or "6".
 
-        For a sequence outside of KITTI, root is None and name is a folder. The folder holds
-        calib.txt, the frames (in image_0 or in the folder itself) and optionally times.txt and
-        poses.txt.
+        For a sequence outside of KITTI, root is None and name is a folder. The folder is a raw
+        drive, or holds calib.txt, the frames (in image_0 or in the folder itself) and optionally
+        times.txt and poses.txt.
         camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence
         without ground truth; the default is one metre a frame.
         """
-        self.root, self.folder, self.poses_path = _locate(root, name)
+        self.root, self.folder, self.poses_path = locate(root, name)
         self.name, self.speed = self.folder.name, speed
         frame_folder = images_of(self.folder, camera)
         self.frame_paths = images(frame_folder)
         if not self.frame_paths:
             raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
         check_numbering(self.frame_paths)
-        self.intrinsics = read_intrinsics(self.folder / "calib.txt", frame_folder.name)
-        times = self.folder / "times.txt"
+        self.calibration_path, times = texts_of(self.folder, frame_folder)
+        self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
         self.has_times = times.is_file()
-        self.times = read_times(times) if self.has_times else FRAME_TIME * np.arange(len(self))
+        self.times = times_of(times) if self.has_times else FRAME_TIME * np.arange(len(self))
         check_count(times, len(self.times), self.frame_paths)
-        self.has_truth = self.poses_path.is_file()
+        self.has_truth = self.poses_path.exists()
         if self.has_truth:
-            self._poses = read_poses(self.poses_path)
+            self._poses = truth_of(self.poses_path)
             check_count(self.poses_path, len(self._poses), self.frame_paths)
         if speed is not None and (
             self.has_truth or not self.has_times or not 0 < speed <= MAX_SPEED
@@ -169,8 +190,9 @@ class Sequence:
         """All files of the sequence: frames and calibration, and the files of times and poses
         if they exist.
         """
-        texts = self.folder / "calib.txt", self.folder / "times.txt", self.poses_path
-        return [*self.frame_paths, *filter(Path.is_file, texts)]
+        texts = *texts_of(self.folder, self.frame_paths[0].parent), self.poses_path
+        made_from = kitti_raw.files(self.folder) if kitti_raw.is_drive(self.folder) else []
+        return [*self.frame_paths, *filter(Path.is_file, texts), *made_from]
 
     @property
     def label_names(self) -> list[str]:
@@ -187,7 +209,7 @@ class Sequence:
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
         size = read_gray(self.frame_paths[0]).shape
-        check_camera(self.folder / "calib.txt", self.intrinsics, self.frame_paths[0], size)
+        check_camera(self.calibration_path, self.intrinsics, self.frame_paths[0], size)
         return size
 
     def frame(self, index: int) -> np.ndarray:
@@ -212,26 +234,31 @@ class Sequence:
         return short
 
 
-def _locate(root, name):
-    """Root, folder and file of poses of a sequence. The arguments are those of Sequence."""
-    if root is None:
-        folder = Path(name).resolve()
-        if folder.parent.name != "sequences":
-            return folder.parent, folder, folder / "poses.txt"
+def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]:
+    """Root, folder and poses of a sequence: a file, or the OXTS's folder of a raw drive. The
+    arguments are those of Sequence.
+    """
+    folder = Path(name).resolve()
+    poses = folder / "poses.txt"
+    if root is None and folder.parent.name == "sequences":
         root, name = folder.parent.parent, folder.name  # the folder belongs to a KITTI root
-    root, name = Path(root), str(name)
-    if name in ("", ".", "..") or "/" in name:
-        raise InputError(
-            f"sequence {name!r}: must be the name of a folder in {root / 'sequences'}, such as 00"
-        )
-    if name.isdigit() and not (root / "sequences" / name).is_dir():
-        name = name.zfill(2)
-    return root, root / "sequences" / name, root / "poses" / f"{name}.txt"
+    if root is not None:
+        root, name = Path(root), str(name)
+        if name in ("", ".", "..") or "/" in name:
+            raise InputError(
+                f"sequence {name!r}: must be the name of a folder in {folder_of(root)}, such as 00"
+            )
+        if name.isdigit() and not (folder_of(root) / name).is_dir():
+            name = name.zfill(2)
+        folder, poses = folder_of(root) / name, root / "poses" / f"{name}.txt"
+    if kitti_raw.is_drive(folder):
+        poses = folder / kitti_raw.OXTS
+    return root or folder.parent, folder, poses
 
 
 def name_of(root: str | Path, name: str) -> str:
     """Full name of a sequence, "06" for "6". Its results are stored under this name."""
-    return _locate(root, name)[1].name
+    return locate(root, name)[1].name
 
 
 def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -240,9 +267,20 @@ def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np
 
     root, name: as in Sequence. Without times.txt, ten frames a second are assumed.
     """
-    _, folder, path = _locate(root, name)
-    poses, times = read_poses(path), folder / "times.txt"
-    return poses, read_times(times) if times.is_file() else FRAME_TIME * np.arange(len(poses))
+    _, folder, path = locate(root, name)
+    frame_folder = images_of(folder) if kitti_raw.is_drive(folder) else folder
+    poses, times = truth_of(path), texts_of(folder, frame_folder)[1]
+    return poses, times_of(times) if times.is_file() else FRAME_TIME * np.arange(len(poses))
+
+
+def truth_of(path: Path) -> np.ndarray:
+    """Ground truth, (n, 4, 4), from a file of poses, or from the folder of a raw drive's OXTS."""
+    return kitti_raw.read_poses(path.parents[1]) if path.is_dir() else read_poses(path)
+
+
+def times_of(path: Path) -> np.ndarray:
+    """Times, (n,), seconds, from a file of seconds, or from a raw drive's file of time stamps."""
+    return kitti_raw.read_times(path) if path.name == kitti_raw.TIMES else read_times(path)
 
 
 def check_numbering(paths: list[Path]) -> None:
@@ -306,15 +344,17 @@ def check_size(
 
 def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     """Camera matrix (Equation 2.4), (3, 3), pixels: the first three columns of P0, or of P1 to P3
-    for another camera.
+    for another camera; of a raw drive's camera, of P_rect_00 to P_rect_03.
 
     Raises InputError if the line is missing, or if the camera has distortion or skew.
     """
     key = f"P{camera[-1]}" if camera in IMAGE_FOLDERS else "P0"
+    if camera in kitti_raw.IMAGE_FOLDERS:
+        key = f"P_rect_{camera[-2:]}"
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
         matrix = np.array(
-            [line[3:].split() for line in lines if line.startswith(f"{key}:")][0], np.float64
+            [line.split()[1:] for line in lines if line.startswith(f"{key}:")][0], np.float64
         )
         matrix = matrix.reshape(3, 4)[:, :3]
     except OSError as error:

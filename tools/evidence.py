@@ -3,7 +3,8 @@ the data.
 
 `make evidence KITTI=...` uses all sequences of a KITTI folder and the label maps of the model in
 the package. It runs the thesis's masks, the controls of one width with both estimators, and the
-audit's ablations. A stopped run resumes.
+audit's ablations. LABELS=... names further folders of label maps, whose masks are compared with
+those of the package on the sequences that they have. A stopped run resumes.
 """
 
 import os
@@ -11,31 +12,46 @@ import sys
 from pathlib import Path
 
 import failures
+import label_quality
+import numpy as np
 import pandas as pd
 
-from thesis_repro import console, kitti, masks, results
+from thesis_repro import InputError, console, kitti, masks, results
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import write_text
+from thesis_repro.odometry import metrics
 from thesis_repro.report import audit, comparison, style, texts
 from thesis_repro.segmentation import prediction
 from thesis_repro.settings import PREFIX, ROOT, read_settings
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
-from thesis_repro.study.sources import Source
+from thesis_repro.study.sources import Source, named
 
 # BUILD: label maps and runs
 FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"
 # pixels, of masks with the thesis's estimator
 WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)
 SAMPLED_FRAMES = 12  # frames of each sequence in which boundaries and tracks are measured
+# What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
+STREETS = {
+    "00": "a residential street with parked cars",
+    "01": "a slip road onto a motorway",
+    "02": "a main road, then a turn into a road between trees",
+    "05": "a residential street with few parked cars",
+    "06": "a straight street past a building site, with parked cars",
+    "07": "a street of a town with shops and parked cars",
+    "drive0005": "a town; a van and a cyclist move ahead, a pedestrian crosses",
+    "drive0095": "a residential street with parked cars",
+}
 
 texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
 
 
-def write(root, folder, build, frames=None, repetitions=5, processes=1):
+def write(root, folder, build, frames=None, repetitions=5, processes=1, others=()):
     """Run the missing jobs and write all tables, plots and findings into a folder.
 
     root: the KITTI folder. build: keeps label maps and runs; folder and build are absolute paths.
-    frames: how many frames of each sequence to use, None for all.
+    frames: how many frames of each sequence to use, None for all. others: further sources of label
+    maps, for some or all sequences. Raises InputError if one is for none.
     """
     results.stage(build, results="evidence")
     labels, model = build / "labels", prediction.load_shipped()
@@ -43,7 +59,39 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
     for sequence in sequences:
         prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
     names = [sequence.name for sequence in sequences]
-    runs = _runs(root, names, build, frames, repetitions, processes)
+    covered = {
+        source.name: [name for name in names if source.of(name).is_dir()] for source in others
+    }
+    for source in others:
+        if not covered[source.name]:
+            raise InputError(
+                f"{source.folder}: holds no folder of label maps of {', '.join(names)}"
+            )
+
+    def run(planned):
+        sources = [Source(labels), *others]
+        return runner.run(
+            planned, root, sources, build / "odometry", frames=frames, processes=processes
+        )
+
+    runs = _runs(run, root, names, build, frames, repetitions)
+    other_runs = {
+        source: run(
+            [
+                jobs.Job(
+                    name,
+                    "masked",
+                    jobs.CONTROL_WIDTH,
+                    estimator="refined",
+                    repetition=repetition,
+                    source=source,
+                )
+                for name in source_names
+                for repetition in range(repetitions)
+            ]
+        )
+        for source, source_names in covered.items()
+    }
     ablated = ablations.measure(
         root,
         names,
@@ -68,17 +116,21 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
     steps = pd.concat(map(failures.measure, sequences, label_masks), ignore_index=True)
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
-    table = compare.comparisons(runs)
+    table, qualities = compare.comparisons(runs), label_quality.table(runs, other_runs)
+    streets = _streets(sequences)
     results.sweep(folder)
     style.save_all(
         {
             "comparison": comparison.figure_comparison(table),
             "failures": failures.figure(steps, sequences, label_masks),
+            "label_quality": label_quality.figure(qualities),
         },
         {
             "comparison": comparison.table_comparison(table),
             "failures": failures.table(steps),
             "widths": comparison.table_widths(runs),
+            "streets": streets,
+            "label_quality": qualities,
             "audit": audit.table(measurements),
         },
         folder,
@@ -92,20 +144,19 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1):
         )
     write_text(
         folder / "README.md",
-        texts.render("evidence.md.j2", findings=texts.findings(runs, table, note)),
+        texts.render(
+            "evidence.md.j2",
+            findings=texts.findings(runs, table, note),
+            streets=style.markdown(streets),
+            width=jobs.CONTROL_WIDTH,
+        ),
     )
 
 
-def _runs(root, names, build, frames, repetitions, processes):
+def _runs(run, root, names, build, frames, repetitions):
     """Return the runs of the comparison. The runs with masks decide the jobs with fewer
-    keypoints.
+    keypoints. run: returns the runs of jobs.
     """
-
-    def run(planned):
-        return runner.run(
-            planned, root, build / "labels", build / "odometry", frames=frames, processes=processes
-        )
-
     planned = jobs.first_jobs(
         root,
         names,
@@ -121,6 +172,23 @@ def _runs(root, names, build, frames, repetitions, processes):
         compare.keypoints_left(runs), root, frames, repetitions, width=jobs.CONTROL_WIDTH
     )
     return run(planned)
+
+
+def _streets(sequences):
+    """Return what each sequence shows, its length (metres) and the sum of its turns (degrees)."""
+    rows = []
+    for sequence in sequences:
+        steps = np.linalg.inv(sequence.poses[:-1]) @ sequence.poses[1:]
+        rows.append(
+            {
+                "sequence": sequence.name,
+                "frames": len(sequence),
+                "metres": round(metrics.travelled(sequence.poses)[-1]),
+                "turns (degrees)": round(metrics.angles(steps[:, :3, :3]).sum()),
+                "street": STREETS.get(sequence.name, ""),
+            }
+        )
+    return pd.DataFrame(rows)
 
 
 def _boundaries(sequences, labels):
@@ -166,6 +234,7 @@ def main():
                 settings.sizes.frames,
                 settings.sizes.repetitions,
                 settings.jobs,
+                named([("labels", Path(path)) for path in sys.argv[1:]], [], masks.MaskSettings()),
             )
             run.end(f"tables, plots and findings: {FOLDER}")
     except Exception as error:

@@ -11,13 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro import odometry
+from thesis_repro import InputError, odometry
 from thesis_repro.kitti import Sequence
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
+import moving  # noqa: E402
 import proposals  # noqa: E402
 import reliability  # noqa: E402
 import train_shipped  # noqa: E402
@@ -133,3 +134,15 @@ def test_make_weights_requires_both_folders():
             ["make", "weights", setting, "-o", "setup"], cwd=ROOT, capture_output=True, text=True
         )
         assert done.returncode and missing in done.stderr
+
+
+def test_keypoints_on_movable_things_are_counted(small_world, small_labels, tmp_path):
+    table = moving.table(small_world / "kitti", small_labels, tmp_path, repetitions=1, frames=5)
+    kinds = table.set_index(["sequence", "keypoints on"])["share (%)"].unstack()
+    assert list(kinds.index) == ["00", "01"]
+    assert kinds["static things"] + kinds["movable things"] == pytest.approx(100, abs=0.11)
+    assert (kinds["movable things"] >= kinds["of these, people and bicycles"]).all()
+    static = table[table["keypoints on"] == "static things"]
+    assert (static["median distance (px)"] < 0.2).all()  # exact poses
+    with pytest.raises(InputError, match="nowhere"):
+        moving.table(small_world / "kitti", tmp_path / "nowhere", tmp_path)

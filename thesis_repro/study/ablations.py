@@ -274,7 +274,7 @@ def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: in
             if len(points) < 10:
                 continue
             moved, tracked = keypoints.track(before, after, points)
-            distances = _sampson_distances(
+            distances = sampson_distances(
                 points[tracked], moved[tracked], motion, sequence.intrinsics
             )
             fields = (
@@ -294,7 +294,7 @@ def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: in
     return pd.DataFrame(rows)
 
 
-def _sampson_distances(
+def sampson_distances(
     previous: np.ndarray, current: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
     """Return the Sampson distances (n,) of matched pixels (n, 2) under a 4x4 motion, in units

@@ -1,0 +1,133 @@
+"""Masks against the quality of their label maps: ratios of errors over the mean IoU, for the
+evidence on real frames.
+"""
+
+import re
+
+import pandas as pd
+
+from thesis_repro.report import captions, style, texts
+from thesis_repro.settings import ROOT
+from thesis_repro.study import compare
+
+REAL, RENDERED = "real frames", "embedded world (rendered)"
+ALL_KEYPOINTS, EXACT = compare.METHODS["baseline"], compare.METHODS["true-labels"]
+PACKAGE = "the model in the package"
+# Mean IoU that the data at hand cannot give, by name of the folder of label maps.
+MEASURED_ELSEWHERE = {
+    "labels_espnetv2": (
+        0.43,
+        "48 KITTI label maps that are not at hand, 11 classes, from colour (README of the data)",
+    )
+}
+RATIO = r"([\d.]+)(?: \([^)]*?([\d.]+)-([\d.]+)\))?"  # "1.09 (95 % CI 0.98-1.32)" or "1.09"
+
+
+def table(runs, other_runs):
+    """Return the ratios of errors with masks from several label maps, refined estimator, one row a
+    source and comparison.
+
+    runs: with the model in the package. other_runs: {source: runs with masks from its label maps},
+    which may cover fewer sequences; masks of the package are then also compared on these alone. The
+    last rows come from figures/comparison.csv, the embedded world.
+    """
+    baseline, masked = (compare.of_method(runs, name, "refined") for name in ("baseline", "masked"))
+    quality = {PACKAGE: _on_card(), **MEASURED_ELSEWHERE}
+    rows = [_row(PACKAGE, masked, baseline, quality)]
+    for name, others in other_runs.items():
+        same = masked[masked["sequence"].isin(others["sequence"])]
+        rows += [
+            _row(PACKAGE, same, baseline, quality),
+            _row(name, others, baseline, quality),
+            _row(name, others, same, quality, f"masks of {PACKAGE}"),
+        ]
+    return pd.DataFrame(rows + _of_embedded_world())
+
+
+def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
+    ratios = {
+        metric: compare.ratios(rows, reference, metric)
+        for metric in compare.JUDGING_METRICS
+        if metric in rows and metric in reference
+    }
+    mean_iou, where = quality.get(name, (float("nan"), "not known"))
+    return {
+        "label maps": name,
+        "mean IoU": mean_iou,
+        "mean IoU from": where,
+        "odometry": REAL,
+        "sequences": ", ".join(sorted(rows["sequence"].unique())),
+        "over": over,
+        **{
+            compare.METRICS[metric]: texts.ratio(compare.geometric_mean(by_sequence))
+            for metric, by_sequence in ratios.items()
+        },
+    }
+
+
+def _on_card():
+    """Return the mean IoU of the model in the package on KITTI's pairs held out, from its card."""
+    found = re.search(
+        r"\*\*Quality on (KITTI's .*?)\*\*.*?mean IoU \*\*([\d.]+)\*\*",
+        (ROOT / captions.CARD).read_text(encoding="utf-8"),
+        re.S,
+    )
+    return float(found[2]), f"{found[1]}, 11 classes, from gray (model card)"
+
+
+def _of_embedded_world():
+    """Return the rows of the embedded world: its own network and its exact label maps."""
+    ratios = pd.read_csv(ROOT / "figures" / "comparison.csv")
+    ratios = ratios[
+        (ratios["estimator"] == "refined estimator") & (ratios["over"] == ALL_KEYPOINTS)
+    ].set_index("keypoints")
+    quality = pd.read_csv(ROOT / "figures" / "domain_gap.csv", index_col="measure")
+    trained = float(
+        quality.loc["mean IoU over these", "the model of this run: the odometry's frames"]
+    )
+    masked = ratios[ratios.index.str.startswith(compare.METHODS["masked"])].iloc[0]
+    sources = {
+        "a network trained for minutes": (trained, "its own frames, 12 classes", masked),
+        EXACT: (1.0, "exact", ratios.loc[EXACT]),
+    }
+    return [
+        {
+            "label maps": name,
+            "mean IoU": mean_iou,
+            "mean IoU from": where,
+            "odometry": RENDERED,
+            "sequences": f"{row['sequences']} drives",
+            "over": ALL_KEYPOINTS,
+            **{label: row[label] for label in compare.JUDGING_METRICS.values() if label in row},
+        }
+        for name, (mean_iou, where, row) in sources.items()
+    ]
+
+
+def figure(table):
+    """Draw the ratios to all keypoints over the mean IoU, one panel a judging metric, from
+    `table`.
+    """
+    rows = table[(table["over"] == ALL_KEYPOINTS) & table["mean IoU"].notna()]
+    labels = [label for label in compare.JUDGING_METRICS.values() if label in rows]
+    drawing, panels = style.new_figure(1, len(labels), height=3.6, squeeze=False)
+    for panel, label in zip(panels[0], labels):
+        numbers = rows[label].str.extract(RATIO).astype(float)
+        for number, (index, row) in enumerate(rows.iterrows()):
+            ratio, low, high = numbers.loc[index]
+            color = style.line_style(number)["color"]
+            panel.plot([row["mean IoU"]] * 2, [low, high], color=color, linewidth=1.6)
+            panel.plot(
+                row["mean IoU"],
+                ratio,
+                "o" if row["odometry"] == REAL else "s",
+                color=color,
+                markerfacecolor=color if row["odometry"] == REAL else "white",
+                label=f"{row['label maps']}; {row['odometry']}: {row['sequences']}",
+            )
+        panel.axhline(1, color="black", linewidth=0.8)
+        panel.set(title=label, xlabel="mean IoU of the label maps", xlim=(0.25, 1.05))
+        style.ratio_axis(panel.yaxis, [1, *numbers.to_numpy().ravel()])
+    panels[0, 0].set_ylabel("ratio to all keypoints\n(below 1: lower)")
+    style.legend_below(drawing, list(panels[0]), 1)
+    return drawing
