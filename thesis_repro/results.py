@@ -151,7 +151,7 @@ def sweep(folder):
             path.unlink(missing_ok=True)
 
 
-_held = set()  # device and inode of each path that this process has locked
+_held: set[tuple[int, int]] = set()  # device and inode of each path that this process has locked
 
 
 @contextmanager

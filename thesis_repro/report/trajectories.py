@@ -36,7 +36,7 @@ def by_sequence(paths, root, sequence=None):
     paths: files of one sequence, or folders with a file NN.txt or NN.tum for each sequence with
     ground truth in a KITTI root. sequence: the only sequence to return, or None for all.
     """
-    files = {}
+    files: dict[str, dict[str, Path]] = {}
     for path in paths:
         path_files = {sequence: path}
         if path.is_dir():

@@ -107,18 +107,13 @@ def write_video(path, sequence, settings=THESIS, masks=None):
     was not written whole.
     """
     rate = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 1 / FRAME_TIME
-    writer = None
+    writer = cv2.VideoWriter()
     with atomic(path) as temporary:
         for picture in pictures(sequence, settings, masks):
-            if writer is None:
+            if not writer.isOpened():
                 with console.quiet():  # OpenCV looks for the codec's tag, which WebM does not use
-                    writer = cv2.VideoWriter(
-                        str(temporary),
-                        cv2.CAP_FFMPEG,
-                        cv2.VideoWriter_fourcc(*"VP80"),
-                        rate,
-                        picture.shape[1::-1],
-                    )
+                    vp8, size = cv2.VideoWriter_fourcc(*"VP80"), picture.shape[1::-1]
+                    writer.open(str(temporary), cv2.CAP_FFMPEG, vp8, rate, size)
             writer.write(picture)
         writer.release()
         # the writer reports no errors, such as a full disk

@@ -116,7 +116,7 @@ def _write_batches(model, batches, done):
 
 def _ahead(pool, function, items):
     """Yield the function's result for each item, in order; the threads work two items ahead."""
-    waiting = deque()
+    waiting: deque = deque()
     for item in items:
         waiting.append(pool.submit(function, item))
         if len(waiting) > 2:
