@@ -40,7 +40,8 @@ def table_of_change(best, runs, metric, reported_as):
     4.1 in percent.
 
     The column "one run each" has the thesis's literal procedure: one run of all keypoints and of
-    each width (repetition 0), also for the choice of the width. best: the rows of each sequence's best width (`thesis_tables.of_chosen_width`). The last rows
+    each width (repetition 0), also for the choice of the width.
+    best: the rows of each sequence's best width (`thesis_tables.of_chosen_width`). The last rows
     have the sum of the percentages (the thesis's "aggregate"), their mean with its bootstrap
     interval, and their median.
     """
