@@ -52,7 +52,9 @@ def _visible_texts(figure):
 
 
 def watch(shell, path):
-    """Append the faults of every figure that the notebook of an IPython shell saves to a file."""
+    """Append the faults of every figure that the notebook of an IPython shell saves to a file, and
+    the number of figures that a cell has made but not shown.
+    """
 
     def wrap_save_figure(_):
         style = sys.modules.get("thesis_repro.report.style")
@@ -68,4 +70,11 @@ def watch(shell, path):
 
         style.save_figure = checked
 
+    def report_hidden(_):
+        pyplot = sys.modules.get("matplotlib.pyplot")
+        if pyplot and pyplot.get_fignums():
+            with open(path, "a", encoding="utf-8") as file:
+                file.write(f"{len(pyplot.get_fignums())} figures are not shown\n")
+
     shell.events.register("post_run_cell", wrap_save_figure)
+    shell.events.register("post_run_cell", report_hidden)

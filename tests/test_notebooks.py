@@ -22,6 +22,8 @@ FIGURES = [
 ]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
 EXECUTED = re.compile(r"nbconvert .* --output \.(\d\d)_")  # in the output of make
+# a call that saves a figure, at the start of a line
+SAVED = re.compile(r"^(?:style\.save_figure\(|keep\((?:\w+\.)?figure|keep_paths\()", re.MULTILINE)
 JUPYTER = ROOT / ".venv" / "bin" / "jupyter-nbconvert"
 
 
@@ -124,6 +126,19 @@ def test_figures_have_no_raw_tex_and_no_texts_that_overlap(executed):
     faults = (executed / "faults.txt").read_text().splitlines()
     assert {f"{name}: saved" for name in FIGURES} <= set(faults)
     assert [fault for fault in faults if not fault.endswith(": saved")] == []
+
+
+@pytest.mark.notebooks
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_every_cell_shows_the_figures_that_it_saves(executed, name):
+    read = json.loads((executed / "build/embedded-smoke/notebooks" / name).read_text())["cells"]
+    hidden = {}
+    for cell in read:
+        saved = len(SAVED.findall("".join(cell["source"]))) * (cell["cell_type"] == "code")
+        shown = sum("image/png" in output.get("data", ()) for output in cell.get("outputs", ()))
+        if shown < saved:
+            hidden["".join(cell["source"])[:60]] = (saved, shown)
+    assert hidden == {}
 
 
 @pytest.mark.notebooks

@@ -11,7 +11,7 @@ from thesis_repro.study import ablations, compare
 
 def test_rows_are_numbered_and_every_measurement_has_a_row():
     rows = audit.WORDS["rows"]
-    assert [int(row["row"]) for row in rows] == list(range(1, len(rows) + 1)) and len(rows) >= 70
+    assert [int(row["row"]) for row in rows] == list(range(1, len(rows) + 1)) and len(rows) >= 85
     assert all(row[key].strip() for row in rows for key in ("where", "does", "right", "switch"))
     assert {spec["row"] for spec in audit.WORDS["measured"] + audit.WORDS["arithmetic"]} <= {
         row["row"] for row in rows

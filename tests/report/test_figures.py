@@ -108,7 +108,7 @@ def test_numbers_of_the_convolution_sum_to_its_response():
     )
     assert products == pytest.approx(np.multiply(field, weights), abs=0.02)
     assert 1.25 + sum(products) == pytest.approx(convolution()[3][6, 4], abs=0.05)
-    assert f"{convolution()[3][6, 4]:.2f}" in figure.get_supxlabel()
+    assert f"{convolution()[3][6, 4]:.1f}" in figure.get_supxlabel()
 
 
 def test_the_iou_figure_shows_areas_and_their_ratio():

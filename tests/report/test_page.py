@@ -230,6 +230,18 @@ def test_each_artefact_is_written_by_the_notebooks_that_are_named():
         assert [name for name in names if f'\\"{name}' not in code] == []
 
 
+def test_the_gallery_has_every_artefact_in_the_order_of_the_thesis(run):
+    read(run)
+    gallery = (run.settings.figures / page.GALLERY).read_text()
+    titles = re.findall(r"^### (?:\w+ \w+\.\d+\. )?(.+)$", gallery, re.MULTILINE)
+    assert titles == [artefact["title"] for artefact in ARTEFACTS]
+    links = re.findall(r"\]\(([^)]+)\)", gallery)
+    assert len(links) > 40 and all((run.settings.figures / link).is_file() for link in links)
+    assert "embedded world" in gallery and all(
+        artefact["caption"] in gallery for artefact in ARTEFACTS
+    )
+
+
 def test_links_are_relative_and_exist_and_no_folder_of_the_machine_is_named(run):
     shown = read(run)
     links = shown.values("a", "href") + shown.values("img", "src")

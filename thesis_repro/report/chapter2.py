@@ -5,8 +5,8 @@ Cells of the notebooks draw diagrams and plots of one formula or table (2.1, 2.3
 """
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
@@ -48,8 +48,8 @@ def figure_2_02(patch, kernel, bias, feature_map, activated, pixel):
     show_numbers(axes[1, 2], (field * kernel)[..., 0], "is w x", ".2f")
     remark = "" if len(sums) == 1 else " (above: the first channel)"
     figure.supxlabel(
-        f"y = b + Σ w x = {bias:.2f} + {' + '.join(f'{term:.2f}' for term in sums)} = "
-        f"{bias + sums.sum():.2f}{remark}",
+        f"y = b + Σ w x = {bias:.2f} + {' + '.join(f'{term:.2f}' for term in sums)} ≈ "
+        f"{bias + sums.sum():.1f}{remark}",
         fontsize=9,
     )
     return figure
@@ -112,7 +112,6 @@ def figure_2_07(model):
     return figure
 
 
-@rc_context({"text.parse_math": True})
 def figure_2_08(poses, title):
     """Figure 2.8: camera poses C of a sequence from above, and the motions T between them
     (Equations 2.2, 2.3).
@@ -122,7 +121,13 @@ def figure_2_08(poses, title):
     # the first camera is at the origin and looks up the page
     poses = np.linalg.inv(poses[0]) @ poses
     positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
-    text_style = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": 10}
+    text_style = {
+        "textcoords": "offset points",
+        "ha": "center",
+        "va": "center",
+        "fontsize": 10,
+        "parse_math": True,
+    }
     figure, axes = style.new_figure(height=3.8)
     axes.plot(*positions.T, "o", markersize=4, color="black")
     axes.quiver(*positions.T, *ahead.T, color=BLUE, angles="xy", scale=18, width=0.006, zorder=3)
@@ -146,10 +151,12 @@ def figure_2_08(poses, title):
     axes.set(
         xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)"
     )
-    axes.set_title(title, parse_math=False)
+    axes.set_title(title)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.2)
-    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=0.8)
+    legend = axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=0.8)
+    # rc_context would also reset whether notebooks show figures
+    plt.setp(legend.get_texts(), parse_math=True)
     return figure
 
 
@@ -169,7 +176,9 @@ def figure_2_09(first, second, title):
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
     both, offset = np.vstack([first, gap, second]), (0, first.shape[0] + gap.shape[0])
     figure, (axes,) = style.frame_panels(both)
-    style.show_image(axes, both, f"{title}: the {len(best)} best of {len(matches)} ORB matches")
+    style.show_image(
+        axes, both, f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
+    )
     lines = LineCollection(
         [
             (points[match.queryIdx].pt, np.add(second_points[match.trainIdx].pt, offset))
@@ -179,15 +188,16 @@ def figure_2_09(first, second, title):
         cmap="plasma",
         linewidth=0.8,
     )
-    lines.set_clim(0, max((match.distance for match in best), default=1))
     axes.add_collection(lines)
-    figure.colorbar(lines, ax=axes, shrink=0.7, pad=0.01, label="bits of 256 that differ")
+    figure.colorbar(
+        lines, ax=axes, shrink=0.7, pad=0.01, label="descriptor bits that differ, of 256"
+    )
     return figure
 
 
 def figure_2_11(first, second, kept, lost, new, titles):
-    """Figure 2.11: one scene from two viewpoints, with keypoints that were found again, lost and
-    new.
+    """Figure 2.11: one scene from two viewpoints, with the keypoints that both frames have (see
+    `found_again`), and those of one frame only.
 
     kept: the same keypoints in the first and in the second frame, a pair of arrays. All arrays are
     (n, 2) pixels.
@@ -195,11 +205,25 @@ def figure_2_11(first, second, kept, lost, new, titles):
     figure, axes = style.frame_panels(first, 2)
     for panel, image, title, points in zip(axes, (first, second), titles, kept, strict=True):
         style.show_image(panel, image, title)
-        panel.scatter(*points.T, s=5, color=GREEN, linewidths=0, label=f"{len(points)} found again")
+        panel.scatter(
+            *points.T, s=5, color=GREEN, linewidths=0, label=f"{len(points)} in both frames"
+        )
     axes[0].scatter(
-        *lost.T, s=9, color=RED, marker="x", linewidths=0.8, label=f"{len(lost)} not found again"
+        *lost.T,
+        s=9,
+        color=RED,
+        marker="x",
+        linewidths=0.8,
+        label=f"{len(lost)} in the first frame only",
     )
-    axes[1].scatter(*new.T, s=9, color=ORANGE, marker="^", linewidths=0, label=f"{len(new)} new")
+    axes[1].scatter(
+        *new.T,
+        s=9,
+        color=ORANGE,
+        marker="^",
+        linewidths=0,
+        label=f"{len(new)} in the second frame only",
+    )
     style.legend_below(figure, axes, 3)
     return figure
 

@@ -1,8 +1,8 @@
 """Figures 4.6, 4.7 and 4.9 to 4.16: errors in metres, and keypoints. comparison.py shows ratios of
 errors.
 
-`runs` is the table of `runner.run`. Lines and bars show the mean over repetitions. Bands and error
-bars go from the lowest to the highest repetition.
+`runs` is the table of `runner.run`. Lines and bars show the mean over repetitions, or the only run.
+Bands and error bars go from the lowest to the highest repetition.
 """
 
 import matplotlib.pyplot as plt
@@ -25,6 +25,7 @@ def figure_paths(truths, rows, paths, method):
     """Figures 4.6, 4.11, 4.12: the paths from above, and below each path its distance to the ground
     truth.
 
+    Small errors are enlarged in the paths, by a factor that is in the panel's title.
     truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method;
     repetition 0 is bold, the other repetitions are faint. paths: {(sequence, run): estimated
     positions (n, 3)}.
@@ -48,7 +49,13 @@ def figure_paths(truths, rows, paths, method):
         true = truths[name]
         along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
         above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
-        for repetition, run in enumerate(runs["run"]):
+        # paths meet at frame 1, as for the RMSE
+        distances = [
+            paths[name, run] - paths[name, run][1] - (true - true[1]) for run in runs["run"]
+        ]
+        room = 0.15 * np.ptp(true[:, [0, 2]], axis=0).max() / max(np.abs(distances).max(), 1e-9)
+        factor = max(scale for scale in (1, 2, 5, 10, 20, 50, 100) if scale <= max(room, 1))
+        for repetition, distance in enumerate(distances):
             line = {
                 "color": METHODS[method][1],
                 "linewidth": 0.6,
@@ -57,13 +64,13 @@ def figure_paths(truths, rows, paths, method):
             }
             if repetition == 0:
                 line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
-            # paths meet at frame 1, as for the RMSE
-            estimated = paths[name, run] + (true[1] - paths[name, run][1])
-            above.plot(estimated[:, 0], estimated[:, 2], **line)
-            below.plot(along, np.linalg.norm(estimated - true, axis=1), **line)
+            drawn = true + factor * distance
+            above.plot(drawn[:, 0], drawn[:, 2], **line)
+            below.plot(along, np.linalg.norm(distance, axis=1), **line)
         row = errors.loc[name]
         span = f" ({row['lowest']:.2g}-{row['highest']:.2g})" if len(runs) > 1 else ""
-        above.set_title(f"{name}: {row['mean']:.2g}{span} m", fontsize=8)
+        enlarged = f"errors x{factor} in the path" if factor > 1 else "errors not enlarged"
+        above.set_title(f"{name}: {row['mean']:.2g}{span} m\n{enlarged}", fontsize=8)
         above.set_aspect("equal", adjustable="datalim")
         below.set_ylim(0, None)
         below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
@@ -74,7 +81,8 @@ def figure_paths(truths, rows, paths, method):
         above.set_ylabel("z (m) over x (m)", fontsize=7.5)
         below.set_ylabel("distance (m)", fontsize=7.5)
     style.legend_below(figure, axes[0, :1], 3)
-    figure.suptitle("sequence: RMSE, mean (lowest-highest of the repetitions)", fontsize=9)
+    repeated = ", mean (lowest-highest of the repetitions)" if rows["repetition"].any() else ""
+    figure.suptitle(f"sequence: RMSE{repeated}", fontsize=9)
     return figure
 
 
@@ -101,7 +109,8 @@ def figure_4_07(runs):
 def figure_against_width(runs, metric):
     """Figures 4.9, 4.10: the metric against dilation width, one line a sequence.
 
-    Below, one panel a sequence has the bands of the repetitions with masks and with all keypoints.
+    Below, one panel a sequence has a bar at each width that was repeated, and the band of the
+    repetitions with all keypoints.
     """
     masked = compare.of_method(runs, "masked")
     baseline = compare.spread(compare.of_method(runs, "baseline"), metric)
@@ -116,18 +125,18 @@ def figure_against_width(runs, metric):
         xlabel="dilation width (pixels)",
         ylabel=label,
         ylim=(0, None),
-        title=f"{metric.upper()} against dilation width, means over repetitions",
+        title=f"{metric.upper()} against dilation width",
     )
     _, panels = style.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
         errors = compare.spread(masked[masked["sequence"] == name], metric, by="dilation_width")
-        panel.fill_between(
+        panel.vlines(
             errors.index,
             errors["lowest"],
             errors["highest"],
             color=MASKED,
-            alpha=0.25,
-            linewidth=0,
+            alpha=0.35,
+            linewidth=4,
             label=f"masked, {BAND}",
         )
         panel.plot(
@@ -210,7 +219,9 @@ def _spread_by_method(runs, metric):
 
 
 def _bar(axes, positions, table, width, method):
-    """Draw bars at the means of a table, with error bars from lowest to highest."""
+    """Draw bars at the means of a table, with error bars from lowest to highest of the
+    repetitions.
+    """
     label, color, hatch = METHODS[method]
     axes.bar(
         positions,
@@ -222,6 +233,7 @@ def _bar(axes, positions, table, width, method):
         edgecolor="white",
         linewidth=0,
     )
+    table = table.where(table["highest"] > table["lowest"])  # a single run has no error bar
     errors = [table["mean"] - table["lowest"], table["highest"] - table["mean"]]
     axes.errorbar(
         positions, table["mean"], yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2

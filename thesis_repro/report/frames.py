@@ -8,8 +8,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from thesis_repro.cityscapes import colorize
+from thesis_repro.masks import dilate
 from thesis_repro.report import style
-from thesis_repro.report.style import BLUE, EDGE_COLOR, KEYPOINT, ORANGE, PAGE_WIDTH, PINK, SKY
+from thesis_repro.report.style import BLUE, EDGE_COLOR, KEYPOINT, ORANGE, PINK, SKY
 
 
 def figure_3_03(image, label_map, prediction, label):
@@ -58,7 +59,8 @@ def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
         {
             "frame": frame,
             "predicted label map": style.label_colors(label_map, frame),
-            "Canny edges (5, 15) of the label map": edge_image,
+            # thin lines would drop out where the picture is reduced
+            "Canny edges (5, 15) of the label map, drawn wider": dilate(edge_image, 5),
             f"edges dilated by {dilation_width}x{dilation_width}": mask,
         },
         columns=2,
@@ -73,7 +75,7 @@ def figure_masks(frame, masks, keypoints, true_edges=None):
     masks: {title: (h, w)}. keypoints: {title: (n, 2)}. true_edges: (h, w), 255 on boundaries, or
     None if unknown.
     """
-    edges = np.zeros_like(frame) if true_edges is None else true_edges
+    edges = np.zeros_like(frame) if true_edges is None else dilate(true_edges, 3)
     pictures = {
         title: _with_edges(np.where(mask > 0, frame // 2 + 127, frame // 3), edges)
         for title, mask in masks.items()
@@ -135,9 +137,7 @@ def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation
             kept_title: frame,
         },
         {all_title: all_keypoints, kept_title: kept_keypoints},
-        columns=3,
         label_maps=[prediction],
-        width=1.4 * PAGE_WIDTH,
     )
 
 
@@ -150,7 +150,7 @@ def figure_4_08(views, title):
         height, width = view.crop.shape
         text = f"frame {view.frame}: {len(view.keypoints)} keypoints"
         if view.expected is not None:
-            text += f",\n{view.jumped} of {len(view.expected)} tracked here gone"
+            text += f";\n{view.jumped} of {len(view.expected)} rings without a keypoint"
             panel.scatter(
                 *view.expected.T, s=34, facecolors="none", edgecolors=PINK, linewidths=1.1
             )
@@ -170,7 +170,7 @@ def figure_4_08(views, title):
                 markersize=6,
                 markerfacecolor="none",
                 color=PINK,
-                label="keypoints of the frame before, tracked to here",
+                label="where keypoints of the frame before are now",
             ),
         ],
         loc="outside lower center",
@@ -180,11 +180,11 @@ def figure_4_08(views, title):
     return figure
 
 
-def _pictures(frame, pictures, keypoints=(), columns=1, label_maps=(), width=PAGE_WIDTH):
+def _pictures(frame, pictures, keypoints=(), columns=1, label_maps=()):
     """Show pictures {title: picture} of a frame's shape, with keypoints {title: (n, 2)} and a
     legend of label maps.
     """
-    figure, axes = style.frame_panels(frame, -(-len(pictures) // columns), columns, width)
+    figure, axes = style.frame_panels(frame, -(-len(pictures) // columns), columns)
     for panel, (title, picture) in zip(axes, pictures.items()):
         style.show_image(panel, picture, title)
         if title in keypoints:

@@ -1,5 +1,5 @@
 """The page with all tables and figures of a run or a study: index.html beside them. It needs no
-network or server.
+network or server. README.md beside it is a gallery of the same, for reading in a repository.
 
 `python -m thesis_repro.report.page` writes the page, and converts executed notebooks to HTML.
 """
@@ -20,10 +20,11 @@ from thesis_repro.files import listed, write_text
 from thesis_repro.report import captions, tables, texts, trainings
 from thesis_repro.settings import ROOT, read_settings
 
-PAGE = "index.html"
+PAGE, GALLERY = "index.html", "README.md"
 EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
 # ids of the artefacts at the top of a page
+ROWS_SHOWN = 36  # the gallery only links to longer tables
 OPENING = ("figure_4_05", "findings", "figure-comparison")
 # packages that affect the numbers most
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")
@@ -49,6 +50,10 @@ def update(settings):
             if not html.is_file() or html.stat().st_mtime < path.stat().st_mtime:
                 write_text(html, notebook_html(path, page))
         write_text(page, build(settings))
+        gallery = texts.render(
+            "gallery.md.j2", settings=settings, chapters=_chapters(settings), page=PAGE
+        )
+        write_text(settings.figures / GALLERY, gallery)
 
 
 def _executed(settings):
@@ -76,13 +81,18 @@ def notebook_html(path, page):
     )
 
 
-def build(settings):
-    """Return the page of a run as HTML, made from the files in its folders."""
+def _chapters(settings):
+    """Return the described artefacts of each chapter, {title: artefacts}."""
     numbers = tables.beside_the_thesis(settings)
-    chapters = {
+    return {
         title: [_describe(settings.figures, artefact, settings, numbers) for artefact in artefacts]
         for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()
     }
+
+
+def build(settings):
+    """Return the page of a run as HTML, made from the files in its folders."""
+    chapters = _chapters(settings)
     executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
     return texts.render(
         "page.html.j2",
@@ -138,13 +148,15 @@ def _describe(folder, artefact, settings=None, numbers=None):
     """
     kind, name = artefact["kind"], artefact["name"]
     files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
-    content, details, rows = None, None, 0
+    content, details, rows, markdown = None, None, 0, None
     if files and kind == "text":  # the page folds the part after the first heading
         content, _, details = files[0].read_text(encoding="utf-8").partition("\n## ")
         content, details = texts.html(content), texts.html(f"## {details}") if details else None
     elif kind == "table" and files and files[0].suffix == ".csv":
         table = tables.read(files[0])
         content, rows = tables.html(table), len(table)
+        if len(table) <= ROWS_SHOWN and len(files) > 1:
+            markdown = files[1].read_text(encoding="utf-8")
     there = bool(files) and (kind == "figure" or content is not None)
     number = None
     if name in captions.THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
@@ -175,6 +187,7 @@ def _describe(folder, artefact, settings=None, numbers=None):
         "content": content,
         "details": details,
         "rows": rows,
+        "markdown": markdown,
         "files": [path.name for path in files],
         "makers": [
             notebook for notebook, names in captions.MADE_BY.items() if settings and name in names

@@ -17,6 +17,7 @@ PAGE_WIDTH = 7.2  # inches
 matplotlib.rcParams.update(
     {
         "font.size": 9,
+        "font.sans-serif": ["DejaVu Sans", "sans-serif"],  # each text of an SVG file lists them
         "axes.titlesize": 9,
         "axes.labelsize": 9,
         "legend.fontsize": 8,
@@ -180,7 +181,7 @@ def save_figure(figure, folder, name, note):
     if any(axes.images for axes in figure.axes):
         ending, other, note_in_file = ".webp", ".svg", Image.Exif()
         note_in_file[ExifTags.Base.ImageDescription] = note
-        options = {"pil_kwargs": {"quality": 90, "exif": note_in_file}}
+        options = {"pil_kwargs": {"quality": 75, "exif": note_in_file}}
     else:
         ending, other = ".svg", ".webp"
         options = {"metadata": {"Date": None, "Creator": None, "Description": note}}

@@ -39,6 +39,8 @@ def table_of_change(best, runs, metric, reported_as):
     """Tables 4.2 and 4.3: the metric (m) with all keypoints and with the best mask, and Equation
     4.1 in percent.
 
+    The column "one run each" has the thesis's literal procedure: one run of all keypoints and of
+    each width (repetition 0), also for the choice of the width.
     best: the rows of each sequence's best width (`thesis_tables.of_chosen_width`). The last rows
     have the sum of the percentages (the thesis's "aggregate"), their mean with Student's t
     interval, and their median.
@@ -48,6 +50,11 @@ def table_of_change(best, runs, metric, reported_as):
     )
     baseline = compare.of_method(runs, "baseline")
     changes = thesis_tables.changes(best, baseline, metric)
+    single, alone = (
+        compare.of_method(runs[runs["repetition"] == 0], method)
+        for method in ("masked", "baseline")
+    )
+    literal = thesis_tables.changes(thesis_tables.of_chosen_width(single), alone, metric)
     table = pd.DataFrame(
         {
             f"{metric.upper()}, {method} (m)": rows.groupby("sequence")[metric]
@@ -61,7 +68,12 @@ def table_of_change(best, runs, metric, reported_as):
         f"mean, {compare.LEVEL} % CI over sequences",
     )
     summary = {}
-    for name, values in (("change (%)", changes), (reported_column, reported)):
+    columns = {
+        "change (%)": changes,
+        "change (%), one run each": literal,
+        reported_column: reported,
+    }
+    for name, values in columns.items():
         low, high = compare.mean_interval(values)
         summary[name] = {
             "sum (the thesis's aggregate)": values.sum(min_count=1),
@@ -71,9 +83,9 @@ def table_of_change(best, runs, metric, reported_as):
             "median": values.median(),
             "sequences improved": (values < 0).sum(),
         }
-    table = table.assign(**{"change (%)": changes, reported_column: reported.reindex(table.index)})
+    table = table.assign(**{name: values.reindex(table.index) for name, values in columns.items()})
     table = pd.concat([table, pd.DataFrame(summary, dtype=float).reindex(columns=table.columns)])
-    return table.round({"change (%)": 2, reported_column: 2}).rename_axis("sequence").reset_index()
+    return table.round(dict.fromkeys(columns, 2)).rename_axis("sequence").reset_index()
 
 
 def _three_digits(value):

@@ -11,7 +11,7 @@ from thesis_repro.files import progress
 NOTHING = 255
 
 # The library's default noise at the time of the thesis: a variance of 10 to 50 grey levels squared.
-# Today's default is about ten times as strong.
+# Today's default is about fifteen times as strong.
 NOISE_STD = (10**0.5 / 255, 50**0.5 / 255)
 
 
