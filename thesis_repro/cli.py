@@ -14,7 +14,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 from thesis_repro import InputError, longrun, one_line
-from thesis_repro.settings import PROFILES, SEED, frames, number, scheduler_address, widths
+from thesis_repro.settings import (
+    PROFILES,
+    SEED,
+    check_outside,
+    frames,
+    number,
+    scheduler_address,
+    widths,
+)
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
@@ -107,7 +115,7 @@ def masks(options):
         LabelMasks(options.labels, sequence, width, _mask_settings(options))
         for width in sorted(set().union(*options.dilation))
     ]
-    _check_outputs(options, options.labels, sequence.folder)
+    _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
     _print_oddities(sequence, mask_sets)
     for label_masks in mask_sets:
         width = label_masks.dilation_width
@@ -134,12 +142,10 @@ def odometry(options):
     masks = _masks(options, sequence)
     _check_outputs(
         options,
-        sequence.poses_path,
-        sequence.folder / "calib.txt",
-        sequence.folder / "times.txt",
-        sequence.frame_paths[0].parent,
         options.masks,
         options.labels,
+        sequence.folder,
+        sequence.frame_paths[0].parent,
     )
     _print_oddities(sequence, [masks] if masks else [])
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
@@ -233,7 +239,7 @@ def study(options):
         _print(options, plan.of_study(planned), "plan.txt.j2")
         return 0
     folder = options.folder.absolute()
-    _check_outputs(options, options.kitti, *(source.folder for source in planned.sources))
+    _check_outputs(options, *(source.folder for source in planned.sources))
     # this import takes seconds, so the input is checked first
     from thesis_repro.report import study
 
@@ -260,9 +266,7 @@ def evaluate(options):
     sequences = trajectories.by_sequence(options.poses, options.kitti, options.sequence)
     if options.plot and len(sequences) > 1:
         raise InputError("--plot: shows only one sequence; name it with --sequence")
-    _check_outputs(
-        options, *options.poses, *(file for files in sequences.values() for file in files.values())
-    )
+    _check_outputs(options, *options.poses)
     rows = []
     for sequence, files in sequences.items():
         truth, times = (values[: options.frames] for values in true_path(options.kitti, sequence))
@@ -391,20 +395,30 @@ def _check_outputs(options, *inputs):
     """Raise InputError, before anything runs, if an output cannot be written or would overwrite
     or mix with inputs.
     """
-    from thesis_repro.files import check_output
+    from thesis_repro.files import check_output, is_stream
 
-    used, folder = {path.resolve() for path in inputs if path}, vars(options).get("folder")
-    if folder and any(path.is_relative_to(folder.resolve()) for path in used):
-        raise InputError(f"--output {folder}: holds input of this command; name another folder")
+    data = [path for path in (vars(options).get("kitti"), *inputs) if path]
+    # a sequence given alone belongs to the folder above sequences/
+    data += [
+        above.parent
+        for path in data
+        for above in path.resolve().parents
+        if above.name == "sequences"
+    ]
+    folder, used = vars(options).get("folder"), set()
+    if folder:
+        check_outside(f"--output {folder}", folder, data)
+        if any(path.resolve().is_relative_to(folder.resolve()) for path in data):
+            raise InputError(f"--output {folder}: holds input of this command; name another folder")
     for name, path in _output_files(options).items():
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
         check_output(path)
-        if not used.isdisjoint((path.resolve(), path.resolve().parent)):
-            raise InputError(
-                f"--{name} {path}: is used by this command, or in a folder of its input; name another"
-            )
+        if not is_stream(path):
+            check_outside(f"--{name} {path}", path, data)
+        if path.resolve() in used:
+            raise InputError(f"--{name} {path}: is another output of this command; name another")
         used.add(path.resolve())
 
 

@@ -26,8 +26,8 @@ EVO = {
 
 @pytest.fixture
 def files(tmp_path):
-    """A KITTI folder with the ground truth of sequence 07, and two estimates of it."""
-    write_kitti_poses(tmp_path / "poses/07.txt", winding())
+    """A folder with the ground truth of sequence 07, in kitti, and two estimates of it."""
+    write_kitti_poses(tmp_path / "kitti/poses/07.txt", winding())
     for name, seed, stretch in (("good", 1, 1.0), ("long", 2, 1.2)):
         write_kitti_poses(tmp_path / f"{name}.txt", winding(seed=seed, stretch=stretch))
     return tmp_path
@@ -38,7 +38,7 @@ def evaluate(files, *options):
         [
             "evaluate",
             "--kitti",
-            str(files),
+            str(files / "kitti"),
             "--sequence",
             "7",
             str(files / "good.txt"),
@@ -68,7 +68,12 @@ def test_errors_equal_those_of_evos_tools(files, alignment, monkeypatch, capsys)
     rows = json.loads(capsys.readouterr().out)
     assert [row["trajectory"] for row in rows] == [str(files / name) for name in ("good", "long")]
     for row in rows:
-        arguments = ["kitti", files / "poses/07.txt", f"{row['trajectory']}.txt", *EVO[alignment]]
+        arguments = [
+            "kitti",
+            files / "kitti/poses/07.txt",
+            f"{row['trajectory']}.txt",
+            *EVO[alignment],
+        ]
         ape = printed_by("evo_ape", *arguments, monkeypatch=monkeypatch, capsys=capsys)
         rpe = printed_by("evo_rpe", *arguments, monkeypatch=monkeypatch, capsys=capsys)
         turns = printed_by(
@@ -110,10 +115,18 @@ def test_tum_keyframes_are_matched_by_time(files, capsys):
 
 
 def test_folders_of_sequences_get_a_mean(files, capsys):
-    write_kitti_poses(files / "poses/08.txt", winding())
+    write_kitti_poses(files / "kitti/poses/08.txt", winding())
     for name, seed in (("07", 1), ("08", 2), ("11", 3)):  # 11 has no ground truth
         write_kitti_poses(files / f"ours/{name}.txt", winding(seed=seed))
-    command = ["evaluate", "--kitti", str(files), str(files / "ours"), "--json", "--frames", "120"]
+    command = [
+        "evaluate",
+        "--kitti",
+        str(files / "kitti"),
+        str(files / "ours"),
+        "--json",
+        "--frames",
+        "120",
+    ]
     assert main(command) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["sequence"] for row in rows] == ["07", "08", "mean of 2"]
@@ -121,7 +134,7 @@ def test_folders_of_sequences_get_a_mean(files, capsys):
     assert [row["rmse_m"] for row in rows] == pytest.approx([*values, np.mean(values)])
     assert main([*command, "--sequence", "08"]) == 0
     assert [row["sequence"] for row in json.loads(capsys.readouterr().out)] == ["08"]
-    (files / "poses").rename(files / "elsewhere")
+    (files / "kitti/poses").rename(files / "elsewhere")
     assert main(command) == 1 and "ours" in capsys.readouterr().err
 
 
@@ -135,7 +148,17 @@ def test_trajectories_that_cannot_be_compared_are_named(files, capsys):
         assert evaluate(files, *options) == 1
         assert named in capsys.readouterr().err
     assert (
-        main(["evaluate", "--kitti", str(files), "--sequence", "11", str(files / "good.txt")]) == 1
+        main(
+            [
+                "evaluate",
+                "--kitti",
+                str(files / "kitti"),
+                "--sequence",
+                "11",
+                str(files / "good.txt"),
+            ]
+        )
+        == 1
     )
     assert "poses/11.txt" in capsys.readouterr().err
     with pytest.raises(InputError, match="alignment='sim'"):
