@@ -110,10 +110,12 @@ def masks(options):
     """
     from thesis_repro.masks import LabelMasks, write_masks
 
-    sequence = _sequence(options)
+    sequence, settings = _sequence(options), _mask_settings(options)
+    if not options.dilation and settings.keep != "static":
+        raise InputError("--dilation W: needed for masks from boundaries")
     mask_sets = [
-        LabelMasks(options.labels, sequence, width, _mask_settings(options))
-        for width in sorted(set().union(*options.dilation))
+        LabelMasks(options.labels, sequence, width, settings)
+        for width in sorted(set().union(*options.dilation or [(1,)]))
     ]
     _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
     _print_oddities(sequence, mask_sets)
@@ -121,7 +123,7 @@ def masks(options):
         width = label_masks.dilation_width
         folder = options.folder if len(mask_sets) == 1 else options.folder / f"mask{width}"
         write_masks(label_masks, folder)
-        print(f"{folder}: {len(label_masks)} masks of width {width}")
+        print(f"{folder}: {len(label_masks)} masks{f' of width {width}' * bool(options.dilation)}")
 
 
 def odometry(options):
@@ -157,6 +159,7 @@ def odometry(options):
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
         longrun.warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
+    longrun.warn(check.step_oddities(sequence.name, result.failed, len(sequence)))
     record = texts.run_record(result, sequence, settings.alignment)
     if options.video:
         from thesis_repro.report import video
@@ -219,6 +222,8 @@ def study(options):
     has_labels = any(kind == "labels" for kind, _ in options.sources)
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
+    # one of any width, if masks have none
+    all_widths = (options.controls or 1,) if options.keep == "static" else ALL_WIDTHS
     names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
     planned = series.Study(
         options.kitti.absolute(),
@@ -226,7 +231,7 @@ def study(options):
         sources.named(
             options.sources, options.name, _mask_settings(options, has_labels), options.invert
         ),
-        tuple(sorted(set().union(*options.widths or [ALL_WIDTHS] if has_labels else []))),
+        tuple(sorted(set().union(*options.widths or [all_widths] if has_labels else []))),
         options.controls,
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
@@ -269,12 +274,18 @@ def evaluate(options):
     _check_outputs(options, *options.poses)
     rows = []
     for sequence, files in sequences.items():
-        truth, times = (values[: options.frames] for values in true_path(options.kitti, sequence))
+        truth, times = true_path(options.kitti, sequence)
+        longrun.warn(check.truth_oddities(sequence, truth, times))
         paths = {
             name: trajectories.read(file, times, options.frames) for name, file in files.items()
         }
+        truth = truth[: options.frames]
         for name, (matched, poses) in paths.items():
-            longrun.warn(check.path_oddities(name, poses, truth[matched]))
+            longrun.warn(
+                check.path_oddities(
+                    name, poses, truth[matched], options.align not in ("sim3", "scale")
+                )
+            )
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
         drawing = trajectories.figure(
@@ -370,6 +381,10 @@ def _mask_settings(options, has_labels=True):
     )
     if not has_labels and settings != MaskSettings():
         raise InputError(f"{', '.join(MASKS)}: need --labels DIR, label maps to make masks from")
+    for name in ("boundaries", "symmetric", "classes", "dilation", "widths"):
+        value = vars(options).get(name)
+        if settings.keep == "static" and value not in (None, [], vars(MaskSettings).get(name)):
+            raise InputError(f"--{name}: --keep static uses no boundaries; leave it out")
     return settings
 
 
@@ -378,10 +393,11 @@ def _masks(options, sequence):
     from thesis_repro.masks import LabelMasks, MaskFolder
 
     settings = _mask_settings(options, options.labels)
-    if bool(options.labels) != (options.dilation is not None):
+    if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
         raise InputError("--labels DIR, --dilation W: give both or neither")
     if options.labels:
-        return LabelMasks(options.labels, sequence, options.dilation, settings)
+        width = 1 if options.dilation is None else options.dilation
+        return LabelMasks(options.labels, sequence, width, settings)
     if options.invert and not options.masks:
         raise InputError("--invert: needs --masks DIR")
     return MaskFolder(options.masks, sequence, options.invert) if options.masks else None
@@ -639,7 +655,6 @@ def build_parser():
     add(
         "--dilation",
         **WIDTHS,
-        required=True,
         help="in pixels, such as 5,10 or 1-15; several get a subfolder each",
     )
 

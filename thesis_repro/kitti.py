@@ -42,6 +42,10 @@ MAX_MISSING_NAMED = 10_000  # frames
 MAX_SPEED = 10_000  # metres a second
 MAX_POSITION = 1e9  # metres
 ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
+QUATERNION_TOLERANCE = 0.01  # of its length; files have few digits
+# Matched poses of a file with times: least share of those within the common time, and of all. A
+# file of keyframes may cover more frames than an excerpt has.
+MIN_MATCHED = 0.3, 0.1
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
@@ -85,14 +89,14 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     """Folder of a sequence's frames. Raises InputError if the camera is unknown or the folder is
     missing.
 
-    The default is the first of IMAGE_FOLDERS that exists. If none exists, it is the sequence's
+    The default is the left camera's, gray or else colour. If neither exists, it is the sequence's
     folder itself.
     """
     if camera is not None and camera not in IMAGE_FOLDERS:
         raise InputError(
             f"camera {camera!r}: unknown; choose one of {', '.join(sorted(IMAGE_FOLDERS))}"
         )
-    candidates = [Path(folder) / name for name in ([camera] if camera else IMAGE_FOLDERS)]
+    candidates = [Path(folder) / name for name in ([camera] if camera else IMAGE_FOLDERS[:2])]
     frame_folder = next(
         (path for path in candidates if path.is_dir()), candidates[0] if camera else Path(folder)
     )
@@ -132,7 +136,12 @@ class Sequence:
         frame_folder = images_of(self.folder, camera)
         self.frame_paths = images(frame_folder)
         if not self.frame_paths:
-            raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
+            raise InputError(
+                f"{frame_folder}: holds no PNG or JPEG frames of the left camera, to which the ground "
+                "truth belongs (--camera image_1 takes the right one)"
+                if images_of(self.folder) == self.folder and (self.folder / "image_1").is_dir()
+                else f"{frame_folder}: holds no PNG or JPEG frames"
+            )
         check_numbering(self.frame_paths)
         self.intrinsics = read_intrinsics(self.folder / "calib.txt", frame_folder.name)
         times = self.folder / "times.txt"
@@ -245,8 +254,15 @@ def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np
     root, name: as in Sequence. Without times.txt, ten frames a second are assumed.
     """
     _, folder, path = _locate(root, name)
-    poses, times = read_poses(path), folder / "times.txt"
-    return poses, read_times(times) if times.is_file() else FRAME_TIME * np.arange(len(poses))
+    poses, path_of_times = read_poses(path), folder / "times.txt"
+    if not path_of_times.is_file():
+        return poses, FRAME_TIME * np.arange(len(poses))
+    times = read_times(path_of_times)
+    if len(times) != len(poses):
+        raise InputError(
+            f"{path_of_times}: {len(times)} times for {len(poses)} poses in {path}; one a frame is needed"
+        )
+    return poses, times
 
 
 def check_numbering(paths: list[Path]) -> None:
@@ -308,10 +324,11 @@ def check_size(
         )
 
 
-def _read_numbers(path, columns):
+def _read_numbers(path, columns, comments=None):
     try:
-        with open(path, encoding="utf-8") as file, warnings.catch_warnings(action="ignore"):
-            rows = np.loadtxt(file, np.float64, comments=None, ndmin=2)
+        # some editors begin a file with a byte order mark
+        with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
+            rows = np.loadtxt(file, np.float64, comments=comments, ndmin=2)
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
@@ -329,7 +346,7 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     """
     key = f"P{camera[-1]}" if camera in IMAGE_FOLDERS else "P0"
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
         matrix = np.array(
             [line[3:].split() for line in lines if line.startswith(f"{key}:")][0], np.float64
         )
@@ -338,17 +355,19 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, IndexError):
         matrix = np.zeros((3, 3))
-    (fx, _, u), (_, fy, v), _ = matrix
-    without_skew = np.array([[fx, 0, u], [0, fy, v], [0, 0, 1]])
-    if (
-        min(fx, fy) <= 0
-        or not np.isfinite(matrix).all()
-        or not np.array_equal(matrix, without_skew)
-    ):
+    if not is_camera_matrix(matrix):
         raise InputError(
             f"{path}: must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
         )
     return matrix
+
+
+def is_camera_matrix(matrix: np.ndarray) -> bool:
+    """Whether a matrix is that of Equation 2.4, (3, 3), without skew."""
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return False
+    (fx, _, u), (_, fy, v), _ = matrix
+    return min(fx, fy) > 0 and np.array_equal(matrix, [[fx, 0, u], [0, fy, v], [0, 0, 1]])
 
 
 def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[int, int]) -> None:
@@ -375,12 +394,16 @@ def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[in
 def read_times(path: str | Path) -> np.ndarray:
     """Times of the frames, (n,), seconds, one a line. Raises InputError unless they increase."""
     times = _read_numbers(path, 1)[:, 0]
+    _check_increase(path, times)
+    return times
+
+
+def _check_increase(path, times):
     steps_back = np.flatnonzero(np.diff(times) <= 0)
     if len(steps_back):
         raise InputError(
             f"{path}, line {steps_back[0] + 2}: time does not increase; mend or remove the file"
         )
-    return times
 
 
 def read_poses(path: str | Path) -> np.ndarray:
@@ -392,16 +415,23 @@ def read_poses(path: str | Path) -> np.ndarray:
     rows = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        is_rotation = (errors <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
-    bad_lines = np.flatnonzero(~is_rotation | (np.abs(positions).max(axis=1) > MAX_POSITION))
+    bad_lines = np.flatnonzero(~are_poses(poses))
     if len(bad_lines):
         raise InputError(
             f"{path}, line {bad_lines[0] + 1}: must be a right-handed rotation and a position in metres"
         )
     return poses
+
+
+def are_poses(poses: np.ndarray) -> np.ndarray:
+    """Whether each of (n, 4, 4) is a right-handed rotation and a position in metres: (n,)
+    booleans.
+    """
+    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        is_rotation = (errors <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
+    return is_rotation & (np.abs(positions).max(axis=1) <= MAX_POSITION)
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
@@ -424,24 +454,37 @@ def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Read a file in TUM's format and match its poses to the frames' times (n,), seconds, with evo.
 
     Returns the indices of the matched frames, (m,), and their poses, (m, 4, 4). Raises InputError
-    if m is below two.
+    for a line without a time after the line before, a position in metres and a unit quaternion, and
+    if too few poses are matched (MIN_MATCHED), as with another unit of time.
     """
-    from evo import EvoException  # takes 0.4 s to load
-    from evo.core.sync import matching_time_indices
-    from evo.tools import file_interface
+    from evo.core.sync import matching_time_indices  # takes 0.4 s to load
+    from evo.core.trajectory import PoseTrajectory3D
 
-    try:
-        trajectory = file_interface.read_tum_trajectory_file(path)
-    except EvoException as error:
-        raise InputError(f"{path}: {error}") from None
-    numbers, nearest = matching_time_indices(times, trajectory.timestamps)
-    poses = np.array(trajectory.poses_se3)[nearest]
-    if len(poses) < 2 or not np.isfinite(poses).all():
+    rows = _read_numbers(path, 8, "#")
+    _check_increase(path, rows[:, 0])
+    bad_lines = np.flatnonzero(
+        (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > QUATERNION_TOLERANCE)
+        | (np.abs(rows[:, 1:4]).max(axis=1) > MAX_POSITION)
+    )
+    if len(bad_lines):
         raise InputError(
-            f"{path}: {len(poses)} poses at the frames' times, {times[0]:g} to {times[-1]:g} s; at least "
-            "two finite poses are needed"
+            f"{path}, pose {bad_lines[0] + 1}: must be a time, a position in metres and a unit "
+            "quaternion (x, y, z, w)"
         )
-    return np.array(numbers), poses
+    trajectory = PoseTrajectory3D(rows[:, 1:4], np.roll(rows[:, 4:], 1, axis=1), rows[:, 0])
+    numbers, nearest = matching_time_indices(times, rows[:, 0])
+    # how many of the one lie within the time of the other
+    shared = min(
+        np.count_nonzero((values >= others[0]) & (values <= others[-1]))
+        for values, others in ((times, rows[:, 0]), (rows[:, 0], times))
+    )
+    least = max(2, MIN_MATCHED[0] * shared, MIN_MATCHED[1] * min(len(rows), len(times)))
+    if len(numbers) < least:
+        raise InputError(
+            f"{path}: {len(numbers)} of {len(rows)} poses are at the time of a frame, "
+            f"{times[0]:g} to {times[-1]:g} s; its times are {rows[0, 0]:.10g} to {rows[-1, 0]:.10g}"
+        )
+    return np.array(numbers), np.array(trajectory.poses_se3)[nearest]
 
 
 def _write_rows(path, rows):

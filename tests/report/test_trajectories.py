@@ -138,6 +138,112 @@ def test_folders_of_sequences_get_a_mean(files, capsys):
     assert main(command) == 1 and "ours" in capsys.readouterr().err
 
 
+def moved(poses, change):
+    changed = poses.copy()
+    changed[:, :3, 3] = change(changed[:, :3, 3])
+    return changed
+
+
+MIRROR = np.diag([-1.0, 1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda poses: moved(poses, lambda at: 100 * at),
+        lambda poses: moved(poses, lambda at: 0.1 * at),
+        lambda poses: moved(poses, lambda at: 2 * at),
+        np.linalg.inv,
+        lambda poses: poses[::-1],
+        lambda poses: moved(poses, lambda at: at[:, ::-1]),
+        lambda poses: MIRROR @ poses @ MIRROR,
+        lambda poses: np.linalg.inv(poses[:-1, None]) @ poses[1:, None],
+        None,
+    ],
+)
+def test_a_doubtful_ground_truth_is_told(files, change, capsys):
+    path, truth = files / "kitti/poses/07.txt", winding()
+    write_kitti_poses(path, truth if change is None else change(truth).reshape(-1, 4, 4))
+    write_kitti_poses(files / "good.txt", truth[: len(path.read_text().splitlines())])
+    assert (
+        main(
+            [
+                "evaluate",
+                "--kitti",
+                str(files / "kitti"),
+                "--sequence",
+                "7",
+                str(files / "good.txt"),
+            ]
+        )
+        == 0
+    )
+    assert ("warning: " in capsys.readouterr().err) == (change is not None)
+
+
+def tum(change):
+    """Lines of a file in TUM's format with its numbers (160, 8) changed."""
+    rows = np.zeros((160, 8))
+    rows[:, 0], rows[:, 3], rows[:, 7] = 0.1 * np.arange(160), np.arange(160), 1
+    return "\n".join(" ".join(map(repr, row)) for row in change(rows).tolist())
+
+
+def doubled(rows):
+    rows[5, 0] = rows[4, 0]
+    return rows
+
+
+# {file: its text}: what the error names; None if the files are evaluated
+TIMES = "".join(f"{0.1 * index}\n" for index in range(160))
+FILES = [
+    ({"ours/07.txt~": "old", "ours/06.times": "0", "ours/07.tum": tum(np.array)}, None),
+    ({"ours/07.tum": "\ufeff# t x y z\n" + tum(np.array)}, None),
+    ({"ours/07.tum": tum(np.array), "ours/07.txt": "1"}, "07.t"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1000, 1, 1, 1, 1, 1, 1, 1])}, "07.tum: 1 of 160"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1, 1, 1, 1, 0])}, "07.tum, pose 1"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1e300, 1, 1, 1, 1])}, "07.tum, pose 2"),
+    ({"ours/07.tum": tum(doubled)}, "07.tum, line 6"),
+    ({"ours/07.tum": tum(np.array), "kitti/sequences/07/times.txt": TIMES + "16\n"}, "times.txt"),
+    ({"ours/07.tum": tum(np.array), "kitti/sequences/07/times.txt": TIMES[:-5]}, "times.txt"),
+]
+
+
+@pytest.mark.parametrize("texts, named", FILES)
+def test_files_that_would_give_wrong_numbers_are_refused(files, texts, named, capsys):
+    for path, text in texts.items():
+        (files / path).parent.mkdir(parents=True, exist_ok=True)
+        (files / path).write_text(text, encoding="utf-8")
+    assert main(
+        ["evaluate", "--kitti", str(files / "kitti"), str(files / "ours"), "--json"]
+    ) == bool(named)
+    out, err = capsys.readouterr()
+    assert named in err if named else [row["poses"] for row in json.loads(out)] == [160]
+
+
+def test_two_formats_of_one_name_and_means_over_other_sequences(files, capsys):
+    write_kitti_poses(files / "kitti/poses/08.txt", winding())
+    for path in ("ours/07.txt", "ours/08.txt", "both/07.txt", "both/08.txt", "both/09.txt"):
+        write_kitti_poses(files / path, winding(seed=1))
+    write_kitti_poses(files / "kitti/poses/09.txt", winding())
+    write_tum(files / "good.tum", winding(seed=2), 0.1 * np.arange(160))
+    command = ["evaluate", "--kitti", str(files / "kitti"), "--json"]
+    assert main([*command, str(files / "ours"), str(files / "both")]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["sequence"] for row in rows[5:]] == ["mean of 07, 08", "mean of 07, 08, 09"]
+    assert (
+        main(
+            [
+                *command,
+                "--sequence",
+                "07",
+                *(str(files / f"good.{kind}") for kind in ("txt", "tum")),
+            ]
+        )
+        == 0
+    )
+    assert len({row["rmse_m"] for row in json.loads(capsys.readouterr().out)}) == 2
+
+
 def test_trajectories_that_cannot_be_compared_are_named(files, capsys):
     straight = np.tile(np.eye(4), (160, 1, 1))
     write_kitti_poses(files / "long.txt", straight)

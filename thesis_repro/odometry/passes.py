@@ -72,6 +72,11 @@ class Result:
             self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
         )
 
+    @property
+    def failed(self) -> int:
+        """Number of frames with a flag other than "stationary"."""
+        return int((~self.frames["flag"].isin(["", "stationary"])).sum())
+
     def with_poses(self, poses: np.ndarray) -> "Result":
         """Copy with other poses (n, 4, 4), also in the table of frames."""
         columns = dict(zip("xyz", poses[:, :3, 3].T, strict=True)) | dict(
