@@ -375,7 +375,8 @@ def mask_oddities(source, sequence):
     option = "" if has_labels else "; --invert inverts masks"
     if coverage.min() < MIN_COVERAGE or coverage.mean() > MAX_COVERAGE:
         faults.append(f"leave {coverage.min():.1%} to {coverage.max():.1%} of the frames{option}")
-    elif not has_labels:
+    # masks that this project wrote are what their record says
+    elif not has_labels and ("keep" not in record or source.invert):
         contrasts = [
             _contrast(sequence.frame(index), mask)
             for index, mask in zip(indices, sampled_masks, strict=True)

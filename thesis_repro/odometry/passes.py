@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, stages
+from thesis_repro import InputError, longrun, stages
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
@@ -200,6 +200,7 @@ def _run(
         if description is not None:
             indices = progress(indices, description, total=len(sequence), initial=done)
         for index in indices:
+            longrun.check_stop()
             frame = sequence.frame(index)
             if shared is not None:
                 shared.expect(

@@ -94,7 +94,8 @@ class OdometrySettings:
                 continue
             # numbers of numpy are of these abstract kinds, too
             kind = numbers.Real if is_float else numbers.Integral
-            if not isinstance(value, kind) or not least <= value <= most:
+            is_number = isinstance(value, kind)
+            if not is_number or not least <= value <= most:
                 raise InputError(
                     f"odometry setting {name}: {value!r} is not a "
                     f"{'' if is_float else 'whole '}number from {least} to {most}"
