@@ -324,13 +324,13 @@ def stoppable():
         for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
     }
-    _stops.clear()
     for number in handlers:
         signal.signal(number, stop)
     try:
         yield
         check_stop()
     finally:
+        _stops.clear()
         for number, handler in handlers.items():
             signal.signal(number, handler)
 
@@ -355,8 +355,8 @@ def end_with_parent():
 
 
 def interrupt_without(*ancestors):
-    """Send SIGTERM to this process when it or one of the `ancestors` (process ids) loses its parent,
-    even if that was killed (Linux only). Looks once a second, in a thread.
+    """Send SIGTERM to this process when it or one of the `ancestors` (process ids) loses its
+    parent, even if that was killed (Linux only). A thread looks once a second.
     """
 
     def parents():
