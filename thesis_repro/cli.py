@@ -595,7 +595,8 @@ def build_parser():
         sub = commands.add_parser(
             name,
             help=function.__doc__,
-            description=textwrap.fill(function.__doc__, 80),
+            # python -OO leaves docstrings out
+            description=textwrap.fill(function.__doc__ or "", 80),
             epilog="\n".join(
                 [
                     "examples:",

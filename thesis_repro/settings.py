@@ -232,6 +232,8 @@ def read_settings(environment=None):
         if not folder.is_dir():
             raise InputError(f"{name}={values[name]}: no such folder")
     for name in {"BUILD", "FIGURES"} & values.keys():
+        if re.search(r"[`$\"'\\;&|<>()*?\[\]{}!\n]", values[name]):  # make passes them to a shell
+            raise InputError(f"{name}={values[name]}: has a character that shells treat specially")
         check_outside(f"{name}={values[name]}", Path(values[name]), folders.values())
     readers = {"WIDTHS": widths, "FRAMES": frames}
     sizes = replace(
