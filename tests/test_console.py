@@ -1,14 +1,17 @@
 """Locks of folders, deletion of old results, logs, and one line for errors of the machine."""
 
+import ctypes
 import errno
 import fcntl
 import logging
 import os
+import signal
 import warnings
 
 import pytest
 
-from thesis_repro import InputError, console, files, results
+from thesis_repro import InputError, console, files, odometry, results
+from thesis_repro.kitti import Sequence
 
 
 def test_a_folder_is_locked_by_one_process(tmp_path):
@@ -125,3 +128,14 @@ def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
     assert any("WARNING" in line and "odd" in line for line in lines)
     handlers = logging.getLogger("thesis_repro").handlers
     assert not any(isinstance(handler, console._LogFile) for handler in handlers)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_that_compiled_code_loses_stops_at_the_next_frame(tiny_kitti, number):
+    """Exceptions are lost in callbacks of C, as while Numba compiles."""
+    with pytest.raises(KeyboardInterrupt), console.stoppable():
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
+        with pytest.raises(KeyboardInterrupt):
+            odometry.run(Sequence(tiny_kitti, "00"))
+    assert len(odometry.run(Sequence(tiny_kitti, "00")).poses) == 4

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from conftest import SHARED
+from paths import SHARED
 
 from thesis_repro import InputError, check, cli, kitti, kitti_raw
 

@@ -17,6 +17,7 @@ from thesis_repro import InputError, console, one_line
 from thesis_repro.settings import (
     PROFILES,
     SEED,
+    check_outside,
     number,
     read_frames,
     read_widths,
@@ -109,18 +110,20 @@ def masks(options):
     """
     from thesis_repro.masks import LabelMasks, write_masks
 
-    sequence = _sequence(options)
+    sequence, settings = _sequence(options), _mask_settings(options)
+    if not options.dilation and settings.keep != "static":
+        raise InputError("--dilation W: needed for masks from boundaries")
     mask_sets = [
-        LabelMasks(options.labels, sequence, width, _mask_settings(options))
-        for width in sorted(set().union(*options.dilation))
+        LabelMasks(options.labels, sequence, width, settings)
+        for width in sorted(set().union(*options.dilation or [(1,)]))
     ]
-    _check_outputs(options, options.labels, sequence.folder)
+    _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
     _print_oddities(sequence, mask_sets)
     for label_masks in mask_sets:
         width = label_masks.dilation_width
         folder = options.folder if len(mask_sets) == 1 else options.folder / f"mask{width}"
         write_masks(label_masks, folder)
-        print(f"{folder}: {len(label_masks)} masks of width {width}")
+        print(f"{folder}: {len(label_masks)} masks{f' of width {width}' * bool(options.dilation)}")
 
 
 def odometry(options):
@@ -142,9 +145,10 @@ def odometry(options):
         options,
         sequence.poses_path,
         *kitti.texts_of(sequence.folder, sequence.frame_paths[0].parent),
-        sequence.frame_paths[0].parent,
         options.masks,
         options.labels,
+        sequence.folder,
+        sequence.frame_paths[0].parent,
     )
     _print_oddities(sequence, [masks] if masks else [])
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
@@ -153,8 +157,8 @@ def odometry(options):
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
-        for line in check.path_oddities(sequence.name, result.poses, sequence.poses):
-            console.log.warning(line)
+        _warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
+    _warn(check.step_oddities(sequence.name, result.failed, len(sequence)))
     record = texts.run_record(result, sequence)
     if options.video:
         from thesis_repro.report import video
@@ -193,6 +197,8 @@ def study(options):
     has_labels = any(kind == "labels" for kind, _ in options.sources)
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
+    # one of any width, if masks have none
+    all_widths = (options.controls or 1,) if options.keep == "static" else ALL_WIDTHS
     names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
@@ -200,7 +206,7 @@ def study(options):
         sources.named(
             options.sources, options.name, _mask_settings(options, has_labels), options.invert
         ),
-        tuple(sorted(set().union(*options.widths or [ALL_WIDTHS] if has_labels else []))),
+        tuple(sorted(set().union(*options.widths or [all_widths] if has_labels else []))),
         options.controls,
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
@@ -213,7 +219,7 @@ def study(options):
         _print(options, plan.of_study(planned, options.folder), "plan.txt.j2")
         return 0
     folder = options.folder.absolute()
-    _check_outputs(options, options.kitti, *(source.folder for source in planned.sources))
+    _check_outputs(options, *(source.folder for source in planned.sources))
     # this import takes seconds, so the input is checked first
     from thesis_repro.report import study
 
@@ -242,18 +248,21 @@ def evaluate(options):
     sequences = trajectories.by_sequence(options.poses, options.kitti, options.sequence)
     if options.plot and len(sequences) > 1:
         raise InputError("--plot: shows only one sequence; name it with --sequence")
-    _check_outputs(
-        options, *options.poses, *(file for files in sequences.values() for file in files.values())
-    )
+    _check_outputs(options, *options.poses)
     rows = []
     for sequence, files in sequences.items():
-        truth, times = (values[: options.frames] for values in true_path(options.kitti, sequence))
+        truth, times = true_path(options.kitti, sequence)
+        _warn(check.truth_oddities(sequence, truth, times))
         paths = {
             name: trajectories.read(file, times, options.frames) for name, file in files.items()
         }
+        truth = truth[: options.frames]
         for name, (matched, poses) in paths.items():
-            for line in check.path_oddities(name, poses, truth[matched]):
-                console.log.warning(line)
+            _warn(
+                check.path_oddities(
+                    name, poses, truth[matched], options.align not in ("sim3", "scale")
+                )
+            )
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
         drawing = trajectories.figure(
@@ -309,9 +318,13 @@ def _print_oddities(sequence, mask_sets):
             line, mask_warnings = check.mask_oddities(masks, sequence)
             console.log.info(line)
             warnings += mask_warnings
-    for line in warnings:
-        console.log.warning(line)
+    _warn(warnings)
     return warnings
+
+
+def _warn(lines):
+    for line in lines:
+        console.log.warning(line)
 
 
 def _image_folders(root):
@@ -350,6 +363,10 @@ def _mask_settings(options, has_labels=True):
         raise InputError(
             f"{', '.join(MASK_OPTIONS)}: need --labels DIR, label maps to make masks from"
         )
+    for name in ("boundaries", "symmetric", "classes", "dilation", "widths"):
+        value = vars(options).get(name)
+        if settings.keep == "static" and value not in (None, [], vars(MaskSettings).get(name)):
+            raise InputError(f"--{name}: --keep static uses no boundaries; leave it out")
     return settings
 
 
@@ -358,10 +375,11 @@ def _masks(options, sequence):
     from thesis_repro.masks import LabelMasks, MaskFolder
 
     settings = _mask_settings(options, options.labels)
-    if bool(options.labels) != (options.dilation is not None):
+    if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
         raise InputError("--labels DIR, --dilation W: give both or neither")
     if options.labels:
-        return LabelMasks(options.labels, sequence, options.dilation, settings)
+        width = 1 if options.dilation is None else options.dilation
+        return LabelMasks(options.labels, sequence, width, settings)
     if options.invert and not options.masks:
         raise InputError("--invert: needs --masks DIR")
     return MaskFolder(options.masks, sequence, options.invert) if options.masks else None
@@ -375,20 +393,30 @@ def _check_outputs(options, *inputs):
     """Raise InputError, before anything runs, if an output cannot be written or would overwrite
     or mix with inputs.
     """
-    from thesis_repro.files import check_output
+    from thesis_repro.files import check_output, is_stream
 
-    used, folder = {path.resolve() for path in inputs if path}, vars(options).get("folder")
-    if folder and any(path.is_relative_to(folder.resolve()) for path in used):
-        raise InputError(f"--output {folder}: holds input of this command; name another folder")
+    data = [path for path in (vars(options).get("kitti"), *inputs) if path]
+    # a sequence given alone belongs to the folder above sequences/
+    data += [
+        above.parent
+        for path in data
+        for above in path.resolve().parents
+        if above.name == "sequences"
+    ]
+    folder, used = vars(options).get("folder"), set()
+    if folder:
+        check_outside(f"--output {folder}", folder, data)
+        if any(path.resolve().is_relative_to(folder.resolve()) for path in data):
+            raise InputError(f"--output {folder}: holds input of this command; name another folder")
     for name, path in _output_files(options).items():
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
         check_output(path)
-        if not used.isdisjoint((path.resolve(), path.resolve().parent)):
-            raise InputError(
-                f"--{name} {path}: is used by this command, or in a folder of its input; name another"
-            )
+        if not is_stream(path):
+            check_outside(f"--{name} {path}", path, data)
+        if path.resolve() in used:
+            raise InputError(f"--{name} {path}: is another output of this command; name another")
         used.add(path.resolve())
 
 
@@ -554,7 +582,8 @@ def build_parser():
         sub = commands.add_parser(
             name,
             help=function.__doc__,
-            description=textwrap.fill(function.__doc__, 80),
+            # python -OO leaves docstrings out
+            description=textwrap.fill(function.__doc__ or "", 80),
             epilog="\n".join(
                 [
                     "examples:",
@@ -616,7 +645,6 @@ def build_parser():
     add(
         "--dilation",
         **WIDTHS,
-        required=True,
         help="in pixels, such as 5,10 or 1-15; several get a subfolder each",
     )
 

@@ -12,6 +12,7 @@ import os
 import resource
 import signal
 import sys
+import threading
 import time
 from contextlib import contextmanager, suppress
 from datetime import timedelta
@@ -244,23 +245,37 @@ def stoppable():
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that worker processes end too.
 
     They raise KeyboardInterrupt with the signal's number. An ignored signal (nohup) stays ignored.
+    The exception is lost in a callback of compiled code, such as Numba's compiler; then
+    `check_stop` raises it again.
     """
 
     def stop(number, _):
+        _stops.append(number)
         raise KeyboardInterrupt(number)
 
-    numbers = [
-        number
-        for number in (signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) == signal.SIG_DFL
-    ]
-    for number in numbers:
+    handlers = {
+        number: signal.getsignal(number)
+        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+    }
+    for number in handlers:
         signal.signal(number, stop)
     try:
         yield
+        check_stop()
     finally:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+        _stops.clear()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+_stops = []  # numbers of the signals that arrived within `stoppable`
+
+
+def check_stop():
+    """Raise KeyboardInterrupt if a signal to stop has arrived (see `stoppable`)."""
+    if _stops:
+        raise KeyboardInterrupt(_stops[0])
 
 
 def end_with_parent():
@@ -271,3 +286,23 @@ def end_with_parent():
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
         if os.getppid() == 1:
             os._exit(1)  # the parent has ended already
+
+
+def interrupt_without(*ancestors):
+    """Send SIGTERM to this process when it or one of the `ancestors` (process ids) loses its
+    parent, even if that was killed (Linux only). A thread looks once a second.
+    """
+
+    def parents():
+        stats = (Path(f"/proc/{process}/stat").read_text() for process in (os.getpid(), *ancestors))
+        return [stat.rpartition(")")[2].split()[1] for stat in stats]
+
+    def watch():
+        with suppress(OSError):
+            at_start = parents()
+            while parents() == at_start:
+                time.sleep(1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    if Path("/proc/self/stat").exists():
+        threading.Thread(target=watch, daemon=True).start()

@@ -188,9 +188,9 @@ def atomic(path):
     """Yield a temporary path; rename it to `path` when the block ends, or delete it if the block
     raises an error.
 
-    A symbolic link is kept and its target is replaced. A file in a folder of results is added to
-    the list of files written there (see `results.stage`). A stream (see `is_stream`) gets the bytes
-    when the block ends.
+    A symbolic link is kept and its target is replaced; in a folder of results, the link is. A file
+    there is added to the list of files written there (see `results.stage`). A stream (see
+    `is_stream`) gets the bytes when the block ends.
     """
     path = Path(path)
     if is_stream(path):
@@ -203,7 +203,7 @@ def atomic(path):
             else:
                 path.write_bytes(temporary.read_bytes())
         return
-    target = path.resolve() if path.is_symlink() else path
+    target = path.resolve() if path.is_symlink() and _results_of(path) is None else path
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_path(target)
     try:
@@ -232,14 +232,19 @@ def _add_to_list(path, file):
     """Add a file that is about to be renamed to `path` to the list of its folder of results, if
     there is one.
     """
-    folder = next(
-        (folder for folder in path.absolute().parents if (folder / console.RECORD).exists()), None
-    )
+    folder = _results_of(path)
     if folder is not None and path.name != console.RECORD:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         # short appends do not mix
         with open(folder / LIST, "a", encoding="utf-8") as written:
             written.write(f"{digest} {json.dumps(str(path.absolute().relative_to(folder)))}\n")
+
+
+def _results_of(path):
+    """Return the folder of results that a file lies in, or None."""
+    return next(
+        (folder for folder in path.absolute().parents if (folder / console.RECORD).exists()), None
+    )
 
 
 def is_stream(path):

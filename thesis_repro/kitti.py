@@ -89,15 +89,15 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     """Folder of a sequence's frames. Raises InputError if the camera is unknown or the folder is
     missing.
 
-    The default is the first of IMAGE_FOLDERS that exists, or of a raw drive's. If none exists, it
-    is the sequence's folder itself.
+    The default is the left camera's, gray or else colour. If neither exists, it is the sequence's
+    folder itself.
     """
     cameras, inner = IMAGE_FOLDERS, ""
     if kitti_raw.is_drive(folder):
         cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
     if camera is not None and camera not in cameras:
         raise InputError(f"camera {camera!r}: unknown; choose one of {', '.join(sorted(cameras))}")
-    candidates = [Path(folder) / name / inner for name in ([camera] if camera else cameras)]
+    candidates = [Path(folder) / name / inner for name in ([camera] if camera else cameras[:2])]
     frame_folder = next(
         (path for path in candidates if path.is_dir()), candidates[0] if camera else Path(folder)
     )
@@ -149,7 +149,12 @@ class Sequence:
         frame_folder = images_of(self.folder, camera)
         self.frame_paths = images(frame_folder)
         if not self.frame_paths:
-            raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
+            raise InputError(
+                f"{frame_folder}: holds no PNG or JPEG frames of the left camera, to which the ground "
+                "truth belongs (--camera image_1 takes the right one)"
+                if images_of(self.folder) == self.folder and (self.folder / "image_1").is_dir()
+                else f"{frame_folder}: holds no PNG or JPEG frames"
+            )
         check_numbering(self.frame_paths)
         self.calibration_path, times = texts_of(self.folder, frame_folder)
         self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
@@ -269,8 +274,15 @@ def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np
     """
     _, folder, path = locate(root, name)
     frame_folder = images_of(folder) if kitti_raw.is_drive(folder) else folder
-    poses, times = truth_of(path), texts_of(folder, frame_folder)[1]
-    return poses, times_of(times) if times.is_file() else FRAME_TIME * np.arange(len(poses))
+    poses, path_of_times = truth_of(path), texts_of(folder, frame_folder)[1]
+    if not path_of_times.is_file():
+        return poses, FRAME_TIME * np.arange(len(poses))
+    times = times_of(path_of_times)
+    if len(times) != len(poses):
+        raise InputError(
+            f"{path_of_times}: {len(times)} times for {len(poses)} poses in {path}; one a frame is needed"
+        )
+    return poses, times
 
 
 def truth_of(path: Path) -> np.ndarray:
@@ -352,7 +364,7 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     if camera in kitti_raw.IMAGE_FOLDERS:
         key = f"P_rect_{camera[-2:]}"
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
         matrix = np.array(
             [line.split()[1:] for line in lines if line.startswith(f"{key}:")][0], np.float64
         )
@@ -361,17 +373,19 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, IndexError):
         matrix = np.zeros((3, 3))
-    (fx, _, u), (_, fy, v), _ = matrix
-    without_skew = np.array([[fx, 0, u], [0, fy, v], [0, 0, 1]])
-    if (
-        min(fx, fy) <= 0
-        or not np.isfinite(matrix).all()
-        or not np.array_equal(matrix, without_skew)
-    ):
+    if not is_camera_matrix(matrix):
         raise InputError(
             f"{path}: must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
         )
     return matrix
+
+
+def is_camera_matrix(matrix: np.ndarray) -> bool:
+    """Whether a matrix is that of Equation 2.4, (3, 3), without skew."""
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return False
+    (fx, _, u), (_, fy, v), _ = matrix
+    return min(fx, fy) > 0 and np.array_equal(matrix, [[fx, 0, u], [0, fy, v], [0, 0, 1]])
 
 
 def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[int, int]) -> None:

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from thesis_repro import InputError, results
-from thesis_repro.cityscapes import ID, read_label_map
-from thesis_repro.files import is_whole, listed, progress, read_gray, write_png
+from thesis_repro.cityscapes import ID, N_CLASSES, read_label_map
+from thesis_repro.files import is_whole, listed, numbers_of, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence, check_size
 
 BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
@@ -165,7 +165,18 @@ def keypoint_mask(
 ) -> np.ndarray:
     """Keypoint mask of one frame from its label map: `dilate(edges(...))` without the
     `forbidden` pixels.
+
+    Raises InputError unless the label map is (h, w) uint8 label ids.
     """
+    label_map = np.asarray(label_map)
+    if label_map.ndim != 2 or label_map.dtype != np.uint8 or not label_map.size:
+        raise InputError(
+            f"label map: {label_map.dtype} of shape {label_map.shape}; must be uint8 ids, (height, width)"
+        )
+    if label_map.max() >= N_CLASSES:
+        raise InputError(
+            f"label map: holds {label_map.max()}; must hold Cityscapes label ids, 0 to {N_CLASSES - 1}"
+        )
     return _finish_mask(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
 
 
@@ -342,9 +353,11 @@ def _paths_by_frame(folder, sequence, kind):
             f"{sequence.name}"
         )
     present = {path.name: path for path in listed(folder)}
-    # A single mask with a frame's name is the mask of that frame only.
-    if kind == "mask" and len(present) == 1 and not present.keys() & set(sequence.label_names):
-        return list(present.values()) * len(sequence)
+    # A single mask named as frames are is the mask of one frame only.
+    if kind == "mask" and len(present) == 1:
+        stem = Path(*present).name.removesuffix(".png").removesuffix(".png")
+        if numbers_of([*sequence.frame_paths, Path(stem)]) is None:
+            return list(present.values()) * len(sequence)
     # some tools append .png to the whole name
     paths = [
         present.get(name) or present.get(f"{frame.name}.png")

@@ -231,6 +231,10 @@ def read_settings(environment=None):
     for name, folder in folders.items():
         if not folder.is_dir():
             raise InputError(f"{name}={values[name]}: no such folder")
+    for name in {"BUILD", "FIGURES"} & values.keys():
+        if re.search(r"[`$\"'\\;&|<>()*?\[\]{}!\n]", values[name]):  # make passes them to a shell
+            raise InputError(f"{name}={values[name]}: has a character that shells treat specially")
+        check_outside(f"{name}={values[name]}", Path(values[name]), folders.values())
     readers = {"WIDTHS": read_widths, "FRAMES": read_frames}
     sizes = replace(
         PROFILES[profile],
@@ -257,6 +261,15 @@ def read_settings(environment=None):
         scheduler=scheduler_address(values.get("DASK_SCHEDULER")),
         kitti_semantic=folders.get("KITTI_SEMANTIC"),
     )
+
+
+def check_outside(name, path, data):
+    """Raise InputError if an output lies in or below one of the paths given as data, which are only
+    read. name: how the user gave the output.
+    """
+    for folder in data:
+        if path.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{name}: lies in {folder}, which is data and only read; name another")
 
 
 def _run_name(folders, profile, sizes):

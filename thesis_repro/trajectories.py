@@ -10,12 +10,17 @@ from thesis_repro.files import write_text
 
 MAX_POSITION = 1e9  # metres
 ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
+QUATERNION_TOLERANCE = 0.01  # of its length; files have few digits
+# Matched poses of a file with times: least share of those within the common time, and of all. A
+# file of keyframes may cover more frames than an excerpt has.
+MIN_MATCHED = 0.3, 0.1
 
 
-def _read_numbers(path, columns):
+def _read_numbers(path, columns, comments=None):
     try:
-        with open(path, encoding="utf-8") as file, warnings.catch_warnings(action="ignore"):
-            rows = np.loadtxt(file, np.float64, comments=None, ndmin=2)
+        # some editors begin a file with a byte order mark
+        with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
+            rows = np.loadtxt(file, np.float64, comments=comments, ndmin=2)
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
@@ -28,12 +33,16 @@ def _read_numbers(path, columns):
 def read_times(path: str | Path) -> np.ndarray:
     """Times of the frames, (n,), seconds, one a line. Raises InputError unless they increase."""
     times = _read_numbers(path, 1)[:, 0]
+    _check_increase(path, times)
+    return times
+
+
+def _check_increase(path, times):
     steps_back = np.flatnonzero(np.diff(times) <= 0)
     if len(steps_back):
         raise InputError(
             f"{path}, line {steps_back[0] + 2}: time does not increase; mend or remove the file"
         )
-    return times
 
 
 def read_poses(path: str | Path) -> np.ndarray:
@@ -45,16 +54,23 @@ def read_poses(path: str | Path) -> np.ndarray:
     rows = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        is_rotation = (errors <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
-    bad_lines = np.flatnonzero(~is_rotation | (np.abs(positions).max(axis=1) > MAX_POSITION))
+    bad_lines = np.flatnonzero(~are_poses(poses))
     if len(bad_lines):
         raise InputError(
             f"{path}, line {bad_lines[0] + 1}: must be a right-handed rotation and a position in metres"
         )
     return poses
+
+
+def are_poses(poses: np.ndarray) -> np.ndarray:
+    """Whether each of (n, 4, 4) is a right-handed rotation and a position in metres: (n,)
+    booleans.
+    """
+    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        is_rotation = (errors <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
+    return is_rotation & (np.abs(positions).max(axis=1) <= MAX_POSITION)
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
@@ -77,24 +93,37 @@ def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Read a file in TUM's format and match its poses to the frames' times (n,), seconds, with evo.
 
     Returns the indices of the matched frames, (m,), and their poses, (m, 4, 4). Raises InputError
-    if m is below two.
+    for a line without a time after the line before, a position in metres and a unit quaternion, and
+    if too few poses are matched (MIN_MATCHED), as with another unit of time.
     """
-    from evo import EvoException  # takes 0.4 s to load
-    from evo.core.sync import matching_time_indices
-    from evo.tools import file_interface
+    from evo.core.sync import matching_time_indices  # takes 0.4 s to load
+    from evo.core.trajectory import PoseTrajectory3D
 
-    try:
-        trajectory = file_interface.read_tum_trajectory_file(path)
-    except EvoException as error:
-        raise InputError(f"{path}: {error}") from None
-    numbers, nearest = matching_time_indices(times, trajectory.timestamps)
-    poses = np.array(trajectory.poses_se3)[nearest]
-    if len(poses) < 2 or not np.isfinite(poses).all():
+    rows = _read_numbers(path, 8, "#")
+    _check_increase(path, rows[:, 0])
+    bad_lines = np.flatnonzero(
+        (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > QUATERNION_TOLERANCE)
+        | (np.abs(rows[:, 1:4]).max(axis=1) > MAX_POSITION)
+    )
+    if len(bad_lines):
         raise InputError(
-            f"{path}: {len(poses)} poses at the frames' times, {times[0]:g} to {times[-1]:g} s; at least "
-            "two finite poses are needed"
+            f"{path}, pose {bad_lines[0] + 1}: must be a time, a position in metres and a unit "
+            "quaternion (x, y, z, w)"
         )
-    return np.array(numbers), poses
+    trajectory = PoseTrajectory3D(rows[:, 1:4], np.roll(rows[:, 4:], 1, axis=1), rows[:, 0])
+    numbers, nearest = matching_time_indices(times, rows[:, 0])
+    # how many of the one lie within the time of the other
+    shared = min(
+        np.count_nonzero((values >= others[0]) & (values <= others[-1]))
+        for values, others in ((times, rows[:, 0]), (rows[:, 0], times))
+    )
+    least = max(2, MIN_MATCHED[0] * shared, MIN_MATCHED[1] * min(len(rows), len(times)))
+    if len(numbers) < least:
+        raise InputError(
+            f"{path}: {len(numbers)} of {len(rows)} poses are at the time of a frame, "
+            f"{times[0]:g} to {times[-1]:g} s; its times are {rows[0, 0]:.10g} to {rows[-1, 0]:.10g}"
+        )
+    return np.array(numbers), np.array(trajectory.poses_se3)[nearest]
 
 
 def _write_rows(path, rows):

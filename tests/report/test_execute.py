@@ -1,6 +1,7 @@
 """Executing notebooks: progress, logs, failures and interrupts."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -97,13 +98,33 @@ def test_a_dead_kernel_is_reported(start, tmp_path):
     )
 
 
+WAITING = (
+    "import os, time\nfrom pathlib import Path\n"
+    "try:\n    Path('pid').write_text(str(os.getpid()))\n    time.sleep(100)\n"
+    "finally:\n    Path('tidied').touch()"
+)
+
+
+def test_a_notebook_ends_when_make_is_killed(tmp_path):
+    nbformat.write(
+        nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(WAITING)]), tmp_path / "one.ipynb"
+    )
+    # a shell in the place of make, and the one of its recipe
+    recipe = f"bash -c '{shlex.join(COMMAND)} 2>/dev/null; :' & wait; :"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(["bash", "-c", recipe], cwd=tmp_path, env=environment)
+    wait_for((tmp_path / "pid").is_file)
+    time.sleep(0.5)
+    kernel = psutil.Process(int((tmp_path / "pid").read_text()))
+    converter = kernel.parent()
+    process.kill()
+    process.wait()
+    assert psutil.wait_procs([kernel, converter], timeout=20)[1] == []
+
+
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_notebook_leaves_no_kernel_running(start, tmp_path, sent):
-    process = start(
-        "import os, time\nfrom pathlib import Path\n"
-        "try:\n    Path('pid').write_text(str(os.getpid()))\n    time.sleep(100)\n"
-        "finally:\n    Path('tidied').touch()"
-    )
+    process = start(WAITING)
     wait_for((tmp_path / "pid").is_file)
     time.sleep(0.5)
     process.send_signal(sent)

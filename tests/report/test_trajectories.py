@@ -26,8 +26,8 @@ EVO = {
 
 @pytest.fixture
 def files(tmp_path):
-    """A KITTI folder with the ground truth of sequence 07, and two estimates of it."""
-    write_kitti_poses(tmp_path / "poses/07.txt", winding())
+    """A folder with the ground truth of sequence 07, in kitti, and two estimates of it."""
+    write_kitti_poses(tmp_path / "kitti/poses/07.txt", winding())
     for name, seed, stretch in (("good", 1, 1.0), ("long", 2, 1.2)):
         write_kitti_poses(tmp_path / f"{name}.txt", winding(seed=seed, stretch=stretch))
     return tmp_path
@@ -38,7 +38,7 @@ def evaluate(files, *options):
         [
             "evaluate",
             "--kitti",
-            str(files),
+            str(files / "kitti"),
             "--sequence",
             "7",
             str(files / "good.txt"),
@@ -68,7 +68,12 @@ def test_errors_equal_those_of_evos_tools(files, alignment, monkeypatch, capsys)
     rows = json.loads(capsys.readouterr().out)
     assert [row["trajectory"] for row in rows] == [str(files / name) for name in ("good", "long")]
     for row in rows:
-        arguments = ["kitti", files / "poses/07.txt", f"{row['trajectory']}.txt", *EVO[alignment]]
+        arguments = [
+            "kitti",
+            files / "kitti/poses/07.txt",
+            f"{row['trajectory']}.txt",
+            *EVO[alignment],
+        ]
         ape = printed_by("evo_ape", *arguments, monkeypatch=monkeypatch, capsys=capsys)
         rpe = printed_by("evo_rpe", *arguments, monkeypatch=monkeypatch, capsys=capsys)
         turns = printed_by(
@@ -110,10 +115,18 @@ def test_tum_keyframes_are_matched_by_time(files, capsys):
 
 
 def test_folders_of_sequences_get_a_mean(files, capsys):
-    write_kitti_poses(files / "poses/08.txt", winding())
+    write_kitti_poses(files / "kitti/poses/08.txt", winding())
     for name, seed in (("07", 1), ("08", 2), ("11", 3)):  # 11 has no ground truth
         write_kitti_poses(files / f"ours/{name}.txt", winding(seed=seed))
-    command = ["evaluate", "--kitti", str(files), str(files / "ours"), "--json", "--frames", "120"]
+    command = [
+        "evaluate",
+        "--kitti",
+        str(files / "kitti"),
+        str(files / "ours"),
+        "--json",
+        "--frames",
+        "120",
+    ]
     assert main(command) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["sequence"] for row in rows] == ["07", "08", "mean of 2"]
@@ -121,8 +134,114 @@ def test_folders_of_sequences_get_a_mean(files, capsys):
     assert [row["rmse_m"] for row in rows] == pytest.approx([*values, np.mean(values)])
     assert main([*command, "--sequence", "08"]) == 0
     assert [row["sequence"] for row in json.loads(capsys.readouterr().out)] == ["08"]
-    (files / "poses").rename(files / "elsewhere")
+    (files / "kitti/poses").rename(files / "elsewhere")
     assert main(command) == 1 and "ours" in capsys.readouterr().err
+
+
+def moved(poses, change):
+    changed = poses.copy()
+    changed[:, :3, 3] = change(changed[:, :3, 3])
+    return changed
+
+
+MIRROR = np.diag([-1.0, 1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda poses: moved(poses, lambda at: 100 * at),
+        lambda poses: moved(poses, lambda at: 0.1 * at),
+        lambda poses: moved(poses, lambda at: 2 * at),
+        np.linalg.inv,
+        lambda poses: poses[::-1],
+        lambda poses: moved(poses, lambda at: at[:, ::-1]),
+        lambda poses: MIRROR @ poses @ MIRROR,
+        lambda poses: np.linalg.inv(poses[:-1, None]) @ poses[1:, None],
+        None,
+    ],
+)
+def test_a_doubtful_ground_truth_is_told(files, change, capsys):
+    path, truth = files / "kitti/poses/07.txt", winding()
+    write_kitti_poses(path, truth if change is None else change(truth).reshape(-1, 4, 4))
+    write_kitti_poses(files / "good.txt", truth[: len(path.read_text().splitlines())])
+    assert (
+        main(
+            [
+                "evaluate",
+                "--kitti",
+                str(files / "kitti"),
+                "--sequence",
+                "7",
+                str(files / "good.txt"),
+            ]
+        )
+        == 0
+    )
+    assert ("warning: " in capsys.readouterr().err) == (change is not None)
+
+
+def tum(change):
+    """Lines of a file in TUM's format with its numbers (160, 8) changed."""
+    rows = np.zeros((160, 8))
+    rows[:, 0], rows[:, 3], rows[:, 7] = 0.1 * np.arange(160), np.arange(160), 1
+    return "\n".join(" ".join(map(repr, row)) for row in change(rows).tolist())
+
+
+def doubled(rows):
+    rows[5, 0] = rows[4, 0]
+    return rows
+
+
+# {file: its text}: what the error names; None if the files are evaluated
+TIMES = "".join(f"{0.1 * index}\n" for index in range(160))
+FILES = [
+    ({"ours/07.txt~": "old", "ours/06.times": "0", "ours/07.tum": tum(np.array)}, None),
+    ({"ours/07.tum": "\ufeff# t x y z\n" + tum(np.array)}, None),
+    ({"ours/07.tum": tum(np.array), "ours/07.txt": "1"}, "07.t"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1000, 1, 1, 1, 1, 1, 1, 1])}, "07.tum: 1 of 160"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1, 1, 1, 1, 0])}, "07.tum, pose 1"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1e300, 1, 1, 1, 1])}, "07.tum, pose 2"),
+    ({"ours/07.tum": tum(doubled)}, "07.tum, line 6"),
+    ({"ours/07.tum": tum(np.array), "kitti/sequences/07/times.txt": TIMES + "16\n"}, "times.txt"),
+    ({"ours/07.tum": tum(np.array), "kitti/sequences/07/times.txt": TIMES[:-5]}, "times.txt"),
+]
+
+
+@pytest.mark.parametrize("texts, named", FILES)
+def test_files_that_would_give_wrong_numbers_are_refused(files, texts, named, capsys):
+    for path, text in texts.items():
+        (files / path).parent.mkdir(parents=True, exist_ok=True)
+        (files / path).write_text(text, encoding="utf-8")
+    assert main(
+        ["evaluate", "--kitti", str(files / "kitti"), str(files / "ours"), "--json"]
+    ) == bool(named)
+    out, err = capsys.readouterr()
+    assert named in err if named else [row["poses"] for row in json.loads(out)] == [160]
+
+
+def test_two_formats_of_one_name_and_means_over_other_sequences(files, capsys):
+    write_kitti_poses(files / "kitti/poses/08.txt", winding())
+    for path in ("ours/07.txt", "ours/08.txt", "both/07.txt", "both/08.txt", "both/09.txt"):
+        write_kitti_poses(files / path, winding(seed=1))
+    write_kitti_poses(files / "kitti/poses/09.txt", winding())
+    write_tum(files / "good.tum", winding(seed=2), 0.1 * np.arange(160))
+    command = ["evaluate", "--kitti", str(files / "kitti"), "--json"]
+    assert main([*command, str(files / "ours"), str(files / "both")]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["sequence"] for row in rows[5:]] == ["mean of 07, 08", "mean of 07, 08, 09"]
+    assert (
+        main(
+            [
+                *command,
+                "--sequence",
+                "07",
+                *(str(files / f"good.{kind}") for kind in ("txt", "tum")),
+            ]
+        )
+        == 0
+    )
+    assert len({row["rmse_m"] for row in json.loads(capsys.readouterr().out)}) == 2
 
 
 def test_trajectories_that_cannot_be_compared_are_named(files, capsys):
@@ -135,7 +254,17 @@ def test_trajectories_that_cannot_be_compared_are_named(files, capsys):
         assert evaluate(files, *options) == 1
         assert named in capsys.readouterr().err
     assert (
-        main(["evaluate", "--kitti", str(files), "--sequence", "11", str(files / "good.txt")]) == 1
+        main(
+            [
+                "evaluate",
+                "--kitti",
+                str(files / "kitti"),
+                "--sequence",
+                "11",
+                str(files / "good.txt"),
+            ]
+        )
+        == 1
     )
     assert "poses/11.txt" in capsys.readouterr().err
     with pytest.raises(InputError, match="alignment='sim'"):

@@ -160,6 +160,14 @@ REFUSED = [
 {ODOMETRY} --tum out/path.txt -> --tum out/path.txt
 {ODOMETRY} --tum path.txt/path.tum -> path.txt
 {ODOMETRY} --tum {POSES} -> --tum {POSES}
+{ODOMETRY} --plot {FRAMES}/../new.png -> new.png
+{ODOMETRY} --tum kitti/sequences/00/../new.txt -> ../new.txt
+odometry --sequence kitti/sequences/00 --output kitti/poses/07.txt -> poses/07.txt
+{MASKED} --video masks/new.mp4 -> masks/new.mp4
+{EVALUATE} --plot kitti/new.png -> kitti/new.png
+{MASKS[:-3]}kitti/masks -> --output kitti/masks
+predict --images kitti/sequences/00 --output kitti/sequences/99 -> kitti/sequences/99
+study --kitti kitti --labels labels --output labels/study -> labels/study
 odometry --kitti kitti --sequence 77 -> sequences/77
 odometry --kitti kitti --sequence ../00 -> '../00'
 {MASKS[:-3]}labels -> --output labels

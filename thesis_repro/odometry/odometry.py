@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from thesis_repro import InputError
+from thesis_repro.kitti import is_camera_matrix
 from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
 from thesis_repro.odometry.refined.fit import RefinedMotion, fit, measured, smaller_rotation
 from thesis_repro.odometry.refined.guided import ransac_with_prior
 from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency, is_consistent
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
+from thesis_repro.trajectories import are_poses
 
 TIMED_PARTS = ("detect", "track", "essential", "pose")
 ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
@@ -94,12 +96,20 @@ class Odometry:
         start: np.ndarray | None = None,
         shared: keypoints.SharedKeypoints | None = None,
     ):
-        """intrinsics: 3x3, pixels. start: pose of the first frame, 4x4. shared: keypoints
-        shared with other runs.
+        """intrinsics: 3x3, pixels, as (fx, 0, u), (0, fy, v), (0, 0, 1). start: pose of the first
+        frame, 4x4. shared: keypoints shared with other runs. Raises InputError for another matrix,
+        and for a start that is no pose.
         """
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
+        if not is_camera_matrix(self.intrinsics):
+            raise InputError(
+                "intrinsics: must be (fx, 0, u), (0, fy, v), (0, 0, 1) in pixels, not "
+                f"{self.intrinsics.tolist()}"
+            )
+        if self.pose.shape != (4, 4) or not are_poses(self.pose[None]).all():
+            raise InputError("start: must be a pose, 4x4: a right-handed rotation and a position")
         self.prior = MotionPrior()  # used by the refined estimator and the fallback only
         self.keypoints: Any = shared or keypoints  # both have `detect` and `track`
         self.count = 0
@@ -286,6 +296,11 @@ class Odometry:
             raise InputError(
                 f"frame {self.count}: shape {frame.shape}, earlier frames {self.previous.shape}; "
                 "all frames must have the same size"
+            )
+        if mask is not None and np.count_nonzero(mask) > np.count_nonzero(mask == mask.max()):
+            raise InputError(
+                f"frame {self.count}: the mask holds {len(np.unique(mask))} different values; a mask has "
+                "0 and 255 (keypoint_mask makes masks from label maps)"
             )
 
 

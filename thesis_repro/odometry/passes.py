@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, results
+from thesis_repro import InputError, console, results
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
@@ -71,6 +71,11 @@ class Result:
         return (
             self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
         )
+
+    @property
+    def failed(self) -> int:
+        """Number of frames with a flag other than "stationary"."""
+        return int((~self.frames["flag"].isin(["", "stationary"])).sum())
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:
@@ -188,6 +193,7 @@ def _run(
         if description is not None:
             indices = progress(indices, description, total=len(sequence), initial=done)
         for index in indices:
+            console.check_stop()
             frame = sequence.frame(index)
             if shared is not None:
                 shared.expect(

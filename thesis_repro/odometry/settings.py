@@ -1,7 +1,8 @@
 """Settings of the odometry: the thesis's and alternatives."""
 
 import math
-from dataclasses import dataclass
+import numbers
+from dataclasses import dataclass, fields
 
 from thesis_repro import InputError
 
@@ -63,26 +64,30 @@ class OdometrySettings:
                     f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
                     f"choose one of {', '.join(known)}"
                 )
+        types = {field.name: field.type for field in fields(self)}
         for name, least, most in (
             ("max_keypoints", 0, 2**31 - 1),
             ("min_distance", 0, 10_000),
             ("redetect_below", 0, 2**31 - 1),
             ("quality", 0, 1),
+            ("threshold", 1e-9, 1e9),
             ("block_size", 1, 31),
             ("window", 3, 101),
             ("levels", 0, 10),
             ("shuffle_seed", 0, 2**32 - 1),
             ("scale_gate", 0, math.inf),
         ):
-            value = getattr(self, name)
-            if value is not None and not least <= value <= most:
+            value, is_float = getattr(self, name), types[name] is float
+            if value is None and types[name] is not int and not is_float:
+                continue
+            # numbers of numpy are of these abstract kinds, too
+            kind = numbers.Real if is_float else numbers.Integral
+            is_number = isinstance(value, kind)
+            if not is_number or not least <= value <= most:
                 raise InputError(
-                    f"odometry setting {name}: {value} is not in the range {least} to {most}"
+                    f"odometry setting {name}: {value!r} is not a "
+                    f"{'' if is_float else 'whole '}number from {least} to {most}"
                 )
-        if not 0 < self.threshold < math.inf:
-            raise InputError(
-                f"odometry setting threshold: {self.threshold} is not above 0; the thesis has 0.0003"
-            )
 
 
 THESIS = OdometrySettings()

@@ -32,8 +32,10 @@ class Execution(ExecutePreprocessor):
     log_file = Unicode("execution.log").tag(config=True)
 
     def preprocess(self, nb, resources=None, km=None):
-        # so that the kernel ends with this program
+        # so that the kernel ends with this program, and this program with make: the parent of the
+        # shell that runs it
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+        console.interrupt_without(os.getppid())
         sys.excepthook = _print_error  # nbconvert may fail to write the executed notebook
         name, path, started = resources["metadata"]["name"], Path(self.log_file), time.monotonic()
         try:
@@ -66,7 +68,13 @@ class Execution(ExecutePreprocessor):
         self.extra_arguments = ["--IPKernelApp.capture_fd_output=False"]
         # progress bars (`files.progress`) go to the standard error of this program
         environment = os.environ | {f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2"}
-        return super().setup_kernel(env=environment, stdout=self._log, stderr=self._log, **options)
+        return super().setup_kernel(
+            env=environment,
+            stdout=self._log,
+            stderr=self._log,
+            preexec_fn=console.end_with_parent,
+            **options,
+        )
 
 
 def _print_error(kind, error, _traceback):

@@ -217,13 +217,17 @@ def save_all(figures, tables, folder, note):
 
 def markdown(table):
     """Return a pandas table as Markdown, with numbers aligned to the right and missing values
-    empty.
+    empty. Names are no HTML.
     """
     numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
     rows = [list(table.columns), ["---:" if right else ":---" for right in numeric]]
     rows += [
         [
-            "" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value)
+            ""
+            if pd.isna(value)
+            else f"{value:g}"
+            if isinstance(value, float)
+            else str(value).replace("<", "&lt;")
             for value in row
         ]
         for row in table.itertuples(index=False)

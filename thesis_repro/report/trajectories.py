@@ -45,14 +45,20 @@ def by_sequence(paths, root, sequence=None):
                 if sequence
                 else [file.stem for file in listed(Path(root or "", "poses"), "*.txt")]
             )
-            path_files = {file.stem: file for file in listed(path, "*.t*") if file.stem in names}
+            found = [file for file in listed(path, "*.t[xu][tm]") if file.stem in names]
+            path_files = {file.stem: file for file in found}
+            for file in found:
+                if file != path_files[file.stem]:
+                    raise InputError(f"{file}: {path_files[file.stem].name} is there too; move one")
         if not path_files or None in path_files:
             raise InputError(
                 f"{path}: name its sequence with --sequence; a folder must contain NN.txt or NN.tum for a "
                 "sequence with ground truth in --kitti"
             )
         for name, file in path_files.items():
-            files.setdefault(name, {})[str(path.with_suffix("") if path.is_file() else path)] = file
+            of_sequence = files.setdefault(name, {})
+            short = str(path.with_suffix("") if path.is_file() else path)
+            of_sequence[str(path) if short in of_sequence else short] = file
     return files
 
 
@@ -60,14 +66,17 @@ def read(file, times, frames=None):
     """Read a trajectory in KITTI's or TUM's format: (indices of its frames (n,), poses (n, 4, 4)).
 
     times: of the ground truth, seconds. A file in KITTI's format needs one pose for each time; for
-    TUM's format see `read_tum`. frames: how many poses of a file in KITTI's format to use. Raises
-    InputError for any other file.
+    TUM's format see `read_tum`. frames: use only the first ones. Raises InputError for any other
+    file.
     """
+    first = ""
     # read_poses reports these errors
-    with suppress(OSError, ValueError), open(file, encoding="utf-8") as lines:
-        if len(next((line for line in lines if not line.startswith("#")), "").split()) == 8:
-            return read_tum(file, times)
-    poses = read_poses(file)[:frames]
+    with suppress(OSError, ValueError), open(file, encoding="utf-8-sig") as lines:
+        first = next((line for line in lines if not line.startswith("#")), "")
+    if len(first.split()) == 8:
+        matched, poses = read_tum(file, times)
+        return matched[matched < len(times[:frames])], poses[matched < len(times[:frames])]
+    poses, times = read_poses(file)[:frames], times[:frames]
     if len(poses) != len(times):
         raise InputError(
             f"{file}: {len(poses)} poses, but the ground truth has {len(times)}; KITTI's format needs one "
@@ -120,14 +129,16 @@ def means(rows):
     """Yield a row like those of `evaluate` with the means of each trajectory that has several
     sequences.
     """
+    sets = pd.DataFrame(rows).groupby("trajectory", sort=False)["sequence"].agg(", ".join)
     for name, errors in pd.DataFrame(rows).groupby("trajectory", sort=False):
         if len(errors) > 1:
+            of = sets[name] if sets.nunique() > 1 else len(errors)
             mean = errors.drop(columns=["poses", "frames", "segments"], errors="ignore").mean(
                 numeric_only=True
             )
             yield {
                 "trajectory": name,
-                "sequence": f"mean of {len(errors)}",
+                "sequence": f"mean of {of}",
                 "poses": int(errors["poses"].sum()),
                 **mean.to_dict(),
                 "note": "",

@@ -36,7 +36,7 @@ for _name, _value in {
 }.items():
     os.environ.setdefault(_name, _value)
 
-
+os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
 
 

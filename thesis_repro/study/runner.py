@@ -126,6 +126,7 @@ def _run_passes(
             frames.append(len(pass_jobs) * len(sequence))
         with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
             for index, failed in pool.run(_run_pass, calls):
+                console.check_stop()
                 failures |= (
                     failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
                 )

@@ -45,6 +45,10 @@ class Study:
             raise InputError(
                 f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}"
             )
+        if self.tested is not None and self.tested < 1:
+            raise InputError(
+                f"--controls {self.tested}: must be a dilation width, 1 or more pixels"
+            )
         sequences = self.opened
         for sequence in sequences:
             if len(sequence) < 3:
@@ -103,14 +107,19 @@ class Study:
                 write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
     def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
-        """Return the warnings of `check.path_oddities` for one run with all keypoints of each
-        sequence.
+        """Return the warnings of `check.step_oddities` and `check.path_oddities` for one run with
+        all keypoints of each sequence.
         """
         baselines = runs[
             (runs["method"] == "baseline") & (runs["repetition"] == 0)
         ].drop_duplicates("sequence")
         true = {sequence.name: sequence.poses for sequence in self.opened}
-        return [
+        lines = [
+            line
+            for run in baselines.itertuples()
+            for line in check.step_oddities(run.sequence, run.flagged, run.frames)
+        ]
+        return lines + [
             line
             for (name, _), poses in runner.run_poses(baselines, folder / "runs").items()
             for line in check.path_oddities(name, poses, true[name])
