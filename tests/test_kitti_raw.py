@@ -1,9 +1,10 @@
 """KITTI's raw drives, as they are downloaded: alone, as a folder of drives, or through a link."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
-from paths import SHARED
 
 from thesis_repro import InputError, check, cli, kitti, kitti_raw
 
@@ -105,7 +106,7 @@ def test_a_damaged_file_is_named(drive, file, text):
 @pytest.mark.real
 @pytest.mark.parametrize("number", ["0005", "0095"])
 def test_real_drives_agree_with_their_odometry_files(kitti_real, number):
-    raw = SHARED / "data/kitti_raw"
+    raw = Path(__file__).resolve().parents[2] / "shared/data/kitti_raw"
     sequence = kitti.Sequence(raw / "2011_09_26", f"2011_09_26_drive_{number}_sync")
     files = raw / f"sequences/drive{number}"
     # the file has seven digits of up to 46 m
