@@ -137,7 +137,7 @@ def test_changed_and_foreign_files_are_not_deleted(tmp_path, capsys, named):
     (folder / named).unlink()
     results.stage(folder, size=4)
     assert not (folder / "in" / "result").exists()
-    assert (str(folder) in capsys.readouterr().out) == (named != "in/result")
+    assert (str(folder) in capsys.readouterr().err) == (named != "in/result")
 
 
 @pytest.mark.parametrize(
