@@ -55,7 +55,7 @@ export PYDEVD_DISABLE_FILE_VALIDATION := 1
 # Without bytecode files, each start of TensorFlow takes 20 s instead of 5 s (pip runs with --no-compile).
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup figures evidence test torture lint lab bench weights clean check-data plan
+.PHONY: help setup figures evidence trainings test torture lint lab bench weights clean check-data plan
 
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data"
@@ -70,6 +70,7 @@ help:
 	@echo "make lab         open the notebooks in JupyterLab with PROFILE=lab (a minute each)"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts; LABELS=/path adds label maps"
+	@echo "make trainings   after make figures: train three more networks, and compare masks from all four"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train a model like the shipped one into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path"
 	@echo "make setup       only install the pinned packages into .venv; GPU=1 adds CUDA for an NVIDIA GPU"
@@ -207,6 +208,10 @@ bench: setup
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
 	@$(BIN)/python tools/evidence.py $(if $(LABELS),"$(LABELS)")
+
+# The network and the drives come from make figures.
+trainings: setup
+	@$(BIN)/python tools/trainings.py
 
 weights: setup
 	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
