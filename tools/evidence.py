@@ -60,7 +60,8 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
         prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
     names = [sequence.name for sequence in sequences]
     covered = {
-        source.name: [name for name in names if source.folder_of(name).is_dir()] for source in others
+        source.name: [name for name in names if source.folder_of(name).is_dir()]
+        for source in others
     }
     for source in others:
         if not covered[source.name]:

@@ -174,7 +174,6 @@ odometry --kitti kitti --sequence ../00 -> '../00'
 {STUDY} --widths 900 -> 900
 check-data -> --kitti
 check-data --kitti nowhere -> nowhere
-plan --kitti kitti --cityscapes nowhere -> nowhere
 synthesize mine --profile smoke -> mine
 predict --images labels mine/../labels --output out -> --images
 predict --images labels --output labels -> --output labels
