@@ -49,8 +49,9 @@ def network_note(settings):
     if network == recorded:
         return f"The network of this run is the recorded one, to the bit ({network})."
     return (
-        f"The network of this run ({network}) is not the recorded one ({recorded}), because sums "
-        "were rounded otherwise: no x86 processor with AVX2, or other values of TF_ENABLE_ONEDNN_OPTS, "
-        "ONEDNN_MAX_CPU_ISA, XLA_FLAGS or TF_NUM_INTRAOP_THREADS. Numbers differ as between the "
-        f"trainings in {TABLE.relative_to(ROOT)}."
+        f"The network of this run ({network}) is not the recorded one ({recorded}): a notebook was "
+        "edited, or sums were rounded otherwise, as on a GPU, on a processor other than x86 with AVX2, "
+        "or with other values of TF_ENABLE_ONEDNN_OPTS, ONEDNN_MAX_CPU_ISA, XLA_FLAGS or "
+        "TF_NUM_INTRAOP_THREADS. By rounding, numbers differ as between the trainings in "
+        f"{TABLE.relative_to(ROOT)}."
     )
