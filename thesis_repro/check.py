@@ -370,8 +370,8 @@ def mask_oddities(source, sequence):
     )
     sampled_masks = [source[index] for index in indices]
     coverage = np.array([masks.coverage(mask) for mask in sampled_masks])
-    description, faults = f"masks keep {coverage.mean():.1%} of sequence {sequence.name}", []
     folder, has_labels = source.paths[0].parent, isinstance(source, masks.LabelMasks)
+    description, faults = f"{folder}: masks keep {coverage.mean():.1%} of {sequence.name}", []
     if has_labels:
         label_maps = [masks.label_map_of(source, index) for index in indices]
         shares = np.mean(

@@ -23,6 +23,7 @@ from thesis_repro.settings import (
     read_widths,
     scheduler_address,
 )
+from thesis_repro.trajectories import MAX_DIFFERENCE
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
@@ -73,7 +74,8 @@ def predict(options):
     from thesis_repro.study import workers
 
     images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
-    names = [folder.resolve().name for folder, _ in images]
+    # the name of a link, not of what it points to, because `study` looks for this name
+    names = [Path(os.path.abspath(folder)).name for folder, _ in images]
     if len(set(names)) < len(names):
         raise InputError("--images: two folders have the same name; use two commands")
     # sequences of a KITTI folder always get subfolders, even if there is only one
@@ -118,7 +120,7 @@ def masks(options):
         for width in sorted(set().union(*options.dilation or [(1,)]))
     ]
     _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
-    _print_oddities(sequence, mask_sets)
+    _warn(_print_oddities(sequence, mask_sets))
     for label_masks in mask_sets:
         width = label_masks.dilation_width
         folder = options.folder if len(mask_sets) == 1 else options.folder / f"mask{width}"
@@ -150,7 +152,7 @@ def odometry(options):
         sequence.folder,
         sequence.frame_paths[0].parent,
     )
-    _print_oddities(sequence, [masks] if masks else [])
+    _warn(_print_oddities(sequence, [masks] if masks else []))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
         write_kitti_poses(options.output, result.poses)
@@ -227,10 +229,9 @@ def study(options):
         warnings = [
             line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)
         ]
+        warnings = _warn(warnings)
         summary = planned.run(folder, options.jobs or cores(), options.dask)
-        for line in planned.path_oddities(summary, folder):
-            console.log.warning(line)
-            warnings.append(line)
+        warnings += _warn(planned.path_oddities(summary, folder))
         counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
         failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
         run.end(f"{len(summary):,} runs{failed}; open {page} in a browser", counts["kept"])
@@ -254,7 +255,14 @@ def evaluate(options):
         truth, times = true_path(options.kitti, sequence)
         _warn(check.truth_oddities(sequence, truth, times))
         paths = {
-            name: trajectories.read(file, times, options.frames) for name, file in files.items()
+            name: trajectories.read(
+                file,
+                times,
+                options.frames,
+                offset=options.t_offset,
+                max_difference=options.t_max_diff,
+            )
+            for name, file in files.items()
         }
         truth = truth[: options.frames]
         for name, (matched, poses) in paths.items():
@@ -309,7 +317,7 @@ def _sequence(options):
 
 
 def _print_oddities(sequence, mask_sets):
-    """Print what masks of a sequence hold, and warn of doubtful input; returns the warnings."""
+    """Print what masks of a sequence hold, and return warnings of doubtful input."""
     from thesis_repro import check
 
     warnings = check.oddities(sequence)
@@ -318,26 +326,34 @@ def _print_oddities(sequence, mask_sets):
             line, mask_warnings = check.mask_oddities(masks, sequence)
             console.log.info(line)
             warnings += mask_warnings
-    _warn(warnings)
     return warnings
 
 
 def _warn(lines):
+    """Print warnings, "place: fault", and return them. One fault of several places is one line."""
+    places: dict[str, list[str]] = {}
     for line in lines:
+        place, _, fault = line.partition(": ")
+        places.setdefault(fault, []).append(place)
+    merged = [f"{', '.join(names)}: {fault}" for fault, names in places.items()]
+    for line in merged:
         console.log.warning(line)
+    return merged
 
 
 def _image_folders(root):
     """Yield (folder, its images) for a folder of images, a sequence, or each sequence of a KITTI
-    folder.
+    folder or of a folder of sequences.
 
     Raises InputError if there are no images, or if frames of a sequence are missing.
     """
     from thesis_repro import files, kitti
 
-    parent = kitti.folder_of(root)
-    inside = [parent / name for name in kitti.with_frames(root)] if parent.is_dir() else []
-    for folder in inside or [root]:
+    folders = [root]
+    if root.is_dir() and not kitti.has_frames(root):
+        parent = kitti.folder_of(root)
+        folders = kitti.folders_with_frames(parent if parent.is_dir() else root) or [root]
+    for folder in folders:
         image_folder = kitti.images_of(folder)
         paths = files.images(image_folder)
         if not paths:
@@ -628,7 +644,7 @@ def build_parser():
         action="extend",
         required=True,
         metavar="DIR",
-        help="folder of PNG or JPEG images, one sequence, or a KITTI folder; several get a subfolder each",
+        help="folder of PNG or JPEG images, one sequence, or a folder of sequences; several get a subfolder each",
     )
     add(
         "--model",
@@ -641,7 +657,13 @@ def build_parser():
     )
 
     add = command(masks, *SEQUENCE, *MASK_OPTIONS, "--output").add_argument
-    add("--labels", type=Path, required=True, metavar="DIR", help="a label map for each frame")
+    add(
+        "--labels",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="a label map for each frame, or a folder of them for each sequence",
+    )
     add(
         "--dilation",
         **WIDTHS,
@@ -660,10 +682,13 @@ def build_parser():
         "--masks",
         type=Path,
         metavar="DIR",
-        help="a mask for each frame or one for all: 255 keep, 0 ignore",
+        help="a mask for each frame or one for all: 255 keep, 0 ignore; or a folder for each sequence",
     )
     either(
-        "--labels", type=Path, metavar="DIR", help="a label map for each frame; needs --dilation"
+        "--labels",
+        type=Path,
+        metavar="DIR",
+        help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
     )
     add(
         "--dilation",
@@ -799,6 +824,22 @@ def build_parser():
         choices=("none", "se3", "sim3", "scale"),
         default="none",
         help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
+    )
+
+    # named as evo's options
+    add(
+        "--t_offset",
+        type=float,
+        default=0.0,
+        metavar="SECONDS",
+        help="add this to the times of files in TUM format, such as ROS's (0)",
+    )
+    add(
+        "--t_max_diff",
+        type=float,
+        default=MAX_DIFFERENCE,
+        metavar="SECONDS",
+        help=f"largest difference between the times of a pose and its frame ({MAX_DIFFERENCE:g})",
     )
 
     command(plan, "--kitti", kitti=REQUIRED)

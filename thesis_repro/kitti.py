@@ -67,11 +67,17 @@ def with_frames(root: str | Path) -> list[str]:
         raise InputError(
             f"{root}: must be the folder that holds sequences/NN/image_0 and poses/NN.txt, or raw drives"
         )
-    return sorted(
-        folder.name
-        for folder in folder_of(root).iterdir()
-        if folder.is_dir() and (images_of(folder) != folder or images(folder))
-    )
+    return [folder.name for folder in folders_with_frames(folder_of(root))]
+
+
+def folders_with_frames(parent: Path) -> list[Path]:
+    """Folders of sequences in a folder, in sorted order."""
+    return sorted(folder for folder in parent.iterdir() if folder.is_dir() and has_frames(folder))
+
+
+def has_frames(folder: Path) -> bool:
+    """Whether a folder is that of a sequence, or holds images itself."""
+    return images_of(folder) != folder or bool(images(folder))
 
 
 def folder_of(root: str | Path) -> Path:
@@ -165,13 +171,15 @@ class Sequence:
         if self.has_truth:
             self._poses = truth_of(self.poses_path)
             check_count(self.poses_path, len(self._poses), self.frame_paths)
-        if speed is not None and (
-            self.has_truth or not self.has_times or not 0 < speed <= MAX_SPEED
-        ):
-            raise InputError(
-                f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s; needs {times}, and no "
-                f"ground truth in {self.poses_path}"
-            )
+        if speed is not None:
+            if self.has_truth:
+                raise InputError(
+                    f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
+                )
+            if not self.has_times:
+                raise InputError(f"{times}: no such file; a speed needs the times of the frames")
+            if not 0 < speed <= MAX_SPEED:
+                raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s")
 
     @property
     def poses(self) -> np.ndarray:

@@ -223,8 +223,8 @@ def coverage(mask: np.ndarray) -> float:
 class LabelMasks:
     """Masks of a sequence, made from label maps on access: masks[i] for frame i.
 
-    folder: holds one label map a frame, of any size, as a PNG with the frame's name. settings: as
-    in `keypoint_mask`.
+    folder: holds one label map a frame, of any size, as a PNG with the frame's name, or a folder of
+    them for each sequence. settings: as in `keypoint_mask`.
     Raises InputError if the folder or a frame's label map is missing.
     """
 
@@ -342,11 +342,19 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
     return mask
 
 
+def folder_of(folder: str | Path, sequence: str) -> Path:
+    """Folder with the label maps or masks of a sequence: the folder of its name in `folder`, or
+    `folder` itself if that holds files, as `thesis-repro predict` and `masks` write them.
+    """
+    folder, subfolder = Path(folder), Path(folder, sequence)
+    return folder if any(folder.glob("[!.]*.png")) and not subfolder.is_dir() else subfolder
+
+
 def _paths_by_frame(folder, sequence, kind):
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
-    folder = Path(folder)
-    if kind == "mask" and folder.is_file():
-        return [folder] * len(sequence)
+    if kind == "mask" and Path(folder).is_file():
+        return [Path(folder)] * len(sequence)
+    folder = folder_of(folder, sequence.name)
     if not folder.is_dir():
         raise InputError(
             f"{folder}: no such folder; it must hold one {kind} for each frame of sequence "

@@ -11,6 +11,7 @@ from thesis_repro.files import write_text
 MAX_POSITION = 1e9  # metres
 ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
 QUATERNION_TOLERANCE = 0.01  # of its length; files have few digits
+MAX_DIFFERENCE = 0.01  # seconds between a pose and its frame, evo's default
 # Matched poses of a file with times: least share of those within the common time, and of all. A
 # file of keyframes may cover more frames than an excerpt has.
 MIN_MATCHED = 0.3, 0.1
@@ -89,12 +90,15 @@ def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
     _write_rows(path, np.column_stack([times, np.asarray(poses)[:, :3, 3], quaternions]))
 
 
-def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def read_tum(
+    path: str | Path, times: np.ndarray, offset: float = 0.0, max_difference: float = MAX_DIFFERENCE
+) -> tuple[np.ndarray, np.ndarray]:
     """Read a file in TUM's format and match its poses to the frames' times (n,), seconds, with evo.
 
-    Returns the indices of the matched frames, (m,), and their poses, (m, 4, 4). Raises InputError
-    for a line without a time after the line before, a position in metres and a unit quaternion, and
-    if too few poses are matched (MIN_MATCHED), as with another unit of time.
+    offset: seconds, added to the file's times. max_difference: seconds between a pose and its
+    frame. Returns the indices of the matched frames, (m,), and their poses, (m, 4, 4). Raises
+    InputError for a line without a time after the line before, a position in metres and a unit
+    quaternion, and if too few poses are matched (MIN_MATCHED), as with another unit of time.
     """
     from evo.core.sync import matching_time_indices  # takes 0.4 s to load
     from evo.core.trajectory import PoseTrajectory3D
@@ -111,7 +115,8 @@ def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
             "quaternion (x, y, z, w)"
         )
     trajectory = PoseTrajectory3D(rows[:, 1:4], np.roll(rows[:, 4:], 1, axis=1), rows[:, 0])
-    numbers, nearest = matching_time_indices(times, rows[:, 0])
+    rows[:, 0] += offset
+    numbers, nearest = matching_time_indices(times, rows[:, 0], max_difference)
     # how many of the one lie within the time of the other
     shared = min(
         np.count_nonzero((values >= others[0]) & (values <= others[-1]))
@@ -121,7 +126,8 @@ def read_tum(path: str | Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
     if len(numbers) < least:
         raise InputError(
             f"{path}: {len(numbers)} of {len(rows)} poses are at the time of a frame, "
-            f"{times[0]:g} to {times[-1]:g} s; its times are {rows[0, 0]:.10g} to {rows[-1, 0]:.10g}"
+            f"{times[0]:g} to {times[-1]:g} s; its times are {rows[0, 0]:.10g} to {rows[-1, 0]:.10g}; "
+            f"--t_offset {offset + times[0] - rows[0, 0]:.15g} takes its first pose for the first frame"
         )
     return np.array(numbers), np.array(trajectory.poses_se3)[nearest]
 

@@ -110,8 +110,14 @@ def test_tum_keyframes_are_matched_by_time(files, capsys):
     assert keyframes["rmse_m"] == pytest.approx(
         metrics.rmse(winding(seed=1)[kept], winding()[kept])
     )
-    write_tum(files / "long.txt", winding(), times + 1000)
-    assert evaluate(files) == 1 and "long.txt" in capsys.readouterr().err
+    # times of day; the error names the offset
+    write_tum(files / "long.txt", winding(seed=1), times + 1.3e9 + 0.02)
+    assert evaluate(files) == 1
+    (offset,) = re.findall(r"long.txt: .* --t_offset (\S+)", capsys.readouterr().err)
+    assert float(offset) == pytest.approx(-1.3e9 - 0.02)
+    assert evaluate(files, "--json", "--t_offset", -1.3e9, "--t_max_diff", 0.03) == 0
+    rmse = json.loads(capsys.readouterr().out)[1]["rmse_m"]
+    assert rmse == pytest.approx(metrics.rmse(winding(seed=1), winding()))
 
 
 def test_folders_of_sequences_get_a_mean(files, capsys):

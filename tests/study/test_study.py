@@ -103,10 +103,11 @@ def test_figures_and_tables_of_a_study(done, study):
     for name in ("comparison", "sources", "paths-00", "paths-01"):
         assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
         assert {f"{name}.svg", f"{name}.webp"} & {path.name for path in folder.iterdir()}
-    for name in ("comparison", "widths", "errors"):
+    for name in ("summary", "comparison", "widths", "errors"):
         latex = (folder / f"{name}.tex").read_text()
         rows = pd.read_csv(folder / f"{name}.csv")
-        body = latex.partition("\\midrule")[2].partition("\\bottomrule")[0]
+        body = latex.rpartition("\\bottomrule")[0] if name == "summary" else latex
+        body = body.rpartition("\\endlastfoot" if name != "summary" else "\\midrule")[2]
         assert body.count("\\\\") == len(rows) and body.count("&") == len(rows) * (
             len(rows.columns) - 1
         )

@@ -22,9 +22,11 @@ def figure_comparison(table):
     interval.
 
     The figure has one row of panels for each estimator. Its columns are the judging metrics and the
-    thesis's RMSE.
+    thesis's RMSE. With several sources of masks it shows only their masks, not the controls.
     """
     rows = _tested(_over_all_keypoints(table))
+    if rows["source"].nunique() > 1:  # controls of every source would be dozens of rows
+        rows = rows[rows["method"] == "masked"]
     labels = _labels(rows)
     order = list(labels.unique())
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
@@ -95,6 +97,36 @@ def _labels(rows):
 def _sequences(table):
     """Return the names of the columns with the ratio of each sequence."""
     return list(table.columns[table.columns.get_loc("verdict") + 1 :])
+
+
+def table_summary(table, runs):
+    """Return one row for each source: the answer of a study (`compare.primary_comparison`).
+
+    The columns are the mean number of keypoints that the masks leave and that of all, the ratio of
+    each judging metric, the verdict, and the control without segmentation that has the lowest
+    ratio of the first judging metric.
+    """
+    judged = compare.primary_comparison(table)
+    estimator = compare.judging_estimator(judged)
+    total = compare.of_method(runs, "baseline", estimator)["mean_keypoints"].mean()
+    controls = _tested(_over_all_keypoints(table))
+    controls = controls[
+        (controls["estimator"] == estimator)
+        & (controls["metric"] == next(iter(compare.JUDGING_METRICS)))
+        & controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)
+    ]
+    rows = []
+    for source, pair in judged.groupby("source", sort=False):
+        row = {
+            "masks": source,
+            "keypoints": f"{pair['keypoints'].iloc[0]:.0f} of {total:.0f}",
+            **{compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()},
+            "verdict": compare.overall(pair["verdict"]),
+        }
+        for _, best in controls[controls["source"] == source].nsmallest(1, "ratio").iterrows():
+            row["best control"] = f"{compare.METHODS[best['method']]} {texts.number(best['ratio'])}"
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def table_comparison(table):

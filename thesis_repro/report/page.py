@@ -25,7 +25,7 @@ EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
 # ids of the artefacts at the top of a page
 ROWS_SHOWN = 36  # the gallery only links to longer tables
-OPENING = ("figure_4_05", "findings", "figure-comparison")
+OPENING = ("figure_4_05", "findings", "figure-comparison", "table-summary")
 # packages that affect the numbers most
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")
 

@@ -39,13 +39,22 @@ def write(study, runs, folder, warnings=()):
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf", metadata={"CreationDate": None})
     numbers = {
+        "summary": comparison.table_summary(table, runs),
         "comparison": comparison.table_comparison(table),
         "widths": comparison.table_widths(runs),
         "errors": tables.table_errors(runs),
         "runs": runs.round(6),
     }
     for name, rows in numbers.items():
-        latex = rows.to_latex(index=False, escape=True, na_rep="", float_format="{:g}".format)
+        latex = rows.to_latex(
+            index=False,
+            escape=True,
+            na_rep="",
+            float_format="{:g}".format,
+            longtable=name != "summary",
+            # narrow enough for a portrait page; long texts are broken
+            column_format=f"lr{(rows.shape[1] - 2) * 'p{18mm}'}" if name == "summary" else None,
+        )
         write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
     names = style.save_all(figures, numbers, folder, note)
     write_text(

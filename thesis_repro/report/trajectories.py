@@ -62,19 +62,19 @@ def by_sequence(paths, root, sequence=None):
     return files
 
 
-def read(file, times, frames=None):
+def read(file, times, frames=None, **matching):
     """Read a trajectory in KITTI's or TUM's format: (indices of its frames (n,), poses (n, 4, 4)).
 
     times: of the ground truth, seconds. A file in KITTI's format needs one pose for each time; for
-    TUM's format see `read_tum`. frames: use only the first ones. Raises InputError for any other
-    file.
+    TUM's format see `read_tum`, which gets `matching`. frames: use only the first ones. Raises
+    InputError for any other file.
     """
     first = ""
     # read_poses reports these errors
     with suppress(OSError, ValueError), open(file, encoding="utf-8-sig") as lines:
         first = next((line for line in lines if not line.startswith("#")), "")
     if len(first.split()) == 8:
-        matched, poses = read_tum(file, times)
+        matched, poses = read_tum(file, times, **matching)
         return matched[matched < len(times[:frames])], poses[matched < len(times[:frames])]
     poses, times = read_poses(file)[:frames], times[:frames]
     if len(poses) != len(times):

@@ -9,7 +9,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TypeAlias
 
-from thesis_repro import InputError, results
+from thesis_repro import InputError, masks, results
 from thesis_repro.cityscapes import read_label_map
 from thesis_repro.files import glance, listed
 from thesis_repro.kitti import Sequence, check_size
@@ -39,10 +39,7 @@ class Source:
 
     def folder_of(self, sequence: str) -> Path:
         """Return the folder with the files of one sequence."""
-        subfolder = self.folder / sequence
-        # as `thesis-repro predict` and `masks` write them
-        has_files = any(self.folder.glob("[!.]*.png"))
-        return self.folder if has_files and not subfolder.is_dir() else subfolder
+        return masks.folder_of(self.folder, sequence)
 
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
         """Return the masks of a sequence. dilation_width: pixels, for masks from label maps.
@@ -50,9 +47,9 @@ class Source:
         Raises InputError if a frame has no file.
         """
         if self.kind == "masks":
-            return MaskFolder(self.folder_of(sequence.name), sequence, self.invert)
+            return MaskFolder(self.folder, sequence, self.invert)
         assert dilation_width is not None  # masks from label maps need a width
-        return LabelMasks(self.folder_of(sequence.name), sequence, dilation_width, self.settings)
+        return LabelMasks(self.folder, sequence, dilation_width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError if a file is not a label map, or not a mask of size (height, width)."""
