@@ -106,12 +106,12 @@ def test_the_answer_comes_first_and_41_artefacts_in_the_order_of_the_thesis(run)
     ids = [
         attributes["id"]
         for tag, attributes in shown.elements
-        if tag in ("figure", "section", "h2") and "chapter" not in attributes["id"]
+        if tag in ("figure", "section") or attributes.get("id") == "notebooks"
     ]
     added = [f"{artefact['kind']}-{artefact['name']}" for artefact in captions.ADDED[1:]]
     added.remove(page.OPENING[2])
     in_order = [name for name in captions.THESIS if name not in page.OPENING]
-    assert ids == [*page.OPENING, *in_order, *added, "notebooks"] and len(captions.THESIS) == 41
+    assert ids == [*page.OPENING[:3], *in_order, *added, "notebooks"] and len(captions.THESIS) == 41
     images = [f"{artefact['name']}.svg" for artefact in ARTEFACTS if artefact["kind"] == "figure"]
     assert sorted(shown.values("img", "src")) == sorted(images) and all(shown.values("img", "alt"))
     assert shown.text.index("What it shows") < shown.text.index("Chapter 2")
@@ -267,20 +267,17 @@ def test_the_page_in_git_does_not_depend_on_the_machine_or_day(run):
     in_git = replace(run.settings, figures=ROOT / "figures")  # read, not written
     before = page.build(in_git)
     assert (
-        platform.python_version() not in before.replace("tensorflow", "") and "2024" not in before
+        platform.python_version() not in before.replace("tensorflow", "")
+        and "29 February" not in before
     )
     os.utime(run.executed, (1900000000,) * 2)
     assert page.build(in_git) == before and "2030" in page.build(run.settings)
     shown = Reader(before)
-    links = [
-        link
-        for link in shown.values("a", "href") + shown.values("img", "src")
-        if not link.startswith("#")
-    ]
-    assert len(links) > 80 and [link for link in links if "/" in link] == [
-        page.EVIDENCE,
-        "../docs/own-masks.md",
-    ]
+    links = shown.values("a", "href") + shown.values("img", "src")
+    # links to executed notebooks work only where these are
+    files = [link for link in links if not re.match("#|https:", link) and "my%20build" not in link]
+    missing = [link for link in files if not (ROOT / "figures" / link.split("#")[0]).is_file()]
+    assert len(files) > 80 and missing == []
     assert str(Path("my build", "embedded-demo", "notebooks")) in shown.text
 
 

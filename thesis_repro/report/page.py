@@ -8,10 +8,12 @@ import importlib.metadata
 import itertools
 import os
 import platform
+import re
 import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
+from urllib.parse import quote
 
 from markupsafe import Markup
 
@@ -21,7 +23,6 @@ from thesis_repro.report import captions, tables, texts, trainings
 from thesis_repro.settings import ROOT, read_settings
 
 PAGE, GALLERY = "index.html", "README.md"
-EVIDENCE = "kitti_excerpts/README.md"  # beside the default run's page
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
 # ids of the artefacts at the top of a page
 ROWS_SHOWN = 36  # the gallery only links to longer tables
@@ -106,19 +107,27 @@ def build(settings):
         missing=[
             artefact for artefact in artefacts if not artefact["there"] and not artefact["left_out"]
         ],
-        repository=settings.figures.is_relative_to(ROOT)
-        and os.path.relpath(ROOT, settings.figures),
-        # in a clone there is no build folder to link to
-        notebooks={}
-        if settings.figures_in_git
-        else {
+        documents={
+            name: _document(name, settings)
+            for name in (("answer",) if settings.figures_in_git else ()) + ("own-masks",)
+            if settings.figures.is_relative_to(ROOT)
+        },
+        notebooks={
             path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
             for path in executed
         },
-        evidence=(settings.figures / EVIDENCE).is_file() and EVIDENCE,
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
         made=_made(executed, settings.figures_in_git),
     )
+
+
+def _document(name, settings):
+    """Return a text of the folder docs for a page: its first paragraph and the rest, as HTML."""
+    text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+    # links are relative to docs
+    folder = quote(os.path.relpath(ROOT / "docs", settings.figures))
+    _, first, rest = re.sub(r"\]\((?!\w+:|#)", f"]({folder}/", text).split("\n\n", 2)
+    return texts.html(first), texts.html(rest)
 
 
 def build_study(folder, names, **facts):
