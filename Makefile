@@ -7,6 +7,20 @@ MAKEFLAGS += --no-print-directory
 
 PYTHON ?= python3
 BIN := .venv/bin
+# Refuse a wrong or missing Python, and another one than that of .venv.
+version = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+INSTALLED := $(if $(wildcard .venv/ready),$(call version,$(BIN)/python))
+ifneq (,$(filter-out help clean,$(MAKECMDGOALS)))
+ifneq (,$(if $(INSTALLED),$(filter command line,$(origin PYTHON)),no .venv))
+GIVEN_VERSION := $(call version,$(PYTHON))
+ifeq (,$(filter 3.11 3.12 3.13,$(GIVEN_VERSION)))
+$(error $(PYTHON) is $(or $(GIVEN_VERSION),no Python): Python 3.11, 3.12 or 3.13 is needed; name one with PYTHON=/path)
+endif
+ifeq (,$(filter $(or $(INSTALLED),$(GIVEN_VERSION)),$(GIVEN_VERSION)))
+$(error $(PYTHON) is $(GIVEN_VERSION), but .venv has Python $(INSTALLED): run make clean first, or leave PYTHON out)
+endif
+endif
+endif
 
 # Refuse a misspelled setting, for which the default would silently be used.
 SIZES := IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
@@ -84,8 +98,6 @@ install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --
             [ $$? != 130 ] && $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile $(1); }
 
 .venv/ready: environment.txt pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || { \
-	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1 | head -1): Python 3.11, 3.12 or 3.13 is needed; name one with PYTHON=/path" >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { \
 	  echo "$(PYTHON) has no venv module: install it (Debian and Ubuntu: apt-get install python3-venv)" >&2; exit 1; }
 	@echo "installing the pinned packages into .venv (2.4 GB)"
@@ -106,7 +118,7 @@ NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 ifneq (,$(filter figures,$(MAKECMDGOALS)))
 # $(shell) does not see exported variables in older versions of make, so they are passed on.
 RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS DASK_SCHEDULER $(SIZES),THESIS_REPRO_$(name)='$(subst ','\'',$(THESIS_REPRO_$(name)))') \
-         $(PYTHON) -m thesis_repro.settings)
+         $(if $(INSTALLED),$(BIN)/python,$(PYTHON)) -m thesis_repro.settings)
 ifeq (,$(RUN))
 $(error the settings above are wrong)
 endif

@@ -138,6 +138,7 @@ def test_make_takes_odd_folders_and_refuses_unknown_settings(tiny_kitti, tmp_pat
         ("EPOCH=3", "EPOCH: "),
         ("KITTI=", "KITTI"),
         ("GPU=no", "GPU=no"),
+        ("PYTHON=none", "none is no Python"),
         ("FIGURES=a b", "FIGURES"),
         ("DASK_SCHEDULER=mine", "mine"),
     ):
