@@ -24,8 +24,8 @@ from thesis_repro.study.study import Study
 # frames of two timed runs: their difference leaves out the cost of starting a run
 SHORT, LONG = 3, 9
 LABEL_MAP_BYTES, ROW_BYTES = 6_000, 450  # of a label map, and of a frame of a run
-# of a notebook, whatever the number of frames: imports, figures, small examples
-NOTEBOOK_SECONDS = 16
+# of a notebook and of a study, whatever the number of frames: imports, figures, small examples
+NOTEBOOK_SECONDS, STUDY_SECONDS = 16, 20
 RUNS_IN_07 = 7  # cost of notebook 7, in runs with all keypoints over its sequence
 
 
@@ -48,7 +48,7 @@ def of_study(study: Study, folder: Path) -> dict[str, Any]:
         study.sources,
         folder / "runs",
     )
-    return _plan([step], frames, run_frames * ROW_BYTES)
+    return _plan([step], frames, run_frames * ROW_BYTES, STUDY_SECONDS)
 
 
 def of_thesis(root: Path, sizes: Profile, folder: Path) -> dict[str, Any]:
