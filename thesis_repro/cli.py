@@ -847,11 +847,18 @@ def build_parser():
 
 
 def main(arguments=None):
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:  # it was closed
+            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))
     options = build_parser().parse_args(arguments)
     options.command_line = shlex.join(
         ["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)]
     )
     try:
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise InputError("the working folder was deleted; change to another one") from None
         with console.stoppable():
             console.need_addresses(4 if options.function is predict else 2)
             code = options.function(options) or 0

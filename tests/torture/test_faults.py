@@ -122,3 +122,15 @@ def test_a_closed_pipe_is_no_error(words, tmp_path):
         and len(result.stdout.splitlines()) == 1
         and (tmp_path / "out.txt").exists()
     )
+
+
+@pytest.mark.parametrize(
+    "around", ["{} >&-", "{} >&- 2>&-", "mkdir gone; cd gone; rmdir ../gone; {}"]
+)
+def test_closed_streams_and_a_deleted_folder(words, tmp_path, around):
+    command = shlex.join(map(str, words("odometry.txt")))
+    result = run(["bash", "-c", around.format(command)], tmp_path)
+    deleted = "gone" in around
+    assert result.returncode == deleted and ("Traceback" not in result.stderr)
+    assert (tmp_path / "out.txt").exists() == (not deleted)
+    assert ("the working folder was deleted" in result.stderr) == deleted
