@@ -72,10 +72,6 @@ def run(
     with results.claimed(folder):
         for sequence in sequences.values():
             _stage(folder, sequence, sources_by_name)
-        for job, path in files.items():
-            table = results.kept_table(path, len(sequences[job.sequence]))
-            if table is None or not np.isfinite(poses_of(table)).all():
-                path.unlink(missing_ok=True)  # missing results are made again
         finished = sum(path.is_file() for path in files.values())
         failures = _run_passes(jobs, sequences, sources_by_name, folder, processes, scheduler)
     rows = []
@@ -205,10 +201,7 @@ def _passes(
             key: job for key, job in sequence_jobs.items() if not result_file(folder, job).is_file()
         }
         for path in sorted((folder / name).glob(CHECKPOINTS)):
-            try:
-                keys = results.resume(path)[0]["job"]["runs"]
-            except InputError:  # a damaged checkpoint is deleted below
-                keys = []
+            keys = results.resume(path)[0]["runs"]
             if not sequence_jobs.keys() >= set(keys):
                 continue  # it holds jobs that are not requested now but may be later
             if waiting.keys().isdisjoint(keys):
