@@ -43,31 +43,28 @@ def opencv_threads(count: int) -> Iterator[None]:
 
 def time_runs(
     jobs: Iterable[Job],
-    kitti: Path,
+    sequences: Iterable[Sequence],
     labels: Path | Iterable[Source],
     folder: Path,
     *,
-    frames: int,
     processes: int = 1,
 ) -> pd.DataFrame:
     """Time each job as a separate run; returns a table of sequence, run, method, dilation_width and
     seconds.
 
-    Only the first `frames` frames are timed, without the first two steps, which load compiled code.
-    The jobs of a sequence take turns at every frame, so that other programs slow all of them
-    equally. Call it after `runner.run`, with the same folder and label maps. Times in the folder
-    are not measured again.
+    The first two steps are not timed, because they load compiled code. The jobs of a sequence take
+    turns at every frame, so that other programs slow all of them equally. Call it after
+    `runner.run`, with the same folder and label maps. Times in the folder are not measured again.
     """
     jobs, sources = list(jobs), by_name(labels)
-    names = sorted({job.sequence for job in jobs})
     calls = [
         (
-            [job for job in jobs if job.sequence == name],
-            Sequence(kitti, name).subset(frames),
+            [job for job in jobs if job.sequence == sequence.name],
+            sequence,
             sources,
-            folder / name / f"seconds-{frames}.csv",
+            folder / sequence.name / f"seconds-{len(sequence)}.csv",
         )
-        for name in names
+        for sequence in sequences
     ]
     with workers.open_pool(processes) as pool:
         tables = dict(
