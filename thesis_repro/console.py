@@ -125,13 +125,6 @@ def need_addresses(gigabytes):
         )
 
 
-def remedy(text):
-    """Return what to do about an error, to be appended to its text; empty for an unknown text."""
-    remedies = dict.fromkeys(NO_MEMORY_TEXTS, NO_MEMORY)
-    remedies |= {os.strerror(number): remedy for number, remedy in REMEDIES.items()}
-    return next((f"; {remedy}" for words, remedy in remedies.items() if words in text), "")
-
-
 def report_error(error):
     """Print the error that ends a command, and return the exit status. Raises an error that
     `explain` does not know.

@@ -65,9 +65,9 @@ def bare_calls(previous, frame, points, intrinsics):
         lambda: cv2.goodFeaturesToTrack(
             frame,
             THESIS.max_keypoints,
-            keypoints.QUALITY,
+            THESIS.quality,
             THESIS.min_distance,
-            blockSize=keypoints.BLOCK_SIZE,
+            blockSize=THESIS.block_size,
         ),
     ]
 

@@ -71,11 +71,9 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
 
     def run(planned):
         sources = [Source(labels), *others]
-        return runner.run(
-            planned, root, sources, build / "odometry", frames=frames, processes=processes
-        )
+        return runner.run(planned, sequences, sources, build / "odometry", processes=processes)
 
-    runs = _runs(run, root, names, build, frames, repetitions)
+    runs = _runs(run, sequences, repetitions)
     other_runs = {
         source: run(
             [
@@ -94,11 +92,9 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
         for source, source_names in covered.items()
     }
     ablated = ablations.measure(
-        root,
-        names,
+        sequences,
         labels,
         build / "audit",
-        frames=frames,
         repetitions=repetitions,
         baseline_repetitions=max(10, repetitions),
         processes=processes,
@@ -154,13 +150,12 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
     )
 
 
-def _runs(run, root, names, build, frames, repetitions):
+def _runs(run, sequences, repetitions):
     """Return the runs of the comparison. The runs with masks decide the jobs with fewer
     keypoints. run: returns the runs of jobs.
     """
     planned = jobs.first_jobs(
-        root,
-        names,
+        sequences,
         {"thesis": WIDTHS, "refined": []},
         tested=jobs.CONTROL_WIDTH,
         repetitions=repetitions,
@@ -170,7 +165,7 @@ def _runs(run, root, names, build, frames, repetitions):
         thesis_tables.best_widths(compare.of_method(runs, "masked")), repetitions
     )
     planned += jobs.keypoint_control_jobs(
-        compare.keypoints_left(runs), root, frames, repetitions, width=jobs.CONTROL_WIDTH
+        compare.keypoints_left(runs), sequences, repetitions, width=jobs.CONTROL_WIDTH
     )
     return run(planned)
 

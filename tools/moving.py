@@ -77,7 +77,8 @@ def table(root, labels, build, repetitions=REPETITIONS, frames=None):
         for method, width in (("baseline", None), ("static", jobs.CONTROL_WIDTH))
         for repetition in range(repetitions)
     ]
-    runs = runner.run(planned, root, [Source(labels)], build, frames=frames, processes=cores())
+    sequences = [kitti.Sequence(root, name).subset(frames) for name in names]
+    runs = runner.run(planned, sequences, [Source(labels)], build, processes=cores())
     by_method = [runs[runs["method"] == method] for method in ("static", "baseline")]
     ratios = {
         metric: compare.ratios(*by_method, metric)
@@ -85,8 +86,9 @@ def table(root, labels, build, repetitions=REPETITIONS, frames=None):
         if metric in runs
     }
     rows = []
-    for name in names:
-        points = tracks(kitti.Sequence(root, name).subset(frames), labels / name)
+    for sequence in sequences:
+        name = sequence.name
+        points = tracks(sequence, labels / name)
         for kind, ids in KINDS.items():
             pixels = points.loc[points["id"].isin(ids), "pixels"]
             row = {

@@ -86,11 +86,10 @@ def label_maps(settings, sequences, seed):
     return Source(folder, name=f"seed {seed}"), facts
 
 
-def run(settings, names, sources):
+def run(settings, sequences, sources):
     """Return the table of the runs that Table 4.2, the comparison and its verdicts need."""
     listed = jobs.first_jobs(
-        settings.kitti,
-        names,
+        sequences,
         {"thesis": settings.sizes.widths, "refined": []},
         tested=jobs.CONTROL_WIDTH,
         sources=sources,
@@ -102,19 +101,17 @@ def run(settings, names, sources):
         if job.method in ("baseline", "masked", *compare.SEGMENTATION_FREE_CONTROLS)
         and (job.repetition == 0 or job.dilation_width in (None, jobs.CONTROL_WIDTH))
     ]
-    options = {"frames": settings.sizes.frames, "processes": settings.jobs}
     folder = settings.build / "trainings/odometry"
-    runs = runner.run(listed, settings.kitti, sources, folder, **options)
+    runs = runner.run(listed, sequences, sources, folder, processes=settings.jobs)
     for source in sources:
         listed += jobs.keypoint_control_jobs(
             compare.keypoints_left(compare.of_source(runs, source.name)),
-            settings.kitti,
-            settings.sizes.frames,
+            sequences,
             settings.sizes.repetitions,
             source=source.name,
             width=jobs.CONTROL_WIDTH,
         )
-    return runner.run(listed, settings.kitti, sources, folder, **options)
+    return runner.run(listed, sequences, sources, folder, processes=settings.jobs)
 
 
 def rows(runs, comparison, source, facts):
@@ -159,10 +156,13 @@ def main():
     settings = read_settings()
     tf.config.threading.set_intra_op_parallelism_threads(settings.sizes.threads)
     memory.keep_freed()
-    names = kitti.sequences(settings.kitti)
-    sequences = [kitti.Sequence(settings.kitti, name) for name in names]
+    sequences = [kitti.Sequence(settings.kitti, name) for name in kitti.sequences(settings.kitti)]
     trained = [label_maps(settings, sequences, seed) for seed in SEEDS]
-    runs = run(settings, names, [source for source, _ in trained])
+    runs = run(
+        settings,
+        [sequence.subset(settings.sizes.frames) for sequence in sequences],
+        [source for source, _ in trained],
+    )
     files.write_text(settings.build / "trainings/runs.csv", runs.to_csv(index=False))
     comparison = compare.comparisons(runs)
     table = pd.DataFrame(

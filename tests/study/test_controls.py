@@ -104,17 +104,17 @@ def test_spread_keypoints_have_the_asked_number(sequence):
 def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     small_world, small_labels, tmp_path
 ):
-    kitti = small_world / "kitti"
-    jobs = first_jobs(kitti, ["00"], {"thesis": (5, WIDTH), "refined": ()}, tested=5)
+    opened = [Sequence(small_world / "kitti", "00").subset(5)]
+    jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
     assert {job.dilation_width for job in jobs if job.method in controls.MASKS} == {5}
-    runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5)
+    runs = runner.run(jobs, opened, small_labels, tmp_path)
     left = compare.keypoints_left(runs)
     masked = compare.of_method(runs, "masked")
     jobs += reduced_jobs(thesis_tables.best_widths(masked)) + keypoint_control_jobs(
-        left, kitti, 5, width=5
+        left, opened, width=5
     )
     assert len({job.name for job in jobs}) == len(jobs)
-    runs = runner.run(jobs, kitti, small_labels, tmp_path, frames=5).set_index("run")
+    runs = runner.run(jobs, opened, small_labels, tmp_path).set_index("run")
     assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
     number = runs["mean_keypoints"]
     assert left["00"] == number["masked-05-0"] < number["masked-10-0"]

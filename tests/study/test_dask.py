@@ -122,9 +122,10 @@ def reads(log):
 
 
 def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, scheduler, tmp_path):
-    jobs = first_jobs(small_world / "kitti", ["00", "01"], {"thesis": (5, 15)}, repetitions=2)
-    kitti, (processes, log) = small_world / "kitti", workers
-    here = runner.run(jobs, kitti, small_labels, tmp_path / "here")
+    opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
+    jobs = first_jobs(opened, {"thesis": (5, 15)}, repetitions=2)
+    processes, log = workers
+    here = runner.run(jobs, opened, small_labels, tmp_path / "here")
     there, killed, finished = tmp_path / "there", [], {}
 
     def kill():
@@ -146,7 +147,7 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
 
     killer = threading.Thread(target=kill)
     killer.start()
-    result = runner.run(jobs, kitti, small_labels, there, scheduler=scheduler)
+    result = runner.run(jobs, opened, small_labels, there, scheduler=scheduler)
     killer.join()
 
     pd.testing.assert_frame_equal(result, here, check_exact=True)
@@ -181,10 +182,11 @@ def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
 def test_a_worker_with_other_folders_or_other_code_is_reported(
     small_world, small_labels, tmp_path, monkeypatch
 ):
-    jobs, kitti = first_jobs(small_world / "kitti", ["00"], {"thesis": ()}), small_world / "kitti"
-    runner.run(jobs, kitti, small_labels, tmp_path)
+    opened = Sequence(small_world / "kitti", "00")
+    jobs = first_jobs([opened], {"thesis": ()})
+    runner.run(jobs, [opened], small_labels, tmp_path)
     record = runner.results.record(tmp_path / "00")
-    inputs = Sequence(kitti, "00"), runner.by_name(small_labels)
+    inputs = opened, runner.by_name(small_labels)
     elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record, 1)
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})

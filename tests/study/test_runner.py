@@ -16,13 +16,17 @@ from thesis_repro.study.sources import Source
 WIDTHS = (5, 10, 15)
 
 
+def opened(world, frames=None):
+    return [Sequence(world / "kitti", name).subset(frames) for name in ("00", "01")]
+
+
 @pytest.fixture(scope="module")
 def finished(small_world, small_labels, tmp_path_factory):
     folder = tmp_path_factory.mktemp("odometry")
-    jobs = first_jobs(small_world / "kitti", ["00", "01"], {"thesis": WIDTHS})
-    summary = runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
+    jobs = first_jobs(opened(small_world), {"thesis": WIDTHS})
+    summary = runner.run(jobs, opened(small_world), small_labels, folder, processes=2)
     jobs += reduced_jobs(thesis_tables.best_widths(compare.of_method(summary, "masked")))
-    return folder, jobs, runner.run(jobs, small_world / "kitti", small_labels, folder, processes=2)
+    return folder, jobs, runner.run(jobs, opened(small_world), small_labels, folder, processes=2)
 
 
 def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, finished):
@@ -59,7 +63,7 @@ def test_only_missing_runs_are_run_again(small_world, small_labels, finished, mo
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
     lost = folder / "00" / "masked-05-0.csv"
     lost.unlink()
-    again = runner.run(jobs, small_world / "kitti", small_labels, folder)
+    again = runner.run(jobs, opened(small_world), small_labels, folder)
     assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost}
     pd.testing.assert_frame_equal(again, summary)
 
@@ -83,16 +87,16 @@ def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(
     monkeypatch.setattr(Sequence, "frame", frame)
     if isinstance(error, KeyboardInterrupt):
         with pytest.raises(KeyboardInterrupt):
-            runner.run(jobs, small_world / "kitti", small_labels, tmp_path)
+            runner.run(jobs, opened(small_world), small_labels, tmp_path)
     else:
-        assert set(runner.run(jobs, small_world / "kitti", small_labels, tmp_path)["sequence"]) == {
+        assert set(runner.run(jobs, opened(small_world), small_labels, tmp_path)["sequence"]) == {
             "00"
         }
     assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".log", ".npz"}
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
     read.clear()
     # jobs with a checkpoint resume in their old passes
-    runner.run(jobs + [Job("01", "masked", 7)], small_world / "kitti", small_labels, tmp_path)
+    runner.run(jobs + [Job("01", "masked", 7)], opened(small_world), small_labels, tmp_path)
     assert [index for name, index in read if name == "01"] == [*range(5, 12), *range(12)]
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
     assert not list(tmp_path.rglob("pass-*"))
@@ -111,14 +115,12 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
     jobs = [
-        *first_jobs(small_world / "kitti", ["00"], {"thesis": WIDTHS}),
+        *first_jobs(opened(small_world)[:1], {"thesis": WIDTHS}),
         Job("00", "true-labels", 10),
         Job("00", "mirrored", 10),
         Job("00", "masked", dilation_width=0),
     ]
-    summary = runner.run(
-        jobs, small_world / "kitti", tmp_path / "labels", tmp_path / "runs", frames=5
-    )
+    summary = runner.run(jobs, opened(small_world, 5), tmp_path / "labels", tmp_path / "runs")
     assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
     printed = capsys.readouterr().err
     assert (
@@ -127,18 +129,18 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     )
     assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
     with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
-        runner.run(jobs[-1:], small_world / "kitti", small_labels, tmp_path / "none")
+        runner.run(jobs[-1:], opened(small_world), small_labels, tmp_path / "none")
 
 
 def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path):
-    kitti, jobs = (
-        small_world / "kitti",
-        [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)],
-    )
+    jobs = [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)]
 
     def keypoints(*settings):
         summary = runner.run(
-            jobs, kitti, [Source(small_labels, "labels", "", *settings)], tmp_path, frames=4
+            jobs,
+            opened(small_world, 4),
+            [Source(small_labels, "labels", "", *settings)],
+            tmp_path,
         )
         return summary.set_index("method")["mean_keypoints"]
 
@@ -150,7 +152,7 @@ def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_
         "exact", symmetric=True, classes=("road", "building"), movable=3, margin=20
     )
     few = keypoints(chosen)
-    sequence = Sequence(kitti, "00").subset(4)
+    sequence = opened(small_world, 4)[0]
     alone = odometry.run(sequence, masks=LabelMasks(small_labels / "00", sequence, 10, chosen))
     assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
 
@@ -158,17 +160,16 @@ def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_
 def test_runs_are_timed_once(small_world, small_labels, finished, monkeypatch):
     folder, jobs, _ = finished
     first = [job for job in jobs if job.method != "reduced"]
-    timed = timing.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
+    timed = timing.time_runs(first, opened(small_world, 4), small_labels, folder)
     assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
-    again = timing.time_runs(first, small_world / "kitti", small_labels, folder, frames=4)
+    again = timing.time_runs(first, opened(small_world, 4), small_labels, folder)
     pd.testing.assert_frame_equal(timed, again)
 
 
 def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitti):
     label_maps, ready = Source(tiny_kitti, name="net"), Source(tiny_kitti, "masks", "ready")
     jobs = first_jobs(
-        small_world / "kitti",
-        ["00"],
+        opened(small_world)[:1],
         {"thesis": (5, 10), "refined": ()},
         tested=10,
         sources=(label_maps, ready),
@@ -184,5 +185,5 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
     assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()
     net, ready_made = (set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready"))
     assert net == {"masked", *controls.MASKS} and net - ready_made == set(controls.OF_LABEL_MAPS)
-    without_truth = first_jobs(tiny_kitti, ["00"], {"thesis": (5,)}, tested=5)
+    without_truth = first_jobs([Sequence(tiny_kitti, "00")], {"thesis": (5,)}, tested=5)
     assert "true-labels" not in {job.method for job in without_truth}

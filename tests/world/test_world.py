@@ -276,23 +276,6 @@ def test_the_two_halves_make_the_whole_in_either_order(out, tmp_path):
         assert contents(half) == contents(out)
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"sequences": ("11",)},
-        {"sequences": ()},
-        {"frames": 1},
-        {"scale": 3},
-        {"seed": -1},
-        {"train_images": 0.5},
-    ],
-)
-def test_bad_parameters_write_nothing(tmp_path, bad):
-    with pytest.raises(InputError, match=next(iter(bad))):
-        dataset.write(tmp_path / "new", **{**SMALL, **bad})
-    assert not (tmp_path / "new").exists()
-
-
 def test_a_folder_with_other_files_is_not_changed(out, tmp_path):
     before = contents(out)
     with pytest.raises(InputError):  # other parameters

@@ -11,8 +11,6 @@ import numpy as np
 from thesis_repro.compiled import fast
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
-QUALITY = THESIS.quality  # least strength, as a share of the strongest corner (inside the mask)
-BLOCK_SIZE = THESIS.block_size
 WINDOW, LEVELS = THESIS.window, THESIS.levels
 TRACKER = {
     "winSize": (WINDOW, WINDOW),
@@ -160,27 +158,13 @@ def _key(points):
     return np.ascontiguousarray(points).view(np.int64).ravel()
 
 
-def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
-    """Corner strength of each pixel, equal to cv2.cornerMinEigenVal to the bit, and its ranked
-    local maxima.
+def find_corners(frame: np.ndarray, block_size: int) -> Corners:
+    """Corner strength of each pixel and its ranked local maxima.
 
     The maxima are indices into the flattened image, strongest first. Of equal maxima, the last
     pixel comes first. Pixels on the border are left out.
     """
-    scale = 1 / (4 * BLOCK_SIZE * 255)  # 4 is the sum of the smoothing weights 1, 2, 1
-    dx, dy = (
-        cv2.copyMakeBorder(
-            cv2.Sobel(frame, cv2.CV_32F, *order, scale=scale),
-            *[BLOCK_SIZE // 2] * 4,
-            cv2.BORDER_REFLECT_101,
-        )
-        for order in ((1, 0), (0, 1))
-    )
-    strength = (
-        _min_eigenvalues(dx, dy)
-        if block_size == BLOCK_SIZE
-        else cv2.cornerMinEigenVal(frame, block_size)
-    )
+    strength = cv2.cornerMinEigenVal(frame, block_size)
     is_peak = (strength == cv2.dilate(strength, None)) & (strength > 0)
     is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
     peaks = np.flatnonzero(is_peak)
@@ -189,44 +173,6 @@ def find_corners(frame: np.ndarray, block_size: int = BLOCK_SIZE) -> Corners:
     return strength, np.sort(strength.ravel()[peaks].view(np.int32).astype(np.int64) << 32 | peaks)[
         ::-1
     ] & 0xFFFFFFFF
-
-
-@fast
-def _min_eigenvalues(dx, dy):
-    """Smaller eigenvalue of the gradient matrix, summed over squares of BLOCK_SIZE; the padded
-    border is cut off.
-    """
-    height, width = dx.shape[0] - BLOCK_SIZE + 1, dx.shape[1] - BLOCK_SIZE + 1
-    smaller = np.empty((height, width), np.float32)
-    products, half = np.empty((3, dx.shape[1]), np.float32), np.float32(0.5)
-    # in OpenCV's order and double precision
-    rows, sums = np.zeros((BLOCK_SIZE, 3, width)), np.zeros((3, width))
-    for y in range(dx.shape[0]):
-        for x in range(dx.shape[1]):
-            products[0, x] = dx[y, x] * dx[y, x]
-            products[1, x] = dx[y, x] * dy[y, x]
-            products[2, x] = dy[y, x] * dy[y, x]
-        for k in range(3):
-            product, row, total = products[k], rows[y % BLOCK_SIZE, k], sums[k]
-            for x in range(width):
-                along = (
-                    np.float64(product[x])
-                    + product[x + 1]
-                    + product[x + 2]
-                    + product[x + 3]
-                    + product[x + 4]
-                )
-                total[x] = total[x] - row[x] + along
-                row[x] = along
-        if y >= BLOCK_SIZE - 1:
-            for x in range(width):
-                xx, xy, yy = (
-                    np.float32(sums[0, x]) * half,
-                    np.float32(sums[1, x]),
-                    np.float32(sums[2, x]) * half,
-                )
-                smaller[y - BLOCK_SIZE + 1, x] = xx + yy - np.sqrt((xx - yy) * (xx - yy) + xy * xy)
-    return smaller
 
 
 @fast

@@ -1,6 +1,5 @@
 """The odometry, frame by frame: keypoints, the motion between two frames, and the new pose."""
 
-import gc
 import time
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -362,17 +361,11 @@ def warm_up(refined: bool) -> None:
     """Load or compile the compiled functions, so that the measured time of the first frame does
     not include it.
     """
-    was_collecting = gc.isenabled()
-    gc.disable()  # garbage collection takes an eighth of the compiler's time and frees little
-    try:
-        keypoints.detect(np.zeros((8, 8), np.uint8), THESIS)
-        points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
-        pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
-        pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
-        if refined:
-            ahead = np.array([0.0, 0.0, 1.0])
-            fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)
-            ransac_with_prior(points, points[::-1], 1.0, np.eye(3), ahead, 180.0, 180.0)
-    finally:
-        if was_collecting:
-            gc.enable()
+    keypoints.detect(np.zeros((8, 8), np.uint8), THESIS)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
+    pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
+    pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
+    if refined:
+        ahead = np.array([0.0, 0.0, 1.0])
+        fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)
+        ransac_with_prior(points, points[::-1], 1.0, np.eye(3), ahead, 180.0, 180.0)

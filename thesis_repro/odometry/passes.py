@@ -2,19 +2,17 @@
 tracking.
 """
 
-import hashlib
 import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, console, results
+from thesis_repro import console, results
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
@@ -131,9 +129,9 @@ def run_many(
     the same masks object and the same KEYPOINT_SETTINGS share masks and keypoints. Runs that differ
     only in `estimator` share essential matrices.
     workers: number of threads for the estimators.
-    checkpoint: file in which the state is stored every CHECKPOINT frames. A stopped pass resumes
-    from it if it is started again with the same file, sequence and settings. The caller deletes the
-    file after storing the results, and uses another file for other masks.
+    checkpoint: file in which the state is stored every CHECKPOINT frames, and from which a stopped
+    pass resumes. The caller deletes the file after storing the results, and uses another file for
+    another sequence, other settings or other masks.
     """
     return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
 
@@ -185,8 +183,7 @@ def _run(
     # the first run of each group detects and tracks for its group
     leaders = [group[0][0] for group in groups]
     step_lengths = scales(sequence)
-    job = _job(sequence, members)
-    done = _resume(checkpoint, job, members, leaders)
+    done = _resume(checkpoint, members, leaders)
     with ThreadPoolExecutor(workers) as pool:
         pending: list[_Estimate] = []
         indices: Iterable[int] = range(done, len(sequence))
@@ -221,7 +218,7 @@ def _run(
             if checkpoint and (index + 1) % CHECKPOINT == 0:
                 _finish(pending)
                 pending = []
-                _store(checkpoint, job, index + 1, members, leaders)
+                _store(checkpoint, index + 1, members, leaders)
         _finish(pending)
     return {
         name: _result(member, SHARED_TIMES if shared else ()) for name, member in members.items()
@@ -260,23 +257,7 @@ def _finish(estimates: Iterable[_Estimate]) -> None:
 # Checkpoints
 
 
-def _job(sequence: Sequence, members: Mapping[str, _Run]) -> dict[str, Any]:
-    """Inputs of a pass. A pass resumes from a checkpoint only if they are equal."""
-    arrays = (sequence.intrinsics, start_pose(sequence), scales(sequence))
-    numbers = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
-    return {
-        "sequence": sequence.name,
-        "frames": len(sequence),
-        "numbers": numbers,
-        "opencv": cv2.__version__,
-        "columns": NUMBER_COLUMNS,
-        "runs": {name: asdict(member.odometry.settings) for name, member in members.items()},
-    }
-
-
-def _store(
-    checkpoint: Path, job: dict, done: int, members: Mapping[str, _Run], leaders: list[_Run]
-) -> None:
+def _store(checkpoint: Path, done: int, members: Mapping[str, _Run], leaders: list[_Run]) -> None:
     last = leaders[0].odometry  # the previous frame is the same in all runs
     arrays = {
         "numbers": np.array([member.numbers[:done] for member in members.values()]),
@@ -292,20 +273,14 @@ def _store(
     if last.previous is not None:
         arrays["previous"] = last.previous
     flags = {name: member.flags for name, member in members.items()}
-    results.store(checkpoint, {"job": job, "done": done, "gap": last.gap, "flags": flags}, arrays)
+    state = {"runs": list(members), "done": done, "gap": last.gap, "flags": flags}
+    results.store(checkpoint, state, arrays)
 
 
-def _resume(
-    checkpoint: Path | None, job: dict, members: Mapping[str, _Run], leaders: list[_Run]
-) -> int:
-    """Restore the state from a checkpoint of the same job. Returns the number of finished
-    frames, 0 without one.
-    """
-    try:
-        stored = results.resume(checkpoint) if checkpoint else None
-    except InputError:  # a damaged file: start from the first frame
-        stored = None
-    if stored is None or stored[0].get("job") != job:
+def _resume(checkpoint: Path | None, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
+    """Restore the state from a checkpoint. Returns the number of finished frames, 0 without one."""
+    stored = results.resume(checkpoint) if checkpoint else None
+    if stored is None:
         return 0
     state, arrays = stored
     done = int(state["done"])

@@ -88,4 +88,4 @@ def _reason(error):
     name, text = type(error).__name__, str(error)
     if isinstance(error, CellExecutionError):
         name, text = error.ename, error.evalue
-    return f"{name}: {text}".splitlines()[0] + console.remedy(text)
+    return f"{name}: {text}".splitlines()[0]

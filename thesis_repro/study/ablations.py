@@ -62,26 +62,25 @@ def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.
 
 
 def measure(
-    kitti: Path,
-    names: Iterable[str],
+    sequences: Iterable[Sequence],
     labels: Path,
     folder: Path,
     *,
-    frames: int | None = None,
     processes: int = 1,
     **options: Any,
 ) -> pd.DataFrame:
     """Run every ablation on every sequence; returns a table with one row a run.
 
-    kitti: the odometry root. labels: a folder with one folder of label maps a sequence. folder: for
-    the results; finished sequences in it are not run again. frames: number of frames of each
-    sequence, None for all.
-    options: those of `runs_of`.
+    labels: a folder with one folder of label maps a sequence. folder: for the results; finished
+    sequences in it are not run again. options: those of `runs_of`.
 
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
-    calls = [(kitti, name, labels / name, folder / name, frames, options) for name in names]
+    calls = [
+        (sequence, labels / sequence.name, folder / sequence.name, options)
+        for sequence in sequences
+    ]
     with workers.open_pool(processes) as pool:
         tables = dict(
             progress(pool.run(_measure, calls), "ablations", total=len(calls), unit="sequence")
@@ -90,9 +89,8 @@ def measure(
 
 
 def _measure(
-    kitti: Path, name: str, labels: Path, folder: Path, frames: int | None, options: dict[str, Any]
+    sequence: Sequence, labels: Path, folder: Path, options: dict[str, Any]
 ) -> pd.DataFrame:
-    sequence = Sequence(kitti, name).subset(frames)
     results.stage(
         folder,
         options=options,
@@ -103,7 +101,7 @@ def _measure(
         model=results.made_from(labels),
     )
     path = folder / "runs.csv"
-    if results.kept_table(path) is None:
+    if not path.is_file():
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **options)
         run_results = odometry.run_many(
@@ -117,7 +115,7 @@ def _measure(
                 runs, run_results.values(), strict=True
             )
         ]
-        write_text(path, pd.DataFrame(rows).assign(sequence=name).to_csv(index=False))
+        write_text(path, pd.DataFrame(rows).assign(sequence=sequence.name).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 

@@ -88,8 +88,7 @@ class Job:
 
 
 def first_jobs(
-    kitti: Path,
-    names: Iterable[str],
+    sequences: Iterable[Sequence],
     widths: Mapping[str, Iterable[int]],
     *,
     tested: int | None = None,
@@ -99,14 +98,15 @@ def first_jobs(
     """Return the jobs that need no other results: all keypoints, masks of every width, and controls
     that are masks.
 
-    names: of the sequences. widths: pixels, for masks from label maps, by estimator: {"thesis":
+    widths: pixels, for masks from label maps, by estimator: {"thesis":
     range(1, 16)}.
     tested: width (pixels) of the controls, None for no controls; it is added to the widths of every
     estimator.
     sources: of masks. All keypoints are run once for all sources.
     """
     jobs: list[Job] = []
-    for name in names:
+    for sequence in sequences:
+        name = sequence.name
         jobs += _repeated([Job(name, "baseline")], widths, repetitions)
         for source in sources:
             has_widths = source.kind == "labels"
@@ -127,7 +127,10 @@ def first_jobs(
             for method in controls.MASKS if tested else ():
                 if method in controls.OF_LABEL_MAPS and not has_widths:
                     continue
-                if method == "true-labels" and not controls.true_labels(kitti, name).is_dir():
+                if (
+                    method == "true-labels"
+                    and not controls.true_labels(sequence.root, name).is_dir()
+                ):
                     continue
                 jobs += _repeated(
                     [Job(name, method, tested if has_widths else None, source=source.name)],
@@ -165,8 +168,7 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
 
 def keypoint_control_jobs(
     keypoints: Mapping[str, float],
-    kitti: Path,
-    frames: int | None = None,
+    sequences: Iterable[Sequence],
     repetitions: int = 1,
     estimators: Iterable[str] = tuple(ESTIMATORS),
     source: str = "",
@@ -178,8 +180,12 @@ def keypoint_control_jobs(
     keypoints: {sequence: mean number that masks leave}. width: of these masks, pixels.
     """
     jobs: list[Job] = []
-    for name, number in keypoints.items():
-        distance = controls.min_distance(Sequence(kitti, name).subset(frames), number)
+    for sequence in sequences:
+        name = sequence.name
+        if name not in keypoints:  # its runs with masks failed
+            continue
+        number = keypoints[name]
+        distance = controls.min_distance(sequence, number)
         jobs += _repeated(
             [
                 Job(name, "fewer", width, max_keypoints=max(1, round(number)), source=source),

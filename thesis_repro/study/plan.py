@@ -7,7 +7,6 @@ Times are for one core. On a busy machine they can be wrong by a third.
 import time
 from collections.abc import Callable, Iterable
 from contextlib import redirect_stderr, redirect_stdout
-from functools import partial
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,8 +32,6 @@ def of_study(study: Study, folder: Path) -> dict[str, Any]:
     """Return the plan of the runs of a study with your own masks that are not in its folder yet,
     see `_plan`.
     """
-    sequences = {sequence.name: sequence for sequence in study.opened}
-    frames = {name: len(sequence) for name, sequence in sequences.items()}
     # the keypoint controls of each source are planned when the masked runs are done
     later = (
         study.repetitions * len(study.estimators) * len(study.sources) * len(jobs.KEYPOINT_CONTROLS)
@@ -43,12 +40,11 @@ def of_study(study: Study, folder: Path) -> dict[str, Any]:
         "odometry",
         study.first_jobs(),
         later if study.tested else 0,
-        sequences,
-        study.kitti,
+        study.opened,
         study.sources,
         folder / "runs",
     )
-    return _plan([step], frames, run_frames * ROW_BYTES, STUDY_SECONDS)
+    return _plan([step], study.opened, run_frames * ROW_BYTES, STUDY_SECONDS)
 
 
 def of_thesis(root: Path, sizes: Profile, folder: Path) -> dict[str, Any]:
@@ -64,16 +60,12 @@ def of_thesis(root: Path, sizes: Profile, folder: Path) -> dict[str, Any]:
         # imported here because TensorFlow takes seconds to load
         from thesis_repro.segmentation import prediction
 
-    sequences = {
-        name: kitti.Sequence(root, name).subset(sizes.frames) for name in kitti.sequences(root)
-    }
-    frames = {name: len(sequence) for name, sequence in sequences.items()}
-    name, total = _longest(frames), sum(frames.values())
-    timed_frames = sum(min(count, sizes.timed_frames) for count in frames.values())
-    model, sequence = prediction.load_shipped(), sequences[name]
+    sequences = [kitti.Sequence(root, name).subset(sizes.frames) for name in kitti.sequences(root)]
+    timed, total = _longest(sequences), sum(map(len, sequences))
+    timed_frames = sum(min(len(sequence), sizes.timed_frames) for sequence in sequences)
+    model = prediction.load_shipped()
     planned = jobs.first_jobs(
-        root,
-        frames,
+        sequences,
         {"thesis": sizes.widths, "refined": []},
         tested=jobs.CONTROL_WIDTH,
         repetitions=sizes.repetitions,
@@ -82,7 +74,7 @@ def of_thesis(root: Path, sizes: Profile, folder: Path) -> dict[str, Any]:
     later = (1 + len(jobs.KEYPOINT_CONTROLS) * len(jobs.ESTIMATORS)) * sizes.repetitions
 
     def predict(count: int, folder: Path) -> None:
-        prediction.write_label_maps(model, sequence.subset(count).frame_paths, folder / name)
+        prediction.write_label_maps(model, timed.subset(count).frame_paths, folder / timed.name)
 
     with TemporaryDirectory() as labels:
         predict(LONG, Path(labels))
@@ -92,17 +84,14 @@ def of_thesis(root: Path, sizes: Profile, folder: Path) -> dict[str, Any]:
             planned,
             later,
             sequences,
-            root,
             [Source(Path(labels))],
             folder / "odometry",
         )
-        _, one_run = _seconds(lambda count, _: odometry.run(sequence.subset(count)))
+        _, one_run = _seconds(lambda count, _: odometry.run(timed.subset(count)))
         _, all_ablations = _seconds(
-            lambda count, folder: ablations.measure(
-                root, [name], Path(labels), folder, frames=count
-            )
+            lambda count, folder: ablations.measure([timed.subset(count)], Path(labels), folder)
         )
-    in_07 = min(frames.values())
+    in_07 = min(map(len, sequences))
     steps = [
         ("05: label maps", total, "frames", total * label_map),
         ("07: one sequence", in_07, "frames", in_07 * RUNS_IN_07 * one_run),
@@ -116,7 +105,7 @@ def of_thesis(root: Path, sizes: Profile, folder: Path) -> dict[str, Any]:
         ("09: ablations", total, "frames", total * all_ablations),
     ]
     return _plan(
-        steps, frames, total * LABEL_MAP_BYTES + run_frames * ROW_BYTES, 6 * NOTEBOOK_SECONDS
+        steps, sequences, total * LABEL_MAP_BYTES + run_frames * ROW_BYTES, 6 * NOTEBOOK_SECONDS
     )
 
 
@@ -124,58 +113,43 @@ def _odometry(
     name: str,
     planned: list[jobs.Job],
     later: int,
-    sequences: dict[str, kitti.Sequence],
-    root: Path,
+    sequences: list[kitti.Sequence],
     sources: Iterable[Source],
     folder: Path,
 ) -> tuple[tuple[str, int, str, float], int]:
     """Return the step (see `_plan`) of the runs without a result in a folder, and their frames.
 
     later: number of further runs of each sequence, such as controls whose settings follow from
-    other runs. The passes of the longest sequence are timed one by one, divided as for all cores,
-    because the runs of a pass share work.
+    other runs. The runs of the longest sequence are timed together, because they share work.
     """
-    timed = _longest({name: len(sequence) for name, sequence in sequences.items()})
-    passes = jobs.in_passes(planned, sequences, cores())
-    times = [
-        _seconds(partial(_run_pass, pass_jobs, root, sources))
-        for pass_jobs in passes
-        if pass_jobs[0].sequence == timed
-    ]
-    start, frame = np.sum(times, axis=0) / sum(job.sequence == timed for job in planned)
+    timed = _longest(sequences)
+    timed_jobs = [job for job in planned if job.sequence == timed.name]
+    times = _seconds(
+        lambda count, results: runner.run(timed_jobs, [timed.subset(count)], sources, results)
+    )
+    start, frame = np.array(times) / len(timed_jobs)
     seconds, runs, run_frames = 0.0, 0, 0
-    for sequence in sequences.values():
-        results = [
-            runner.result_file(folder, job).is_file()
+    for sequence in sequences:
+        left = later + sum(
+            not runner.result_file(folder, job).is_file()
             for job in planned
             if job.sequence == sequence.name
-        ]
-        controls = ("reduced", *jobs.KEYPOINT_CONTROLS)
-        done = sum(
-            path.name.startswith(controls) for path in (folder / sequence.name).rglob("*.csv")
         )
-        left = results.count(False) + max(0, later - done)
         runs, run_frames = runs + left, run_frames + left * len(sequence)
         seconds += left * (start + len(sequence) * frame)
     return (name, runs, "runs", seconds), run_frames
 
 
-def _run_pass(
-    pass_jobs: list[jobs.Job], root: Path, sources: Iterable[Source], frames: int, folder: Path
-) -> None:
-    runner.run(pass_jobs, root, sources, folder, frames=frames)
-
-
 def _plan(
     steps: list[tuple[str, int, str, float]],
-    frames: dict[str, int],
+    sequences: list[kitti.Sequence],
     disk: float,
     once: float = 0,
 ) -> dict[str, Any]:
     """Return a plan as a record for the template plan.txt.j2.
 
-    steps: (name, number, unit, seconds on one core). frames: by sequence. disk: bytes. once:
-    seconds that more cores do not shorten.
+    steps: (name, number, unit, seconds on one core). disk: bytes. once: seconds that more cores do
+    not shorten.
     """
     seconds = sum(step[-1] for step in steps)
     return {
@@ -184,23 +158,23 @@ def _plan(
         "seconds": once + seconds,
         "cores": cores(),
         "on_all_cores": once + seconds / cores(),
-        "sequences": len(frames),
-        "frames": sum(frames.values()),
-        "timed": _longest(frames),
+        "sequences": len(sequences),
+        "frames": sum(map(len, sequences)),
+        "timed": _longest(sequences).name,
         "timed_frames": LONG,
         "disk": disk,
         "fewest": compare.MIN_SEQUENCES,
     }
 
 
-def _longest(frames: dict[str, int]) -> str:
+def _longest(sequences: list[kitti.Sequence]) -> kitti.Sequence:
     """Return the longest sequence, whose first frames are timed."""
-    name = max(frames, key=lambda name: frames[name])
-    if frames[name] < LONG:
+    longest = max(sequences, key=len)
+    if len(longest) < LONG:
         raise InputError(
             f"the sequences are too short to plan from; one of {LONG} frames or more is needed"
         )
-    return name
+    return longest
 
 
 def _seconds(run: Callable[[int, Path], Any]) -> tuple[float, float]:

@@ -36,22 +36,20 @@ def result_file(folder: Path, job: Job) -> Path:
 
 def run(
     jobs: Iterable[Job],
-    kitti: Path,
+    sequences: Iterable[Sequence],
     sources: Path | Iterable[Source],
     folder: Path,
     *,
-    frames: int | None = None,
     processes: int = 1,
     scheduler: str | None = None,
 ) -> pd.DataFrame:
     """Run the jobs that have no result yet; returns the table of all runs that succeeded, one row a
     job.
 
-    kitti: the odometry root. sources: folder with one folder of label maps a sequence, or the
+    sequences: those of the jobs. sources: folder with one folder of label maps a sequence, or the
     sources of the jobs.
     folder: for the results; results from other data, code or mask settings in it are deleted.
-    frames: number of frames of each sequence, None for all. processes: number of processes on this
-    machine.
+    processes: number of processes on this machine.
     scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then do the work with
     the same results. They need this package, and the three folders under the same paths. One thread
     a worker is best.
@@ -64,27 +62,21 @@ def run(
     disk space or memory. Finished results are kept.
     """
     jobs, sources_by_name = list(dict.fromkeys(jobs)), by_name(sources)
-    sequences = {
-        name: Sequence(kitti, name).subset(frames)
-        for name in sorted({job.sequence for job in jobs})
-    }
+    names = {job.sequence for job in jobs}
+    opened = {sequence.name: sequence for sequence in sequences if sequence.name in names}
     files = {job: result_file(folder, job) for job in jobs}
     with results.claimed(folder):
-        for sequence in sequences.values():
+        for sequence in opened.values():
             _stage(folder, sequence, sources_by_name)
-        for job, path in files.items():
-            table = results.kept_table(path, len(sequences[job.sequence]))
-            if table is None or not np.isfinite(poses_of(table)).all():
-                path.unlink(missing_ok=True)  # missing results are made again
         finished = sum(path.is_file() for path in files.values())
-        failures = _run_passes(jobs, sequences, sources_by_name, folder, processes, scheduler)
+        failures = _run_passes(jobs, opened, sources_by_name, folder, processes, scheduler)
     rows = []
     for job, path in files.items():
         if path.is_file():
             table = pd.read_csv(
                 path, keep_default_na=False, na_values={"detected": "", "tracked": ""}
             )
-            errors = measures(table, sequences[job.sequence].poses)
+            errors = measures(table, opened[job.sequence].poses)
             rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **errors})
     if not rows:
         raise InputError(
@@ -205,10 +197,7 @@ def _passes(
             key: job for key, job in sequence_jobs.items() if not result_file(folder, job).is_file()
         }
         for path in sorted((folder / name).glob(CHECKPOINTS)):
-            try:
-                keys = results.resume(path)[0]["job"]["runs"]
-            except InputError:  # a damaged checkpoint is deleted below
-                keys = []
+            keys = results.resume(path)[0]["runs"]
             if not sequence_jobs.keys() >= set(keys):
                 continue  # it holds jobs that are not requested now but may be later
             if waiting.keys().isdisjoint(keys):

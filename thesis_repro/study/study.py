@@ -128,8 +128,7 @@ class Study:
     def first_jobs(self) -> list[jobs.Job]:
         """Return the jobs that need no other results."""
         return jobs.first_jobs(
-            self.kitti,
-            self.sequences,
+            self.opened,
             dict.fromkeys(self.estimators, self.widths),
             tested=self.tested,
             sources=self.sources,
@@ -144,10 +143,9 @@ class Study:
         """
         run = partial(
             runner.run,
-            kitti=self.kitti,
+            sequences=self.opened,
             sources=self.sources,
             folder=folder / "runs",
-            frames=self.frames,
             processes=processes,
             scheduler=scheduler,
         )
@@ -171,8 +169,7 @@ class Study:
                     width = None if source.kind == "masks" else self.tested
                     study_jobs += jobs.keypoint_control_jobs(
                         keypoints,
-                        self.kitti,
-                        self.frames,
+                        self.opened,
                         self.repetitions,
                         self.estimators,
                         source.name,

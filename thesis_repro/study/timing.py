@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry, results
+from thesis_repro import InputError, masks, odometry
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.settings import cores
@@ -43,31 +43,28 @@ def opencv_threads(count: int) -> Iterator[None]:
 
 def time_runs(
     jobs: Iterable[Job],
-    kitti: Path,
+    sequences: Iterable[Sequence],
     labels: Path | Iterable[Source],
     folder: Path,
     *,
-    frames: int,
     processes: int = 1,
 ) -> pd.DataFrame:
     """Time each job as a separate run; returns a table of sequence, run, method, dilation_width and
     seconds.
 
-    Only the first `frames` frames are timed, without the first two steps, which load compiled code.
-    The jobs of a sequence take turns at every frame, so that other programs slow all of them
-    equally. Call it after `runner.run`, with the same folder and label maps. Times in the folder
-    are not measured again.
+    The first two steps are not timed, because they load compiled code. The jobs of a sequence take
+    turns at every frame, so that other programs slow all of them equally. Call it after
+    `runner.run`, with the same folder and label maps. Times in the folder are not measured again.
     """
     jobs, sources = list(jobs), by_name(labels)
-    names = sorted({job.sequence for job in jobs})
     calls = [
         (
-            [job for job in jobs if job.sequence == name],
-            Sequence(kitti, name).subset(frames),
+            [job for job in jobs if job.sequence == sequence.name],
+            sequence,
             sources,
-            folder / name / f"seconds-{frames}.csv",
+            folder / sequence.name / f"seconds-{len(sequence)}.csv",
         )
-        for name in names
+        for sequence in sequences
     ]
     with workers.open_pool(processes) as pool:
         tables = dict(
@@ -79,9 +76,10 @@ def time_runs(
 def _time_jobs(
     jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
 ) -> pd.DataFrame:
-    kept = results.kept_table(path, dtype={"sequence": str})
-    if kept is not None and {job.name for job in jobs} <= set(kept["run"]):
-        return kept
+    if path.is_file():
+        kept = pd.read_csv(path, dtype={"sequence": str})
+        if {job.name for job in jobs} <= set(kept["run"]):
+            return kept
     scales = odometry.scales(sequence)
     masks_by_job, _ = masks_of(jobs, sequence, sources)
     odometries = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}

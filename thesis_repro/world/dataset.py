@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
 
-from thesis_repro import InputError, console, kitti, results, trajectories
+from thesis_repro import console, kitti, results, trajectories
 from thesis_repro.files import is_whole, progress, write_png, write_text
 from thesis_repro.world import drives, street, textures
 
@@ -128,8 +128,8 @@ def write(
     complete world of the same parameters is kept.
     only: "kitti" or "cityscapes", to write one of the two.
     Returns (number of pictures rendered, number of pictures in total).
-    Raises InputError for a folder that holds other files or is in use by another run, a world of
-    other parameters, or a bad parameter.
+    Raises InputError for a folder that holds other files or is in use by another run, and for a
+    world of other parameters.
     """
     out = Path(out)
     parameters = {
@@ -140,7 +140,6 @@ def write(
         "validation_images": validation_images,
         "seed": seed,
     }
-    _check(**parameters)
     with results.claimed(out):
         results.stage(out, replace=replace, code=results.code("world"), **parameters)
         pictures = [
@@ -167,20 +166,6 @@ def write(
             if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # written last
                 _write_sequence_texts(out, name, frames or drives.DRIVES[name].frames, scale, seed)
     return len(missing), len(pictures)
-
-
-def _check(sequences, frames, scale, **numbers):
-    """Raise InputError for a parameter of `write` that describes no world."""
-    if not sequences or not set(sequences) <= set(SEQUENCES):
-        raise InputError(
-            f"sequences: must be among 00 to 10, not {' '.join(map(str, sequences)) or 'none'}"
-        )
-    if not 0.1 <= scale <= 1:
-        raise InputError(f"scale: must lie between 0.1 and 1 (KITTI's full size), not {scale!r}")
-    for name, value in {"frames": 2 if frames is None else frames, **numbers}.items():
-        least = 2 if name == "frames" else 0
-        if not isinstance(value, int) or value < least:
-            raise InputError(f"{name}: must be a whole number of at least {least}, not {value!r}")
 
 
 def _pictures(root, sequences, frames, scale, train_images, validation_images, seed):
