@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from thesis_repro.segmentation.prediction import SHIPPED
 from thesis_repro.settings import read_settings
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = {
-    "01": "02 03 09 11 13 15 25",
+    "01": "02 03 05 09 11 13 15 25",
     "02": "02 03 04 06 08 17",
-    "03": "02 03 15 17 19 27",
+    "03": "02 03 30 15 17 19 27",
     "04": "02 03 05 06 08 12 16",
     "05": "02 03 05 12 17",
     "06": "02 03 04 26",
@@ -135,6 +136,51 @@ def test_network_and_loss_change_the_masked_row(small_world, tmp_path):
     )
     everywhere, masked = ([json.dumps(table[row]) for table in rows] for row in THESIS)
     assert len(set(everywhere)) == 1 and len(set(masked)) == 3
+
+
+WRONG_KNOBS = [
+    # notebook, its knob, a wrong value, words of the answer
+    ("01", "VALIDATION_SHARE, RANDOM_STATE = 0.2", "VALIDATION_SHARE, RANDOM_STATE = 2", "0 and 1"),
+    ("03", "BASE_FILTERS = settings.sizes.base_filters", "BASE_FILTERS = 0", "BASE_FILTERS=0"),
+    ("03", "DEPTH = 4", "DEPTH = 7", "DEPTH=7: must be a whole number from 1 to 6"),
+    ("04", "EPOCHS = settings.sizes.epochs", "EPOCHS = 0", "EPOCHS=0"),
+    ("04", "BATCH_SIZE = settings.sizes.batch_size", "BATCH_SIZE = 0", "BATCH_SIZE=0"),
+    ("05", 'CLASS = "road"', 'CLASS = "street"', "choose from"),
+    ("06", "CANNY = (5, 15)", "CANNY = 5", "canny=5: must be a tuple"),
+    ("06", "CANNY = (5, 15)", "CANNY = (5, 15, 20)", "must be two numbers"),
+    ("06", "DILATION_WIDTH = 10", "DILATION_WIDTH = -3", "must be a whole number from 1 to"),
+    ("06", "DILATION_WIDTH = 10", "DILATION_WIDTH = 2.5", "must be a whole number from 1 to"),
+    ("06", "VIEWS = 3", "VIEWS = 0", "VIEWS=0"),
+    ("06", '"canny", ()', '"canny", ("sky")', "classes='sky': must be a tuple, such as"),
+    ("07", "FRAME = None, 1", "FRAME = None, 0", "FRAME=0: must be a whole number from 1 to 11"),
+    ("07", "FRAME = None, 1", "FRAME = None, 637", "FRAME=637"),
+    (
+        "07",
+        "MAX_KEYPOINTS, QUALITY, MIN_DISTANCE, BLOCK_SIZE = 2000",
+        "MAX_KEYPOINTS, QUALITY, MIN_DISTANCE, BLOCK_SIZE = 0",
+        "MAX_KEYPOINTS=0",
+    ),
+    ("07", "WINDOW, LEVELS = 21", "WINDOW, LEVELS = 2", "odometry setting window"),
+    ("08", 'METRIC = "se3"', 'METRIC = "error"', "choose one of"),
+]
+
+
+def test_a_wrong_knob_is_answered_in_one_line(small_world, small_labels, tmp_path):
+    build = read_settings(environment(small_world, tmp_path)).build
+    shutil.copytree(small_labels, build / "labels")
+    (build / "masks.json").write_text("{}")  # by notebook 6
+    (build / "model").mkdir()
+    shutil.copy(SHIPPED, build / "model" / "model.keras")
+    texts = [
+        f"try:\n    exec({code(number, {number: {knob: wrong}})!r}, {{}})\n"
+        "except Exception as error:\n    print(f'ANSWER {type(error).__name__}: {error}')"
+        for number, knob, wrong, _ in WRONG_KNOBS
+    ]
+    done = run(small_world, tmp_path, *texts)
+    answers = [line for line in done.stdout.splitlines() if line.startswith("ANSWER ")]
+    assert len(answers) == len(WRONG_KNOBS), done.stderr[-3000:]
+    for (number, _, wrong, words), answer in zip(WRONG_KNOBS, answers):
+        assert answer.startswith("ANSWER InputError: ") and words in answer, (number, wrong, answer)
 
 
 @pytest.mark.torture

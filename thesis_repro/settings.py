@@ -300,11 +300,12 @@ def _changed_sizes(profile, sizes):
     return texts
 
 
-def number(name, text):
-    """Return the whole number in the text of setting `name`. Raises InputError if LIMITS does
-    not allow it.
+def number(name, text, limits=None):
+    """Return the whole number in the text of setting `name`. Raises InputError if its limits
+    (default: LIMITS[name]) do not allow it. Notebooks check the numbers of their knobs with it.
     """
-    least, most, step = LIMITS[name]
+    least, most, step = limits or LIMITS[name]
+    text = str(text)
     value = int(text) if re.fullmatch("[0-9]{1,19}", text) else -1
     if not least <= value <= most or value % step:
         multiple = f", a multiple of {step}" if step > 1 else ""
