@@ -81,7 +81,7 @@ help:
 	@echo "make test        run the unit tests, and every notebook with PROFILE=smoke"
 	@echo "make torture     run the tests of kills, faults and bad input (some minutes)"
 	@echo "make lint        check format and style (Ruff) and types (mypy)"
-	@echo "make lab         open the notebooks in JupyterLab with PROFILE=lab (a minute each)"
+	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (one to two minutes each)"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts; LABELS=/path adds label maps"
 	@echo "make trainings   after make figures: train three more networks, and compare masks from all four"
@@ -210,8 +210,13 @@ lint: setup
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
 
+# Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
+LAB := $(if $(THESIS_REPRO_BUILD),$(THESIS_REPRO_BUILD),build)/lab
 lab: setup
-	@$(BIN)/jupyter lab notebooks --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate $(if $(filter 0,$(shell id -u)),--allow-root)
+	@mkdir -p "$(LAB)" && for notebook in notebooks/*.ipynb; do \
+	  [ -e "$(LAB)/$${notebook##*/}" ] || cp "$$notebook" "$(LAB)" || exit 1; done
+	@echo "the notebooks are copies in $(LAB); delete one to get it anew"
+	@$(BIN)/jupyter lab "$(LAB)" --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate $(if $(filter 0,$(shell id -u)),--allow-root)
 
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)

@@ -6,6 +6,7 @@ where it is 0.
 
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from numbers import Integral, Real
 from pathlib import Path
 
 import cv2
@@ -44,7 +45,7 @@ class MaskSettings:
     margin: no keypoints within this many pixels of the frame's border. Points there are lost in the
     next frame, and networks that pad with zeros predict false boundaries there.
     ids: ids in the files, Cityscapes' "labels" or its "train" ids (`cityscapes.TRAINED`).
-    Raises InputError for an unknown name or a negative number.
+    Raises InputError for an unknown name, a bad number, or no tuple where one belongs.
     """
 
     boundaries: str = "canny"
@@ -57,8 +58,15 @@ class MaskSettings:
     canny: tuple[float, float] = (5, 15)
 
     def __post_init__(self) -> None:
-        for name in ("classes", "canny"):  # lists, if read from JSON
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name, example in (("classes", '("sky",)'), ("canny", "(5, 15)")):
+            values = getattr(self, name)
+            if not isinstance(values, (tuple, list)):  # a list, if read from JSON
+                raise InputError(f"{name}={values!r}: must be a tuple, such as {example}")
+            object.__setattr__(self, name, tuple(values))
+        if len(self.canny) != 2 or not all(
+            isinstance(threshold, Real) and threshold >= 0 for threshold in self.canny
+        ):
+            raise InputError(f"canny={self.canny}: must be two numbers from 0 on, such as (5, 15)")
         for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP), ("ids", IDS)):
             if getattr(self, name) not in known:
                 raise InputError(
@@ -68,8 +76,8 @@ class MaskSettings:
             if name not in ID:
                 raise InputError(f"classes: {name!r} is no label; choose from {', '.join(ID)}")
         for name, pixels in (("movable", self.movable or 0), ("margin", self.margin)):
-            if pixels < 0:
-                raise InputError(f"{name}={pixels}: must be 0 or more pixels")
+            if not isinstance(pixels, Integral) or pixels < 0:
+                raise InputError(f"{name}={pixels}: must be a whole number of pixels, 0 or more")
 
 
 def edges(
@@ -135,10 +143,10 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
 def check_width(dilation_width: int, size: tuple[int, int]) -> None:
     """Raise InputError if a dilation width is not possible for frames of (height, width)."""
     limit = 2 * max(size)  # a wider square always covers the whole frame
-    if not 1 <= dilation_width <= limit:
+    if not isinstance(dilation_width, Integral) or not 1 <= dilation_width <= limit:
         raise InputError(
-            f"dilation width {dilation_width}: must be 1 to {limit} pixels for frames of "
-            f"{size[1]}x{size[0]}"
+            f"dilation width {dilation_width}: must be a whole number from 1 to {limit} pixels for "
+            f"frames of {size[1]}x{size[0]}"
         )
 
 

@@ -28,6 +28,8 @@ class Execution(ExecutePreprocessor):
 
     # the notebook may name a kernel that is not installed here
     kernel_name = Unicode("python3").tag(config=True)
+    # without it nbconvert shows the picture that stands for sliders
+    store_widget_state = False
     # for the output of libraries and the traceback of a failure
     log_file = Unicode("execution.log").tag(config=True)
 

@@ -2,6 +2,8 @@
 Markdown.
 """
 
+from base64 import b64encode
+
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
@@ -132,6 +134,30 @@ def class_legend(figure, *label_maps, also=()):
     handles += also
     figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * -(-len(handles) // 5))
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
+
+
+def with_sliders(draw, **sliders):
+    """Show the figure that `draw` returns, with sliders of ipywidgets for its arguments.
+
+    What shows no sliders, such as nbconvert or a repository's page, shows the first figure.
+    """
+    from IPython.core.pylabtools import print_figure
+    from IPython.display import display
+    from ipywidgets import Image, VBox
+
+    picture = Image(layout={"width": "720px"})
+
+    def redraw(_=None):
+        picture.value = print_figure(
+            draw(**{name: slider.value for name, slider in sliders.items()}), dpi=150
+        )
+        plt.close()
+
+    for slider in sliders.values():
+        slider.observe(redraw, "value")
+    redraw()
+    both = VBox([*sliders.values(), picture])._repr_mimebundle_()
+    display(both | {"image/png": b64encode(picture.value).decode()}, raw=True)
 
 
 def ratio_axis(axis, values):
