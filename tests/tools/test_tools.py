@@ -4,14 +4,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import keras
 import numpy as np
-import pandas as pd
 import pytest
 
-from thesis_repro import InputError, odometry
+from thesis_repro import InputError
 from thesis_repro.kitti import Sequence
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,8 +17,6 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
 import moving  # noqa: E402
-import proposals  # noqa: E402
-import reliability  # noqa: E402
 import train_shipped  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -33,45 +29,6 @@ def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypat
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
     assert (table["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
     assert len(json.loads(table.to_json(orient="records"))) == 6
-
-
-def test_a_wrong_turn_is_counted_once():
-    line = np.tile(np.eye(4), (6, 1, 1))
-    line[:, 2, 3] = 0.3 * np.arange(6)
-    turned = line.copy()
-    turned[2:, :3, :3] = [[0.999, 0, 0.0447], [0, 1, 0], [-0.0447, 0, 0.999]]  # 2.6 degrees, once
-    for flag, unflagged in (("", 1), ("ambiguous motion", 0)):
-        frames = pd.DataFrame({"flag": ["", "", flag, "", "motion not determined", ""]})
-        counts = reliability.count_steps(
-            odometry.Result(turned, frames), SimpleNamespace(poses=line), np.arange(6) > 0
-        )
-        assert (counts["steps"], counts["wrong"], counts["unflagged"]) == (5, 1, unflagged)
-        assert counts["largest"] == pytest.approx(2.56, abs=0.01) and counts["not_determined"] == 1
-
-
-def test_a_run_is_compared_with_its_shuffles_and_a_series_resumes(small_world, tmp_path):
-    arguments = [
-        "--kitti",
-        str(small_world / "kitti"),
-        "--frames",
-        "5",
-        "--keypoints",
-        "300",
-        "--shuffles",
-        "2",
-        "--output",
-        str(tmp_path),
-    ]
-    assert reliability.main(arguments) == 0
-    trials = tmp_path / "00-all.csv"
-    table = pd.read_csv(trials)
-    assert len(table) == 2
-    table.loc[1, "rmse"] *= 10
-    table.to_csv(trials, index=False)
-    assert reliability.main(arguments) == 0  # reads the file instead of running again
-    rows = pd.read_csv(tmp_path / "failures.csv").set_index("method")
-    assert rows["over"].to_dict() == {"all": 1, "spread": 0}
-    assert reliability.main([*arguments, "--methods", "masked-5"]) == 1
 
 
 def test_muon_treats_convolutions_as_matrices():
@@ -119,13 +76,6 @@ def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path):
         model.output_shape == (None, 320, 320, 35)
         and "20001" in (tmp_path / "README.md").read_text()
     )
-
-
-@pytest.mark.torture
-def test_all_proposals_are_trained_and_measured(camvid_real):
-    table = proposals.compare(camvid_real, seconds=0.1, seeds=(0,), images=8)
-    assert len(table) == 3 and (table["images seen"] > 0).all()  # CamVid is gray here
-    assert table["pixel accuracy"].between(0, 1).all() and (table["images"] == 2).all()
 
 
 def test_make_weights_requires_both_folders():
