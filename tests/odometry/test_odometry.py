@@ -386,10 +386,8 @@ def assert_same(result, expected):
 def test_many_runs_in_one_pass_give_the_bits_of_separate_runs(drive):
     bad = Changed(drive, {4: np.zeros_like(drive.frame(0))}, frames=7)
     together = odometry.run_many(bad, variants())
-    threaded = odometry.run_many(bad, variants(), workers=3)
     for name, (settings, masks) in variants().items():
         assert_same(together[name], odometry.run(bad, settings, masks))
-        assert_same(together[name], threaded[name])
     assert (together["kept"].frames["detected"].isna()).any()
     assert together["all"].frames["track_seconds"].isna().all()
 
@@ -415,7 +413,7 @@ def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypa
         "essential_matrix",
         lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1],
     )
-    together = odometry.run_many(few, runs, workers=2)
+    together = odometry.run_many(few, runs)
     assert asked == list(range(len(few))) and len(estimated) == 2 * (len(few) - 1)
     for name, (settings, masks) in runs.items():
         assert_same(together[name], odometry.run(few, settings, masks))
@@ -438,12 +436,6 @@ def test_a_killed_pass_resumes_with_the_same_bits(drive, tmp_path, monkeypatch):
     assert resumed_drive.read == [4, 5, 6, 7, 8, 9]
     for name, (settings, masks) in runs.items():
         assert_same(resumed[name], odometry.run(drive, settings, masks))
-
-
-def test_an_exception_in_a_thread_stops_the_pass(drive, monkeypatch):
-    monkeypatch.setattr(pose, "recover_pose", None)
-    with pytest.raises(TypeError):
-        odometry.run_many(drive, {"all": (THESIS, None), "reduced": (SMALL, None)}, workers=2)
 
 
 @pytest.mark.parametrize(

@@ -187,10 +187,10 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(
     runner.run(jobs, [opened], small_labels, tmp_path)
     record = runner.results.record(tmp_path / "00")
     inputs = opened, runner.by_name(small_labels)
-    elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record, 1)
+    elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record)
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
-    older = runner._run_pass(jobs, *inputs, tmp_path, record, 1)
+    older = runner._run_pass(jobs, *inputs, tmp_path, record)
     assert (
         elsewhere[jobs[0]] != older[jobs[0]] and not (tmp_path / "00" / "baseline-0.csv").exists()
     )

@@ -171,8 +171,7 @@ class Odometry:
         """Estimate the motion from the step's correspondences. Returns the essential matrix.
 
         essential: the result of another Odometry for the same correspondences. Its settings may
-        differ in `estimator` only. This method is thread-safe, because it reads no state that later
-        steps change.
+        differ in `estimator` only.
         """
         if not step.points:
             return None

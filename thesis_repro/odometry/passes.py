@@ -4,7 +4,6 @@ tracking.
 
 import time
 from collections.abc import Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -111,7 +110,7 @@ def run(
     masks: see Masks. description: text of the progress bar; None for no bar.
     Raises InputError if a frame cannot be read, or if a mask and its frame differ in size.
     """
-    return _run(sequence, {"": (settings, masks)}, None, description, None, 1)[""]
+    return _run(sequence, {"": (settings, masks)}, None, description, None)[""]
 
 
 def run_many(
@@ -119,7 +118,6 @@ def run_many(
     runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
     description: str | None = None,
     checkpoint: Path | None = None,
-    workers: int = 1,
 ) -> dict[str, Result]:
     """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}, equal
     to separate runs.
@@ -128,12 +126,11 @@ def run_many(
     detection and tracking are blank, because they cannot be measured for a single run. Runs with
     the same masks object and the same KEYPOINT_SETTINGS share masks and keypoints. Runs that differ
     only in `estimator` share essential matrices.
-    workers: number of threads for the estimators.
     checkpoint: file in which the state is stored every CHECKPOINT frames, and from which a stopped
     pass resumes. The caller deletes the file after storing the results, and uses another file for
     another sequence, other settings or other masks.
     """
-    return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint, workers)
+    return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint)
 
 
 @dataclass
@@ -145,22 +142,15 @@ class _Run:
     numbers: np.ndarray
     flags: dict[int, str] = field(default_factory=dict)
 
-
-@dataclass
-class _Estimate:
-    """Runs that share the essential matrix of one frame, one Step for each run, and the
-    estimating thread.
-    """
-
-    runs: list[_Run]
-    steps: list[Step]
-    mask_seconds: float
-    future: Future | None = None
-
-    def work(self) -> None:
-        essential = None
-        for run, step in zip(self.runs, self.steps, strict=True):
-            essential = run.odometry.estimate(step, essential)
+    def finish(self, step: Step, mask_seconds: float) -> None:
+        """Move the pose by an estimated step, and store its row."""
+        row = self.odometry.compose(step).row()
+        flag = row.pop("flag")
+        self.numbers[step.frame] = [
+            np.nan if value is None else value for value in (*row.values(), mask_seconds)
+        ]
+        if flag:
+            self.flags[step.frame] = flag
 
 
 def _run(
@@ -169,7 +159,6 @@ def _run(
     shared: keypoints.SharedKeypoints | None,
     description: str | None,
     checkpoint: Path | None,
-    workers: int,
 ) -> dict[str, Result]:
     members = {
         name: _Run(
@@ -184,42 +173,30 @@ def _run(
     leaders = [group[0][0] for group in groups]
     step_lengths = scales(sequence)
     done = _resume(checkpoint, members, leaders)
-    with ThreadPoolExecutor(workers) as pool:
-        pending: list[_Estimate] = []
-        indices: Iterable[int] = range(done, len(sequence))
-        if description is not None:
-            indices = progress(indices, description, total=len(sequence), initial=done)
-        for index in indices:
-            console.check_stop()
-            frame = sequence.frame(index)
-            if shared is not None:
-                shared.expect(
-                    frame,
-                    [(leader.odometry.previous, leader.odometry.points) for leader in leaders],
-                )
-            estimates = []
-            for leader, group in zip(leaders, groups, strict=True):
-                started = time.perf_counter()
-                mask = None if leader.masks is None else leader.masks[index]
-                mask_seconds = time.perf_counter() - started
-                step = leader.odometry.observe(frame, step_lengths[index], mask)
-                for runs_of_matrix in group:
-                    estimate = _Estimate(
-                        runs_of_matrix, [step.copy() for _ in runs_of_matrix], mask_seconds
-                    )
-                    if workers > 1:
-                        estimate.future = pool.submit(estimate.work)
-                    else:
-                        estimate.work()
-                    estimates.append(estimate)
-            # Tracking does not depend on the motion, so the estimators may run one frame behind.
-            _finish(pending)
-            pending = estimates
-            if checkpoint and (index + 1) % CHECKPOINT == 0:
-                _finish(pending)
-                pending = []
-                _store(checkpoint, index + 1, members, leaders)
-        _finish(pending)
+    indices: Iterable[int] = range(done, len(sequence))
+    if description is not None:
+        indices = progress(indices, description, total=len(sequence), initial=done)
+    for index in indices:
+        console.check_stop()
+        frame = sequence.frame(index)
+        if shared is not None:
+            shared.expect(
+                frame,
+                [(leader.odometry.previous, leader.odometry.points) for leader in leaders],
+            )
+        for leader, group in zip(leaders, groups, strict=True):
+            started = time.perf_counter()
+            mask = None if leader.masks is None else leader.masks[index]
+            mask_seconds = time.perf_counter() - started
+            observed = leader.odometry.observe(frame, step_lengths[index], mask)
+            for runs_of_matrix in group:
+                essential = None
+                for run in runs_of_matrix:
+                    step = observed.copy()
+                    essential = run.odometry.estimate(step, essential)
+                    run.finish(step, mask_seconds)
+        if checkpoint and (index + 1) % CHECKPOINT == 0:
+            _store(checkpoint, index + 1, members, leaders)
     return {
         name: _result(member, SHARED_TIMES if shared else ()) for name, member in members.items()
     }
@@ -236,22 +213,6 @@ def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
         essential_key = tuple(getattr(settings, key) for key in ESSENTIAL_SETTINGS)
         groups.setdefault(keypoint_key, {}).setdefault(essential_key, []).append(member)
     return [list(group.values()) for group in groups.values()]
-
-
-def _finish(estimates: Iterable[_Estimate]) -> None:
-    """Wait for the estimates, move the poses and store the rows."""
-    for estimate in estimates:
-        if estimate.future is not None:
-            estimate.future.result()  # raises an error of the thread here
-        for run, step in zip(estimate.runs, estimate.steps, strict=True):
-            row = run.odometry.compose(step).row()
-            flag = row.pop("flag")
-            run.numbers[step.frame] = [
-                np.nan if value is None else value
-                for value in (*row.values(), estimate.mask_seconds)
-            ]
-            if flag:
-                run.flags[step.frame] = flag
 
 
 # Checkpoints

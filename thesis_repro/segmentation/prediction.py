@@ -1,6 +1,5 @@
 """Label maps for images and whole sequences (A.7)."""
 
-from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import lru_cache
@@ -51,11 +50,10 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     """Write the label map of each image as output_dir/NAME.png: 320x320, 8 bit, Cityscapes ids
     (A.7.2).
 
-    Images of any size are stretched to the model's input, as in the appendix. Decoding and writing
-    run in parallel with the network. A killed run resumes: complete batches are skipped, and of an
-    incomplete batch all images are predicted again, because the bits depend on the batch, but only
-    missing files are written. The folder is a stage (see results): label maps of another model or
-    of other images in it are deleted.
+    Images of any size are stretched to the model's input, as in the appendix. A killed run resumes:
+    complete batches are skipped, and of an incomplete batch all images are predicted again, because
+    the bits depend on the batch, but only missing files are written. The folder is a stage (see
+    results): label maps of another model or of other images in it are deleted.
 
     Returns the number of images predicted.
     Raises InputError for an unreadable image, two images of one name, and a folder that holds files
@@ -105,33 +103,21 @@ def _write_batches(model, batches, done):
     each written batch.
     """
 
-    def decode(batch):
-        return np.stack([read_image(path, *model.input_shape[1:]) for path, _ in batch])
-
-    with ThreadPoolExecutor(2) as pool:
-        predicted = map(_compiled(model), _ahead(pool, decode, batches))
-        for count in _ahead(pool, _write, zip(batches, predicted)):
-            done(count)
-
-
-def _ahead(pool, function, items):
-    """Yield the function's result for each item, in order; the threads work two items ahead."""
-    waiting: deque = deque()
-    for item in items:
-        waiting.append(pool.submit(function, item))
-        if len(waiting) > 2:
-            yield waiting.popleft().result()
-    yield from (future.result() for future in waiting)
+    run, shape = _compiled(model), model.input_shape[1:]
+    with ThreadPoolExecutor() as pool:
+        for batch in batches:
+            images = pool.map(lambda pair: read_image(pair[0], *shape), batch)
+            label_maps = run(np.stack(list(images)))
+            list(pool.map(_write, batch, label_maps))
+            done(len(batch))
 
 
-def _write(batch):
-    pairs, labels = batch
-    for (_, target), label_map in zip(pairs, labels, strict=True):
-        if not files.is_whole(target):  # an existing file may have been corrected by hand
-            files.write_png(
-                target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
-            )
-    return len(pairs)
+def _write(pair, label_map):
+    target = pair[1]
+    if not files.is_whole(target):  # an existing file may have been corrected by hand
+        files.write_png(
+            target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
+        )
 
 
 def spread_label_maps(run, model_files, sequences, batch_size=16):

@@ -203,14 +203,17 @@ def in_passes(
     """Divide jobs into lists, each for one pass over a sequence. sequences: by name.
 
     Each of several workers gets about PIECES passes, so that all end at about the same time. Jobs
-    with the same keypoints stay in one pass, where they share most of their work. A single worker
-    gets one pass a sequence.
+    with the same keypoints stay in one pass, where they share most of their work, unless that would
+    leave workers without one. A single worker gets one pass a sequence.
     """
+    jobs = list(jobs)
+    unshared: dict[str, Any] = {"estimator": "", "repetition": 0}
+    if len({replace(job, **unshared) for job in jobs}) < workers:
+        unshared = {"estimator": ""}
     groups: dict[str, dict[Job, list[Job]]] = {}
     for job in jobs:
-        groups.setdefault(job.sequence, {}).setdefault(
-            replace(job, estimator="", repetition=0), []
-        ).append(job)
+        keypoints = replace(job, **unshared)
+        groups.setdefault(job.sequence, {}).setdefault(keypoints, []).append(job)
     total = sum(len(job_lists) * len(sequences[name]) for name, job_lists in groups.items())
     passes = []
     for name, by_keypoints in groups.items():

@@ -101,7 +101,6 @@ def _run_passes(
     failures: dict[Job, str] = {}
     with workers.open_pool(processes, scheduler) as pool:
         passes = _passes(jobs, sequences, folder, pool.size)
-        threads = -(-pool.size // max(1, len(passes)))
         calls, frames = [], []
         for pass_jobs in passes:
             sequence = sequences[pass_jobs[0].sequence]
@@ -112,7 +111,6 @@ def _run_passes(
                     sources,
                     folder,
                     results.record(folder / sequence.name),
-                    threads,
                 )
             )
             frames.append(len(pass_jobs) * len(sequence))
@@ -250,7 +248,6 @@ def _run_pass(
     sources: dict[str, Source],
     folder: Path,
     record: dict,
-    threads: int,
 ) -> dict[Job, str]:
     """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason}
     for the failed ones.
@@ -274,7 +271,6 @@ def _run_pass(
             sequence,
             {job.name: (job.settings, masks) for job, masks in masks_by_job.items()},
             checkpoint=checkpoint,
-            workers=threads,
         )
         for job in masks_by_job:
             if not result_file(folder, job).is_file():
