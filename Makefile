@@ -81,7 +81,7 @@ help:
 	@echo "make test        run the unit tests, and every notebook with PROFILE=smoke"
 	@echo "make torture     run the tests of kills, faults and bad input (some minutes)"
 	@echo "make lint        check format and style (Ruff) and types (mypy)"
-	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (one to two minutes each)"
+	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each)"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts; LABELS=/path adds label maps"
 	@echo "make trainings   after make figures: train three more networks, and compare masks from all four"

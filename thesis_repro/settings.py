@@ -94,7 +94,7 @@ PROFILES = {
         repetitions=2,
         world=_world(2, 12, 12, 4),
     ),
-    # For a course: a notebook takes one to two minutes on two cores. Three short drives show how
+    # For a course: a notebook takes up to two minutes on two cores. Three short drives show how
     # much of a difference is chance.
     "lab": Profile(
         image_size=128,
