@@ -24,7 +24,7 @@ endif
 
 # Refuse a misspelled setting, for which the default would silently be used.
 SIZES := IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
-KNOWN := KITTI LABELS CITYSCAPES CAMVID KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON GPU $(SIZES)
+KNOWN := KITTI LABELS CITYSCAPES CAMVID KITTI_SEMANTIC PSEUDO PROFILE BUILD FIGURES JOBS DASK_SCHEDULER PYTHON GPU $(SIZES)
 GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
 UNKNOWN := $(filter-out $(KNOWN) MAKEFLAGS MAKEOVERRIDES -*-%,$(GIVEN))
 ifneq (,$(UNKNOWN))
@@ -86,7 +86,7 @@ help:
 	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts; LABELS=/path adds label maps"
 	@echo "make trainings   after make figures: train three more networks, and compare masks from all four"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
-	@echo "make weights     train a model like the shipped one into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path"
+	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
 	@echo "make setup       only install the pinned packages into .venv; GPU=1 adds CUDA for an NVIDIA GPU"
 	@echo "make clean       delete .venv, build and the figures of other data and profiles"
 
@@ -231,9 +231,8 @@ trainings: setup
 	@$(BIN)/python tools/trainings.py
 
 weights: setup
-	@$(if $(CAMVID),,echo "CAMVID must name the folder of CamVid (train, trainannot, val, valannot)" >&2; exit 1)
-	@$(if $(KITTI_SEMANTIC),,echo "KITTI_SEMANTIC must name the folder of KITTI's street scenes (train, trainannot)" >&2; exit 1)
-	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" build/shipped
+	@$(foreach name,CAMVID KITTI_SEMANTIC PSEUDO,$(if $($(name)),,echo "$(name) must name a folder with train and trainannot" >&2; exit 1;))
+	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" "$(PSEUDO)" build/shipped
 
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -1,9 +1,9 @@
 """Train the model in the package and write it with its card: python tools/train_shipped.py --help.
 
-The thesis's U-Net with 16 base filters learns from CamVid, KITTI's semantic benchmark and the
-embedded world. Some pairs of KITTI are held out. The last phase runs twice from the same state:
-without the held-out pairs, which gives a twin that can be measured on them, and with all pairs,
-which gives the model. A stopped training resumes.
+The thesis's U-Net with 16 base filters learns from CamVid, KITTI's semantic benchmark, KITTI frames
+labelled by a published network, and the embedded world. Some pairs of the benchmark are held out.
+The last phase runs twice from the same state: without the held-out pairs, which gives a twin that
+can be measured on them, and with all pairs, which gives the model. A stopped training resumes.
 """
 
 import argparse
@@ -33,11 +33,12 @@ EPOCH = 100  # steps
 LEARNING_RATE, ADAM_SHARE, WEIGHT_DECAY = 0.02, 0.15, 0.004
 # indices of KITTI's pairs, in blocks because neighbours show one street
 HELD_OUT = (*range(4), *range(-3, 0))
-SHARES = {"camvid": 0.5, "kitti": 0.4, "world": 0.1}  # of a batch
+# ids that the network behind the pseudo labels predicts well; only these count in the common phase
+TRUSTED_IDS = (7, 11, 17, 21, 23, 26)
 # share shown like KITTI's camera; the rest like CamVid's
-KITTI_LOOK = {"camvid": 0.4, "kitti": 0.85, "world": 0.7}
+KITTI_LOOK = {"camvid": 0.4, "kitti": 0.85, "pseudo": 0.85, "world": 0.7}
 # focal lengths of the images as they are read, pixels
-FOCAL = {"camvid": 430, "kitti": 359, "world": 410}
+FOCAL = {"camvid": 430, "kitti": 359, "pseudo": 370, "world": 410}
 # focal lengths across and down of frames stretched to 320x320
 LOOKS = {"camvid": (289, 385), "kitti": (185, 611)}
 # a class's weight: its share of the pixels to this power, at most the limit
@@ -49,9 +50,12 @@ class Phase(NamedTuple):
     size: int  # height and width of the crops, pixels
     batch_size: int
     epochs: int
+    shares: dict  # of a batch, by source
 
 
-COMMON, LAST = Phase(160, 8, 105), Phase(320, 4, 7)  # small crops take a quarter of the time
+# small crops take a quarter of the time
+COMMON = Phase(160, 8, 55, {"camvid": 0.4, "kitti": 0.25, "pseudo": 0.25, "world": 0.1})
+LAST = Phase(320, 4, 10, {"camvid": 0.2, "kitti": 0.4, "pseudo": 0.3, "world": 0.1})
 
 LIGHT = [
     A.RandomGamma((60, 165), p=1),
@@ -117,17 +121,14 @@ class Views(training.Batches):
         return self.steps
 
     def __iter__(self):
-        random, (size, batch_size, _) = (
-            np.random.default_rng((SEED, self.phase.size, self.epoch)),
-            self.phase,
-        )
+        random = np.random.default_rng((SEED, self.phase.size, self.epoch))
+        size, batch_size, _, shares = self.phase
+        names, ends = np.array(list(shares)), np.cumsum(list(shares.values()))
         for _ in range(self.steps):
             # evenly spaced, to mix every batch
             places = (np.arange(batch_size) + random.random()) / batch_size
             pairs = []
-            for name in np.array(list(SHARES))[
-                np.searchsorted(np.cumsum(list(SHARES.values()))[:-1], places)
-            ]:
+            for name in names[np.searchsorted(ends[:-1], places)]:
                 look = "kitti" if random.random() < KITTI_LOOK[name] else "camvid"
                 image, label = self.sources[name][random.integers(len(self.sources[name]))]
                 image, label = view(image, label, name, look, size, random)
@@ -136,12 +137,12 @@ class Views(training.Batches):
             yield images, np.where(np.isin(labels, quality.EVALUATED), labels, augmentation.NOTHING)
 
 
-def class_weights(sources):
+def class_weights(sources, shares_of_batch):
     """Return the weight of each of the 35 ids in the loss: larger for rare classes, 0 for ids
     not evaluated.
     """
     shares = sum(
-        SHARES[name]
+        shares_of_batch[name]
         * np.mean(
             [np.bincount(label.ravel(), minlength=256) / label.size for _, label in pairs], axis=0
         )
@@ -175,7 +176,7 @@ def weighted_loss(weights):
     return cross_entropy_and_dice
 
 
-def train(camvid, kitti_semantic, folder, common=COMMON, last=LAST, steps=EPOCH):
+def train(camvid, kitti_semantic, pseudo, folder, common=COMMON, last=LAST, steps=EPOCH):
     """Train in a folder; return (twin, model), which share all but the last phase, and KITTI's
     held-out pairs.
     """
@@ -189,11 +190,16 @@ def train(camvid, kitti_semantic, folder, common=COMMON, last=LAST, steps=EPOCH)
     all_sources = {
         "camvid": _read(cityscapes.pairs(camvid, "train")),
         "kitti": _read(pairs),
+        "pseudo": _read(cityscapes.pairs(pseudo, "train")),
         "world": world_images,
     }
     training_sources = all_sources | {
         "kitti": _read([pair for pair in pairs if pair not in held_out])
     }
+    trusted = [
+        (image, np.where(np.isin(label, TRUSTED_IDS), label, augmentation.NOTHING))
+        for image, label in all_sources["pseudo"]
+    ]
     keras.utils.set_random_seed(SEED)
     memory.keep_freed()
     model = build_unet((None, None, 1), cityscapes.N_CLASSES, BASE_FILTERS)
@@ -204,7 +210,6 @@ def train(camvid, kitti_semantic, folder, common=COMMON, last=LAST, steps=EPOCH)
         weight_decay=WEIGHT_DECAY,
         adam_weight_decay=WEIGHT_DECAY,
     )
-    model.compile(optimizer, training.fused_loss(weighted_loss(class_weights(all_sources))))
     optimizer.build(model.trainable_variables)
     made_from = {
         "code": results.code("segmentation/unet"),
@@ -216,6 +221,8 @@ def train(camvid, kitti_semantic, folder, common=COMMON, last=LAST, steps=EPOCH)
 
     def fit(name, sources, phase, rate):
         batches = Views(sources, phase, steps)
+        loss = weighted_loss(class_weights(sources, phase.shares))
+        model.compile(optimizer, training.fused_loss(loss))
         resumable = training.ResumableTraining(
             results.stage(folder / name, **made_from), model, batches
         )
@@ -231,9 +238,10 @@ def train(camvid, kitti_semantic, folder, common=COMMON, last=LAST, steps=EPOCH)
     def cosine(epoch):
         return LEARNING_RATE * 0.5 * (1 + np.cos(np.pi * (epoch + 0.5) / last.epochs))
 
-    fit(
-        "common", training_sources, common, lambda epoch: LEARNING_RATE * (0.5 if epoch == 0 else 1)
-    )
+    def warm_up(epoch):
+        return LEARNING_RATE * (0.5 if epoch == 0 else 1)
+
+    fit("common", training_sources | {"pseudo": trusted}, common, warm_up)
     variables = model.variables + optimizer.variables
     state = [variable.numpy() for variable in variables]
     fit("twin", training_sources, last, cosine)
@@ -280,6 +288,7 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("camvid", type=Path, help="folder with train, trainannot, val and valannot")
     parser.add_argument("kitti_semantic", type=Path, help="folder with train and trainannot")
+    parser.add_argument("pseudo", type=Path, help="folder with train and trainannot")
     parser.add_argument(
         "output", type=Path, help="folder for the state of the training, the model and its card"
     )
@@ -298,7 +307,13 @@ def main(arguments=None):
             LAST._replace(epochs=options.last_epochs),
         )
         twin, model, held_out = train(
-            options.camvid, options.kitti_semantic, options.output, common, last, options.steps
+            options.camvid,
+            options.kitti_semantic,
+            options.pseudo,
+            options.output,
+            common,
+            last,
+            options.steps,
         )
         file = options.output / prediction.SHIPPED.name
         with files.atomic(file) as temporary:

@@ -62,6 +62,7 @@ def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path):
     arguments = [
         str(camvid_real),
         str(kitti_semantic),
+        str(camvid_real.parent / "kitti_pseudo"),
         str(tmp_path),
         "--epochs",
         "1",
@@ -78,8 +79,8 @@ def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path):
     )
 
 
-def test_make_weights_requires_both_folders():
-    for setting, missing in (("CAMVID=x", "KITTI_SEMANTIC"), ("KITTI_SEMANTIC=x", "CAMVID")):
+def test_make_weights_requires_all_folders():
+    for setting, missing in (("CAMVID=x", "KITTI_SEMANTIC"), ("PSEUDO=x", "CAMVID")):
         done = subprocess.run(
             ["make", "weights", setting, "-o", "setup"], cwd=ROOT, capture_output=True, text=True
         )
