@@ -63,8 +63,19 @@ def _executed(settings):
 
 def notebook_html(path, page):
     """Convert an executed notebook to HTML with a link to the page."""
-    from nbconvert import HTMLExporter  # slow to import, and seldom needed
+    import nbformat  # these are slow to import, and seldom needed
+    from latex2mathml.converter import convert
+    from nbconvert import HTMLExporter
 
+    read = nbformat.read(path, as_version=4)
+    for cell in read.cells:
+        if cell.cell_type == "markdown":  # browsers show MathML without scripts
+            cell.source = re.sub(
+                r"\$\$(.+?)\$\$",
+                lambda equation: convert(equation[1], display="block"),
+                cell.source,
+                flags=re.DOTALL,
+            )
     # nbconvert's complete pages load scripts from the network, but the basic template does not
     content, resources = HTMLExporter(
         template_name="basic",
@@ -72,7 +83,7 @@ def notebook_html(path, page):
         exclude_input_prompt=True,
         exclude_output_prompt=True,
         exclude_anchor_links=True,
-    ).from_filename(str(path))
+    ).from_notebook_node(read)
     return texts.render(
         "notebook.html.j2",
         title=path.stem,

@@ -60,7 +60,7 @@ UNITS = {
 
 METHODS = {  # in the order in which they are shown
     "baseline": "all keypoints",
-    "masked": "mask",
+    "masked": "masks",
     "exact-boundaries": "exact class boundaries",
     "corrected": "corrected mask",
     "fallback": "mask with fallback",
