@@ -38,19 +38,13 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
         assert sum(text in problem for problem in problems) == 1, text
 
 
-def test_damage_within_a_file_is_found_by_a_deep_check(tiny_kitti, tiny_cityscapes, monkeypatch):
+def test_damage_within_a_file_is_found_by_a_deep_check(tiny_kitti, tiny_cityscapes):
     frame, label = tiny_kitti / IMAGES / "000001.png", tiny_cityscapes / "trainannot/street_1.png"
     data = bytearray(frame.read_bytes())
     data[len(data) // 2] ^= 1
     frame.write_bytes(data)
     cv2.imwrite(str(label), np.full((16, 32), 200, np.uint8))
-    decoded, read = [], files._read
-    monkeypatch.setattr(
-        files, "_read", lambda path, *rest: (decoded.append(path), read(path, *rest))[1]
-    )
     assert check_kitti(tiny_kitti)[1] == check_cityscapes(tiny_cityscapes)[1] == []
-    # the first and last frame; the first and last pair of each of two splits
-    assert len(decoded) == 2 + 2 * 4
     for problems, path in (
         (check_kitti(tiny_kitti, deep=True)[1], frame),
         (check_cityscapes(tiny_cityscapes, deep=True)[1], label),

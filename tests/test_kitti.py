@@ -39,19 +39,6 @@ def test_tum_files_are_read_by_evo(tmp_path):
     assert (trajectory.orientations_quat_wxyz[:, 0] >= 0).all()
 
 
-# frames of the excerpts in ../shared/data/kitti
-REAL_FRAMES = {"00": 200, "01": 51, "02": 110, "05": 150, "06": 51, "07": 120}
-
-
-@pytest.mark.real
-def test_reads_real_sequences(kitti_real):
-    assert sequences(kitti_real) == list(REAL_FRAMES)
-    for name, count in REAL_FRAMES.items():
-        sequence = Sequence(kitti_real, name)
-        assert len(sequence) == count and sequence.frame(count - 1).shape == sequence.size
-    assert Sequence(kitti_real, "00").intrinsics[0, 0] == 718.856
-
-
 def test_sequences_with_and_without_published_poses(tiny_kitti):
     for name in ("03", "11"):
         (tiny_kitti / "sequences" / name / "image_0").mkdir(parents=True)
@@ -78,16 +65,13 @@ def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
 
 def test_the_camera_can_be_chosen(tiny_kitti):
     folder = tiny_kitti / "sequences/00"
-    (folder / "image_2").mkdir()
-    for index in range(4):
-        cv2.imwrite(
-            str(folder / f"image_2/{index:06d}.png"), np.full((48, 64, 3), (0, 0, 200), np.uint8)
-        )
-    assert Sequence(tiny_kitti, "00").frame(0).std() > 10
+    shutil.copytree(folder / "image_0", folder / "image_2")
+    assert Sequence(tiny_kitti, "00").frame_paths[0].parent.name == "image_0"
     with pytest.raises(InputError, match="calib.txt"):
         Sequence(tiny_kitti, "00", camera="image_2")
     (folder / "calib.txt").write_text("P2: 60 0 30 5 0 60 20 0 0 0 1 0\n")
-    assert abs(int(Sequence(tiny_kitti, "00", camera="image_2").frame(0)[0, 0]) - 0.299 * 200) < 2
+    colour = Sequence(tiny_kitti, "00", camera="image_2")
+    assert colour.frame_paths[0].parent.name == "image_2" and colour.intrinsics[0, 0] == 60
 
 
 def test_frames_are_ordered_by_number_and_a_missing_one_is_named(tiny_kitti):
@@ -100,9 +84,6 @@ def test_frames_are_ordered_by_number_and_a_missing_one_is_named(tiny_kitti):
     (images / "drive_11.png").rename(images / "drive_15.png")
     with pytest.raises(InputError, match="drive_11.png"):
         Sequence(tiny_kitti, "00")
-    for index, name in enumerate((8, 9, 10, 15)):  # every fifth frame of a drive has no gap
-        (images / f"drive_{name}.png").rename(images / f"drive_{100 + 5 * index}.png")
-    assert len(Sequence(tiny_kitti, "00")) == 4
 
 
 def test_without_ground_truth_steps_are_assumed(tiny_kitti):

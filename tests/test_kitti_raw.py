@@ -1,5 +1,6 @@
 """KITTI's raw drives, as they are downloaded: alone, as a folder of drives, or through a link."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -20,26 +21,16 @@ CALIBRATION = {
 
 
 @pytest.fixture
-def drive(tmp_path):
+def drive(tmp_path, tiny_kitti):
     """A drive of four frames: north by a metre a frame, then a turn of 90 degrees to the left."""
-    day, noise = (
-        tmp_path / "2011_09_26",
-        np.random.default_rng(0).integers(0, 256, (48, 80), np.uint8),
-    )
-    for name in ("oxts", "image_00", "image_02"):
-        (day / NAME / name / "data").mkdir(parents=True)
-    stamps = "".join(f"2011-09-26 23:59:59.{n}00000123\n" for n in (6, 7, 9))
+    day = tmp_path / "2011_09_26"
+    stamps = [f"2011-09-26 23:59:59.{n}00000123\n" for n in (6, 7, 9)]
     for name in ("image_00", "image_02"):
-        (day / NAME / name / "timestamps.txt").write_text(
-            f"{stamps}2011-09-27 00:00:00.000000123\n"
-        )
+        shutil.copytree(tiny_kitti / "sequences/00/image_0", day / NAME / name / "data")
+        times = "".join([*stamps, "2011-09-27 00:00:00.000000123\n"])
+        (day / NAME / name / "timestamps.txt").write_text(times)
+    (day / NAME / "oxts/data").mkdir(parents=True)
     for index in range(4):
-        left = noise[:, index : index + 64]
-        cv2.imwrite(str(day / NAME / f"image_00/data/{index:010d}.png"), left)
-        cv2.imwrite(
-            str(day / NAME / f"image_02/data/{index:010d}.png"),
-            np.full((48, 64, 3), (0, 0, 200), np.uint8),
-        )
         north, yaw = METRE * min(index, 2), np.pi / 2 * (1 + (index == 3))
         numbers = f"{north:.17g} 8.5 100 0 0 {yaw:.17g}" + " 0" * 24
         (day / NAME / f"oxts/data/{index:010d}.txt").write_text(numbers)
@@ -61,12 +52,12 @@ def test_a_drive_has_poses_times_and_cameras(drive):
     np.testing.assert_allclose(turn, [np.pi / 2, 0, 0], atol=1e-9)
     np.testing.assert_allclose(sequence.poses[3, :3, 3], [0, -1.75, 1.25], atol=1e-9)
     colour = kitti.Sequence(None, drive, camera="image_02")
-    assert colour.intrinsics[0, 0] == 60 and abs(int(colour.frame(0)[0, 0]) - 0.299 * 200) < 2
+    assert colour.intrinsics[0, 0] == 60 and colour.frame_paths[0].parts[-3] == "image_02"
     assert np.array_equal(colour.poses, sequence.poses)
     assert set(sequence.files) >= {*drive.glob("oxts/data/*"), *drive.parent.glob("calib*")}
 
 
-def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti, capsys):
+def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
     assert kitti.sequences(drive.parent) == [NAME]
     (tiny_kitti / "sequences/drive0001").symlink_to(drive)
     assert kitti.sequences(tiny_kitti) == ["00", "drive0001"]
@@ -78,8 +69,6 @@ def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti, c
         assert np.array_equal(poses, sequence.poses) and np.array_equal(times, sequence.times)
         assert check.check_kitti(root)[1] == []
     assert [folder for folder, _ in cli._image_folders(drive.parent)] == [drive]
-    assert cli.main(["odometry", "--sequence", str(drive), "--json"]) == 0
-    assert '"frames": 4' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -40,23 +40,10 @@ def test_paths_of_different_or_no_length_are_refused():
             metrics.rmse(estimated, true)
 
 
-def test_ate_by_alignment():
-    true = winding()
-    shifted = true.copy()
-    shifted[:, :3, 3] += 3, 0, 4
-    assert metrics.ate(shifted, true)["rmse"] == pytest.approx(5.0)
-    assert metrics.ate(shifted, true, "se3")["rmse"] == pytest.approx(0, abs=1e-9)
-    larger = shifted.copy()
-    larger[:, :3, 3] /= 1.25
-    similar = metrics.ate(larger, true, "sim3")
-    assert similar["rmse"] == pytest.approx(0, abs=1e-9) and similar["scale"] == pytest.approx(1.25)
-    assert metrics.rpe(ahead(5, turn=2.0), ahead(5))["rotation_median"] == pytest.approx(2.0)
-    straight = metrics.ate(ahead(5), ahead(5), "se3")  # fixes no rotation
-    assert (
-        np.isnan(straight["rmse"])
-        and straight["note"]
-        and metrics.ate(ahead(5), ahead(5))["rmse"] == 0
-    )
+def test_a_straight_path_cannot_be_aligned():
+    straight = metrics.ate(ahead(5), ahead(5), "se3")
+    assert np.isnan(straight["rmse"]) and straight["note"]
+    assert metrics.ate(ahead(5), ahead(5))["rmse"] == 0
 
 
 def test_kitti_errors_by_hand():

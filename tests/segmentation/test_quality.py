@@ -41,8 +41,6 @@ def test_quality_agrees_with_keras_and_with_a_plain_count():
     assert measured.iou_score == pytest.approx(expected["iou_score"], abs=1e-5)
     assert measured.f1_score == pytest.approx(expected["f1-score"], abs=1e-5)
     assert measured.accuracy == pytest.approx((predicted == labels).mean())
-    road = ((predicted == 7) & (labels == 7)).sum() / ((predicted == 7) | (labels == 7)).sum()
-    assert measured.classes.loc["road", "iou"] == pytest.approx(road)
     # the library counts the 31 absent classes, which are hardly predicted, as perfect
     assert measured.iou_score > measured.mean_iou + 0.3
     with pytest.raises(InputError):

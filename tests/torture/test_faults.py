@@ -113,24 +113,15 @@ def test_a_terminated_study_ends_its_workers(words, tmp_path, number):
     resumes(words, "study", tmp_path)
 
 
-def test_a_closed_pipe_is_no_error(words, tmp_path):
-    result = run(
-        ["bash", "-c", f"{shlex.join(map(str, words('odometry.txt')))} | head -1"], tmp_path
-    )
-    assert (
-        "Traceback" not in result.stderr
-        and len(result.stdout.splitlines()) == 1
-        and (tmp_path / "out.txt").exists()
-    )
-
-
-@pytest.mark.parametrize(
-    "around", ["{} >&-", "{} >&- 2>&-", "mkdir gone; cd gone; rmdir ../gone; {}"]
-)
-def test_closed_streams_and_a_deleted_folder(words, tmp_path, around):
+@pytest.mark.parametrize("around", ["{} | head -1", "{} >&-", "{} >&- 2>&-"])
+def test_closed_streams_are_no_error(words, tmp_path, around):
     command = shlex.join(map(str, words("odometry.txt")))
     result = run(["bash", "-c", around.format(command)], tmp_path)
-    deleted = "gone" in around
-    assert result.returncode == deleted and ("Traceback" not in result.stderr)
-    assert (tmp_path / "out.txt").exists() == (not deleted)
-    assert ("the working folder was deleted" in result.stderr) == deleted
+    assert result.returncode == 0 and "Traceback" not in result.stderr
+    assert (tmp_path / "out.txt").exists()
+
+
+def test_a_deleted_working_folder(words, tmp_path):
+    command = shlex.join(map(str, words("odometry.txt")))
+    lines = f"mkdir gone; cd gone; rmdir ../gone; {command}"
+    refused(run(["bash", "-c", lines], tmp_path), "working folder")

@@ -133,16 +133,18 @@ def test_make_takes_odd_folders_and_refuses_unknown_settings(tiny_kitti, tmp_pat
     assert (
         planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout
     ), planned
-    for word, named in (
-        ("EPOCHS=0", "EPOCHS=0: "),
-        ("EPOCH=3", "EPOCH: "),
-        ("KITTI=", "KITTI"),
-        ("GPU=no", "GPU=no"),
-        ("PYTHON=none", "none is no Python"),
-        ("FIGURES=a b", "FIGURES"),
-        ("DASK_SCHEDULER=mine", "mine"),
+    for target, word, named in (
+        ("figures", "EPOCHS=0", "EPOCHS=0: "),
+        ("figures", "EPOCH=3", "EPOCH: "),
+        ("figures", "KITTI=", "KITTI"),
+        ("figures", "GPU=no", "GPU=no"),
+        ("figures", "PYTHON=none", "none is no Python"),
+        ("figures", "FIGURES=a b", "FIGURES"),
+        ("figures", "DASK_SCHEDULER=mine", "mine"),
+        ("weights", f"CAMVID={odd}", "KITTI_SEMANTIC"),
+        ("weights", f"KITTI_SEMANTIC={odd}", "CAMVID"),
     ):
-        refused = make("figures", word, f"BUILD={tmp_path / 'other'}")
+        refused = make(target, word, f"BUILD={tmp_path / 'other'}")
         assert refused.returncode != 0 and not (tmp_path / "other").exists(), refused
         assert named in refused.stderr and "Traceback" not in refused.stderr, refused
 
