@@ -42,7 +42,7 @@ def table(runs, other_runs):
             _row(name, others, baseline, quality),
             _row(name, others, same, quality, f"masks of {PACKAGE}"),
         ]
-    return pd.DataFrame(rows + _of_embedded_world())
+    return pd.DataFrame(rows + _of_embedded_world()).drop_duplicates()
 
 
 def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
