@@ -23,7 +23,6 @@ from thesis_repro.settings import (
     read_widths,
     scheduler_address,
 )
-from thesis_repro.trajectories import MAX_DIFFERENCE
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
@@ -250,18 +249,14 @@ def evaluate(options):
     if options.plot and len(sequences) > 1:
         raise InputError("--plot: shows only one sequence; name it with --sequence")
     _check_outputs(options, *options.poses)
-    rows = []
+    rows, matching = [], {"offset": options.t_offset}
+    if options.t_max_diff is not None:
+        matching["max_difference"] = options.t_max_diff
     for sequence, files in sequences.items():
         truth, times = true_path(options.kitti, sequence)
         _warn(check.truth_oddities(sequence, truth, times))
         paths = {
-            name: trajectories.read(
-                file,
-                times,
-                options.frames,
-                offset=options.t_offset,
-                max_difference=options.t_max_diff,
-            )
+            name: trajectories.read(file, times, options.frames, **matching)
             for name, file in files.items()
         }
         truth = truth[: options.frames]
@@ -837,9 +832,8 @@ def build_parser():
     add(
         "--t_max_diff",
         type=float,
-        default=MAX_DIFFERENCE,
         metavar="SECONDS",
-        help=f"largest difference between the times of a pose and its frame ({MAX_DIFFERENCE:g})",
+        help="largest difference between the times of a pose and its frame (0.01)",
     )
 
     command(plan, "--kitti", kitti=REQUIRED)
