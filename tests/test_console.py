@@ -125,6 +125,8 @@ def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_that_compiled_code_loses_stops_at_the_next_frame(tiny_kitti, number):
     """Exceptions are lost in callbacks of C, as while Numba compiles."""
+    # shells start background jobs with SIGINT ignored, which `stoppable` respects
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with pytest.raises(KeyboardInterrupt), console.stoppable():
         ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
         with pytest.raises(KeyboardInterrupt):
