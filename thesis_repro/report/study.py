@@ -53,7 +53,7 @@ def write(study, runs, folder, warnings=()):
             float_format="{:g}".format,
             longtable=name != "summary",
             # narrow enough for a portrait page; long texts are broken
-            column_format=f"lr{(rows.shape[1] - 2) * 'p{18mm}'}" if name == "summary" else None,
+            column_format=f"lr{(rows.shape[1] - 2) * 'p{17mm}'}" if name == "summary" else None,
         )
         write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
     names = style.save_all(figures, numbers, folder, note)
