@@ -238,7 +238,8 @@ def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
     """On frames of the small world, given as if they were real."""
     done = make_figures(tmp_path, f"KITTI={small_world / 'kitti'}", "WIDTHS=5,10", "REPETITIONS=1")
     assert done.returncode == 0, done.stdout + done.stderr
-    (build,) = (tmp_path / "build").iterdir()  # no world is rendered
+    # no world is rendered
+    (build,) = (path for path in (tmp_path / "build").iterdir() if path.is_dir())
     assert (
         build.name.endswith("-smoke-widths-5_10-repetitions-1") and not (build / "model").exists()
     )
@@ -247,7 +248,7 @@ def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
         for path in (tmp_path / "figures" / build.name).iterdir()
         if path.suffix in (".svg", ".webp")
     }
-    left_out = {"figure_4_01", "figure_4_02", *(f"figure_3_{n:02d}" for n in range(1, 6))}
+    left_out = {"figure_4_01", "figure_4_02", *(f"figure_3_{n:02d}" for n in (1, 2, 3, 5))}
     assert set(FIGURES) - figures == left_out
 
 
