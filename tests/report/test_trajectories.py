@@ -33,19 +33,9 @@ def files(tmp_path):
     return tmp_path
 
 
-def evaluate(files, *options):
-    return main(
-        [
-            "evaluate",
-            "--kitti",
-            str(files / "kitti"),
-            "--sequence",
-            "7",
-            str(files / "good.txt"),
-            str(files / "long.txt"),
-            *map(str, options),
-        ]
-    )
+def evaluate(files, *options, names=("good.txt", "long.txt"), sequence="7"):
+    words = ["evaluate", "--kitti", files / "kitti", "--sequence", sequence]
+    return main([*map(str, words), *(str(files / name) for name in names), *map(str, options)])
 
 
 def printed_by(tool, *arguments, monkeypatch, capsys):
@@ -171,19 +161,7 @@ def test_a_doubtful_ground_truth_is_told(files, change, capsys):
     path, truth = files / "kitti/poses/07.txt", winding()
     write_kitti_poses(path, truth if change is None else change(truth).reshape(-1, 4, 4))
     write_kitti_poses(files / "good.txt", truth[: len(path.read_text().splitlines())])
-    assert (
-        main(
-            [
-                "evaluate",
-                "--kitti",
-                str(files / "kitti"),
-                "--sequence",
-                "7",
-                str(files / "good.txt"),
-            ]
-        )
-        == 0
-    )
+    assert evaluate(files, names=["good.txt"]) == 0
     assert ("warning: " in capsys.readouterr().err) == (change is not None)
 
 
@@ -236,17 +214,7 @@ def test_two_formats_of_one_name_and_means_over_other_sequences(files, capsys):
     assert main([*command, str(files / "ours"), str(files / "both")]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["sequence"] for row in rows[5:]] == ["mean of 07, 08", "mean of 07, 08, 09"]
-    assert (
-        main(
-            [
-                *command,
-                "--sequence",
-                "07",
-                *(str(files / f"good.{kind}") for kind in ("txt", "tum")),
-            ]
-        )
-        == 0
-    )
+    assert evaluate(files, "--json", names=["good.txt", "good.tum"]) == 0
     assert len({row["rmse_m"] for row in json.loads(capsys.readouterr().out)}) == 2
 
 
@@ -259,19 +227,7 @@ def test_trajectories_that_cannot_be_compared_are_named(files, capsys):
     for options, named in (([], "long.txt: 9"), (["--plot", files / "both.doc"], "both.doc")):
         assert evaluate(files, *options) == 1
         assert named in capsys.readouterr().err
-    assert (
-        main(
-            [
-                "evaluate",
-                "--kitti",
-                str(files / "kitti"),
-                "--sequence",
-                "11",
-                str(files / "good.txt"),
-            ]
-        )
-        == 1
-    )
+    assert evaluate(files, sequence="11") == 1
     assert "poses/11.txt" in capsys.readouterr().err
     with pytest.raises(InputError, match="alignment='sim'"):
         trajectories.evaluate({"good": (np.arange(160), winding())}, winding(), "sim")

@@ -24,8 +24,8 @@ from thesis_repro.settings import ROOT, read_settings
 
 PAGE, GALLERY = "index.html", "README.md"
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
-# ids of the artefacts at the top of a page
 ROWS_SHOWN = 36  # the gallery only links to longer tables
+# ids of the artefacts at the top of a page
 OPENING = ("figure_4_05", "findings", "figure-comparison", "table-summary")
 # packages that affect the numbers most
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")
