@@ -1,6 +1,7 @@
 """The planned time: it includes every notebook that runs odometry and is near the real time."""
 
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -41,6 +42,11 @@ def test_a_study_takes_about_as_long_as_planned(small_world, small_labels, tmp_p
     runner.run(study.first_jobs(), study.opened, study.sources, tmp_path / "runs")
     assert 1 / 3 < planned["steps"][0][-1] / (time.process_time() - started) < 3
     assert plan.of_study(study, tmp_path)["steps"][0][1:] == (0, "runs", 0)  # all is done
+    with_controls = replace(study, widths=(5,), tested=5)
+    folder = tmp_path / "with_controls"
+    assert plan.of_study(with_controls, folder)["steps"][0][1] > 2
+    with_controls.run(folder)
+    assert plan.of_study(with_controls, folder)["steps"][0][1] == 0
 
 
 def test_the_command_prints_a_table(small_world, small_labels, tiny_kitti, tmp_path, capsys):

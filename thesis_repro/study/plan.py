@@ -129,12 +129,15 @@ def _odometry(
     )
     start, frame = np.array(times) / len(timed_jobs)
     seconds, runs, run_frames = 0.0, 0, 0
+    later_methods = ("reduced", *jobs.KEYPOINT_CONTROLS)  # names of results begin with the method
     for sequence in sequences:
-        left = later + sum(
+        left = sum(
             not runner.result_file(folder, job).is_file()
             for job in planned
             if job.sequence == sequence.name
         )
+        made = (folder / sequence.name).rglob("*.csv")
+        left += max(0, later - sum(path.name.startswith(later_methods) for path in made))
         runs, run_frames = runs + left, run_frames + left * len(sequence)
         seconds += left * (start + len(sequence) * frame)
     return (name, runs, "runs", seconds), run_frames
