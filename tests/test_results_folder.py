@@ -119,3 +119,13 @@ def test_changed_and_foreign_files_are_not_deleted(tmp_path, capsys, named):
     results.stage(folder, size=4)
     assert not (folder / "in" / "result").exists()
     assert (str(folder) in capsys.readouterr().err) == (named != "in/result")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "frame,x\n0,1.0\n1,2", "frame,x\n0,1.0\n1,two\n", "frame,x\n0,1.0\n"]
+)
+def test_a_damaged_table_is_not_kept(tmp_path, text):
+    for content, whole in (("frame,x\n0,1.0\n1,2.0\n", True), (text, False)):
+        (tmp_path / "a.csv").write_text(content)
+        assert (results.kept_table(tmp_path / "a.csv", rows=2) is not None) == whole
+    assert results.kept_table(tmp_path / "b.csv") is None

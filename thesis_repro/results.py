@@ -25,6 +25,7 @@ from modulefinder import ModuleFinder
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from thesis_repro import InputError, console
 from thesis_repro.console import LOG, RECORD
@@ -197,6 +198,30 @@ def locked(path):
     finally:
         _held.discard(key)
         os.close(descriptor)
+
+
+TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
+
+
+def kept_table(path, rows=None, **options):
+    """Return the table that an earlier run wrote to a CSV file, or None if there is none or it is
+    damaged.
+
+    Damaged means empty, cut off, with another number of rows than `rows`, or with text outside
+    TEXT_COLUMNS.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    with suppress(ValueError, UnicodeError):  # pandas' errors are ValueErrors
+        table = pd.read_csv(path, **options)
+        numeric = all(
+            name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table
+        )
+        if numeric and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
+            return table
+    console.log.warning(f"{path}: is damaged and will be made again")
+    return None
 
 
 # Checkpoints

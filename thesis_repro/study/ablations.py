@@ -101,7 +101,7 @@ def _measure(
         model=results.made_from(labels),
     )
     path = folder / "runs.csv"
-    if not path.is_file():
+    if results.kept_table(path) is None:
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **options)
         run_results = odometry.run_many(

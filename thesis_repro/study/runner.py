@@ -68,6 +68,10 @@ def run(
     with results.claimed(folder):
         for sequence in opened.values():
             _stage(folder, sequence, sources_by_name)
+        for job, path in files.items():
+            table = results.kept_table(path, len(opened[job.sequence]))
+            if table is None or not np.isfinite(poses_of(table)).all():
+                path.unlink(missing_ok=True)  # missing results are made again
         finished = sum(path.is_file() for path in files.values())
         failures = _run_passes(jobs, opened, sources_by_name, folder, processes, scheduler)
     rows = []

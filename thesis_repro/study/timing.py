@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry
+from thesis_repro import InputError, masks, odometry, results
 from thesis_repro.files import progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.settings import cores
@@ -76,10 +76,9 @@ def time_runs(
 def _time_jobs(
     jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
 ) -> pd.DataFrame:
-    if path.is_file():
-        kept = pd.read_csv(path, dtype={"sequence": str})
-        if {job.name for job in jobs} <= set(kept["run"]):
-            return kept
+    kept = results.kept_table(path, dtype={"sequence": str})
+    if kept is not None and {job.name for job in jobs} <= set(kept["run"]):
+        return kept
     scales = odometry.scales(sequence)
     masks_by_job, _ = masks_of(jobs, sequence, sources)
     odometries = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
