@@ -69,7 +69,7 @@ export PYDEVD_DISABLE_FILE_VALIDATION := 1
 # Without bytecode files, each start of TensorFlow takes 20 s instead of 5 s (pip runs with --no-compile).
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup figures evidence trainings test torture lint lab bench weights clean check-data plan
+.PHONY: help setup figures evidence trainings test torture lint lab bench weights clean check-data
 
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data"
@@ -77,7 +77,6 @@ help:
 	@echo "                 KITTI_SEMANTIC=/path           also test the label maps on KITTI's street scenes"
 	@echo "                 PROFILE=smoke|lab|demo|thesis  size of the run (demo); single sizes: IMAGE_SIZE BASE_FILTERS"
 	@echo "                 BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS; number of processes: JOBS"
-	@echo "make plan        estimate the time and disk space of make figures KITTI=/path, with the same settings, without training"
 	@echo "make test        run the unit tests, and every notebook with PROFILE=smoke"
 	@echo "make torture     run the tests of kills, faults and bad input (some minutes)"
 	@echo "make lint        check format and style (Ruff) and types (mypy)"
@@ -191,9 +190,6 @@ $(RUN)/drives: $(filter $(RUN)/notebooks/01_%,$(EXECUTED)) $(RUN)/checked
 	@touch $@
 endif
 endif
-
-plan: setup
-	@$(BIN)/python -m thesis_repro plan $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI")
 
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $(DATA_OPTIONS)

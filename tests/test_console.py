@@ -53,23 +53,27 @@ def test_temporary_files_of_a_killed_run_are_deleted(tmp_path):
     assert [path.name for path in results.stage(other, size=3).iterdir()] == [results.RECORD]
 
 
-def test_results_are_deleted_before_their_records_and_the_log_is_kept(tmp_path, monkeypatch):
-    folder, gone = results.stage(tmp_path / "out", size=3), []
+def test_a_killed_move_of_old_results_is_finished_and_the_log_stays(tmp_path, monkeypatch):
+    folder = results.stage(tmp_path / "out", size=3)
     results.stage(folder / "in", size=3)
     for path in (folder / "result", folder / "in" / "result"):
-        files.write_text(path, "")
+        files.write_text(path, "old")
     (folder / console.LOG).touch()
-    unlink = type(folder).unlink
+    with monkeypatch.context() as patch:
+        moved, rename = [], type(folder).rename
 
-    def noted(path, **options):
-        gone.append(path.name)
-        unlink(path, **options)
+        def killed(path, target):
+            if moved:
+                raise KeyboardInterrupt
+            moved.append(rename(path, target))
 
-    monkeypatch.setattr(type(folder), "unlink", noted)
+        patch.setattr(type(folder), "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            results.stage(folder, size=4)
+    assert results.record(folder) == {"size": 3}
     results.stage(folder, size=4)
-    gone = [name for name in gone if name in ("result", results.RECORD)]
-    assert gone == ["result", "result", results.RECORD, results.RECORD]
     assert {path.name for path in folder.iterdir()} == {results.RECORD, console.LOG}
+    assert len(list(tmp_path.glob("out.old-*/**/result"))) == 2
 
 
 # as numpy raises it

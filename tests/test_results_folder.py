@@ -102,23 +102,21 @@ def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeyp
         results.listing([tmp_path / "pipe"])
 
 
-@pytest.mark.parametrize("named", ["notes.txt", "in/.env.1", "in/result", "link"])
-def test_changed_and_foreign_files_are_not_deleted(tmp_path, capsys, named):
-    folder = results.stage(tmp_path / "a", size=3)
-    files.write_text(folder / "in" / "result", "result")
-    if named == "link":
-        (folder / named).symlink_to("/nowhere")
-    else:
-        (folder / named).write_text("by hand")
-    before = {path: path.is_file() and path.read_text() for path in folder.rglob("*")}
-    results.stage(folder, size=3)
-    with pytest.raises(InputError, match=named):
-        results.stage(folder, size=4)
-    assert {path: path.is_file() and path.read_text() for path in folder.rglob("*")} == before
-    (folder / named).unlink()
-    results.stage(folder, size=4)
-    assert not (folder / "in" / "result").exists()
-    assert (str(folder) in capsys.readouterr().err) == (named != "in/result")
+def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, capsys):
+    folder = tmp_path / "a"
+    for size in (3, 4, 5):
+        results.stage(folder, size=size)
+        files.write_text(folder / "in" / "result", f"result of {size}")
+        (folder / "link").symlink_to("/nowhere")
+        (folder / ".env").write_text(f"by hand, {size}")
+    results.stage(folder, size=5)
+    for path, size in ((folder, 5), (tmp_path / "a.old-1", 3), (tmp_path / "a.old-2", 4)):
+        assert results.record(path) == {"size": size} and (path / "link").is_symlink()
+        assert (path / "in" / "result").read_text() == f"result of {size}"
+        assert (path / ".env").read_text() == f"by hand, {size}"
+    assert capsys.readouterr().err.count("a.old-2") == 1
+    results.stage(results.stage(tmp_path / "empty", size=1), size=2)
+    assert not (tmp_path / "empty.old-1").exists()
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def check_kitti(root, deep=False):
         usable += [] if sequence_problems else [name]
     for commands, names in (
         ("odometry, predict and masks", usable),
-        ("evaluate, study and plan", [name for name in usable if name in with_truth]),
+        ("evaluate and study", [name for name in usable if name in with_truth]),
     ):
         facts.append(
             f"can be run: {commands} with {', '.join(names)}"

@@ -84,17 +84,17 @@ def predict(options):
         for name, (_, paths) in zip(names, images)
     ]
     _check_outputs(
-        options, *options.images, *(paths[0].parent for paths, _ in sequences), *options.model
+        options, *options.images, *(paths[0].parent for paths, _ in sequences), options.model
     )
     with quietly():  # this import takes seconds, so the files are checked first
-        from thesis_repro.segmentation import prediction
-    model_files = options.model or [prediction.SHIPPED]
+        from thesis_repro.segmentation import prediction, training
+    model_file = options.model or prediction.SHIPPED
     with console.logged(options.folder, options.command_line) as run:
         if options.dask:
             with workers.open_pool(1, options.dask) as pool:
-                new = prediction.spread_label_maps(pool.run, model_files, sequences)
+                new = prediction.spread_label_maps(pool.run, model_file, sequences)
         else:
-            model = prediction.load(tuple(model_files))
+            model = training.load_model(model_file)
             new = sum(
                 prediction.write_label_maps(model, paths, output) for paths, output in sequences
             )
@@ -214,11 +214,6 @@ def study(options):
         options.frames,
     )
     planned.check()
-    if options.plan:
-        from thesis_repro.study import plan
-
-        _print(options, plan.of_study(planned, options.folder), "plan.txt.j2")
-        return 0
     folder = options.folder.absolute()
     _check_outputs(options, *(source.folder for source in planned.sources))
     # this import takes seconds, so the input is checked first
@@ -283,20 +278,6 @@ def evaluate(options):
         alignment=options.align,
         table=trajectories.table(rows, options.align),
     )
-
-
-def plan(options):
-    """estimate the time and disk space of make figures on this machine, without training (takes a
-    minute)
-    """
-    from thesis_repro.settings import read_settings
-    from thesis_repro.study import plan
-
-    # the sizes of the thesis, unless make's PROFILE, FRAMES and so on change them
-    settings = read_settings(
-        {"THESIS_REPRO_PROFILE": "thesis"} | os.environ | {"THESIS_REPRO_KITTI": str(options.kitti)}
-    )
-    _print(options, plan.of_thesis(options.kitti, settings.sizes, settings.build), "plan.txt.j2")
 
 
 # Helpers of several commands
@@ -404,7 +385,7 @@ def _check_outputs(options, *inputs):
     """Raise InputError, before anything runs, if an output cannot be written or would overwrite
     or mix with inputs.
     """
-    from thesis_repro.files import check_output, is_stream
+    from thesis_repro.files import check_output
 
     data = [path for path in (vars(options).get("kitti"), *inputs) if path]
     # a sequence given alone belongs to the folder above sequences/
@@ -424,8 +405,7 @@ def _check_outputs(options, *inputs):
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
         check_output(path)
-        if not is_stream(path):
-            check_outside(f"--{name} {path}", path, data)
+        check_outside(f"--{name} {path}", path, data)
         if path.resolve() in used:
             raise InputError(f"--{name} {path}: is another output of this command; name another")
         used.add(path.resolve())
@@ -433,7 +413,6 @@ def _check_outputs(options, *inputs):
 
 def _print(options, record, template, **values):
     """Print a result as JSON or with a template, and name the written files on standard error."""
-    from thesis_repro.files import is_stdout, is_stream
     from thesis_repro.report import texts
 
     text = (
@@ -442,10 +421,9 @@ def _print(options, record, template, **values):
         else texts.render(template, record=record, **values).rstrip()
     )
     outputs = _output_files(options)
-    print(text, file=sys.stderr if any(map(is_stdout, outputs.values())) else None)
+    print(text)
     for name, path in outputs.items():
-        if not is_stream(path):
-            console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
+        console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 # The parser
@@ -644,11 +622,8 @@ def build_parser():
     add(
         "--model",
         type=Path,
-        nargs="+",
-        action="extend",
-        default=[],
         metavar="FILE",
-        help="trained model (.keras, .hdf5); the outputs of several are averaged (the model in the package)",
+        help="trained model, .keras or .hdf5 (the model in the package)",
     )
 
     add = command(masks, *SEQUENCE, *MASK_OPTIONS, "--output").add_argument
@@ -788,11 +763,6 @@ def build_parser():
         help="number of processes (number of cores)",
     )
     either("--dask", **SHARED["--dask"])
-    add(
-        "--plan",
-        action="store_true",
-        help="print the estimated time and disk space, and run nothing",
-    )
 
     add = command(
         evaluate,
@@ -835,8 +805,6 @@ def build_parser():
         metavar="SECONDS",
         help="largest difference between the times of a pose and its frame (0.01)",
     )
-
-    command(plan, "--kitti", kitti=REQUIRED)
     return parser
 
 

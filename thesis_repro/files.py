@@ -1,14 +1,11 @@
 """Reading of images, atomic writing of files, and progress bars."""
 
-import hashlib
-import json
 import os
 import re
 import secrets
 import stat
 import struct
 import sys
-import tempfile
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -20,9 +17,6 @@ from tqdm.utils import ObjectWrapper
 
 from thesis_repro import InputError, console
 
-LIST = (
-    "written.log"  # in a folder of results: the files that were written there, see `files.atomic`
-)
 # matches the names that `temporary_path` returns
 TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")
 BAR_DELAY = 1  # seconds before a progress bar appears
@@ -188,21 +182,9 @@ def atomic(path):
     """Yield a temporary path; rename it to `path` when the block ends, or delete it if the block
     raises an error.
 
-    A symbolic link is kept and its target is replaced; in a folder of results, the link is. A file
-    there is added to the list of files written there (see `results.stage`). A stream (see
-    `is_stream`) gets the bytes when the block ends.
+    A symbolic link is kept and its target is replaced; in a folder of results, the link is.
     """
     path = Path(path)
-    if is_stream(path):
-        with tempfile.TemporaryDirectory() as folder:
-            temporary = Path(folder, f"output{path.suffix}")
-            yield temporary
-            if is_stdout(path):
-                sys.stdout.flush()
-                sys.stdout.buffer.write(temporary.read_bytes())
-            else:
-                path.write_bytes(temporary.read_bytes())
-        return
     target = path.resolve() if path.is_symlink() and _results_of(path) is None else path
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_path(target)
@@ -211,7 +193,6 @@ def atomic(path):
         yield temporary
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())  # otherwise a crash of the system could leave an empty file
-            _add_to_list(target, file)
         os.replace(temporary, target)
     except Exception as error:
         number, name = console.number_of(error), getattr(error, "filename", None)
@@ -228,18 +209,6 @@ def temporary_path(path):
     return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
 
 
-def _add_to_list(path, file):
-    """Add a file that is about to be renamed to `path` to the list of its folder of results, if
-    there is one.
-    """
-    folder = _results_of(path)
-    if folder is not None and path.name != console.RECORD:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-        # short appends do not mix
-        with open(folder / LIST, "a", encoding="utf-8") as written:
-            written.write(f"{digest} {json.dumps(str(path.absolute().relative_to(folder)))}\n")
-
-
 def _results_of(path):
     """Return the folder of results that a file lies in, or None."""
     return next(
@@ -247,34 +216,22 @@ def _results_of(path):
     )
 
 
-def is_stream(path):
-    """Return whether a path is a device, a pipe or an open stream, which renaming a file cannot
-    replace.
-    """
-    is_open = is_stdout(path) or str(path).startswith(("/dev/std", "/dev/fd/", "/proc/self/fd/"))
-    return is_open or path.exists() and not path.is_file() and not path.is_dir()
-
-
-def is_stdout(path):
-    """Return whether a path stands for standard output."""
-    return str(path) in ("-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1")
-
-
 def check_output(path):
-    """Raise InputError if a file cannot be written to `path`, or could be deleted later with
+    """Raise InputError if a file cannot be written to `path`, or could be moved away later with
     results around it.
     """
-    if is_stream(path):
-        return
-    path = path.resolve() if path.is_symlink() else path.absolute()
-    parent = next(folder for folder in path.parents if folder.exists())
-    if path.is_dir() or not parent.is_dir() or not os.access(parent, os.W_OK):
+    # renaming a file cannot replace a device, a pipe or an open stream
+    is_stream = str(path).startswith(("/dev/", "/proc/")) or path.name == "-"
+    folders = (path.resolve() if path.is_symlink() else path.absolute()).parents
+    parent = next(folder for folder in folders if folder.exists())
+    is_file = path.is_file() or not path.exists()
+    if is_stream or not is_file or not parent.is_dir() or not os.access(parent, os.W_OK):
         raise InputError(
             f"{path}: cannot be written; name a file in a folder that you may write to"
         )
-    if any((folder / console.RECORD).exists() for folder in path.parents):
+    if any((folder / console.RECORD).exists() for folder in folders):
         raise InputError(
-            f"{path}: is in a folder of results, with which it could be deleted; name a file elsewhere"
+            f"{path}: is in a folder of results, with which it could be moved; name a file elsewhere"
         )
 
 

@@ -294,7 +294,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
     """Write the mask of every frame as a PNG with the frame's name (A.8). `MaskFolder` reads them.
 
     The folder is a stage (see results): a stopped run resumes, and masks made from other label maps
-    or settings are deleted.
+    or settings are moved aside.
     """
     with results.claimed(folder):
         folder = results.stage(

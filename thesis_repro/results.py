@@ -1,10 +1,9 @@
 """Folders of results: which inputs they were made from, who works in them, and how a stopped job
 resumes.
 
-A *stage* is a folder of results with a record of their inputs and a list of the files written there
-(`stage`). Its lock keeps other runs out (`claimed`). A *checkpoint* is one file from which a long
-job resumes (`store`, `resume`). A *digest* stands for the content of an input and has twelve
-hexadecimal digits.
+A *stage* is a folder of results with a record of their inputs (`stage`). Its lock keeps other runs
+out (`claimed`). A *checkpoint* is one file from which a long job resumes (`store`, `resume`). A
+*digest* stands for the content of an input and has twelve hexadecimal digits.
 """
 
 import ast
@@ -17,7 +16,6 @@ import sqlite3
 import stat
 import time
 import zipfile
-from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
@@ -29,7 +27,7 @@ import pandas as pd
 
 from thesis_repro import InputError, console
 from thesis_repro.console import LOG, RECORD
-from thesis_repro.files import LIST, TEMPORARY, atomic, progress, write_text
+from thesis_repro.files import TEMPORARY, atomic, progress, write_text
 
 _PACKAGE = Path(__file__).parent
 
@@ -38,18 +36,15 @@ def stage(folder, *, replace=True, **inputs):
     """Prepare a folder for results that are made from `inputs` (JSON values), and return its path.
 
     Results that an earlier run made from the same inputs stay. Temporary files of killed runs are
-    deleted. Results of other inputs are deleted after a message, or InputError is raised if
-    `replace` is False. Raises InputError also if another run uses the folder, if most of its inputs
-    have other names (results of another kind), and if a file that would be deleted is not on the
-    list of files written there or was changed since.
+    deleted. Results of other inputs are moved to a new folder beside it, FOLDER.old-1, or
+    InputError is raised if `replace` is False. Raises InputError also if another run uses the
+    folder, and if most of its inputs have other names (results of another kind).
     """
     folder = Path(folder)
     with claimed(folder):
         inputs, earlier = json.loads(json.dumps(inputs, default=str)), record(folder)
         names = [path.name for path in folder.iterdir()]
-        if earlier is None and not all(
-            name in (LOG, LIST) or TEMPORARY.fullmatch(name) for name in names
-        ):
+        if earlier is None and not all(name == LOG or TEMPORARY.fullmatch(name) for name in names):
             raise InputError(
                 f"{folder}: holds files that this project did not make; choose an empty or new folder"
             )
@@ -66,44 +61,29 @@ def stage(folder, *, replace=True, **inputs):
                     f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
                     "choose another folder"
                 )
-            _delete_results(folder, changed)
+            _move_aside(folder, changed)
         sweep(folder)
         if earlier != inputs:
             write_text(folder / RECORD, json.dumps(inputs, indent=1, sort_keys=True))
     return folder
 
 
-def _delete_results(folder, changed):
-    """Delete the results in a folder, unless one of its files is not on the list or was changed
-    since.
+def _move_aside(folder, changed):
+    """Move all that is in a folder of results into a new folder beside it. Nothing is deleted,
+    because a user may have changed or added files.
     """
-    written, results, records = defaultdict(set), [], []  # written: digests by path
-    for path in folder.rglob(LIST):
-        for line in path.read_text(encoding="utf-8").splitlines():
-            with suppress(ValueError):  # a kill may cut off a line
-                digest, name = line.split(" ", 1)
-                written[path.parent / json.loads(name)].add(digest)
-    for path in (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()):
-        if path.name in (RECORD, LIST):
-            records.append(path)
-        elif path.name != LOG and not TEMPORARY.fullmatch(path.name):
-            if path.is_symlink() or path not in written or _sha256(path) not in written[path]:
-                raise InputError(
-                    f"{folder}: cannot delete its results, made with another {changed}: {path} was not "
-                    "written by this project, or was changed since; move it away, or name another folder"
-                )
-            results.append(path)
-    if results:
-        console.log.info(f"{folder}: deleting {len(results):,} files, made with another {changed}")
-    # the folder's record goes last, so that a killed deletion can be repeated
-    for path in (
-        *results,
-        *sorted(records, key=lambda path: (-len(path.parts), path.name == RECORD)),
-    ):
-        path.unlink()
-        with suppress(OSError):  # the folder is not empty yet
-            path.parent.rmdir()
-    folder.mkdir(exist_ok=True)
+    # the record goes last, so that a killed move can be repeated; the log is being written
+    paths = sorted(folder.glob("*"), key=lambda path: path.name == RECORD)
+    paths = [path for path in paths if path.name != LOG]
+    if len(paths) < 2:  # there is only the record
+        return
+    number = 1
+    while (aside := folder.with_name(f"{folder.name}.old-{number}")).exists():
+        number += 1
+    aside.mkdir()
+    for path in paths:
+        path.rename(aside / path.name)
+    console.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
 
 
 def record(folder):

@@ -81,10 +81,9 @@ def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(
             yield index, function(*calls[index])
 
     model.save(tmp_path / "model.keras")
-    prediction.load.cache_clear()
     monkeypatch.setattr(prediction, "PART", 4)
     sequences = [(frames, tmp_path / "spread" / "00"), (frames[:5], tmp_path / "spread" / "01")]
-    arguments = run, [tmp_path / "model.keras"], sequences, 2
+    arguments = run, tmp_path / "model.keras", sequences, 2
     assert prediction.spread_label_maps(*arguments) == len(frames) + 5
     for paths, folder in sequences:
         alone = tmp_path / "alone" / folder.name
@@ -103,7 +102,7 @@ def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(
 @pytest.mark.parametrize(
     "answer",
     [
-        lambda write, folder, call: write((folder / "other.keras",), *call[1:]),
+        lambda write, folder, call: write(folder / "other.keras", *call[1:]),
         lambda write, folder, call: write(call[0], folder / "elsewhere", *call[2:]),
         lambda *_: "the worker died",
     ],
@@ -118,7 +117,7 @@ def test_workers_that_see_other_files_or_die_write_nothing(model, frames, tmp_pa
     untrained(2).save(tmp_path / "other.keras")
     sequences = [(frames[:3], tmp_path / "out")]
     with pytest.raises(InputError):
-        prediction.spread_label_maps(run, [tmp_path / "model.keras"], sequences)
+        prediction.spread_label_maps(run, tmp_path / "model.keras", sequences)
     assert contents(tmp_path / "out") == {}
 
 
@@ -143,21 +142,6 @@ def test_colour_input(tmp_path):
         cityscapes.read_label_map(tmp_path / "out" / "street.png")[::5, ::5], expected
     )
     assert not np.array_equal(expected, prediction.predict(model, picture[None, ..., ::-1])[0])
-
-
-def test_an_ensemble_predicts_from_the_mean_probability(model, tmp_path):
-    members = [model, model, untrained(2)]
-    mean = np.mean(
-        [member.predict(IMAGES.astype(np.float32), verbose=0) for member in members], axis=0
-    )
-
-    labels = prediction.predict(prediction.ensemble(members), IMAGES)
-    assert (labels == mean.argmax(-1)).mean() > 0.9999
-    assert not np.array_equal(labels, prediction.predict(members[0], IMAGES))
-    model.save(tmp_path / "a.keras")
-    untrained(1, size=32).save(tmp_path / "b.keras")
-    with pytest.raises(InputError, match="b.keras"):
-        prediction.load((tmp_path / "a.keras", tmp_path / "b.keras"))
 
 
 def test_the_shipped_model_is_the_thesiss_network_and_recognises_streets(kitti_real, tmp_path):

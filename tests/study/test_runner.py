@@ -92,7 +92,7 @@ def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(
         assert set(runner.run(jobs, opened(small_world), small_labels, tmp_path)["sequence"]) == {
             "00"
         }
-    assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".log", ".npz"}
+    assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".npz"}
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
     read.clear()
     # jobs with a checkpoint resume in their old passes

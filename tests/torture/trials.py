@@ -139,7 +139,7 @@ def contents(folder):
     return {
         str(path.relative_to(folder)): sha256(_content(path)).hexdigest()
         for path in Path(folder).rglob("*")
-        if path.is_file() and path.name not in (console.LOG, files.LIST)
+        if path.is_file() and path.name != console.LOG
     }
 
 

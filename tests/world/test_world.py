@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thesis_repro import InputError, cityscapes, files, kitti
+from thesis_repro import InputError, cityscapes, kitti
 from thesis_repro.cityscapes import ID
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.settings import PROFILES
@@ -33,7 +33,7 @@ def contents(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != files.LIST
+        if path.is_file()
     }  # the list's order depends on the run
 
 

@@ -6,7 +6,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import cv2
-import keras
 import numpy as np
 import tensorflow as tf
 
@@ -53,7 +52,7 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     Images of any size are stretched to the model's input, as in the appendix. A killed run resumes:
     complete batches are skipped, and of an incomplete batch all images are predicted again, because
     the bits depend on the batch, but only missing files are written. The folder is a stage (see
-    results): label maps of another model or of other images in it are deleted.
+    results): label maps of another model or of other images in it are moved aside.
 
     Returns the number of images predicted.
     Raises InputError for an unreadable image, two images of one name, and a folder that holds files
@@ -120,23 +119,23 @@ def _write(pair, label_map):
         )
 
 
-def spread_label_maps(run, model_files, sequences, batch_size=16):
+def spread_label_maps(run, model_file, sequences, batch_size=16):
     """Write the label maps of many sequences on many workers; processors of one kind give
     `write_label_maps`' bits.
 
     run: function of (function, list of argument tuples), like `run` of the pools in
     `study.workers`. It calls the function on the workers and yields (index, returned value or
     reason why the worker was lost).
-    model_files: files of one model, or of several for the mean of their probabilities (`ensemble`).
-    sequences: list of (image paths, folder).
+    model_file: of the model. sequences: list of (image paths, folder).
     Workers need this package and must see all files under the same paths. A stopped run resumes.
 
     Returns the number of images predicted.
     Raises InputError in the cases of `write_label_maps`, after all other label maps have been
     written.
     """
-    model_files = tuple(str(Path(path).absolute()) for path in model_files)
-    weights, calls, missing, failures = training.weights_digest(load(model_files)), [], 0, []
+    model_file = Path(model_file).absolute()
+    weights = training.weights_digest(training.load_model(model_file))
+    calls, missing, failures = [], 0, []
     total, step = sum(len(paths) for paths, _ in sequences), max(1, PART // batch_size)
     with ExitStack() as held:
         for paths, folder in sequences:
@@ -145,7 +144,7 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
             missing += sum(map(len, batches))
             calls += [
                 (
-                    model_files,
+                    model_file,
                     Path(folder).absolute(),
                     results.record(folder),
                     batches[start : start + step],
@@ -165,46 +164,17 @@ def spread_label_maps(run, model_files, sequences, batch_size=16):
     return missing
 
 
-@lru_cache(maxsize=1)
-def load(model_files):
-    """Return the model of one file, or the ensemble of several; model_files: tuple of paths. The
-    result is cached.
-
-    Raises InputError for models of different input shapes.
-    """
-    models = [training.load_model(path) for path in model_files]
-    for path, model in zip(model_files, models):
-        if model.input_shape != models[0].input_shape:
-            raise InputError(
-                f"{path}: takes images of {model.input_shape[1:]}, {model_files[0]} of "
-                f"{models[0].input_shape[1:]}; an ensemble needs models of one input size"
-            )
-    return models[0] if len(models) == 1 else ensemble(models)
+# a worker predicts many parts with one model
+_load_once = lru_cache(maxsize=1)(training.load_model)
 
 
-def ensemble(models):
-    """Return one model whose probabilities are the mean of those of several models with the
-    same shapes.
-    """
-    inputs = keras.Input(models[0].input_shape[1:])
-    outputs = []
-    for number, model in enumerate(models):
-        # copied, because names must be unique even if a model is given twice; the loss cannot be
-        # copied
-        member = keras.models.clone_model(keras.Model(model.input, model.output))
-        member.set_weights(model.get_weights())
-        member.name = f"member_{number}"
-        outputs.append(member(inputs))
-    return keras.Model(inputs, keras.layers.Average()(outputs), name="ensemble")
-
-
-def _write_part(model_files, folder, record, batches):
+def _write_part(model_file, folder, record, batches):
     """Write some batches of a sequence, here or on another machine; return the reason of a
     failure, or None.
     """
     try:
         results.check_worker(folder, record)
-        model = load(model_files)
+        model = _load_once(model_file)
         results.check_worker(folder, record, model=training.weights_digest(model), **_arithmetic())
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # the other parts continue, and the caller reports the reason

@@ -48,7 +48,7 @@ def run(
 
     sequences: those of the jobs. sources: folder with one folder of label maps a sequence, or the
     sources of the jobs.
-    folder: for the results; results from other data, code or mask settings in it are deleted.
+    folder: for the results; results from other data, code or mask settings in it are moved aside.
     processes: number of processes on this machine.
     scheduler: address of a Dask scheduler ("tcp://host:8786"), whose workers then do the work with
     the same results. They need this package, and the three folders under the same paths. One thread
@@ -150,9 +150,9 @@ def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
 
 
 def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None:
-    """Delete the results of a sequence that were made from other data, code or settings.
+    """Move aside the results of a sequence that were made from other data, code or settings.
 
-    Each source has a subfolder, so a change of one source does not delete the runs of other
+    Each source has a subfolder, so a change of one source does not move the runs of other
     sources.
     """
     if not sequence.has_truth:

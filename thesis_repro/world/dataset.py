@@ -124,7 +124,7 @@ def write(
     sequences: names among 00 to 10; frames: frames of each sequence, None for its whole drive (41
     to 132); scale: of KITTI's image size, and of 1024x512 for the training images; jobs: number of
     processes, -1 for one a core.
-    replace: delete an embedded world of other parameters first; other files are never deleted. A
+    replace: move an embedded world of other parameters aside first (see `results.stage`). A
     complete world of the same parameters is kept.
     only: "kitti" or "cityscapes", to write one of the two.
     Returns (number of pictures rendered, number of pictures in total).
