@@ -8,7 +8,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from thesis_repro.cli import build_parser, main
+from thesis_repro import cli
+from thesis_repro.cli import main
+from thesis_repro.options import build_parser
 from thesis_repro.trajectories import read_poses
 
 
@@ -16,7 +18,8 @@ def run(command, *options):
     return main([command, *map(str, options)])
 
 
-COMMANDS = next(action for action in build_parser()._actions if action.dest == "command").choices
+PARSER = build_parser(cli.COMMANDS)
+COMMANDS = next(action for action in PARSER._actions if action.dest == "command").choices
 
 
 def test_the_console_script_prints_the_version():
@@ -32,10 +35,8 @@ def test_the_console_script_prints_the_version():
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_shows_two_valid_examples_and_takes_no_abbreviations(name):
     examples = [shlex.split(line) for line in COMMANDS[name].epilog.splitlines()[1:]]
-    assert (
-        len(examples) == 2 and not COMMANDS[name].allow_abbrev and not build_parser().allow_abbrev
-    )
-    assert [build_parser().parse_args(words).command for _, *words in examples] == [name, name]
+    assert len(examples) == 2 and not COMMANDS[name].allow_abbrev and not PARSER.allow_abbrev
+    assert [PARSER.parse_args(words).command for _, *words in examples] == [name, name]
 
 
 def test_forms_of_widths_and_frames():
@@ -44,12 +45,10 @@ def test_forms_of_widths_and_frames():
         (["5", "10"], {5, 10}),
         (["1-2", "4"], {1, 2, 4}),
     ):
-        options = build_parser().parse_args(
-            ["study", "--kitti", "a", "--output", "b", "--widths", *words]
-        )
+        options = PARSER.parse_args(["study", "--kitti", "a", "--output", "b", "--widths", *words])
         assert set().union(*options.widths) == widths
     for text, frames in (("all", None), ("40", 40)):
-        assert build_parser().parse_args(["evaluate", "a.txt", "--frames", text]).frames == frames
+        assert PARSER.parse_args(["evaluate", "a.txt", "--frames", text]).frames == frames
 
 
 def test_written_masks_give_the_same_path_as_label_maps(small_world, small_labels, tmp_path):

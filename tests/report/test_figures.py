@@ -9,7 +9,7 @@ from drawn import problems
 from matplotlib.text import Text
 
 from thesis_repro.cityscapes import ID, LABELS
-from thesis_repro.report import chapter2, flicker, frames, style, trajectories
+from thesis_repro.report import chapter2, chapter3, chapter4, flicker, style, trajectories
 
 
 def texts(figure):
@@ -70,23 +70,23 @@ DRAWN = {
     "2.12": lambda: chapter2.figure_2_12(
         FRAME, POINTS, LABEL_MAP, POINTS, ("frame 0", "its label map")
     ),
-    "3.3": lambda: frames.figure_3_03(FRAME, LABEL_MAP, np.roll(LABEL_MAP, 9), LABELS[ID["car"]]),
-    "3.6": lambda: frames.figure_3_06(FRAME, LABEL_MAP, MASK, MASK, 10),
-    "masks": lambda: frames.figure_masks(
+    "3.3": lambda: chapter3.figure_3_03(FRAME, LABEL_MAP, np.roll(LABEL_MAP, 9), LABELS[ID["car"]]),
+    "3.6": lambda: chapter3.figure_3_06(FRAME, LABEL_MAP, MASK, MASK, 10),
+    "masks": lambda: chapter3.figure_masks(
         FRAME, dict.fromkeys("abc", MASK), dict.fromkeys("abc", POINTS), MASK
     ),
-    "4.2": lambda: frames.figure_4_02(
+    "4.2": lambda: chapter4.figure_4_02(
         FRAME[:, :120], LABEL_MAP[:, :120], LABEL_MAP[:, 100:220], "this model"
     ),
-    "4.3": lambda: frames.figure_4_03(
+    "4.3": lambda: chapter4.figure_4_03(
         FRAME, LABEL_MAP[::2, ::3], "sequence 00, frame 0", LABEL_MAP
     ),
-    "4.4": lambda: frames.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
-    "4.5": lambda: frames.figure_4_05(FRAME, POINTS, LABEL_MAP, MASK, POINTS, 10, "sequence 00"),
-    "4.8": lambda: frames.figure_4_08(
+    "4.4": lambda: chapter4.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
+    "4.5": lambda: chapter4.figure_4_05(FRAME, POINTS, LABEL_MAP, MASK, POINTS, 10, "sequence 00"),
+    "4.8": lambda: chapter4.figure_4_08(
         flicker.follow([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"
     ),
-    "4.8 without keypoints": lambda: frames.figure_4_08(
+    "4.8 without keypoints": lambda: chapter4.figure_4_08(
         flicker.follow([FRAME] * 2, [BLANK] * 2, 5), "00"
     ),
     "paths": lambda: trajectories.figure(
@@ -115,7 +115,9 @@ def test_the_iou_figure_shows_areas_and_their_ratio():
     label_map, prediction = (np.full((20, 20), ID["road"], np.uint8) for _ in range(2))
     # 200 and 300 pixels, one inside the other
     label_map[:10], prediction[:15] = ID["car"], ID["car"]
-    shown = " ".join(texts(frames.figure_3_03(label_map, label_map, prediction, LABELS[ID["car"]])))
+    shown = " ".join(
+        texts(chapter3.figure_3_03(label_map, label_map, prediction, LABELS[ID["car"]]))
+    )
     assert all(number in shown for number in ("200 / 300", "0.67", "200 pixels", "300 pixels"))
 
 

@@ -1,5 +1,5 @@
-"""Figures 4.6, 4.7 and 4.9 to 4.16: errors in metres, and keypoints. comparison.py shows ratios of
-errors.
+"""Figures 4.2 to 4.16: single frames, errors in metres, and keypoints. comparison.py shows ratios
+of errors.
 
 `runs` is the table of `runner.run`. Lines and bars show the mean over repetitions, or the only run.
 Bands and error bars go from the lowest to the highest repetition.
@@ -7,10 +7,22 @@ Bands and error bars go from the lowest to the highest repetition.
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
+from thesis_repro.cityscapes import colorize
 from thesis_repro.odometry import THESIS
 from thesis_repro.report import style
-from thesis_repro.report.style import BASELINE, MASKED, PAGE_WIDTH, REDUCED, TRUTH
+from thesis_repro.report.style import (
+    BASELINE,
+    EDGE_COLOR,
+    KEYPOINT,
+    MASKED,
+    PAGE_WIDTH,
+    PINK,
+    REDUCED,
+    TRUTH,
+)
 from thesis_repro.study import compare, thesis_tables
 
 METHODS = {
@@ -19,6 +31,103 @@ METHODS = {
     "reduced": ("plainly reduced", REDUCED, "\\\\"),
 }
 BAND = "lowest to highest of the repetitions"
+
+
+def figure_4_02(image, label_map, prediction, model_name):
+    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction
+    (Section 4.1).
+    """
+    figure, axes = style.new_figure(1, 3, height=2.5)
+    style.show_image(axes[0], image, "image")
+    style.show_image(axes[1], colorize(label_map), "label map")
+    style.show_image(axes[2], colorize(prediction), f"prediction of\n{model_name}")
+    style.class_legend(figure, label_map, prediction)
+    return figure
+
+
+def figure_4_03(frame, prediction, title, label_map=None):
+    """Figure 4.3: a KITTI frame, its predicted label map at the network's size, and its true
+    label map if known.
+    """
+    label_maps = {"prediction": prediction} | (
+        {} if label_map is None else {"true label map": label_map}
+    )
+    pictures = {
+        text: style.label_colors(label_map, frame) for text, label_map in label_maps.items()
+    }
+    return style.pictures(frame, {title: frame} | pictures, label_maps=label_maps.values())
+
+
+def figure_4_04(frame, edge_image, keypoints, title):
+    """Figure 4.4: the keypoints, (n, 2) pixels, that the mask keeps along the predicted
+    boundaries.
+    """
+    figure, (axes,) = style.frame_panels(frame)
+    brighter = np.clip(230 * (frame / max(np.percentile(frame, 98), 1)) ** 0.6, 0, 255).astype(
+        np.uint8
+    )
+    style.show_image(axes, style.with_edges(brighter, edge_image), title)
+    axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
+    return figure
+
+
+def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation_width, title):
+    """Figure 4.5: the procedure in five panels: frame, all keypoints, prediction, dilated
+    edges, kept keypoints.
+    """
+    all_title = f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints"
+    kept_title = f"(e) the {len(kept_keypoints)} keypoints that the mask keeps"
+    return style.pictures(
+        frame,
+        {
+            f"(a) {title}": frame,
+            all_title: frame,
+            "(c) prediction": style.label_colors(prediction, frame),
+            f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask,
+            kept_title: frame,
+        },
+        {all_title: all_keypoints, kept_title: kept_keypoints},
+        label_maps=[prediction],
+    )
+
+
+def figure_4_08(views, title):
+    """Figure 4.8: one place in consecutive frames, where keypoints jump. views: from
+    `flicker.follow`.
+    """
+    figure, axes = style.new_figure(1, len(views), height=3.4)
+    for panel, view in zip(axes, views, strict=True):
+        height, width = view.crop.shape
+        text = f"frame {view.frame}: {len(view.keypoints)} keypoints"
+        if view.expected is not None:
+            text += f";\n{view.jumped} of {len(view.expected)} rings without a keypoint"
+            panel.scatter(
+                *view.expected.T, s=34, facecolors="none", edgecolors=PINK, linewidths=1.1
+            )
+        style.show_image(panel, style.with_edges(view.crop, view.edges), text)
+        panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
+        # a circle at the border would widen the panel
+        panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    marker = {"linestyle": "none", "marker": "o"}
+    figure.legend(
+        handles=[
+            Patch(color=np.array(EDGE_COLOR) / 255, label="edges of the predicted label map"),
+            Line2D([], [], **marker, markersize=4, color=KEYPOINT["color"], label="keypoints"),
+            Line2D(
+                [],
+                [],
+                **marker,
+                markersize=6,
+                markerfacecolor="none",
+                color=PINK,
+                label="where keypoints of the frame before are now",
+            ),
+        ],
+        loc="outside lower center",
+        ncols=3,
+    )
+    figure.suptitle(title, fontsize=9)
+    return figure
 
 
 def figure_paths(truths, rows, paths, method):

@@ -88,6 +88,29 @@ def show_image(axes, image, title, **options):
     axes.set_axis_off()
 
 
+def pictures(frame, pictures, keypoints=(), columns=1, label_maps=()):
+    """Show pictures {title: picture} of a frame's shape, with keypoints {title: (n, 2)} and a
+    legend of label maps.
+    """
+    figure, axes = frame_panels(frame, -(-len(pictures) // columns), columns)
+    for panel, (title, picture) in zip(axes, pictures.items()):
+        show_image(panel, picture, title)
+        if title in keypoints:
+            panel.scatter(*keypoints[title].T, **KEYPOINT)
+    for panel in axes[len(pictures) :]:
+        panel.set_axis_off()
+    if label_maps:
+        class_legend(figure, *label_maps)
+    return figure
+
+
+def with_edges(frame, edge_image):
+    """Return a gray frame as red, green, blue, with edges marked where `edge_image` is not 0."""
+    picture = np.dstack([frame] * 3)
+    picture[edge_image > 0] = EDGE_COLOR
+    return picture
+
+
 def small_panels(names, xlabel="", figure=None):
     """Return (figure, panels), one small panel for each name, at most four in a row.
 
