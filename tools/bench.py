@@ -12,11 +12,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
@@ -31,13 +29,10 @@ from thesis_repro.files import write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
 from thesis_repro.study import controls, timing
-from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.sources import Source
 
 REPEATS = 3
 WIDTHS = range(1, 17)  # dilation widths in pixels; with all keypoints, 17 runs
-CORES = 2  # for `chain_rate`
-CAMERA = 10.0  # frames a second of KITTI's camera
 FIRST_USE = "from thesis_repro.odometry import odometry; odometry.warm_up(refined=True)"
 
 
@@ -163,39 +158,6 @@ def compile_cost():
         return [seconds(work, clock) for _ in range(2)]
 
 
-def chain_rate(sequence):
-    """Return the frames a second from image file to masked pose on CORES cores, measured in a
-    new process.
-    """
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        return pool.submit(_chain, sequence).result()
-
-
-def _chain(sequence):
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
-    from thesis_repro.segmentation import prediction
-
-    model, metres = prediction.load_shipped(), odometry.scales(sequence)
-
-    def prepare(index):
-        frame = sequence.frame(index)
-        image = cv2.resize(frame, (prediction.SIZE,) * 2)[None, ..., None]
-        return frame, masks.keypoint_mask(
-            prediction.predict(model, image)[0], frame.shape, CONTROL_WIDTH
-        )
-
-    def drive(frames):
-        follower = Odometry(sequence.intrinsics)
-        # reads and segments frames while the odometry works
-        with ThreadPoolExecutor(CORES) as pool:
-            for index, (frame, mask) in enumerate(pool.map(prepare, range(frames))):
-                follower.step(frame, metres[index], mask)
-
-    drive(3)  # loads the compiled code
-    return len(sequence) / seconds(partial(drive, len(sequence)))
-
-
 def measure(sequence):
     """Return a table with a row for each measurement, its reference and their ratio."""
     from thesis_repro.segmentation import prediction
@@ -237,12 +199,6 @@ def measure(sequence):
                 "one by one",
             )
     add("first use, compiling", "s", compile_cost(), "second use")
-    add(
-        f"from file to masked pose, {CORES} cores",
-        "frames/s",
-        (chain_rate(sequence), CAMERA),
-        "KITTI's camera",
-    )
     return pd.DataFrame(rows)
 
 
