@@ -24,7 +24,7 @@ def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
     return {
         method: controls.masks(method, Source(small_labels), sequence, WIDTH)
-        for method in controls.MASKS
+        for method in controls.MASK_CONTROLS
     } | {"masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
 
 
@@ -106,7 +106,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 ):
     opened = [Sequence(small_world / "kitti", "00").subset(5)]
     jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
-    assert {job.dilation_width for job in jobs if job.method in controls.MASKS} == {5}
+    assert {job.dilation_width for job in jobs if job.method in controls.MASK_CONTROLS} == {5}
     runs = runner.run(jobs, opened, small_labels, tmp_path)
     left = compare.keypoints_left(runs)
     masked = compare.of_method(runs, "masked")

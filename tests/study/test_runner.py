@@ -184,6 +184,8 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
     assert count["ready", "masked", "refined"] == 2
     assert rows.loc[rows["source"] == "ready", "dilation_width"].isna().all()
     net, ready_made = (set(rows.loc[rows["source"] == name, "method"]) for name in ("net", "ready"))
-    assert net == {"masked", *controls.MASKS} and net - ready_made == set(controls.OF_LABEL_MAPS)
+    assert net == {"masked", *controls.MASK_CONTROLS} and net - ready_made == set(
+        controls.OF_LABEL_MAPS
+    )
     without_truth = first_jobs([Sequence(tiny_kitti, "00")], {"thesis": (5,)}, tested=5)
     assert "true-labels" not in {job.method for job in without_truth}

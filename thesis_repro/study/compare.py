@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from thesis_repro.odometry.metrics import RELATIVE_LENGTH
-from thesis_repro.study.controls import MASKS
+from thesis_repro.study.controls import MASK_CONTROLS
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
 # The compared errors and their names in tables. The judging metrics decide (see
@@ -353,7 +353,9 @@ def tested_width(runs: pd.DataFrame) -> int | None:
     masked = runs.loc[runs["method"] == "masked", "dilation_width"]
     if len(masked) and masked.isna().all():
         return None
-    control_widths = runs.loc[runs["method"].isin(MASKS), "dilation_width"].dropna().unique()
+    control_widths = (
+        runs.loc[runs["method"].isin(MASK_CONTROLS), "dilation_width"].dropna().unique()
+    )
     widths = control_widths if len(control_widths) else masked.unique()
     return int(widths[0]) if len(widths) == 1 else CONTROL_WIDTH
 

@@ -141,14 +141,14 @@ OF_MASKS = {
 LITERATURE = ("static", "inverse", "static-boundaries")
 OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
 # "fallback" is a setting of the odometry, with the same masks
-MASKS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)
+MASK_CONTROLS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)
 
 
 def masks(
     method: str, source: Source, sequence: Sequence, dilation_width: int | None
 ) -> ControlMasks:
-    """Return the masks of a sequence for a method: "masked" or one of MASKS, a control of the masks
-    of `source`.
+    """Return the masks of a sequence for a method: "masked" or one of MASK_CONTROLS, a control of
+    the masks of `source`.
 
     dilation_width: pixels, for masks from label maps.
     """

@@ -124,7 +124,7 @@ def first_jobs(
                 jobs += _repeated(
                     [Job(name, "masked", width, source=source.name)], estimators, repetitions
                 )
-            for method in controls.MASKS if tested else ():
+            for method in controls.MASK_CONTROLS if tested else ():
                 if method in controls.OF_LABEL_MAPS and not has_widths:
                     continue
                 if (
