@@ -86,7 +86,7 @@ SHARED = {
         help="run on the workers of a Dask scheduler, tcp://host:8786, with the same results",
     ),
 }
-SEQUENCE, REQUIRED = ("--kitti", "--sequence", "--camera", "--frames"), {"required": True}
+SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
 WIDTHS = dict(type=_setting(read_widths), nargs="+", action="extend", metavar="W")
 MASK_OPTIONS = {
     "--boundaries": dict(
@@ -128,6 +128,189 @@ MASK_OPTIONS = {
 }
 
 
+def _shared(*names):
+    return {name: SHARED[name] for name in names}
+
+
+def _source(kind, content):
+    """Return the arguments of an option that adds a source of masks to a study."""
+    return dict(
+        dest="sources",
+        action="append",
+        metavar="DIR",
+        type=lambda text: (kind, _path(text)),
+        help=f"folder with a subfolder NN for each sequence ({content}); can be repeated",
+    )
+
+
+# the arguments of `add_argument` for each option of each command
+COMMANDS = {
+    "synthesize": {
+        "out": dict(
+            type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
+        ),
+        "--profile": dict(choices=tuple(PROFILES), default="demo", help="size of the world (demo)"),
+    },
+    "check-data": {
+        **_shared("--kitti", "--cityscapes"),
+        "--kitti-semantic": dict(
+            type=Path, metavar="ROOT", help="folder of KITTI's street scenes: train/, trainannot/"
+        ),
+        "--deep": dict(
+            action="store_true",
+            help="decode every file, on all cores, not only check its header and end",
+        ),
+    },
+    "predict": {
+        **_shared("--frames", "--dask", "--output"),
+        "--images": dict(
+            type=Path,
+            nargs="+",
+            action="extend",
+            required=True,
+            metavar="DIR",
+            help="folder of PNG or JPEG images, one sequence, or a folder of sequences; several get a subfolder each",
+        ),
+        "--model": dict(
+            type=Path,
+            metavar="FILE",
+            help="trained model, .keras or .hdf5 (the model in the package)",
+        ),
+    },
+    "masks": {
+        **_shared(*SEQUENCE),
+        **MASK_OPTIONS,
+        **_shared("--output"),
+        "--labels": dict(
+            type=Path,
+            required=True,
+            metavar="DIR",
+            help="a label map for each frame, or a folder of them for each sequence",
+        ),
+        "--dilation": dict(
+            **WIDTHS, help="in pixels, such as 5,10 or 1-15; several get a subfolder each"
+        ),
+    },
+    "odometry": {
+        **_shared(*SEQUENCE),
+        **MASK_OPTIONS,
+        **_shared("--invert", "--plot", "--json"),
+        "--speed": dict(
+            type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
+        ),
+        "--masks": dict(
+            type=Path,
+            metavar="DIR",
+            help="a mask for each frame or one for all: 255 keep, 0 ignore; or a folder for each sequence",
+        ),
+        "--labels": dict(
+            type=Path,
+            metavar="DIR",
+            help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
+        ),
+        "--dilation": dict(
+            type=int, metavar="W", help="dilation width, in pixels, of masks from label maps"
+        ),
+        "--estimator": dict(
+            metavar="thesis|inliers|refined",
+            help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+        ),
+        "--detector": dict(
+            metavar="shi-tomasi|orb",
+            help="keypoint detector; the tracker stays the same (shi-tomasi)",
+        ),
+        "--fallback": dict(
+            action="store_true", default=None, help="use all keypoints where masked ones fail"
+        ),
+        "--max-keypoints": dict(
+            type=int, metavar="N", help="maximum number of keypoints in a frame (2000)"
+        ),
+        "--output": dict(
+            type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
+        ),
+        "--tum": dict(type=Path, metavar="FILE", help="write the estimated poses in TUM format"),
+        "--video": dict(
+            type=Path,
+            metavar="OUT.webm",
+            help="write a video of the frames, the keypoints and the path",
+        ),
+    },
+    "study": {
+        "--kitti": SHARED["--kitti"] | {"required": True},
+        **_shared("--sequences", "--frames", "--invert"),
+        **MASK_OPTIONS,
+        **_shared("--output"),
+        "--labels": _source("labels", "label maps, any size"),
+        "--masks": _source("masks", "masks, 255 keeps keypoints, 0 ignores them"),
+        "--name": dict(
+            action="append",
+            default=[],
+            metavar="NAME",
+            help="name of a --labels or --masks folder (its name)",
+        ),
+        "--widths": dict(
+            **WIDTHS,
+            help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",
+        ),
+        "--controls": dict(
+            type=int,
+            nargs="?",
+            const=10,
+            metavar="W",
+            help="run controls, too, for masks of width W (10)",
+        ),
+        "--repetitions": dict(
+            type=int, default=5, metavar="N", help="shuffles of the matched points for each run (5)"
+        ),
+        "--estimator": dict(
+            nargs="+",
+            choices=("thesis", "refined"),
+            default=["thesis"],
+            help="one or both (thesis)",
+        ),
+        "--jobs": dict(
+            type=_setting(partial(number, "JOBS")),
+            metavar="N",
+            help="number of processes (number of cores)",
+        ),
+        **_shared("--dask"),
+    },
+    "evaluate": {
+        **_shared("--kitti"),
+        "--sequence": dict(
+            metavar="NN", help="sequence of the files; of folders, evaluate only this sequence"
+        ),
+        **_shared("--frames", "--plot", "--json"),
+        "poses": dict(
+            type=Path,
+            nargs="+",
+            metavar="FILE_OR_DIR",
+            help="trajectory in KITTI format (a line for each frame) or TUM format (matched by time, "
+            "keyframes suffice), or folder with NN.txt or NN.tum for each sequence, which also gets a mean",
+        ),
+        "--align": dict(
+            choices=("none", "se3", "sim3", "scale"),
+            default="none",
+            help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
+        ),
+        # named as evo's options
+        "--t_offset": dict(
+            type=float,
+            default=0.0,
+            metavar="SECONDS",
+            help="add this to the times of files in TUM format, such as ROS's (0)",
+        ),
+        "--t_max_diff": dict(
+            type=float,
+            metavar="SECONDS",
+            help="largest difference between the times of a pose and its frame (0.01)",
+        ),
+    },
+}
+# of these options, only one may be given
+EXCLUSIVE = {"odometry": ("--masks", "--labels"), "study": ("--jobs", "--dask")}
+
+
 def build_parser(functions):
     """Return the parser. functions: of the commands, by name; their docstrings are the help."""
     parser = _Parser(
@@ -144,17 +327,13 @@ def build_parser(functions):
         .read_text(encoding="utf-8")
         .splitlines()
     )
-
-    def command(name, *shared, **changes):
-        """Add the parser of a command with options of SHARED and MASK_OPTIONS. changes: arguments
-        that differ, by option.
-        """
-        function = functions[name]
+    for name, function in functions.items():
+        # python -OO leaves docstrings out
+        description = " ".join((function.__doc__ or "").split())
         sub = commands.add_parser(
             name,
-            help=function.__doc__,
-            # python -OO leaves docstrings out
-            description=textwrap.fill(function.__doc__ or "", 80),
+            help=description,
+            description=textwrap.fill(description, 80),
             epilog="\n".join(
                 [
                     "examples:",
@@ -164,227 +343,10 @@ def build_parser(functions):
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         sub.set_defaults(function=function)
+        exclusive = sub.add_mutually_exclusive_group() if name in EXCLUSIVE else sub
         mask_options = sub.add_argument_group("how masks are made from label maps")
-        for name in shared:
-            group = mask_options if name in MASK_OPTIONS else sub
-            group.add_argument(
-                name, **(SHARED | MASK_OPTIONS)[name] | changes.get(name.strip("-"), {})
-            )
-        return sub
-
-    add = command("synthesize").add_argument
-    add(
-        "out", type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
-    )
-    add("--profile", choices=tuple(PROFILES), default="demo", help="size of the world (demo)")
-
-    add = command("check-data", "--kitti", "--cityscapes").add_argument
-    add(
-        "--kitti-semantic",
-        type=Path,
-        metavar="ROOT",
-        help="folder of KITTI's street scenes: train/, trainannot/",
-    )
-    add(
-        "--deep",
-        action="store_true",
-        help="decode every file, on all cores, not only check its header and end",
-    )
-
-    add = command("predict", "--frames", "--dask", "--output").add_argument
-    add(
-        "--images",
-        type=Path,
-        nargs="+",
-        action="extend",
-        required=True,
-        metavar="DIR",
-        help="folder of PNG or JPEG images, one sequence, or a folder of sequences; several get a subfolder each",
-    )
-    add(
-        "--model",
-        type=Path,
-        metavar="FILE",
-        help="trained model, .keras or .hdf5 (the model in the package)",
-    )
-
-    add = command("masks", *SEQUENCE, *MASK_OPTIONS, "--output").add_argument
-    add(
-        "--labels",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="a label map for each frame, or a folder of them for each sequence",
-    )
-    add(
-        "--dilation",
-        **WIDTHS,
-        help="in pixels, such as 5,10 or 1-15; several get a subfolder each",
-    )
-
-    sub = command("odometry", *SEQUENCE, *MASK_OPTIONS, "--invert", "--plot", "--json")
-    add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
-    add(
-        "--speed",
-        type=float,
-        metavar="M_PER_S",
-        help="speed, if there is no ground truth (1 m a frame)",
-    )
-    either(
-        "--masks",
-        type=Path,
-        metavar="DIR",
-        help="a mask for each frame or one for all: 255 keep, 0 ignore; or a folder for each sequence",
-    )
-    either(
-        "--labels",
-        type=Path,
-        metavar="DIR",
-        help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
-    )
-    add(
-        "--dilation",
-        type=int,
-        metavar="W",
-        help="dilation width, in pixels, of masks from label maps",
-    )
-    add(
-        "--estimator",
-        metavar="thesis|inliers|refined",
-        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
-    )
-    add(
-        "--detector",
-        metavar="shi-tomasi|orb",
-        help="keypoint detector; the tracker stays the same (shi-tomasi)",
-    )
-    add(
-        "--fallback",
-        action="store_true",
-        default=None,
-        help="use all keypoints where masked ones fail",
-    )
-    add(
-        "--max-keypoints",
-        type=int,
-        metavar="N",
-        help="maximum number of keypoints in a frame (2000)",
-    )
-    add(
-        "--output", type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
-    )
-    add("--tum", type=Path, metavar="FILE", help="write the estimated poses in TUM format")
-    add(
-        "--video",
-        type=Path,
-        metavar="OUT.webm",
-        help="write a video of the frames, the keypoints and the path",
-    )
-
-    sub = command(
-        "study",
-        "--kitti",
-        "--sequences",
-        "--frames",
-        "--invert",
-        *MASK_OPTIONS,
-        "--output",
-        kitti=REQUIRED,
-    )
-    add, either = sub.add_argument, sub.add_mutually_exclusive_group().add_argument
-    for kind, content in (
-        ("labels", "label maps, any size"),
-        ("masks", "masks, 255 keeps keypoints, 0 ignores them"),
-    ):
-        add(
-            f"--{kind}",
-            dest="sources",
-            action="append",
-            metavar="DIR",
-            type=lambda text, kind=kind: (kind, _path(text)),
-            help=f"folder with a subfolder NN for each sequence ({content}); can be repeated",
-        )
-    add(
-        "--name",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="name of a --labels or --masks folder (its name)",
-    )
-    add(
-        "--widths",
-        **WIDTHS,
-        help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",
-    )
-    add(
-        "--controls",
-        type=int,
-        nargs="?",
-        const=10,
-        metavar="W",
-        help="run controls, too, for masks of width W (10)",
-    )
-    add(
-        "--repetitions",
-        type=int,
-        default=5,
-        metavar="N",
-        help="shuffles of the matched points for each run (5)",
-    )
-    add(
-        "--estimator",
-        nargs="+",
-        choices=("thesis", "refined"),
-        default=["thesis"],
-        help="one or both (thesis)",
-    )
-    either(
-        "--jobs",
-        type=_setting(partial(number, "JOBS")),
-        metavar="N",
-        help="number of processes (number of cores)",
-    )
-    either("--dask", **SHARED["--dask"])
-
-    add = command(
-        "evaluate",
-        "--kitti",
-        "--sequence",
-        "--frames",
-        "--plot",
-        "--json",
-        sequence={
-            "required": False,
-            "help": "sequence of the files; of folders, evaluate only this sequence",
-        },
-    ).add_argument
-    add(
-        "poses",
-        type=Path,
-        nargs="+",
-        metavar="FILE_OR_DIR",
-        help="trajectory in KITTI format (a line for each frame) or TUM format (matched by time, keyframes suffice), "
-        "or folder with NN.txt or NN.tum for each sequence, which also gets a mean",
-    )
-    add(
-        "--align",
-        choices=("none", "se3", "sim3", "scale"),
-        default="none",
-        help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
-    )
-
-    # named as evo's options
-    add(
-        "--t_offset",
-        type=float,
-        default=0.0,
-        metavar="SECONDS",
-        help="add this to the times of files in TUM format, such as ROS's (0)",
-    )
-    add(
-        "--t_max_diff",
-        type=float,
-        metavar="SECONDS",
-        help="largest difference between the times of a pose and its frame (0.01)",
-    )
+        for option, arguments in COMMANDS[name].items():
+            is_exclusive = option in EXCLUSIVE.get(name, ())
+            group = mask_options if option in MASK_OPTIONS else exclusive if is_exclusive else sub
+            group.add_argument(option, **arguments)
     return parser
