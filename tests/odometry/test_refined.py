@@ -4,6 +4,7 @@ prior.
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -201,6 +202,31 @@ def test_on_a_plain_drive_the_fit_has_no_flags_and_its_errors_are_smaller_and_va
         errors[estimator] = [metrics.rmse(result.poses, drive.poses) for result in results]
     assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
     assert np.std(errors["refined"]) < 0.5 * np.std(errors["inliers"])
+
+
+@pytest.mark.parametrize("estimator", ["thesis", "refined"])
+@pytest.mark.parametrize(
+    "axis, degrees, zoom, flag",
+    [
+        ("X", 0.3, 1.0, "no parallax"),
+        ("Y", 0.2, 1.0, "no parallax"),
+        ("Y", -1.5, 1.0, "no parallax"),
+        ("Z", 2.0, 1.0, "no parallax"),
+        ("Z", 0.0, 1.005, "zoom"),
+        ("Z", 0.0, 0.97, "zoom"),
+        ("Y", 0.5, 1.01, "zoom"),
+    ],
+)
+def test_a_camera_that_only_turns_or_zooms_is_flagged(estimator, axis, degrees, zoom, flag):
+    drive = Street(1)
+    rotation = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    camera = drive.intrinsics @ np.diag([zoom, zoom, 1])
+    warp = camera @ rotation @ np.linalg.inv(drive.intrinsics)
+    moved = cv2.warpPerspective(drive.frame(0), warp, (480, 160), borderMode=cv2.BORDER_REFLECT)
+    follower = Odometry(drive.intrinsics, replace(THESIS, estimator=estimator))
+    follower.step(drive.frame(0))
+    step = follower.step(moved, 0.5)
+    assert step.updated and {"no parallax", "zoom"} & set(step.flags) == {flag}
 
 
 @pytest.mark.real
