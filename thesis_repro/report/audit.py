@@ -8,6 +8,7 @@ measurements to the rows. Ratios come from `study.compare`. Intervals are those 
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,29 +24,31 @@ TEXTS = ["quantity", "metric", "estimator", "unit", "data"]
 NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
 
 
-def measurement(row, quantity, values, unit="", **more):
+def measurement(
+    row: str, quantity: str, values: Any, unit: str = "", **more: Any
+) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the mean of one or several values, its
     interval and their number.
 
     quantity: a text, or the key of one in audit.json. more: further columns (metric, estimator,
     frames, data).
     """
-    values = np.asarray(values, float).ravel()
-    values = values[~np.isnan(values)]
-    low, high = compare.mean_interval(values)
+    numbers = np.asarray(values, float).ravel()
+    numbers = numbers[~np.isnan(numbers)]
+    low, high = compare.mean_interval(numbers)
     return {
         "row": row,
         "quantity": WORDS["quantities"].get(quantity, quantity),
         "unit": unit,
-        "value": values.mean() if len(values) else np.nan,
+        "value": numbers.mean() if len(numbers) else np.nan,
         "low": low,
         "high": high,
-        "n": len(values),
+        "n": len(numbers),
         **more,
     }
 
 
-def ratio(row, quantity, ratios, **more):
+def ratio(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the geometric mean of one ratio a sequence."""
     mean = compare.geometric_mean(ratios)
     return measurement(
@@ -61,7 +64,7 @@ def ratio(row, quantity, ratios, **more):
     )
 
 
-def table(measurements, data="this run"):
+def table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
     """Return the audit as a table with one line a measurement. The first line of each row has the
     row's texts.
 
@@ -89,14 +92,14 @@ def table(measurements, data="this run"):
     return lines.astype({"n": "Int64", "frames": "Int64"})
 
 
-def rounded(value):
+def rounded(value: float) -> float:
     """Round a number to four significant digits, or to eight close to 1, to show whether an
     interval excludes 1.
     """
     return float(f"{value:.{8 if abs(value - 1) < 5e-4 else 4}g}")
 
 
-def measured(table, kind):
+def measured(table: pd.DataFrame, kind: str) -> list[dict[str, Any]]:
     """Return the measurements that audit.json lists for one kind of table.
 
     Where audit.json gives a unit, they are means over sequences. Otherwise they are ratios to a
@@ -143,7 +146,9 @@ def measured(table, kind):
     return _with_frames(measurements, table)
 
 
-def _select(table, estimator, method, widths):
+def _select(
+    table: pd.DataFrame, estimator: str, method: str | None, widths: str | list | None
+) -> pd.DataFrame:
     """Select the rows of an estimator, a method and some widths; an empty estimator, or None,
     selects all.
     """
@@ -157,7 +162,7 @@ def _select(table, estimator, method, widths):
     return table if method is None else table[table["method"] == method]
 
 
-def _with_frames(measurements, table):
+def _with_frames(measurements: list[dict[str, Any]], table: pd.DataFrame) -> list[dict[str, Any]]:
     """Add the table's mean number of frames a sequence, if known, and drop measurements without
     values.
     """
@@ -169,7 +174,7 @@ def _with_frames(measurements, table):
     return [{**measurement, "frames": frames} for measurement in measurements if measurement["n"]]
 
 
-def of_tables():
+def of_tables() -> list[dict[str, Any]]:
     """Return rows 1, 3, 4, 9, 18, 35, 41, 45, 60, 66, 69, 78 and 89: arithmetic on numbers that the
     thesis reports.
     """
@@ -208,7 +213,7 @@ def of_tables():
     return [{**measurement, "data": "the thesis's numbers"} for measurement in measurements]
 
 
-def of_study(runs):
+def of_study(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Return rows 2, 31, 35 and those that audit.json lists, from the runs of notebook 08."""
     masked, baseline = (compare.of_method(runs, method) for method in ("masked", "baseline"))
     best, stability = (
@@ -230,7 +235,7 @@ def of_study(runs):
     return _with_frames(measurements, runs) + measured(runs, "study")
 
 
-def of_ablations(runs):
+def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Return rows 14 and 39, and the rows that audit.json lists, from the runs of
     `ablations.measure`.
     """

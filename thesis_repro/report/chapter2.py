@@ -4,6 +4,8 @@ Cells of the notebooks draw diagrams and plots of one formula or table (2.1, 2.3
 4.1, 4.17, A.1).
 """
 
+from typing import Any
+
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
@@ -16,7 +18,14 @@ from thesis_repro.report import style
 from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 
-def figure_2_02(patch, kernel, bias, feature_map, activated, pixel):
+def figure_2_02(
+    patch: np.ndarray,
+    kernel: np.ndarray,
+    bias: float,
+    feature_map: np.ndarray,
+    activated: np.ndarray,
+    pixel: tuple[int, int],
+) -> plt.Figure:
     """Figure 2.2 and Equation 2.1: a kernel of the trained network's first layer on a patch of its
     input.
 
@@ -65,7 +74,7 @@ UNET_PARTS = {
 }
 
 
-def figure_2_07(model):
+def figure_2_07(model: Any) -> plt.Figure:
     """Figure 2.7: the U-Net, one box a stage. Its height shows the image size, its width the number
     of channels.
 
@@ -74,7 +83,8 @@ def figure_2_07(model):
     figure, axes = style.new_figure(height=4.0)
     axes.set_axis_off()
     # boxes: the left, right and middle height of each layer's box
-    x, boxes, previous = 0.0, {}, None
+    boxes: dict[str, tuple[float, float, float]] = {}
+    x, previous = 0.0, None
     for layer in model.layers:
         kind = "output" if layer is model.layers[-1] else type(layer).__name__
         if kind not in UNET_PARTS:
@@ -104,7 +114,7 @@ def figure_2_07(model):
         previous = boxes[layer.name] = x, x + width, y
         x += width + 0.32
     axes.autoscale_view()
-    handles = [Patch(color=color, label=text) for text, color in UNET_PARTS.values()]
+    handles: list[Any] = [Patch(color=color, label=text) for text, color in UNET_PARTS.values()]
     handles.append(
         Line2D([], [], color="#777777", marker=">", markersize=5, label="skip connection")
     )
@@ -112,7 +122,7 @@ def figure_2_07(model):
     return figure
 
 
-def figure_2_08(poses, title):
+def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
     """Figure 2.8: camera poses C of a sequence from above, and the motions T between them
     (Equations 2.2, 2.3).
 
@@ -160,7 +170,7 @@ def figure_2_08(poses, title):
     return figure
 
 
-def figure_2_09(first, second, title):
+def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure:
     """Figure 2.9: the 60 ORB matches of smallest descriptor distance between two frames, each
     (height, width).
     """
@@ -195,7 +205,14 @@ def figure_2_09(first, second, title):
     return figure
 
 
-def figure_2_11(first, second, kept, lost, new, titles):
+def figure_2_11(
+    first: np.ndarray,
+    second: np.ndarray,
+    kept: tuple[np.ndarray, np.ndarray],
+    lost: np.ndarray,
+    new: np.ndarray,
+    titles: list[str],
+) -> plt.Figure:
     """Figure 2.11: one scene from two viewpoints, with the keypoints that both frames have (see
     `found_again`), and those of one frame only.
 
@@ -228,7 +245,13 @@ def figure_2_11(first, second, kept, lost, new, titles):
     return figure
 
 
-def figure_2_12(frame, frame_keypoints, label_map, label_keypoints, titles):
+def figure_2_12(
+    frame: np.ndarray,
+    frame_keypoints: np.ndarray,
+    label_map: np.ndarray,
+    label_keypoints: np.ndarray,
+    titles: tuple[str, str],
+) -> plt.Figure:
     """Figure 2.12: a frame, its Shi-Tomasi keypoints, and the Shi-Tomasi keypoints of its label
     map, with counts.
     """
@@ -245,12 +268,14 @@ def figure_2_12(frame, frame_keypoints, label_map, label_keypoints, titles):
     return figure
 
 
-def _arrow(axes, start, end, color, **options):
+def _arrow(axes: plt.Axes, start: Any, end: Any, color: str, **options: Any) -> None:
     properties = {"arrowstyle": "-|>", "color": color, "linewidth": 0.9} | options
     axes.annotate("", end, start, zorder=0, arrowprops=properties)
 
 
-def show_numbers(axes, values, title, form, colors=None):
+def show_numbers(
+    axes: plt.Axes, values: np.ndarray, title: str, form: str, colors: np.ndarray | None = None
+) -> None:
     """Show an array as a table of numbers, on given colors (h, w, 4) or on a color scale whose
     middle is zero.
     """

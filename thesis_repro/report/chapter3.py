@@ -2,14 +2,18 @@
 
 import numpy as np
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from thesis_repro.cityscapes import Label
 from thesis_repro.masks import dilate
 from thesis_repro.report import style
 from thesis_repro.report.style import BLUE, ORANGE, SKY
 
 
-def figure_3_03(image, label_map, prediction, label):
+def figure_3_03(
+    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, label: Label
+) -> Figure:
     """Figure 3.3: intersection and union of a prediction and its label map for one class (Equation
     3.1).
 
@@ -46,7 +50,13 @@ def figure_3_03(image, label_map, prediction, label):
     return figure
 
 
-def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
+def figure_3_06(
+    frame: np.ndarray,
+    label_map: np.ndarray,
+    edge_image: np.ndarray,
+    mask: np.ndarray,
+    dilation_width: int,
+) -> Figure:
     """Figure 3.6: a frame, its predicted label map, the Canny edges of the label map, and the
     edges dilated.
     """
@@ -64,7 +74,12 @@ def figure_3_06(frame, label_map, edge_image, mask, dilation_width):
     )
 
 
-def figure_masks(frame, masks, keypoints, true_edges=None):
+def figure_masks(
+    frame: np.ndarray,
+    masks: dict[str, np.ndarray],
+    keypoints: dict[str, np.ndarray],
+    true_edges: np.ndarray | None = None,
+) -> Figure:
     """Figure "masks": one frame with several masks. The kept area is light; true boundaries are
     drawn on it.
 

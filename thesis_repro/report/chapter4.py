@@ -5,14 +5,18 @@ of errors.
 Bands and error bars go from the lowest to the highest repetition.
 """
 
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from thesis_repro.cityscapes import colorize
 from thesis_repro.odometry import THESIS
 from thesis_repro.report import style
+from thesis_repro.report.flicker import View
 from thesis_repro.report.style import (
     BASELINE,
     EDGE_COLOR,
@@ -33,7 +37,9 @@ METHODS = {
 BAND = "lowest to highest of the repetitions"
 
 
-def figure_4_02(image, label_map, prediction, model_name):
+def figure_4_02(
+    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, model_name: str
+) -> plt.Figure:
     """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction
     (Section 4.1).
     """
@@ -45,7 +51,9 @@ def figure_4_02(image, label_map, prediction, model_name):
     return figure
 
 
-def figure_4_03(frame, prediction, title, label_map=None):
+def figure_4_03(
+    frame: np.ndarray, prediction: np.ndarray, title: str, label_map: np.ndarray | None = None
+) -> plt.Figure:
     """Figure 4.3: a KITTI frame, its predicted label map at the network's size, and its true
     label map if known.
     """
@@ -58,7 +66,9 @@ def figure_4_03(frame, prediction, title, label_map=None):
     return style.pictures(frame, {title: frame} | pictures, label_maps=label_maps.values())
 
 
-def figure_4_04(frame, edge_image, keypoints, title):
+def figure_4_04(
+    frame: np.ndarray, edge_image: np.ndarray, keypoints: np.ndarray, title: str
+) -> plt.Figure:
     """Figure 4.4: the keypoints, (n, 2) pixels, that the mask keeps along the predicted
     boundaries.
     """
@@ -71,7 +81,15 @@ def figure_4_04(frame, edge_image, keypoints, title):
     return figure
 
 
-def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation_width, title):
+def figure_4_05(
+    frame: np.ndarray,
+    all_keypoints: np.ndarray,
+    prediction: np.ndarray,
+    mask: np.ndarray,
+    kept_keypoints: np.ndarray,
+    dilation_width: int,
+    title: str,
+) -> plt.Figure:
     """Figure 4.5: the procedure in five panels: frame, all keypoints, prediction, dilated
     edges, kept keypoints.
     """
@@ -91,7 +109,7 @@ def figure_4_05(frame, all_keypoints, prediction, mask, kept_keypoints, dilation
     )
 
 
-def figure_4_08(views, title):
+def figure_4_08(views: list[View], title: str) -> plt.Figure:
     """Figure 4.8: one place in consecutive frames, where keypoints jump. views: from
     `flicker.follow`.
     """
@@ -108,10 +126,12 @@ def figure_4_08(views, title):
         panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
         # a circle at the border would widen the panel
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    marker = {"linestyle": "none", "marker": "o"}
+    marker: dict[str, Any] = {"linestyle": "none", "marker": "o"}
     figure.legend(
         handles=[
-            Patch(color=np.array(EDGE_COLOR) / 255, label="edges of the predicted label map"),
+            Patch(
+                color=tuple(np.array(EDGE_COLOR) / 255), label="edges of the predicted label map"
+            ),
             Line2D([], [], **marker, markersize=4, color=KEYPOINT["color"], label="keypoints"),
             Line2D(
                 [],
@@ -130,7 +150,12 @@ def figure_4_08(views, title):
     return figure
 
 
-def figure_paths(truths, rows, paths, method):
+def figure_paths(
+    truths: dict[str, np.ndarray],
+    rows: pd.DataFrame,
+    paths: dict[tuple[str, str], np.ndarray],
+    method: str,
+) -> plt.Figure:
     """Figures 4.6, 4.11, 4.12: the paths from above, and below each path its distance to the ground
     truth.
 
@@ -195,7 +220,7 @@ def figure_paths(truths, rows, paths, method):
     return figure
 
 
-def figure_4_07(runs):
+def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
     """Figure 4.7: the keypoints that masks keep, as a part of the thesis's 2000, against
     dilation width.
     """
@@ -215,7 +240,7 @@ def figure_4_07(runs):
     return figure
 
 
-def figure_against_width(runs, metric):
+def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     """Figures 4.9, 4.10: the metric against dilation width, one line a sequence.
 
     Below, one panel a sequence has a bar at each width that was repeated, and the band of the
@@ -226,7 +251,8 @@ def figure_against_width(runs, metric):
     names = sorted(masked["sequence"].unique())
     label = f"{metric.upper()} (m)"
     rows = -(-len(names) // 4)
-    figure = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
+    # Any, because subfigures may also return a single one
+    figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
     _lines(axes, masked.groupby(["sequence", "dilation_width"])[metric].mean().unstack())
@@ -275,7 +301,7 @@ def figure_against_width(runs, metric):
     return figure
 
 
-def figure_of_methods(runs, metric):
+def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
     """Figures 4.13, 4.15: the metric with all keypoints, the best mask and plainly reduced
     keypoints, all sequences.
     """
@@ -290,7 +316,7 @@ def figure_of_methods(runs, metric):
     return figure
 
 
-def figure_of_sequences(runs, metric):
+def figure_of_sequences(runs: pd.DataFrame, metric: str) -> plt.Figure:
     """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel with a scale of its own
     for each sequence.
     """
@@ -306,7 +332,7 @@ def figure_of_sequences(runs, metric):
     return figure
 
 
-def _lines(axes, table):
+def _lines(axes: plt.Axes, table: pd.DataFrame) -> None:
     """Draw one line for each row of a table with one column for each dilation width."""
     for index, (name, row) in enumerate(table.iterrows()):
         axes.plot(row.index, row, marker="o", markersize=2.5, label=name, **style.line_style(index))
@@ -314,7 +340,7 @@ def _lines(axes, table):
     axes.legend(title="sequence", loc="center left", bbox_to_anchor=(1, 0.5))
 
 
-def _spread_by_method(runs, metric):
+def _spread_by_method(runs: pd.DataFrame, metric: str) -> tuple[list[str], dict[str, pd.DataFrame]]:
     """Return the sequences and, for each method of the thesis, a table (mean, lowest, highest)
     with one row each.
     """
@@ -327,7 +353,13 @@ def _spread_by_method(runs, metric):
     return names, {method: table.reindex(names) for method, table in tables.items()}
 
 
-def _bar(axes, positions, table, width, method):
+def _bar(
+    axes: plt.Axes,
+    positions: np.ndarray | list[int],
+    table: pd.DataFrame,
+    width: float,
+    method: str,
+) -> None:
     """Draw bars at the means of a table, with error bars from lowest to highest of the
     repetitions.
     """

@@ -4,9 +4,11 @@ from other sources.
 
 import textwrap
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from thesis_repro.report import style, texts
 from thesis_repro.report.style import BASELINE, MASKED
@@ -17,7 +19,7 @@ SHOWN = (*compare.JUDGING_METRICS, "rmse")
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
 
 
-def figure_comparison(table):
+def figure_comparison(table: pd.DataFrame) -> Figure:
     """Draw each method's ratio to all keypoints: its sequences in grey, geometric mean and
     interval.
 
@@ -72,11 +74,11 @@ def figure_comparison(table):
     return figure
 
 
-def _over_all_keypoints(table):
+def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
     return table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
 
 
-def _tested(rows):
+def _tested(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of the tested width. A source without masks of that width keeps all its
     rows.
     """
@@ -84,7 +86,7 @@ def _tested(rows):
     return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
 
 
-def _labels(rows):
+def _labels(rows: pd.DataFrame) -> pd.Series:
     """Label each row with its method, the width of its masks and, if there are several sources,
     its source.
     """
@@ -94,12 +96,12 @@ def _labels(rows):
     return source + rows["method"].map(compare.METHODS) + width
 
 
-def _sequences(table):
+def _sequences(table: pd.DataFrame) -> list[str]:
     """Return the names of the columns with the ratio of each sequence."""
     return list(table.columns[table.columns.get_loc("verdict") + 1 :])
 
 
-def table_summary(table, runs):
+def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each source: the answer of a study (`compare.primary_comparison`).
 
     The columns are the mean number of keypoints that the masks leave and that of all, the ratio of
@@ -129,7 +131,7 @@ def table_summary(table, runs):
     return pd.DataFrame(rows)
 
 
-def table_comparison(table):
+def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios of each method to all keypoints, and of masks to each control, one column a
     metric.
 
@@ -164,13 +166,13 @@ def table_comparison(table):
     return shown.reindex(columns=[*(name for name in shown if name not in last), *last])
 
 
-def _short(row):
+def _short(row: dict[str, Any] | pd.Series) -> Any:
     return (
         pd.NA if pd.isna(row["ratio"]) else texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
     )
 
 
-def table_widths(runs):
+def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios of errors to all keypoints with the best, the left-out and the fixed width,
     by sequence.
 
@@ -190,7 +192,7 @@ def table_widths(runs):
     return next(iter(tables.values()), pd.DataFrame())
 
 
-def _widths(masked, baseline):
+def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     chosen, stability = (
         thesis_tables.chosen_widths(masked, baseline),
         thesis_tables.stability(masked, baseline),

@@ -11,6 +11,7 @@ import sys
 import time
 import traceback
 from pathlib import Path
+from typing import Any
 
 from nbclient.exceptions import CellExecutionError, DeadKernelError
 from nbconvert.filters import strip_ansi
@@ -33,7 +34,9 @@ class Execution(ExecutePreprocessor):
     # for the output of libraries and the traceback of a failure
     log_file = Unicode("execution.log").tag(config=True)
 
-    def preprocess(self, nb, resources=None, km=None):
+    def preprocess(
+        self, nb: Any, resources: Any = None, km: Any = None
+    ) -> tuple[Any, dict[str, Any]]:
         # so that the kernel ends with this program, and this program with make: the parent of the
         # shell that runs it
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -65,7 +68,7 @@ class Execution(ExecutePreprocessor):
             f"{failure}\nthe traceback is in {os.path.relpath(path)}; the same command resumes"
         )
 
-    def setup_kernel(self, **options):
+    def setup_kernel(self, **options: Any) -> Any:
         # compiled libraries log into the log file, not into the outputs of cells
         self.extra_arguments = ["--IPKernelApp.capture_fd_output=False"]
         # progress bars (`files.progress`) go to the standard error of this program
@@ -79,11 +82,11 @@ class Execution(ExecutePreprocessor):
         )
 
 
-def _print_error(kind, error, _traceback):
+def _print_error(kind: type[BaseException], error: BaseException, _traceback: Any) -> None:
     print(console.explain(error) or f"{kind.__name__}: {error}", file=sys.stderr)
 
 
-def _reason(error):
+def _reason(error: Exception) -> str:
     """Return in one line why a notebook failed."""
     if isinstance(error, DeadKernelError):
         return "the kernel died, probably for lack of memory"

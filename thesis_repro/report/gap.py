@@ -2,6 +2,9 @@
 quality.
 """
 
+from pathlib import Path
+from typing import Any
+
 import pandas as pd
 
 FRAMES = "the odometry's frames"  # the domain for which masks are made
@@ -17,7 +20,7 @@ MEASURES = {  # column: name in the table, factor, digits
 }
 
 
-def table(gap):
+def table(gap: Any) -> pd.DataFrame:
     """Return one row for each measure and class, one column for each model and domain; empty if the
     class is absent.
     """
@@ -44,7 +47,7 @@ def table(gap):
     return table.rename_axis(index="measure", columns=None).reset_index()
 
 
-def label_map_quality(build):
+def label_map_quality(build: Path) -> list[dict[str, Any]]:
     """Return the scores of the model that the odometry uses, one dict a domain, or [] if notebook
     05 measured none.
 

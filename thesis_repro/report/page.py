@@ -13,6 +13,8 @@ import subprocess
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -20,7 +22,7 @@ from markupsafe import Markup
 from thesis_repro import console, results
 from thesis_repro.files import listed, write_text
 from thesis_repro.report import captions, tables, texts, trainings
-from thesis_repro.settings import ROOT, read_settings
+from thesis_repro.settings import ROOT, Settings, read_settings
 
 PAGE, GALLERY = "index.html", "README.md"
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
@@ -31,7 +33,7 @@ OPENING = ("figure_4_05", "findings", "figure-comparison", "table-summary")
 PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")
 
 
-def update(settings):
+def update(settings: Settings) -> None:
     """Write the page of a run, and the HTML of each executed notebook that is newer than its HTML.
 
     Deletes temporary files of killed runs. Raises InputError if another run uses the folder.
@@ -57,11 +59,11 @@ def update(settings):
         write_text(settings.figures / GALLERY, gallery)
 
 
-def _executed(settings):
+def _executed(settings: Settings) -> list[Path]:
     return listed(settings.build / "notebooks", "*.ipynb")
 
 
-def notebook_html(path, page):
+def notebook_html(path: Path, page: Path) -> str:
     """Convert an executed notebook to HTML with a link to the page."""
     import nbformat  # these are slow to import, and seldom needed
     from latex2mathml.converter import convert
@@ -93,7 +95,7 @@ def notebook_html(path, page):
     )
 
 
-def _chapters(settings):
+def _chapters(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     """Return the described artefacts of each chapter, {title: artefacts}."""
     numbers = tables.beside_the_thesis(settings)
     return {
@@ -102,7 +104,7 @@ def _chapters(settings):
     }
 
 
-def build(settings):
+def build(settings: Settings) -> str:
     """Return the page of a run as HTML, made from the files in its folders."""
     chapters = _chapters(settings)
     executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
@@ -132,7 +134,7 @@ def build(settings):
     )
 
 
-def _document(name, settings):
+def _document(name: str, settings: Settings) -> tuple[Markup, Markup]:
     """Return a text of the folder docs for a page: its first paragraph and the rest, as HTML."""
     text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
     # links are relative to docs
@@ -141,7 +143,7 @@ def _document(name, settings):
     return texts.html(first), texts.html(rest)
 
 
-def build_study(folder, names, **facts):
+def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str:
     """Return the page of a study as HTML. names: (kind, name) of its files. facts: further
     values of the template.
     """
@@ -162,7 +164,12 @@ def build_study(folder, names, **facts):
     )
 
 
-def _describe(folder, artefact, settings=None, numbers=None):
+def _describe(
+    folder: Path,
+    artefact: dict[str, Any],
+    settings: Settings | None = None,
+    numbers: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """Return the values that the template needs to show a table, figure or text, or to report
     it as missing.
     """
@@ -183,7 +190,7 @@ def _describe(folder, artefact, settings=None, numbers=None):
         _, chapter, count = name.split("_")
         number = f"{kind.capitalize()} {chapter.upper()}.{int(count)}"
     thesis = dict(artefact.get("thesis", ()))
-    if thesis:
+    if thesis and settings and numbers is not None:
         fill = texts.TEMPLATES.from_string
         thesis["text"] = fill(thesis["text"]).render(captions.REPORTED)
         thesis["here"] = name in numbers and fill(thesis["here"]).render(numbers[name])
@@ -218,11 +225,13 @@ def _describe(folder, artefact, settings=None, numbers=None):
     }
 
 
-def _made(executed=(), in_git=False):
+def _made(executed: list[Path] | None = None, in_git: bool = False) -> dict[str, Any]:
     """Return the packages and, for a page outside git, the machine, commit and day of the
     results.
     """
-    made = {"packages": {name: importlib.metadata.version(name) for name in PACKAGES}}
+    made: dict[str, Any] = {
+        "packages": {name: importlib.metadata.version(name) for name in PACKAGES}
+    }
     if in_git:
         return made
     made |= {
@@ -251,7 +260,7 @@ def _made(executed=(), in_git=False):
     return made
 
 
-def main():
+def main() -> int:
     try:
         settings = read_settings()
         update(settings)

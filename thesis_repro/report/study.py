@@ -2,23 +2,27 @@
 also written as LaTeX and figures as PDF, for use in a paper.
 """
 
+from collections.abc import Collection
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 
 from thesis_repro import InputError, results
 from thesis_repro.files import write_text
-from thesis_repro.masks import label_map_of
+from thesis_repro.masks import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
 from thesis_repro.study import compare, controls
 from thesis_repro.study.jobs import ESTIMATORS
-from thesis_repro.study.sources import KINDS
-from thesis_repro.study.study import PATHS
+from thesis_repro.study.sources import KINDS, Source
+from thesis_repro.study.study import PATHS, Study
 from thesis_repro.trajectories import read_poses
 
 
-def write(study, runs, folder, warnings=()):
+def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[str] = ()) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder, and return
     the page's path.
 
@@ -75,7 +79,7 @@ def write(study, runs, folder, warnings=()):
     return folder / page.PAGE
 
 
-def figure_sources(study):
+def figure_sources(study: Study) -> Figure:
     """Draw the middle frame of the first readable sequence: each source's label map, its mask and
     the kept keypoints.
 
@@ -96,7 +100,7 @@ def figure_sources(study):
         style.show_image(third, frame, "")
         with suppress(InputError):  # the runs report a file that cannot be read
             mask = masks[index]
-            if source.kind == "labels":
+            if isinstance(masks, LabelMasks):
                 label_maps.append(label_map_of(masks, index))
                 style.show_image(
                     first, style.label_colors(label_maps[-1], frame), f"{source.name}: label map"
@@ -110,7 +114,7 @@ def figure_sources(study):
     return figure
 
 
-def figure_paths(study, name, folder):
+def figure_paths(study: Study, name: str, folder: Path) -> Figure:
     """Draw one path with all keypoints and one with each source's masks, shifted as for the
     RMSE.
     """
@@ -131,7 +135,7 @@ def figure_paths(study, name, folder):
     return trajectories.figure(paths, true, f"sequence {name}")
 
 
-def _changed(source):
+def _changed(source: Source) -> str:
     """Return the settings of masks from label maps that differ from the thesis's, such as ";
     margin 10".
     """

@@ -3,6 +3,9 @@ Markdown.
 """
 
 from base64 import b64encode
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+from typing import Any
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -44,11 +47,12 @@ BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
 # note of figures that show no data
 DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"
-KEYPOINT = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}  # style of keypoints on a frame
+# style of keypoints on a frame
+KEYPOINT: dict[str, Any] = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}
 EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges on a frame
 
 
-def line_style(index):
+def line_style(index: int) -> dict[str, Any]:
     """Return colour and dash of the index-th line of a figure. 28 styles differ; neighbours
     also differ in dashes.
     """
@@ -56,7 +60,7 @@ def line_style(index):
     return {"color": colors[index % len(colors)], "linestyle": dashes[index % len(dashes)]}
 
 
-def label_colors(label_map, frame):
+def label_colors(label_map: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """Return a label map in colours, enlarged to the frame's size for display. masks.py
     enlarges in another way.
     """
@@ -65,12 +69,16 @@ def label_colors(label_map, frame):
     return colorize(label_map[np.ix_(rows, columns)])
 
 
-def new_figure(rows=1, columns=1, height=3.2, width=PAGE_WIDTH, **options):
+def new_figure(
+    rows: int = 1, columns: int = 1, height: float = 3.2, width: float = PAGE_WIDTH, **options: Any
+) -> tuple[plt.Figure, Any]:
     """Return a figure and its axes. height, width: inches."""
     return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
 
 
-def frame_panels(frame, rows=1, columns=1, width=PAGE_WIDTH):
+def frame_panels(
+    frame: np.ndarray, rows: int = 1, columns: int = 1, width: float = PAGE_WIDTH
+) -> tuple[plt.Figure, list[Any]]:
     """Return a figure and a list of its axes, which have the shape of a frame and room for
     titles.
     """
@@ -81,21 +89,27 @@ def frame_panels(frame, rows=1, columns=1, width=PAGE_WIDTH):
     return figure, list(axes.flat)
 
 
-def show_image(axes, image, title, **options):
+def show_image(axes: plt.Axes, image: np.ndarray, title: str, **options: Any) -> None:
     """Show an image without ticks; an image with one channel is gray."""
     axes.imshow(image, cmap=options.pop("cmap", "gray"), **options)
     axes.set_title(title)
     axes.set_axis_off()
 
 
-def pictures(frame, pictures, keypoints=(), columns=1, label_maps=()):
+def pictures(
+    frame: np.ndarray,
+    pictures: dict[str, np.ndarray],
+    keypoints: dict[str, np.ndarray] | None = None,
+    columns: int = 1,
+    label_maps: Collection[np.ndarray] = (),
+) -> plt.Figure:
     """Show pictures {title: picture} of a frame's shape, with keypoints {title: (n, 2)} and a
     legend of label maps.
     """
     figure, axes = frame_panels(frame, -(-len(pictures) // columns), columns)
     for panel, (title, picture) in zip(axes, pictures.items()):
         show_image(panel, picture, title)
-        if title in keypoints:
+        if keypoints and title in keypoints:
             panel.scatter(*keypoints[title].T, **KEYPOINT)
     for panel in axes[len(pictures) :]:
         panel.set_axis_off()
@@ -104,14 +118,16 @@ def pictures(frame, pictures, keypoints=(), columns=1, label_maps=()):
     return figure
 
 
-def with_edges(frame, edge_image):
+def with_edges(frame: np.ndarray, edge_image: np.ndarray) -> np.ndarray:
     """Return a gray frame as red, green, blue, with edges marked where `edge_image` is not 0."""
     picture = np.dstack([frame] * 3)
     picture[edge_image > 0] = EDGE_COLOR
     return picture
 
 
-def small_panels(names, xlabel="", figure=None):
+def small_panels(
+    names: list[str], xlabel: str = "", figure: Any = None
+) -> tuple[Any, list[plt.Axes]]:
     """Return (figure, panels), one small panel for each name, at most four in a row.
 
     xlabel: label of the lowest panel of each column. figure: a subfigure for the panels, or None
@@ -133,7 +149,7 @@ def small_panels(names, xlabel="", figure=None):
     return figure, panels
 
 
-def legend_below(figure, panels, columns):
+def legend_below(figure: Any, panels: Iterable[plt.Axes], columns: int) -> None:
     """Add a legend below the figure with each label of the panels once."""
     handles = {
         label: handle
@@ -143,15 +159,15 @@ def legend_below(figure, panels, columns):
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
-def class_legend(figure, *label_maps, also=()):
+def class_legend(figure: plt.Figure, *label_maps: np.ndarray, also: Iterable[Any] = ()) -> None:
     """Add a legend of the classes in label maps below a figure, and make the figure higher.
     also: further handles.
     """
-    names = {}  # some Cityscapes labels share a colour
+    names: dict[tuple, list[str]] = {}  # some Cityscapes labels share a colour
     for index in np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps])):
         names.setdefault(LABELS[index].color, []).append(LABELS[index].name)
-    handles = [
-        Patch(color=np.array(color) / 255, label=", ".join(labels))
+    handles: list[Any] = [
+        Patch(color=tuple(np.array(color) / 255), label=", ".join(labels))
         for color, labels in names.items()
     ]
     handles += also
@@ -159,7 +175,7 @@ def class_legend(figure, *label_maps, also=()):
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
 
 
-def with_sliders(draw, **sliders):
+def with_sliders(draw: Callable[..., plt.Figure], **sliders: Any) -> None:
     """Show the figure that `draw` returns, with sliders of ipywidgets for its arguments.
 
     What shows no sliders, such as nbconvert or a repository's page, shows the first figure.
@@ -170,7 +186,7 @@ def with_sliders(draw, **sliders):
 
     picture = Image(layout={"width": "720px"})
 
-    def redraw(_=None):
+    def redraw(_: Any = None) -> None:
         picture.value = print_figure(
             draw(**{name: slider.value for name, slider in sliders.items()}), dpi=150
         )
@@ -183,13 +199,13 @@ def with_sliders(draw, **sliders):
     display(both | {"image/png": b64encode(picture.value).decode()}, raw=True)
 
 
-def ratio_axis(axis, values):
+def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
     """Make an axis (such as axes.yaxis) logarithmic, with a few round ticks and limits around
     the positive values.
     """
-    values = np.asarray(values, float)
-    values = values[np.isfinite(values) & (values > 0)]
-    low, high = (values.min(), values.max()) if len(values) else (1, 1)
+    positive = np.asarray(values, float)
+    positive = positive[np.isfinite(positive) & (positive > 0)]
+    low, high = (positive.min(), positive.max()) if len(positive) else (1, 1)
     margin = max((high / low) ** 0.05, 1.1 if high < 1.1 * low else 1)
     low, high = low / margin, high * margin
     # within a factor of five, ticks at equal differences are rounder than ticks at equal ratios
@@ -204,7 +220,7 @@ def ratio_axis(axis, values):
     axis.set_minor_locator(NullLocator())
 
 
-def save_figure(figure, folder, name, note):
+def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
     """Write folder/name.webp if the figure contains images, else folder/name.svg, with the data
     note at the foot.
 
@@ -230,7 +246,7 @@ def save_figure(figure, folder, name, note):
     if any(axes.images for axes in figure.axes):
         ending, other, note_in_file = ".webp", ".svg", Image.Exif()
         note_in_file[ExifTags.Base.ImageDescription] = note
-        options = {"pil_kwargs": {"quality": 75, "exif": note_in_file}}
+        options: dict[str, Any] = {"pil_kwargs": {"quality": 75, "exif": note_in_file}}
     else:
         ending, other = ".svg", ".webp"
         options = {"metadata": {"Date": None, "Creator": None, "Description": note}}
@@ -239,19 +255,21 @@ def save_figure(figure, folder, name, note):
     (folder / f"{name}{other}").unlink(missing_ok=True)
 
 
-def write_figure(figure, path, **options):
+def write_figure(figure: plt.Figure, path: Path, **options: Any) -> None:
     """Write a figure in the format that the path's ending names."""
     with atomic(path) as temporary:
         figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
 
 
-def save_table(table, folder, name, note):
+def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
     """Write folder/name.csv and folder/name.md with the data note under the Markdown table."""
     write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
     write_text(folder / f"{name}.md", f"{markdown(table)}\n{note}\n")
 
 
-def save_all(figures, tables, folder, note):
+def save_all(
+    figures: dict[str, plt.Figure], tables: dict[str, pd.DataFrame], folder: Path, note: str
+) -> list[tuple[str, str]]:
     """Write {name: figure} and {name: table}, except empty tables, and return (kind, name) of
     each written one.
     """
@@ -264,7 +282,7 @@ def save_all(figures, tables, folder, note):
     return [*(("figure", name) for name in figures), *(("table", name) for name in tables)]
 
 
-def markdown(table):
+def markdown(table: pd.DataFrame) -> str:
     """Return a pandas table as Markdown, with numbers aligned to the right and missing values
     empty. Names are no HTML.
     """

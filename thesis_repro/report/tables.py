@@ -4,16 +4,20 @@ digits.
 `runs` is the table of `runner.run`. Equation 4.1 and the choice of a width are in `thesis_tables`.
 """
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
 from thesis_repro.report.captions import REPORTED
+from thesis_repro.settings import Settings
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
 
 
-def table_4_1(runs, reported_as):
+def table_4_1(runs: pd.DataFrame, reported_as: str) -> pd.DataFrame:
     """Table 4.1: each sequence's best dilation width and mean number of keypoints, here and in
     the thesis.
     """
@@ -35,7 +39,9 @@ def table_4_1(runs, reported_as):
     ).reset_index()
 
 
-def table_of_change(best, runs, metric, reported_as):
+def table_of_change(
+    best: pd.DataFrame, runs: pd.DataFrame, metric: str, reported_as: str
+) -> pd.DataFrame:
     """Tables 4.2 and 4.3: the metric (m) with all keypoints and with the best mask, and Equation
     4.1 in percent.
 
@@ -88,11 +94,11 @@ def table_of_change(best, runs, metric, reported_as):
     return table.round(dict.fromkeys(columns, 2)).rename_axis("sequence").reset_index()
 
 
-def _three_digits(value):
+def _three_digits(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-def table_errors(runs):
+def table_errors(runs: pd.DataFrame) -> pd.DataFrame:
     """Return keypoints and errors with all keypoints and with masks, by sequence, as means over
     the repetitions.
     """
@@ -124,7 +130,7 @@ def table_errors(runs):
     )
 
 
-def table_budget(measured):
+def table_budget(measured: pd.DataFrame) -> pd.DataFrame:
     """Return the milliseconds of each stage for one frame, one column a method, their sum and the
     frames a second.
 
@@ -142,7 +148,7 @@ def table_budget(measured):
 # For the page
 
 
-def read(path):
+def read(path: Path) -> pd.DataFrame:
     """Read a CSV file as a table with nullable integers. Returns an empty table if the file
     does not exist.
     """
@@ -153,7 +159,7 @@ def read(path):
     )
 
 
-def html(table):
+def html(table: pd.DataFrame) -> Markup:
     """Return a table as HTML with escaped texts. The numbers of a column have the same number
     of digits.
     """
@@ -177,11 +183,11 @@ def html(table):
     )
 
 
-def beside_the_thesis(settings):
+def beside_the_thesis(settings: Settings) -> dict[str, Any]:
     """Return this run's numbers for artefacts whose numbers the thesis reports in its text:
     {name: numbers}.
     """
-    numbers = {}
+    numbers: dict[str, Any] = {}
     history, chosen = (
         read(settings.build / "model" / "history.csv"),
         read(settings.figures / "table_4_1.csv"),

@@ -8,13 +8,15 @@ findings.
 import re
 from math import ceil, log10
 from pathlib import Path
+from typing import Any
 
 import mistune
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from thesis_repro.odometry import metrics
+from thesis_repro.kitti import Sequence
+from thesis_repro.odometry import Result, metrics
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
@@ -35,7 +37,7 @@ TEMPLATES = Environment(
 )
 
 
-def render(template, **values):
+def render(template: str, **values: Any) -> str:
     """Return the text of a template in the folder templates. Repeated empty lines in Markdown
     become one.
     """
@@ -43,13 +45,13 @@ def render(template, **values):
     return re.sub(r"\n{3,}", "\n\n", text) if ".md" in template else text
 
 
-def number(value):
+def number(value: float) -> str:
     """Return a ratio as text with two digits, or with more if it would look like 1."""
     near = 0 < abs(value - 1) < 0.5 * 10**-DIGITS
     return f"{value:.{min(6, ceil(-log10(abs(value - 1))) + 1) if near else DIGITS}f}"
 
 
-def ratio(row):
+def ratio(row: dict[str, Any] | pd.Series) -> str:
     """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high, or only the ratio
     if low is missing.
     """
@@ -61,17 +63,17 @@ def ratio(row):
 
 
 class _Renderer(mistune.HTMLRenderer):
-    def heading(self, text, level, **attributes):
+    def heading(self, text: str, level: int, **attributes: Any) -> str:
         # lower than the headings of the page
         return super().heading(text, max(4, level + 1), **attributes)
 
 
-def html(text):
+def html(text: str) -> Markup:
     """Convert Markdown to HTML. HTML tags in the Markdown are shown as text."""
     return Markup(mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])(text))
 
 
-def ratio_and_far_off(row):
+def ratio_and_far_off(row: dict[str, Any] | pd.Series) -> str:
     """Return `ratio` and the sequences far from the others: "3.85 (95 % CI 0.71-80.41),
     sequence 01 alone 95.20".
     """
@@ -84,7 +86,13 @@ TEMPLATES.filters["ratio"] = ratio_and_far_off
 TEMPLATES.filters["number"] = number
 
 
-def findings(runs, table, data, label_maps=(), trainings=()):
+def findings(
+    runs: pd.DataFrame,
+    table: pd.DataFrame,
+    data: str,
+    label_maps: list[dict[str, Any]] | tuple[()] = (),
+    trainings: list[dict[str, Any]] | tuple[()] = (),
+) -> str:
     """Return the findings of a run, a study or the evidence as Markdown.
 
     table: `compare.comparisons` of the runs. data: one line with the origin of the data.
@@ -136,7 +144,7 @@ def findings(runs, table, data, label_maps=(), trainings=()):
     )
 
 
-def _source_values(runs, table, source):
+def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict[str, Any]:
     """Return the values of one source of masks for the template."""
     runs, judged = compare.of_source(runs, source), compare.primary_comparison(table, source)
     rows = table[(table["source"] == source) & (table["reference"] == "baseline") & table["tested"]]
@@ -150,7 +158,7 @@ def _source_values(runs, table, source):
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     tested, widths = compare.tested_width(runs), masked["dilation_width"].nunique()
     same_best = (
-        thesis_tables.stability(masked, baseline)["same_best"].mean() if widths > 1 else None
+        thesis_tables.stability(masked, baseline)["same_best"].mean() if widths > 1 else pd.NA
     )
     return {
         "name": source,
@@ -168,7 +176,7 @@ def _source_values(runs, table, source):
 # Records of commands, for JSON and for templates
 
 
-def run_record(result, sequence):
+def run_record(result: Result, sequence: Sequence) -> dict[str, Any]:
     """Return the errors, keypoints, time and flags of an `odometry.Result`. An error that is
     not determined is None.
     """

@@ -3,21 +3,23 @@
 `tools/trainings.py` writes the table. It has one row for each training and estimator.
 """
 
+from typing import Any
+
 import pandas as pd
 
 from thesis_repro import results
 from thesis_repro.files import listed
-from thesis_repro.settings import ROOT
+from thesis_repro.settings import ROOT, Settings
 
 TABLE = ROOT / "figures" / "trainings.csv"
 
 
-def read():
+def read() -> pd.DataFrame:
     """Return the table; the first training is the one that `make figures` repeats."""
     return pd.read_csv(TABLE)
 
 
-def summary():
+def summary() -> list[dict[str, Any]]:
     """Return what the trainings give, one dict for each estimator.
 
     verdicts: of each training. ranges: {column: (lowest, highest)} over the trainings, for columns
@@ -36,7 +38,7 @@ def summary():
     ]
 
 
-def network_note(settings):
+def network_note(settings: Settings) -> str:
     """Return one line that says whether a run's network is the recorded one, to the bit; empty for
     a run of other data or sizes.
 

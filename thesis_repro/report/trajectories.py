@@ -2,12 +2,15 @@
 paths.
 """
 
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from evo import EvoException
+from matplotlib.figure import Figure
 
 from thesis_repro import InputError
 from thesis_repro.files import listed
@@ -29,7 +32,9 @@ COLUMNS = {
 }
 
 
-def by_sequence(paths, root, sequence=None):
+def by_sequence(
+    paths: Iterable[Path], root: str | Path | None, sequence: str | None = None
+) -> dict[str, dict[str, Path]]:
     """Return the files of trajectories, {sequence: {trajectory: file}}. A trajectory is named by
     its path.
 
@@ -38,7 +43,7 @@ def by_sequence(paths, root, sequence=None):
     """
     files: dict[str, dict[str, Path]] = {}
     for path in paths:
-        path_files = {sequence: path}
+        path_files: dict[Any, Path] = {sequence: path}
         if path.is_dir():
             names = (
                 [sequence]
@@ -62,7 +67,9 @@ def by_sequence(paths, root, sequence=None):
     return files
 
 
-def read(file, times, frames=None, **matching):
+def read(
+    file: Path, times: np.ndarray, frames: int | None = None, **matching: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """Read a trajectory in KITTI's or TUM's format: (indices of its frames (n,), poses (n, 4, 4)).
 
     times: of the ground truth, seconds. A file in KITTI's format needs one pose for each time; for
@@ -85,8 +92,13 @@ def read(file, times, frames=None, **matching):
     return np.arange(len(poses)), poses
 
 
-def evaluate(paths, true, alignment="none", sequence=""):
-    """Return the errors of each path, a list of dicts. An error that is not determined is None.
+def evaluate(
+    paths: dict[str, tuple[np.ndarray, np.ndarray]],
+    true: np.ndarray,
+    alignment: str = "none",
+    sequence: str = "",
+) -> list[dict[str, Any]]:
+    """Return the errors of each path. An error that is not determined is None.
 
     paths: {name: (frames, poses)} from `read`; true: (n, 4, 4). RMSE and MAE follow the thesis and
     ignore `alignment`. The other errors are of the path after `metrics.align`. The RPE is from one
@@ -125,7 +137,7 @@ def evaluate(paths, true, alignment="none", sequence=""):
     return rows
 
 
-def means(rows):
+def means(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Yield a row like those of `evaluate` with the means of each trajectory that has several
     sequences.
     """
@@ -145,7 +157,9 @@ def means(rows):
             }
 
 
-def aligned(paths, true, alignment):
+def aligned(
+    paths: dict[str, tuple[np.ndarray, np.ndarray]], true: np.ndarray, alignment: str
+) -> dict[str, np.ndarray]:
     """Return {name: poses} after `metrics.align`, without the paths that cannot be aligned."""
     aligned_paths = {}
     for name, (frames, poses) in paths.items():
@@ -154,7 +168,7 @@ def aligned(paths, true, alignment):
     return aligned_paths
 
 
-def table(rows, alignment="none"):
+def table(rows: list[dict[str, Any]], alignment: str = "none") -> pd.DataFrame:
     """Return the rows of `evaluate` and `means` as a table for display."""
     columns = {
         key: name
@@ -165,7 +179,12 @@ def table(rows, alignment="none"):
     return table.astype(dict.fromkeys(columns, float)).rename(columns=columns)
 
 
-def figure(paths, true, title, frames=None):
+def figure(
+    paths: dict[str, np.ndarray],
+    true: np.ndarray | None,
+    title: str,
+    frames: dict[str, np.ndarray] | None = None,
+) -> Figure:
     """Draw the paths from above and, if the ground truth is known, their distance from it.
 
     paths: {name: (n, 4, 4) aligned poses}. true: (n, 4, 4), or None. frames: {name: frame indices

@@ -2,6 +2,9 @@
 so far.
 """
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -9,8 +12,17 @@ from matplotlib.figure import Figure
 
 from thesis_repro import InputError, console
 from thesis_repro.files import atomic, progress
-from thesis_repro.kitti import FRAME_TIME
-from thesis_repro.odometry import THESIS, Odometry, keypoints, scales, start_pose
+from thesis_repro.kitti import FRAME_TIME, Sequence
+from thesis_repro.odometry import (
+    THESIS,
+    Odometry,
+    OdometrySettings,
+    Step,
+    keypoints,
+    scales,
+    start_pose,
+)
+from thesis_repro.odometry.passes import Masks
 from thesis_repro.report.style import BASELINE, TRUTH
 
 # colours as blue, green, red
@@ -20,7 +32,12 @@ MAP_SHARE = 0.75  # height of the map divided by the height of the frame
 DPI = 128  # a power of two, so that pixels convert to inches and back without rounding
 
 
-def draw_frame(frame, step, settings=THESIS, mask=None):
+def draw_frame(
+    frame: np.ndarray,
+    step: Step,
+    settings: OdometrySettings = THESIS,
+    mask: np.ndarray | None = None,
+) -> np.ndarray:
     """Draw a step of the odometry on its frame (height, width): returns (height, width, 3) blue,
     green, red.
 
@@ -43,12 +60,14 @@ def draw_frame(frame, step, settings=THESIS, mask=None):
     return image
 
 
-def _dots(image, points, color):
+def _dots(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int]) -> None:
     for point in np.rint(points).astype(int).tolist():
         cv2.circle(image, point, 2, color, -1, cv2.LINE_AA)
 
 
-def pictures(sequence, settings=THESIS, masks=None):
+def pictures(
+    sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None
+) -> Iterator[np.ndarray]:
     """Run the odometry over a kitti.Sequence and yield one picture for each frame, (h, w, 3) blue,
     green, red.
 
@@ -86,7 +105,7 @@ def pictures(sequence, settings=THESIS, masks=None):
         ]  # colours at half the size need even sizes
 
 
-def _describe(step, true, masked):
+def _describe(step: Step, true: np.ndarray | None, masked: bool) -> str:
     """Describe a step in lines of text that name the colours in the frame."""
     row, lines = step.row(), [f"frame {step.frame}"]
     if true is not None:
@@ -100,7 +119,9 @@ def _describe(step, true, masked):
     return "\n".join([*lines, *step.flags])
 
 
-def write_video(path, sequence, settings=THESIS, masks=None):
+def write_video(
+    path: Path, sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None
+) -> None:
     """Write `pictures` as a WebM video (VP8) with the frame rate of the sequence's times.
 
     Every browser plays VP8. OpenCV takes four times as long for VP9. Raises InputError if the video

@@ -8,8 +8,10 @@ interruption changes a byte.
 """
 
 import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
@@ -28,7 +30,7 @@ CITIES = {
 
 
 @lru_cache(maxsize=2)
-def _drive(name, frames, seed):
+def _drive(name: str, frames: int, seed: int) -> tuple[street.Street, np.ndarray, np.ndarray]:
     """Return a sequence's street, camera-to-world poses in it, (frames, 4, 4), and metres
     driven, (frames,).
     """
@@ -37,7 +39,9 @@ def _drive(name, frames, seed):
     return street.build(rng, textures.build(seed), track, drives.DRIVES[name].style), poses, driven
 
 
-def render_frame(name, index, frames=None, scale=0.5, seed=0):
+def render_frame(
+    name: str, index: int, frames: int | None = None, scale: float = 0.5, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Render frame `index` of a sequence: image and label map, both uint8 (height, width).
 
     frames: length of the sequence, on which the street depends; None for the whole drive.
@@ -50,7 +54,9 @@ def render_frame(name, index, frames=None, scale=0.5, seed=0):
     return _expose(rng, image, plan.level, plan.noise), labels
 
 
-def render_image(split, index, scale=0.5, seed=0):
+def render_image(
+    split: str, index: int, scale: float = 0.5, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Render training or validation image `index` ("train", "val"): image and label map, both
     uint8 (height, width).
     """
@@ -88,7 +94,7 @@ def render_image(split, index, scale=0.5, seed=0):
     return _expose(rng, image, rng.uniform(88, 122), rng.uniform(1.2, 3.0)), labels
 
 
-def _expose(rng, image, level, noise):
+def _expose(rng: np.random.Generator, image: np.ndarray, level: float, noise: float) -> np.ndarray:
     """Return an 8-bit picture with automatic exposure, vignette and sensor noise.
 
     level: mean gray value that the exposure aims at; noise: standard deviation at gray value 120.
@@ -107,18 +113,18 @@ def _expose(rng, image, level, noise):
 
 
 def write(
-    out,
+    out: str | Path,
     *,
-    sequences=SEQUENCES,
-    frames=None,
-    scale=1.0,
-    train_images=100,
-    validation_images=20,
-    seed=0,
-    jobs=-1,
-    replace=False,
-    only=None,
-):
+    sequences: Sequence[str] = SEQUENCES,
+    frames: int | None = None,
+    scale: float = 1.0,
+    train_images: int = 100,
+    validation_images: int = 20,
+    seed: int = 0,
+    jobs: int = -1,
+    replace: bool = False,
+    only: str | None = None,
+) -> tuple[int, int]:
     """Write the embedded world to OUT/kitti and OUT/cityscapes; resumes a stopped run.
 
     sequences: names among 00 to 10; frames: frames of each sequence, None for its whole drive (41
@@ -132,7 +138,7 @@ def write(
     world of other parameters.
     """
     out = Path(out)
-    parameters = {
+    parameters: dict[str, Any] = {
         "sequences": list(sequences),
         "frames": frames,
         "scale": scale,
@@ -168,7 +174,15 @@ def write(
     return len(missing), len(pictures)
 
 
-def _pictures(root, sequences, frames, scale, train_images, validation_images, seed):
+def _pictures(
+    root: Path,
+    sequences: Sequence[str],
+    frames: int | None,
+    scale: float,
+    train_images: int,
+    validation_images: int,
+    seed: int,
+) -> Iterator[tuple[Callable, Path, Path]]:
     """Yield (function that renders it, image path, label map path) for every picture of a world."""
     for name in sequences:
         folder = root / "kitti" / "sequences" / name
@@ -190,7 +204,7 @@ def _pictures(root, sequences, frames, scale, train_images, validation_images, s
             )
 
 
-def _write_pictures(pictures):
+def _write_pictures(pictures: list[tuple[Callable, Path, Path]]) -> int:
     for render, image_path, label_path in pictures:
         image, labels = render()
         write_png(label_path, labels)
@@ -198,7 +212,7 @@ def _write_pictures(pictures):
     return len(pictures)
 
 
-def _write_sequence_texts(root, name, frames, scale, seed):
+def _write_sequence_texts(root: Path, name: str, frames: int, scale: float, seed: int) -> None:
     """Write calib.txt, times.txt and the ground-truth poses of one sequence."""
     folder = root / "kitti" / "sequences" / name
     _, intrinsics = drives.scaled_camera(name, scale)

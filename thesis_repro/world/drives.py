@@ -6,6 +6,7 @@ that line.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -53,7 +54,15 @@ class Track:
     closed: whether the road ends at its start, so that larger s begin another round.
     """
 
-    def __init__(self, pieces, start, stop, origin=(0.0, 0.0), heading=0.0, closed=False):
+    def __init__(
+        self,
+        pieces: tuple[tuple[float, float], ...],
+        start: float,
+        stop: float,
+        origin: tuple[float, float] = (0.0, 0.0),
+        heading: float = 0.0,
+        closed: bool = False,
+    ) -> None:
         """pieces: (metres, degrees to the right) of each piece from s = 0, repeated up to `stop`.
 
         start, stop: s of both ends, start <= 0; before s = 0 the road is straight. origin, heading:
@@ -85,11 +94,11 @@ class Track:
         z = np.concatenate([[0.0], np.cumsum(np.cos(middle)) * STEP])
         self.x, self.z = origin[0] + x - x[first], origin[1] + z - z[first]
 
-    def along(self, s):
+    def along(self, s: float | np.ndarray) -> float | np.ndarray:
         """Return s, on a closed track reduced to its first round."""
         return s % self.s[-1] if self.closed else s
 
-    def at(self, s, d=0.0):
+    def at(self, s: float | np.ndarray, d: float | np.ndarray = 0.0) -> tuple[Any, Any, Any]:
         """Return (x, z, heading) of places (s, d), numbers or arrays of one shape."""
         s = self.along(s)
         heading = np.interp(s, self.s, self.heading)
@@ -253,7 +262,7 @@ DRIVES = {
 SWAY, SENSOR, IMAGE, STREET, TEXTURES = 1, 2, 3, 4, 7001
 
 
-def scaled_camera(name, scale):
+def scaled_camera(name: str, scale: float) -> tuple[tuple[int, int], np.ndarray]:
     """Return size (height, width) and intrinsics (3x3, pixels) of a sequence's camera at a scale.
 
     Whole coordinates are pixel centres, so half a pixel is added before and subtracted after
@@ -271,7 +280,7 @@ def scaled_camera(name, scale):
     )
 
 
-def _driven(drive, track, frames, phase):
+def _driven(drive: Drive, track: Track, frames: int, phase: float) -> np.ndarray:
     """Return the metres driven until each frame, (frames,); the car slows down for bends and stops.
 
     With acceleration a, the squared pace changes by at most 2 a ds over a distance ds, forwards and
@@ -298,7 +307,7 @@ def _driven(drive, track, frames, phase):
     return driven
 
 
-def poses_of(places, angles):
+def poses_of(places: np.ndarray | list, angles: np.ndarray | list) -> np.ndarray:
     """Return camera-to-world poses (n, 4, 4); places: (n, 3) metres; angles: (n, 3) radians
     right, up, clockwise.
     """
@@ -308,7 +317,7 @@ def poses_of(places, angles):
     return poses
 
 
-def way(name, frames, seed):
+def way(name: str, frames: int, seed: int) -> tuple[Track, np.ndarray, np.ndarray]:
     """Return a sequence's `Track`, camera-to-world poses in the street (frames, 4, 4), and
     metres driven (frames,).
     """
@@ -333,7 +342,7 @@ def way(name, frames, seed):
     )
 
 
-def relative_to_first(poses):
+def relative_to_first(poses: np.ndarray) -> np.ndarray:
     """Return poses (n, 4, 4) relative to the first one, which becomes exactly the identity."""
     result = poses.copy()
     result[:, :3, 3] -= poses[0, :3, 3]

@@ -338,7 +338,7 @@ def _draw(faces, textures, view, coefficients, depth, nearest):
                         hits[k] = index
 
 
-def _shadows(faces, sun, position):
+def _shadows(faces: np.ndarray, sun: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Return the shadows of faces on the ground y = 0, as faces.
 
     A point p casts its shadow at p - sun p_y / sun_y. This is linear, so the shadow of a face has a
@@ -371,12 +371,19 @@ def _most(labels, depths):
     return best
 
 
-def render(faces, textures, pose, intrinsics, size, environment):
+def render(
+    faces: np.ndarray,
+    textures: Textures,
+    pose: np.ndarray,
+    intrinsics: np.ndarray,
+    size: tuple[int, int],
+    environment: Environment,
+) -> tuple[np.ndarray, np.ndarray]:
     """Render one view: image float32 (height, width) before exposure and noise, and label map uint8
     of that shape.
 
-    faces: (n, COLUMNS) float64; textures: `Textures`; pose: 4x4 camera-to-world; intrinsics: 3x3 in
-    pixels whose centres have whole coordinates; size: (height, width); environment: `Environment`.
+    faces: (n, COLUMNS) float64; pose: 4x4 camera-to-world; intrinsics: 3x3 in pixels whose centres
+    have whole coordinates; size: (height, width).
     """
     middle = (
         faces[:, CORNER : CORNER + 3]
@@ -415,7 +422,7 @@ def render(faces, textures, pose, intrinsics, size, environment):
     )
 
 
-def _brightness(faces, environment):
+def _brightness(faces: np.ndarray, environment: Environment) -> np.ndarray:
     """Return the factor of each face's texture, (n,): ambient light plus the sun by the cosine
     of its angle.
     """

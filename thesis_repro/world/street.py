@@ -4,6 +4,7 @@ The ground is flat, the road at y = 0 and the sidewalks a kerb higher. Cars driv
 `side` is 1 on the right and -1 on the left, looking along the track.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,7 +30,7 @@ class Mover:
     d: float
     turn: float  # radians to the right of the track's direction
 
-    def at(self, frame, driven):
+    def at(self, frame: int, driven: float) -> np.ndarray:
         """Return the faces in the street at a frame; driven: metres that the camera has driven
         by then.
         """
@@ -50,9 +51,9 @@ class Street:
     parts: list = field(default_factory=list)  # matrices of faces
     movers: list = field(default_factory=list)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.names, self.environment = self.bank.names, environment(self.style)
-        self.crossings = []  # tracks of the roads that cross this one
+        self.crossings: list[Track] = []  # tracks of the roads that cross this one
         if self.style.crossing is not None:
             x, z, heading = self.track.at(self.style.crossing)
             self.crossings.append(Track((), -75.0, 75.0, (x, z), heading - np.pi / 2))
@@ -62,7 +63,14 @@ class Street:
         # |d| at which houses and gardens begin
         self.line = self.style.half + (self.style.sidewalk or 3.0)
 
-    def view(self, pose, intrinsics, size, frame, driven=0.0):
+    def view(
+        self,
+        pose: np.ndarray,
+        intrinsics: np.ndarray,
+        size: tuple[int, int],
+        frame: int,
+        driven: float = 0.0,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Render the image (float32, before exposure and noise) and the label map (uint8), both
         (height, width).
 
@@ -79,23 +87,33 @@ class Street:
             self.environment,
         )
 
-    def off_road(self, x, z):
+    def off_road(self, x: float | np.ndarray, z: float | np.ndarray) -> np.ndarray:
         """Return the distance of points, (n,) each, to the nearest edge of any road; negative
         on a road.
         """
         return _distance(x, z, self.middle) - self.style.half
 
-    def free(self, x, z, margin):
+    def free(self, x: float, z: float, margin: float) -> bool:
         """Return whether a point is more than `margin` metres from all roads, and outside all
         houses.
         """
         return self.off_road(x, z)[0] > margin and _distance(x, z, self.houses)[0] >= 2.4
 
-    def put(self, faces, x, z, yaw, y=-KERB):
+    def put(self, faces: np.ndarray, x: float, z: float, yaw: float, y: float = -KERB) -> None:
         """Place a thing at (x, y, z), turned by yaw (radians to the right)."""
         self.parts.append(things.place(faces, x, z, yaw, y))
 
-    def extrude(self, profile, side, texture, label, span=None, margin=None, step=1.0, **options):
+    def extrude(
+        self,
+        profile: list[tuple[float, float]],
+        side: int,
+        texture: str,
+        label: str,
+        span: tuple[float, float] | None = None,
+        margin: float | None = None,
+        step: float = 1.0,
+        **options: int,
+    ) -> None:
         """Place a strip along the main road; span: (start, stop); margin: metres that it keeps
         from all roads.
         """
@@ -108,7 +126,7 @@ class Street:
             )
         )
 
-    def along(self, step):
+    def along(self, step: float) -> Iterator[float]:
         """Yield places along the main road, about `step` metres apart."""
         s = self.track.s[0] + self.rng.uniform(0, step)
         while s < self.track.s[-1] - 3:
@@ -116,10 +134,8 @@ class Street:
             s += step * self.rng.uniform(0.75, 1.35)
 
 
-def build(rng, bank, track, style):
-    """Lay out a `Street` of a `Style` along a `Track`; rng: NumPy generator; bank: result of
-    `textures.build`.
-    """
+def build(rng: np.random.Generator, bank: Bank, track: Track, style: Style) -> Street:
+    """Lay out a street along a track; bank: result of `textures.build`."""
     street = Street(rng, bank, style, track)
     _lay_ground(street)
     _surround(street)
@@ -130,7 +146,7 @@ def build(rng, bank, track, style):
     return street
 
 
-def _distance(x, z, points):
+def _distance(x: float | np.ndarray, z: float | np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the distance of each place, (n,), to the nearest of the points (m, 2); infinity
     without points.
     """
@@ -138,7 +154,7 @@ def _distance(x, z, points):
     return np.sqrt(((x - points[:, 0]) ** 2 + (z - points[:, 1]) ** 2).min(axis=1, initial=np.inf))
 
 
-def _lay_ground(street):
+def _lay_ground(street: Street) -> None:
     """Place roads, kerbs and sidewalks along the tracks."""
     half, width = street.style.half, street.style.sidewalk
     street.extrude([(-half, 0), (half, 0)], 1, street.style.road, "road", step=2.0, ground=1)
@@ -171,7 +187,7 @@ def _lay_ground(street):
         )
 
 
-def _surround(street):
+def _surround(street: Street) -> None:
     """Place grass around the roads, a forest around the grass, and the sky."""
     faces, light = things.Faces(street.names), street.environment
     low, high = street.middle.min(axis=0) - BEYOND, street.middle.max(axis=0) + BEYOND
@@ -213,7 +229,7 @@ def _surround(street):
     street.parts.append(faces.matrix())
 
 
-def _build_up(street, side):
+def _build_up(street: Street, side: int) -> None:
     """Divide one side of the main road into stretches and fill each with a random zone."""
     rng, s, end = street.rng, street.track.s[0], street.track.s[-1]
     while s < end - 5:
@@ -241,7 +257,15 @@ def _build_up(street, side):
         s = span[1]
 
 
-def _house_row(street, side, span, gap, setback, floors, pitched):
+def _house_row(
+    street: Street,
+    side: int,
+    span: tuple[float, float],
+    gap: float,
+    setback: float,
+    floors: tuple[int, int],
+    pitched: float,
+) -> None:
     """Place houses side by side where there is room.
 
     gap: metres between houses; setback: metres behind the building line; floors: lowest number and
@@ -265,7 +289,7 @@ def _house_row(street, side, span, gap, setback, floors, pitched):
             ],
             axis=1,
         )
-        clear = _distance(*points.T, street.houses).min() >= 0.8
+        clear = _distance(points[:, 0], points[:, 1], street.houses).min() >= 0.8
         if clear and street.off_road(*points.T).min() > street.style.sidewalk - 0.5:
             house = things.building(
                 street.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched
@@ -275,7 +299,7 @@ def _house_row(street, side, span, gap, setback, floors, pitched):
         s += width + gap
 
 
-def _border(street, side, span, kind, height):
+def _border(street: Street, side: int, span: tuple[float, float], kind: str, height: float) -> None:
     """Place a fence, a hedge or a wall along the building line."""
     texture, label, thickness = {
         "fence": ("picket", "fence", 0.0),
@@ -298,7 +322,9 @@ def _border(street, side, span, kind, height):
     )
 
 
-def _scatter(street, side, span, near, far, density):
+def _scatter(
+    street: Street, side: int, span: tuple[float, float], near: float, far: float, density: float
+) -> None:
     """Place trees and bushes `near` to `far` metres behind the building line; density: plants
     for each metre.
     """
@@ -311,7 +337,7 @@ def _scatter(street, side, span, near, far, density):
             street.put(plant(street.names, street.rng), x, z, street.rng.uniform(0, np.pi))
 
 
-def _furnish(street, side):
+def _furnish(street: Street, side: int) -> None:
     """Place lamps, signs, trees, persons and parked cars on one side of the main road."""
     rng, style, track = street.rng, street.style, street.track
     ahead = 0.0 if side > 0 else np.pi  # direction of the traffic on that side
@@ -365,13 +391,13 @@ def _furnish(street, side):
             )
 
 
-def _traffic(street):
+def _traffic(street: Street) -> None:
     """Place moving cars: beside the camera on a highway; else ahead at its pace, towards it and
     on a crossing.
     """
     rng, style, track = street.rng, street.style, street.track
 
-    def drive(road, s, pace, d, turn=0.0):
+    def drive(road: Track, s: float, pace: float | None, d: float, turn: float = 0.0) -> None:
         street.movers.append(Mover(things.car(street.names, rng), road, s, pace, d, turn))
 
     if not style.sidewalk:
@@ -400,7 +426,7 @@ def _traffic(street):
             )
 
 
-def environment(style):
+def environment(style: Style) -> Environment:
     """Return the light of a style as a `raster.Environment`."""
     azimuth, elevation = style.sun if style.sunny else (style.sun[0], 1.35)
     sun = np.array(

@@ -6,8 +6,9 @@ structure, so corners are found on them from near and from far. Windows and pick
 other: the tracker confuses equal ones with their neighbours.
 """
 
+from collections.abc import Iterable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from thesis_repro.world.raster import ALPHA_LEVELS, LEVELS, OPAQUE, Textures
 
 # Metres that one repeat covers (along u, along v); None: one repeat covers the whole width of the
 # surface.
-TILE = {
+TILE: dict[str, tuple[float, Any]] = {
     "road": (28.0, None),
     "highway": (30.0, None),
     "asphalt": (12.0, 12.0),
@@ -59,7 +60,7 @@ class Bank(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def build(seed):
+def build(seed: int) -> Bank:
     """Return all textures of the world with this seed as a `Bank`."""
     painted = _painted(np.random.default_rng((seed, TEXTURES)))
     chunks, start, length = [], np.zeros((len(painted), LEVELS, LEVELS), np.int64), 0
@@ -83,7 +84,7 @@ def build(seed):
     )
 
 
-def _reduced(layer, row_level, column_level, is_alpha):
+def _reduced(layer: np.ndarray, row_level: int, column_level: int, is_alpha: bool) -> np.ndarray:
     """Return one level of a gray or alpha image as a flat array of bytes.
 
     Rows and columns are reduced separately, so a road seen at a flat angle stays sharp in one
@@ -98,7 +99,7 @@ def _reduced(layer, row_level, column_level, is_alpha):
     return np.clip(np.rint(level), 0, 255).astype(np.uint8).ravel()
 
 
-def _painted(rng):
+def _painted(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, ...]]:
     """Return all textures by name: (gray,), or (gray, alpha) for cut-outs. Their sides are
     powers of two.
     """
@@ -150,7 +151,9 @@ def _painted(rng):
 # Surfaces
 
 
-def noise(rng, shape, cell, slope=1.7):
+def noise(
+    rng: np.random.Generator, shape: tuple[int, ...], cell: float, slope: float = 1.7
+) -> np.ndarray:
     """Return periodic noise, float32, standard deviation 1, with structures of up to about `cell`
     pixels.
 
@@ -163,7 +166,7 @@ def noise(rng, shape, cell, slope=1.7):
     return (image / image.std()).astype(np.float32)
 
 
-def _asphalt(rng, shape, patches):
+def _asphalt(rng: np.random.Generator, shape: tuple[int, ...], patches: int) -> np.ndarray:
     """Paint asphalt; patches: number of repaired squares and of cracks."""
     (rows, columns), base = shape, 100.0
     image = base + 9 * noise(rng, shape, 128, 0.9)
@@ -180,7 +183,7 @@ def _asphalt(rng, shape, patches):
     return image
 
 
-def _carriageway(rng, lines):
+def _carriageway(rng: np.random.Generator, lines: Iterable[tuple[float, float, int]]) -> np.ndarray:
     """Paint a road with its markings, (512, 2048), u along the road.
 
     lines: (position, half width, number of dashes), the first two as shares of the road's width; 0
@@ -202,7 +205,14 @@ def _carriageway(rng, lines):
     return image
 
 
-def _slabs(rng, shape, rows, columns, joint, spread=9.0):
+def _slabs(
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+    rows: int,
+    columns: int,
+    joint: int,
+    spread: float = 9.0,
+) -> np.ndarray:
     """Paint slabs or bricks with dark joints, to be added to a surface; each has a random tone
     (deviation `spread`).
 
@@ -220,7 +230,7 @@ def _slabs(rng, shape, rows, columns, joint, spread=9.0):
     return image
 
 
-def _facade(rng, kind):
+def _facade(rng: np.random.Generator, kind: int) -> np.ndarray:
     """Paint two floors of a house with four windows each, (512, 1024); kind: 0 to FACADES - 1."""
     shape = (512, 1024)
     base = (172.0, 128.0, 200.0, 112.0)[kind]
@@ -249,7 +259,11 @@ def _facade(rng, kind):
 # Cut-outs
 
 
-def _outline(shape, polygons, ellipses=()):
+def _outline(
+    shape: tuple[int, ...],
+    polygons: list,
+    ellipses: Iterable[tuple[float, float, float, float]] = (),
+) -> np.ndarray:
     """Return an antialiased alpha image of polygons and ellipses, whose coordinates are shares
     of the size.
     """
@@ -274,7 +288,7 @@ def _outline(shape, polygons, ellipses=()):
     return cv2.resize(mask, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
 
 
-def _leaves(rng):
+def _leaves(rng: np.random.Generator) -> np.ndarray:
     """Paint foliage in clumps, (512, 512), the dark leaves first and the light ones over them."""
     image, count = np.full((512, 512), 38, np.float32), 8192
     clumps = noise(rng, image.shape, 64, 1.4)
@@ -286,7 +300,7 @@ def _leaves(rng):
     return image + 10 * clumps
 
 
-def _tree(rng, leaves):
+def _tree(rng: np.random.Generator, leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Paint a tree in side view, (512, 512); leaves: texture of its crown."""
     shape = (512, 512)
     y, x = np.mgrid[0:512, 0:512]
@@ -304,7 +318,7 @@ def _tree(rng, leaves):
     return image, np.where(foliage | wood, 255.0, 0.0)
 
 
-def _person(rng):
+def _person(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Paint a standing or walking person, (256, 128)."""
     shape = (256, 128)
     stride, shoulder, hip = (
@@ -341,7 +355,7 @@ def _person(rng):
     )
 
 
-def _picket(rng):
+def _picket(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Paint a picket fence, (128, 512), with pickets of unequal width, height and tone."""
     image, alpha = 120 + 8 * noise(rng, (128, 512), 32, 1.2), np.zeros((128, 512))
     alpha[34:46], alpha[96:108] = 255, 255
@@ -354,7 +368,7 @@ def _picket(rng):
     return image, alpha
 
 
-def _sign(kind):
+def _sign(kind: int) -> tuple[np.ndarray, np.ndarray]:
     """Paint a traffic sign, (128, 128): "no entry" (kind 0) or a board. Both look the same from
     behind.
     """
@@ -369,14 +383,14 @@ def _sign(kind):
     return image, _outline(image.shape, [[(0.02, 0.1), (0.98, 0.1), (0.98, 0.9), (0.02, 0.9)]])
 
 
-def _car_side(rng):
+def _car_side(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Paint the right side of a car in middle gray, (256, 512)."""
     shape, length = (256, 512), CAR_PROFILE[:, 0].max()
 
-    def parts(points):
+    def parts(points: np.ndarray | list) -> np.ndarray:
         return np.asarray(points, float) * (1 / length, -1 / CAR_HEIGHT) + (0, 1)
 
-    def wheels(share):
+    def wheels(share: float) -> list[tuple[float, float, float, float]]:
         return [
             (x / length, 1 - 0.31 / CAR_HEIGHT, share * 0.31 / length, share * 0.31 / CAR_HEIGHT)
             for x in (0.85, 3.45)
@@ -401,7 +415,7 @@ def _car_side(rng):
     return image, _outline(shape, [parts(CAR_PROFILE)], wheels(1.0))
 
 
-def _car_end(rng):
+def _car_end(rng: np.random.Generator) -> np.ndarray:
     """Paint the front or rear of a car in middle gray, (128, 256)."""
     image = (
         128

@@ -5,9 +5,12 @@ A thing is built in local coordinates: metres, y = 0 on the ground, x and z arou
 moves it into the street. `names` maps the names of textures to their indices.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from thesis_repro.cityscapes import ID
+from thesis_repro.world.drives import Track
 from thesis_repro.world.raster import COLUMNS, CORNER, EDGE_S, EDGE_T, X, Y, Z
 from thesis_repro.world.textures import CAR_HEIGHT, CAR_PROFILE, FACADES, SIGNS, TILE, TREES
 
@@ -19,23 +22,24 @@ class Faces:
     right and edge_t up.
     """
 
-    def __init__(self, names):
-        self.names, self._rows = names, []
+    def __init__(self, names: dict[str, int]) -> None:
+        self.names = names
+        self._rows: list[tuple] = []
 
     def add(
         self,
-        corner,
-        edge_s,
-        edge_t,
-        texture,
-        label,
-        repeats=(1.0, 1.0),
-        uv=None,
-        gain=1.0,
-        triangle=0,
-        ground=0,
-        lit=1,
-    ):
+        corner: tuple[float, float, float],
+        edge_s: tuple[float, float, float],
+        edge_t: tuple[float, float, float],
+        texture: str,
+        label: str,
+        repeats: tuple[float, float] = (1.0, 1.0),
+        uv: tuple[float, ...] | None = None,
+        gain: float = 1.0,
+        triangle: int = 0,
+        ground: int = 0,
+        lit: int = 1,
+    ) -> None:
         """Add one face; corner and edges in metres. The other arguments are columns that `raster`
         describes.
 
@@ -58,7 +62,15 @@ class Faces:
             )
         )
 
-    def box(self, x, y, z, texture, label, gain=1.0):
+    def box(
+        self,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        z: tuple[float, float],
+        texture: str,
+        label: str,
+        gain: float = 1.0,
+    ) -> None:
         """Add an upright box without a bottom; x, y, z: (low, high) on each axis; low y is the
         top.
         """
@@ -90,12 +102,12 @@ class Faces:
             gain=gain,
         )
 
-    def matrix(self):
+    def matrix(self) -> np.ndarray:
         """Return the faces added so far, (n, COLUMNS)."""
         return np.array(self._rows, np.float64).reshape(-1, COLUMNS)
 
 
-def place(faces, x, z, yaw, y=0.0):
+def place(faces: np.ndarray, x: float, z: float, yaw: float, y: float = 0.0) -> np.ndarray:
     """Return local faces (n, COLUMNS) turned by yaw (radians to the right) and moved to (x, y,
     z).
     """
@@ -111,7 +123,18 @@ def place(faces, x, z, yaw, y=0.0):
     return placed
 
 
-def extrude(names, track, s, side, profile, texture, label, off_road=None, ground=0, lit=1):
+def extrude(
+    names: dict[str, int],
+    track: Track,
+    s: np.ndarray,
+    side: int,
+    profile: list[tuple[float, float]],
+    texture: str,
+    label: str,
+    off_road: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    ground: int = 0,
+    lit: int = 1,
+) -> np.ndarray:
     """Return the faces of a strip along a track, (n, COLUMNS): a road, a sidewalk, a fence or a
     wall.
 
@@ -172,7 +195,7 @@ def extrude(names, track, s, side, profile, texture, label, off_road=None, groun
     return np.concatenate(parts)
 
 
-def car(names, rng):
+def car(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
     """Build a car of random colour and size that looks along z, its middle at the origin."""
     faces = Faces(names)
     gain = float(rng.choice([1.55, 1.15, 0.7, 0.42, 0.32, 1.4]))
@@ -213,7 +236,9 @@ def car(names, rng):
     return faces.matrix()
 
 
-def cut_out(names, texture, label, width, height, gain=1.0):
+def cut_out(
+    names: dict[str, int], texture: str, label: str, width: float, height: float, gain: float = 1.0
+) -> np.ndarray:
     """Build two upright pictures that cross each other."""
     faces = Faces(names)
     for x, z in ((width, 0), (0, width)):
@@ -221,7 +246,9 @@ def cut_out(names, texture, label, width, height, gain=1.0):
     return faces.matrix()
 
 
-def tree(names, rng, lowest=5.0, highest=9.5):
+def tree(
+    names: dict[str, int], rng: np.random.Generator, lowest: float = 5.0, highest: float = 9.5
+) -> np.ndarray:
     """Build a tree; lowest, highest: metres."""
     height = rng.uniform(lowest, highest)
     return cut_out(
@@ -234,12 +261,12 @@ def tree(names, rng, lowest=5.0, highest=9.5):
     )
 
 
-def bush(names, rng):
+def bush(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
     """Build a bush: a small tree whose trunk is below the ground."""
     return place(tree(names, rng, 2.2, 4.0), 0, 0, 0, 1.2)
 
 
-def lamp(names, rng):
+def lamp(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
     """Build a street lamp whose arm reaches to the left."""
     faces, height = Faces(names), rng.uniform(5, 7)
     faces.box((-0.07, 0.07), (-height, 0), (-0.07, 0.07), "metal", "pole")
@@ -250,7 +277,7 @@ def lamp(names, rng):
     return faces.matrix()
 
 
-def sign(names, rng):
+def sign(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
     """Build a traffic sign that is seen from z and from -z."""
     faces, kind = Faces(names), int(rng.integers(0, SIGNS))
     height, size = rng.uniform(1.9, 2.4), rng.uniform(0.65, 0.9) * (1.4 if kind == 1 else 1)
@@ -267,7 +294,14 @@ def sign(names, rng):
     return faces.matrix()
 
 
-def building(names, rng, width, depth, floors, pitched):
+def building(
+    names: dict[str, int],
+    rng: np.random.Generator,
+    width: float,
+    depth: float,
+    floors: int,
+    pitched: bool,
+) -> np.ndarray:
     """Build a house whose front stands at z = 0 and looks to -z; pitched: a roof with a ridge
     instead of a flat one.
     """
