@@ -84,40 +84,6 @@ def test_imports_are_found():
     assert imports(tree, "study") == {"study.runner", "report.style"}
 
 
-def test_public_functions_have_types():
-    untyped = []
-    for name, path in MODULES.items():
-        if name.split(".")[0] not in (
-            "masks",
-            "kitti",
-            "trajectories",
-            "odometry",
-            "study",
-            "report",
-            "world",
-        ):
-            continue
-        body = tree_of(path).body
-        for node in [
-            *body,
-            *(member for item in body if isinstance(item, ast.ClassDef) for member in item.body),
-        ]:
-            if (
-                not isinstance(node, ast.FunctionDef)
-                or node.name.startswith("_")
-                or any(
-                    ast.unparse(decorator) in ("fast", "inner") for decorator in node.decorator_list
-                )
-            ):
-                continue  # compiled functions get their types from their arguments
-            arguments = [*node.args.args, *node.args.kwonlyargs]
-            if node.returns is None or not all(
-                a.annotation for a in arguments if a.arg not in ("self", "cls")
-            ):
-                untyped.append(f"{name}: {node.name}")
-    assert untyped == []
-
-
 def test_no_file_is_read_with_code_in_it():
     # ruff forbids unsafe functions (pyproject.toml), but not these arguments
     assert [

@@ -7,6 +7,7 @@ build_unet.
 """
 
 from importlib import import_module
+from typing import Any
 
 _HOMES = {
     "Sequence": "kitti",
@@ -22,7 +23,7 @@ _HOMES = {
 __all__ = ["InputError", *_HOMES]
 
 
-def one_line(text):
+def one_line(text: object) -> str:
     """Return a text as one printable line: line breaks and control characters become escape
     sequences such as \\n.
     """
@@ -39,19 +40,19 @@ class InputError(ValueError):
     to do.
     """
 
-    def __str__(self):
+    def __str__(self) -> str:
         return one_line(super().__str__())  # file names may hold any character
 
-    def _render_traceback_(self):
+    def _render_traceback_(self) -> list[str]:
         """Let IPython show only the message, without a traceback."""
         return [f"InputError: {self}"]
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return [*globals(), *_HOMES]

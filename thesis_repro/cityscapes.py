@@ -2,8 +2,9 @@
 thesis's flat layout.
 """
 
+from collections.abc import Collection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -104,16 +105,16 @@ class Pair(NamedTuple):
     """
 
     name: str
-    image: Path
-    label: Path
+    image: Any  # Path or None
+    label: Any  # Path or None
 
 
-def colorize(label_map):
+def colorize(label_map: np.ndarray) -> np.ndarray:
     """Colour image (height, width, 3), red, green, blue, of a label map (height, width)."""
     return COLORS[np.minimum(label_map, len(COLORS) - 1)]
 
 
-def pairs(root, split, limit=None):
+def pairs(root: str | Path, split: str, limit: int | None = None) -> list[Pair]:
     """Pairs of image and label map of one split ("train" or "val"), sorted by name.
 
     limit: largest number of pairs; None for all. They are spread evenly over the split, because it
@@ -129,7 +130,7 @@ def pairs(root, split, limit=None):
     return split_pairs
 
 
-def listing(root, split):
+def listing(root: str | Path, split: str) -> list[Pair]:
     """Pairs of one split, sorted by name, including incomplete pairs. Raises InputError if there
     are no images.
 
@@ -164,7 +165,7 @@ def listing(root, split):
     return [Pair(name, images.get(name), labels.get(name)) for name in sorted(images | labels)]
 
 
-def check_complete(pair):
+def check_complete(pair: Pair) -> None:
     """Raise InputError if the image or the label map is missing."""
     if pair.label is None:
         raise InputError(f"{pair.image}: has no label map")
@@ -172,7 +173,7 @@ def check_complete(pair):
         raise InputError(f"{pair.label}: has no image")
 
 
-def read_image(path, height, width, channels=1):
+def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> np.ndarray:
     """Read an image and resize it bilinearly (A.2.1): uint8 (height, width, channels).
 
     channels: 1 for gray, as in the thesis; 3 for red, green, blue.
@@ -181,7 +182,7 @@ def read_image(path, height, width, channels=1):
     return cv2.resize(image, (width, height)).reshape(height, width, channels)
 
 
-def read_label_map(path, train_ids=False):
+def read_label_map(path: str | Path, train_ids: bool = False) -> np.ndarray:
     """Read a label map (height, width) of Cityscapes label ids, uint8. train_ids: translate train
     ids to label ids.
 
@@ -200,7 +201,9 @@ def read_label_map(path, train_ids=False):
     )
 
 
-def load(image_pairs, size, channels=1):
+def load(
+    image_pairs: Collection[Pair], size: int, channels: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size),
     both uint8 (A.2).
 

@@ -5,9 +5,11 @@ import os
 import shlex
 import signal
 import sys
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 from thesis_repro import InputError, console
 from thesis_repro.options import MASK_OPTIONS, build_parser
@@ -31,7 +33,7 @@ OUTPUT_FILES = {
 # itself, so that --help is fast.
 
 
-def synthesize(options):
+def synthesize(options: Any) -> None:
     """write the embedded world, a rendered street, in the folder layouts of KITTI and Cityscapes"""
     from thesis_repro import world
 
@@ -44,7 +46,7 @@ def synthesize(options):
         )
 
 
-def check_data(options):
+def check_data(options: Any) -> int:
     """check folders of KITTI, Cityscapes or KITTI's street scenes: their content, damage, and
     what can be run
     """
@@ -58,7 +60,7 @@ def check_data(options):
     return 0 if check.report(*roots, options.deep) else 1
 
 
-def predict(options):
+def predict(options: Any) -> None:
     """predict label maps (Cityscapes ids as 8-bit PNG, 320x320, named like the frames) for
     images or sequences
     """
@@ -98,7 +100,7 @@ def predict(options):
         )
 
 
-def masks(options):
+def masks(options: Any) -> None:
     """write the keypoint masks of a sequence (appendix A.8): 8-bit PNG images, 255 keeps
     keypoints, 0 ignores them
     """
@@ -120,7 +122,7 @@ def masks(options):
         print(f"{folder}: {len(label_masks)} masks{f' of width {width}' * bool(options.dilation)}")
 
 
-def odometry(options):
+def odometry(options: Any) -> None:
     """run the visual odometry on one sequence and print its errors, number of keypoints and time"""
     from thesis_repro import check, kitti, odometry
     from thesis_repro.odometry import metrics
@@ -175,7 +177,7 @@ def odometry(options):
     )
 
 
-def study(options):
+def study(options: Any) -> int:
     """compare your own label maps or masks with all keypoints and with controls, in tables,
     figures and a page
     """
@@ -225,7 +227,7 @@ def study(options):
     return 1 if failed else 0
 
 
-def evaluate(options):
+def evaluate(options: Any) -> None:
     """compare trajectories with the ground truth: the thesis's RMSE and MAE, ATE, RPE, KITTI's
     t_rel and r_rel
     """
@@ -282,7 +284,7 @@ COMMANDS = {
 # Helpers of several commands
 
 
-def _sequence(options):
+def _sequence(options: Any) -> Any:
     from thesis_repro.kitti import Sequence
 
     sequence = Sequence(
@@ -291,7 +293,7 @@ def _sequence(options):
     return sequence.subset(options.frames)
 
 
-def _print_oddities(sequence, mask_sets):
+def _print_oddities(sequence: Any, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
     from thesis_repro import check
 
@@ -304,7 +306,7 @@ def _print_oddities(sequence, mask_sets):
     return warnings
 
 
-def _warn(lines):
+def _warn(lines: Iterable[str]) -> list[str]:
     """Print warnings, "place: fault", and return them. One fault of several places is one line."""
     places: dict[str, list[str]] = {}
     for line in lines:
@@ -316,7 +318,7 @@ def _warn(lines):
     return merged
 
 
-def _image_folders(root):
+def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     """Yield (folder, its images) for a folder of images, a sequence, or each sequence of a KITTI
     folder or of a folder of sequences.
 
@@ -338,7 +340,7 @@ def _image_folders(root):
         yield folder, paths
 
 
-def _mask_settings(options, has_labels=True):
+def _mask_settings(options: Any, has_labels: bool = True) -> Any:
     from thesis_repro.masks import MaskSettings
 
     settings = MaskSettings(
@@ -361,7 +363,7 @@ def _mask_settings(options, has_labels=True):
     return settings
 
 
-def _masks(options, sequence):
+def _masks(options: Any, sequence: Any) -> Any:
     """The masks that --masks or --labels name, or None."""
     from thesis_repro.masks import LabelMasks, MaskFolder
 
@@ -376,11 +378,11 @@ def _masks(options, sequence):
     return MaskFolder(options.masks, sequence, options.invert) if options.masks else None
 
 
-def _output_files(options):
+def _output_files(options: Any) -> dict[str, Path]:
     return {name: vars(options)[name] for name in OUTPUT_FILES if vars(options).get(name)}
 
 
-def _check_outputs(options, *inputs):
+def _check_outputs(options: Any, *inputs: Path | None) -> None:
     """Raise InputError, before anything runs, if an output cannot be written or would overwrite
     or mix with inputs.
     """
@@ -410,7 +412,7 @@ def _check_outputs(options, *inputs):
         used.add(path.resolve())
 
 
-def _print(options, record, template, **values):
+def _print(options: Any, record: Any, template: str, **values: Any) -> None:
     """Print a result as JSON or with a template, and name the written files on standard error."""
     from thesis_repro.report import texts
 
@@ -425,7 +427,7 @@ def _print(options, record, template, **values):
         console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
-def main(arguments=None):
+def main(arguments: list[str] | None = None) -> int:
     for stream in ("stdout", "stderr"):
         if getattr(sys, stream) is None:  # it was closed
             setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))

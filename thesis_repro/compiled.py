@@ -1,14 +1,16 @@
 """Compile the inner loops with Numba."""
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba
 
 DIGEST_NAME = "compiled-from"  # a file in the folder of Numba's cache
 
 
-def forget_stale(folder):
+def forget_stale(folder: Path) -> None:
     """Delete Numba's cache of the modules in and below a folder if the bytes of one of them have
     changed.
 
@@ -34,7 +36,7 @@ for _folder in (path.parent for path in Path(__file__).parent.glob("*/__init__.p
     forget_stale(_folder)
 
 
-def fast(function, **options):
+def fast(function: Callable, **options: Any) -> Callable:
     """Compile a function of numbers and arrays. The machine code is cached on disk and runs without
     Python's lock.
 
@@ -52,7 +54,7 @@ def fast(function, **options):
         return numba.njit(**options)(function)
 
 
-def inner(function):
+def inner(function: Callable) -> Callable:
     """Compile a function for calls from compiled functions only: it is inlined there, and Python
     cannot call it.
 

@@ -14,10 +14,12 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from logging.handlers import MemoryHandler
 from pathlib import Path
+from typing import Any
 
 from thesis_repro import InputError, one_line
 
@@ -60,7 +62,7 @@ NO_MEMORY_TEXTS = (
 class _Printer(logging.Handler):
     """Prints messages and warnings on standard error, where they do not mix with results."""
 
-    def emit(self, record):
+    def emit(self, record: logging.LogRecord) -> None:
         if record.levelno < logging.ERROR and not hasattr(record, "printed"):
             prefix = "warning: " if record.levelno == logging.WARNING else ""
             print(prefix + one_line(record.getMessage()), file=sys.stderr, flush=True)
@@ -72,7 +74,7 @@ log.setLevel(logging.INFO)
 log.propagate = False
 
 
-def explain(error):
+def explain(error: BaseException | None) -> str | None:
     """Return one line for an InputError or for a lack of space, permission or memory; None for any
     other error.
 
@@ -102,7 +104,7 @@ def explain(error):
     return None
 
 
-def number_of(error):
+def number_of(error: BaseException) -> int | None:
     """Return the system's number of an error, or None. HDF5 and other libraries give the
     system's text only.
     """
@@ -114,7 +116,7 @@ def number_of(error):
     return getattr(error, "errno", None) or next(numbers, None)
 
 
-def need_addresses(gigabytes):
+def need_addresses(gigabytes: int) -> None:
     """Raise InputError if `ulimit -v` is too low. Some libraries would then end the process
     without a message.
     """
@@ -125,7 +127,7 @@ def need_addresses(gigabytes):
         )
 
 
-def report_error(error):
+def report_error(error: Exception) -> int:
     """Print the error that ends a command, and return the exit status. Raises an error that
     `explain` does not know.
     """
@@ -144,7 +146,9 @@ class _LogFile(MemoryHandler):
     files.
     """
 
-    def __init__(self, folder, has_results):
+    target: Any  # the FileHandler; of a MemoryHandler it may be None
+
+    def __init__(self, folder: Path, has_results: bool) -> None:
         super().__init__(
             1,
             target=logging.FileHandler(folder / LOG, delay=True, encoding="utf-8"),
@@ -160,7 +164,7 @@ class _LogFile(MemoryHandler):
             time.monotonic(),
         )
 
-    def shouldFlush(self, record):
+    def shouldFlush(self, record: logging.LogRecord) -> bool:
         self.warnings += record.levelno == logging.WARNING
         self.has_results = (
             self.has_results
@@ -169,7 +173,7 @@ class _LogFile(MemoryHandler):
         )
         return self.has_results
 
-    def end(self, text, reused=0):
+    def end(self, text: str, reused: int = 0) -> None:
         """Print a summary of the run, its time, the number of results reused from an earlier
         run, and its warnings.
         """
@@ -182,11 +186,10 @@ class _LogFile(MemoryHandler):
 
 
 @contextmanager
-def logged(folder, title, has_results=False):
+def logged(folder: str | Path, title: str, has_results: bool = False) -> Iterator[_LogFile]:
     """Log into a folder what `log` prints, Python's warnings, and the error that ends the block.
 
-    Yields the `_LogFile`. title: the first line. has_results: write the log at once, not only when
-    results appear.
+    title: the first line. has_results: write the log at once, not only when results appear.
     """
     handler = _LogFile(Path(folder), has_results)
     loggers = log, logging.getLogger("py.warnings")
@@ -212,7 +215,7 @@ def logged(folder, title, has_results=False):
 
 
 @contextmanager
-def quiet():
+def quiet() -> Iterator[None]:
     """Hide what libraries' own code prints on standard output and error within the block."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -234,7 +237,7 @@ def quiet():
 
 
 @contextmanager
-def stoppable():
+def stoppable() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that worker processes end too.
 
     They raise KeyboardInterrupt with the signal's number. An ignored signal (nohup) stays ignored.
@@ -242,7 +245,7 @@ def stoppable():
     `check_stop` raises it again.
     """
 
-    def stop(number, _):
+    def stop(number: int, _: object) -> None:
         _stops.append(number)
         raise KeyboardInterrupt(number)
 
@@ -262,16 +265,16 @@ def stoppable():
             signal.signal(number, handler)
 
 
-_stops = []  # numbers of the signals that arrived within `stoppable`
+_stops: list[int] = []  # numbers of the signals that arrived within `stoppable`
 
 
-def check_stop():
+def check_stop() -> None:
     """Raise KeyboardInterrupt if a signal to stop has arrived (see `stoppable`)."""
     if _stops:
         raise KeyboardInterrupt(_stops[0])
 
 
-def end_with_parent():
+def end_with_parent() -> None:
     """Let the system kill this worker process when its parent ends, even if the parent is
     killed (Linux only).
     """
@@ -281,16 +284,16 @@ def end_with_parent():
             os._exit(1)  # the parent has ended already
 
 
-def interrupt_without(*ancestors):
+def interrupt_without(*ancestors: int) -> None:
     """Send SIGTERM to this process when it or one of the `ancestors` (process ids) loses its
     parent, even if that was killed (Linux only). A thread looks once a second.
     """
 
-    def parents():
+    def parents() -> list[str]:
         stats = (Path(f"/proc/{process}/stat").read_text() for process in (os.getpid(), *ancestors))
         return [stat.rpartition(")")[2].split()[1] for stat in stats]
 
-    def watch():
+    def watch() -> None:
         with suppress(OSError):
             at_start = parents()
             while parents() == at_start:

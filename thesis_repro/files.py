@@ -6,12 +6,14 @@ import secrets
 import stat
 import struct
 import sys
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, ImageFile, ImageOps
 from tqdm import tqdm
 from tqdm.utils import ObjectWrapper
 
@@ -25,7 +27,7 @@ END_MARKS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
 TAIL = 4096  # bytes at the end of a file in which `glance` looks for its end mark
 
 
-def read_gray(path):
+def read_gray(path: str | Path) -> np.ndarray:
     """Read one image as 8-bit gray, shape (height, width). Colours become their luminance.
 
     Raises InputError if the file is not a complete PNG or JPEG image with 8 bits a channel, and if
@@ -35,14 +37,14 @@ def read_gray(path):
     return _read(path, "L", cv2.IMREAD_GRAYSCALE)
 
 
-def read_color(path):
+def read_color(path: str | Path) -> np.ndarray:
     """Read one image as 8-bit red, green, blue, shape (height, width, 3). Raises what
     `read_gray` raises.
     """
     return _read(path, "RGB", cv2.IMREAD_COLOR_RGB)
 
 
-def read_ids(path):
+def read_ids(path: str | Path) -> np.ndarray:
     """Read one PNG of numbers such as class ids, shape (height, width) uint8, without changing a
     number.
 
@@ -65,7 +67,7 @@ def read_ids(path):
     return np.ascontiguousarray(channels[..., 0])
 
 
-def glance(path):
+def glance(path: str | Path) -> tuple[int, int]:
     """Return the size (height, width) of an image from its header, and check that the file has its
     end.
 
@@ -79,7 +81,7 @@ def glance(path):
         return image.size[::-1]
 
 
-def _read(path, mode, flag):
+def _read(path: str | Path, mode: str, flag: int) -> np.ndarray:
     with _opened(path) as (file, image):
         if image.format != "PNG":
             image.draft(mode, image.size)  # decodes gray directly, as OpenCV does
@@ -97,7 +99,7 @@ def _read(path, mode, flag):
 
 
 @contextmanager
-def _opened(path):
+def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, ImageFile.ImageFile]]:
     """Open an image file and read its header: yields (file, image). Turns all errors of the
     block into InputError.
     """
@@ -129,14 +131,14 @@ def _opened(path):
         raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
-def listed(folder, pattern="*.png"):
+def listed(folder: str | Path, pattern: str = "*.png") -> list[Path]:
     """Return the files of a folder that match a pattern, in sorted order, without hidden
     (temporary) files.
     """
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
 
 
-def images(folder):
+def images(folder: str | Path) -> list[Path]:
     """Return the PNG or JPEG images of a folder, sorted by name with 9 before 10, without hidden
     files.
 
@@ -159,17 +161,17 @@ def images(folder):
     )
 
 
-def numbers_of(paths):
+def numbers_of(paths: Iterable[Path]) -> list[int] | None:
     """Return the integers at the ends of file names, or None if a name has none or the names
     start differently.
     """
     matches = [re.fullmatch(r"(.*?)(\d+)", path.stem) for path in paths]
-    if not all(matches) or len({match[1] for match in matches}) > 1:
+    if not all(matches) or len({match[1] for match in matches if match}) > 1:
         return None
-    return [int(match[2]) for match in matches]
+    return [int(match[2]) for match in matches if match]
 
 
-def is_whole(path):
+def is_whole(path: str | Path) -> bool:
     """Return whether a file is an image with a valid header and end (see `glance`)."""
     try:
         return bool(glance(path))
@@ -178,7 +180,7 @@ def is_whole(path):
 
 
 @contextmanager
-def atomic(path):
+def atomic(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path; rename it to `path` when the block ends, or delete it if the block
     raises an error.
 
@@ -204,19 +206,19 @@ def atomic(path):
         temporary.unlink(missing_ok=True)
 
 
-def temporary_path(path):
+def temporary_path(path: Path) -> Path:
     """Return a temporary path beside `path`, with a random name that nobody can predict."""
     return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
 
 
-def _results_of(path):
+def _results_of(path: Path) -> Path | None:
     """Return the folder of results that a file lies in, or None."""
     return next(
         (folder for folder in path.absolute().parents if (folder / console.RECORD).exists()), None
     )
 
 
-def check_output(path):
+def check_output(path: Path) -> None:
     """Raise InputError if a file cannot be written to `path`, or could be moved away later with
     results around it.
     """
@@ -235,25 +237,25 @@ def check_output(path):
         )
 
 
-def write_text(path, text):
+def write_text(path: str | Path, text: str) -> None:
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_png(path, image):
+def write_png(path: str | Path, image: np.ndarray) -> None:
     """Write one 8-bit image, (height, width) or (height, width, 3) as BGR."""
     data = cv2.imencode(".png", image)[1]  # cv2.imwrite does not notice a full disk
     with atomic(path) as temporary:
         temporary.write_bytes(data)
 
 
-def write_array(path, array):
+def write_array(path: str | Path, array: np.ndarray) -> None:
     """Write a numpy array as .npy."""
     with atomic(path) as temporary, open(temporary, "wb") as file:
         np.save(file, array)
 
 
-def needed(path, notebook):
+def needed(path: str | Path, notebook: str) -> Path:
     """Return `path`, which an earlier notebook writes. Raises InputError with the notebook's
     name if it is missing.
     """
@@ -263,7 +265,13 @@ def needed(path, notebook):
     return path
 
 
-def progress(iterable=None, description="", total=None, unit="frame", initial=0):
+def progress(
+    iterable: Iterable | None = None,
+    description: str = "",
+    total: int | None = None,
+    unit: str = "frame",
+    initial: int = 0,
+) -> tqdm:
     """Return a tqdm progress bar on standard error, or on the file that THESIS_REPRO_PROGRESS
     names.
 
@@ -293,6 +301,6 @@ def progress(iterable=None, description="", total=None, unit="frame", initial=0)
 class _Lines(ObjectWrapper):
     """A file that turns the carriage returns of tqdm into lines."""
 
-    def write(self, text):
+    def write(self, text: str) -> None:
         if text.strip():
             self._wrapped.write(text.strip() + "\n")

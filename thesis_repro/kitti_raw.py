@@ -37,7 +37,7 @@ def files(folder: str | Path) -> list[Path]:
     return [*(calibration(folder, name) for name in names), *_measurements(folder)]
 
 
-def _measurements(folder):
+def _measurements(folder: str | Path) -> list[Path]:
     return listed(Path(folder) / OXTS, "*.txt")
 
 
@@ -78,7 +78,7 @@ def read_poses(folder: str | Path) -> np.ndarray:
     return to_camera @ np.linalg.inv(poses[0]) @ poses @ np.linalg.inv(to_camera)
 
 
-def _imu_poses(measured):
+def _imu_poses(measured: np.ndarray) -> np.ndarray:
     """Poses of the inertial unit, (n, 4, 4), in metres east, north and up.
 
     measured: (n, 6), latitude and longitude (degrees), altitude (metres), roll, pitch and yaw
@@ -98,7 +98,7 @@ def _imu_poses(measured):
     return poses
 
 
-def _text(path):
+def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
@@ -106,7 +106,7 @@ def _text(path):
         raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
-def _numbers(path, key, count):
+def _numbers(path: Path, key: str | None, count: int) -> np.ndarray:
     """Return the `count` numbers of a file, or of its line `key`."""
     lines = _text(path).splitlines()
     texts = [

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -121,7 +122,7 @@ def edges(
     return different.astype(np.uint8) * 255
 
 
-def _enlarge(label_map, size, symmetric):
+def _enlarge(label_map: np.ndarray, size: tuple[int, int], symmetric: bool) -> np.ndarray:
     """Enlarge a label map to the frame's size by nearest neighbour, so that no new ids appear."""
     nearest = cv2.INTER_NEAREST_EXACT if symmetric else cv2.INTER_NEAREST
     return cv2.resize(label_map, size[::-1], interpolation=nearest)
@@ -188,7 +189,9 @@ def keypoint_mask(
     return _finish_mask(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
 
 
-def _edges_and_forbidden(label_map, size, settings):
+def _edges_and_forbidden(
+    label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Edges and forbidden pixels (None if there are none) of a mask; both do not depend on the
     dilation width.
     """
@@ -203,7 +206,11 @@ def _edges_and_forbidden(label_map, size, settings):
     ) if has_forbidden else None
 
 
-def _finish_mask(edges_and_forbidden, dilation_width, settings):
+def _finish_mask(
+    edges_and_forbidden: tuple[np.ndarray, np.ndarray | None],
+    dilation_width: int,
+    settings: MaskSettings,
+) -> np.ndarray:
     edge_image, forbidden_pixels = edges_and_forbidden
     mask = dilate(edge_image, dilation_width, settings.symmetric)
     if settings.keep == "inverse":
@@ -275,7 +282,9 @@ def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)  # masks of several dilation widths share edges
-def _edges_and_forbidden_of_file(path, size, settings):
+def _edges_and_forbidden_of_file(
+    path: Path, size: tuple[int, int], settings: MaskSettings
+) -> tuple[np.ndarray, np.ndarray | None]:
     return _edges_and_forbidden(_read_once(path, settings.ids == "train"), size, settings)
 
 
@@ -358,7 +367,7 @@ def folder_of(folder: str | Path, sequence: str) -> Path:
     return folder if any(folder.glob("[!.]*.png")) and not subfolder.is_dir() else subfolder
 
 
-def _paths_by_frame(folder, sequence, kind):
+def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[Path]:
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
     if kind == "mask" and Path(folder).is_file():
         return [Path(folder)] * len(sequence)
@@ -375,7 +384,7 @@ def _paths_by_frame(folder, sequence, kind):
         if numbers_of([*sequence.frame_paths, Path(stem)]) is None:
             return list(present.values()) * len(sequence)
     # some tools append .png to the whole name
-    paths = [
+    paths: list[Any] = [
         present.get(name) or present.get(f"{frame.name}.png")
         for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)
     ]

@@ -2,9 +2,11 @@
 
 import argparse
 import textwrap
+from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, NoReturn
 
 from thesis_repro import InputError, one_line
 from thesis_repro.settings import PROFILES, number, read_frames, read_widths, scheduler_address
@@ -15,26 +17,26 @@ class _Parser(argparse.ArgumentParser):
     empty paths.
     """
 
-    def __init__(self, **options):
+    def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, **options)
         self.register("type", Path, _path)
 
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {one_line(message)}; see {self.prog} --help\n")
 
 
-def _path(text):
+def _path(text: str) -> Path:
     if not text.strip():
         raise argparse.ArgumentTypeError("is empty; name a file or a folder")
     return Path(text)
 
 
-def _setting(read):
+def _setting(read: Callable[[str], Any]) -> Callable[[str], Any]:
     """Let argparse show the InputError of a function that reads an option, instead of "invalid
     value".
     """
 
-    def read_text(text):
+    def read_text(text: str) -> Any:
         try:
             return read(text)
         except InputError as error:
@@ -44,7 +46,7 @@ def _setting(read):
 
 
 # options of several commands
-SHARED = {
+SHARED: dict[str, dict[str, Any]] = {
     "--kitti": dict(
         type=Path,
         metavar="ROOT",
@@ -88,7 +90,7 @@ SHARED = {
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
 WIDTHS = dict(type=_setting(read_widths), nargs="+", action="extend", metavar="W")
-MASK_OPTIONS = {
+MASK_OPTIONS: dict[str, dict[str, Any]] = {
     "--boundaries": dict(
         metavar="canny|exact",
         default="canny",
@@ -128,11 +130,11 @@ MASK_OPTIONS = {
 }
 
 
-def _shared(*names):
+def _shared(*names: str) -> dict[str, dict[str, Any]]:
     return {name: SHARED[name] for name in names}
 
 
-def _source(kind, content):
+def _source(kind: str, content: str) -> dict[str, Any]:
     """Return the arguments of an option that adds a source of masks to a study."""
     return dict(
         dest="sources",
@@ -144,7 +146,7 @@ def _source(kind, content):
 
 
 # the arguments of `add_argument` for each option of each command
-COMMANDS = {
+COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
     "synthesize": {
         "out": dict(
             type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
@@ -311,7 +313,7 @@ COMMANDS = {
 EXCLUSIVE = {"odometry": ("--masks", "--labels"), "study": ("--jobs", "--dask")}
 
 
-def build_parser(functions):
+def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
     """Return the parser. functions: of the commands, by name; their docstrings are the help."""
     parser = _Parser(
         prog="thesis-repro",

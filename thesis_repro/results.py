@@ -16,11 +16,13 @@ import sqlite3
 import stat
 import time
 import zipfile
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
 from modulefinder import ModuleFinder
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,7 +34,7 @@ from thesis_repro.files import TEMPORARY, atomic, progress, write_text
 _PACKAGE = Path(__file__).parent
 
 
-def stage(folder, *, replace=True, **inputs):
+def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
     """Prepare a folder for results that are made from `inputs` (JSON values), and return its path.
 
     Results that an earlier run made from the same inputs stay. Temporary files of killed runs are
@@ -68,7 +70,7 @@ def stage(folder, *, replace=True, **inputs):
     return folder
 
 
-def _move_aside(folder, changed):
+def _move_aside(folder: Path, changed: str) -> None:
     """Move all that is in a folder of results into a new folder beside it. Nothing is deleted,
     because a user may have changed or added files.
     """
@@ -86,7 +88,7 @@ def _move_aside(folder, changed):
     console.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
 
 
-def record(folder):
+def record(folder: str | Path) -> Any:
     """Return the inputs of the results in a stage's folder as a dict, or None if the folder is
     not a stage.
     """
@@ -99,12 +101,12 @@ def record(folder):
         raise InputError(f"{path}: is damaged; delete its folder") from None
 
 
-def made_from(folder):
+def made_from(folder: str | Path) -> str:
     """Return a digest of the inputs of the results in a stage's folder."""
     return content(Path(folder) / RECORD)
 
 
-def check_worker(folder, made_from, **here):
+def check_worker(folder: str | Path, made_from: dict[str, Any], **here: Any) -> None:
     """Raise InputError if this worker sees another record in a stage's folder, or has other inputs.
 
     made_from: the record that the main process sees. here: inputs as this worker has them, such as
@@ -122,7 +124,7 @@ def check_worker(folder, made_from, **here):
         )
 
 
-def sweep(folder):
+def sweep(folder: str | Path) -> None:
     """Delete the temporary files of killed runs in and below a folder. The caller must hold its
     lock.
     """
@@ -135,7 +137,7 @@ _held: set[tuple[int, int]] = set()  # device and inode of each path that this p
 
 
 @contextmanager
-def claimed(folder):
+def claimed(folder: str | Path) -> Iterator[None]:
     """Create a folder if needed, and lock it until the block ends. Raises InputError if another
     process has locked it.
 
@@ -156,7 +158,7 @@ def claimed(folder):
 
 
 @contextmanager
-def locked(path):
+def locked(path: str | Path) -> Iterator[None]:
     """Lock an existing folder or file until the block ends. The same process may lock it again
     within the block.
     """
@@ -183,7 +185,7 @@ def locked(path):
 TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
 
 
-def kept_table(path, rows=None, **options):
+def kept_table(path: str | Path, rows: int | None = None, **options: Any) -> pd.DataFrame | None:
     """Return the table that an earlier run wrote to a CSV file, or None if there is none or it is
     damaged.
 
@@ -207,7 +209,7 @@ def kept_table(path, rows=None, **options):
 # Checkpoints
 
 
-def store(path, job, arrays):
+def store(path: str | Path, job: Any, arrays: dict[str, Any]) -> None:
     """Write a checkpoint: `job` (JSON values) and arrays by name."""
     with atomic(path) as temporary, open(temporary, "wb") as file:
         np.savez(
@@ -215,7 +217,7 @@ def store(path, job, arrays):
         )
 
 
-def resume(path):
+def resume(path: str | Path) -> Any:
     """Return (job, arrays) of a checkpoint that `store` wrote, or None if there is no file.
 
     Raises InputError for a damaged file.
@@ -239,7 +241,7 @@ def resume(path):
 
 
 @lru_cache
-def code(*places):
+def code(*places: str) -> str:
     """Return a digest of the code of folders ("odometry") or modules ("study/controls") of this
     package.
 
@@ -261,36 +263,36 @@ def code(*places):
 class _PackageFinder(ModuleFinder):
     """Finds the imported modules of this package, but not those of other packages."""
 
-    def find_module(self, name, path, parent=None):
+    def find_module(self, name: str, path: Any, parent: Any = None) -> Any:
         if path is None and name != _PACKAGE.name:
             raise ImportError(name)
         return super().find_module(name, path, parent)
 
 
-def _modules(places):
+def _modules(places: Iterable[str]) -> list[Path]:
     """Files of folders or modules of this package and of all its modules that they import,
     sorted.
     """
-    finder = _PackageFinder([str(_PACKAGE.parent)])
+    finder: Any = _PackageFinder([str(_PACKAGE.parent)])  # its types lack __file__
     for place in places:
         for path in sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"]:
             finder.import_hook(".".join(path.relative_to(_PACKAGE.parent).with_suffix("").parts))
     return sorted({Path(module.__file__) for module in finder.modules.values() if module.__file__})
 
 
-def made_with(*packages):
+def made_with(*packages: str) -> dict[str, Any]:
     """Return the versions of packages that results depend on."""
     return {"versions": {name: importlib.metadata.version(name) for name in packages}}
 
 
-def listing(paths):
+def listing(paths: Iterable[str | Path]) -> str:
     """Return one digest of the names and contents of files."""
-    paths = [Path(path) for path in paths]
-    lines = [f"{path.name}:{digest}\n" for path, digest in zip(paths, contents(paths), strict=True)]
+    files = [Path(path) for path in paths]
+    lines = [f"{path.name}:{digest}\n" for path, digest in zip(files, contents(files), strict=True)]
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
 
 
-def content(path):
+def content(path: str | Path) -> str:
     """Return a digest of the bytes of one file."""
     return contents([path])[0]
 
@@ -299,15 +301,15 @@ def content(path):
 SETTLED = 0.1
 
 
-def contents(paths):
+def contents(paths: Iterable[str | Path]) -> list[str]:
     """Return digests of the bytes of files, in order. Raises InputError for a path that is not a
     regular file.
 
     The digests are remembered in the build folder. A file is read again only if its path, size,
     dates or inode differ.
     """
-    paths = [Path(path).absolute() for path in paths]
-    identities = {path: _identity(path) for path in paths}
+    files = [Path(path).absolute() for path in paths]
+    identities = {path: _identity(path) for path in files}
     keys = {
         path: (json.dumps(str(path)), json.dumps(identity)) for path, identity in identities.items()
     }
@@ -328,10 +330,10 @@ def contents(paths):
             "INSERT OR REPLACE INTO digests VALUES (?, ?, ?)",
             [(*keys[path], digests[path]) for path in settled],
         )
-    return [digests[path][:12] for path in paths]
+    return [digests[path][:12] for path in files]
 
 
-def _identity(path):
+def _identity(path: Path) -> tuple[int, ...]:
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: is not a file; data must be in files")
@@ -339,7 +341,7 @@ def _identity(path):
 
 
 @contextmanager
-def _digest_database():
+def _digest_database() -> Iterator[sqlite3.Connection]:
     """Open the database of digests. The caller ignores its errors and then reads the files
     again.
     """
@@ -352,6 +354,6 @@ def _digest_database():
         yield database
 
 
-def _sha256(path):
+def _sha256(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -8,8 +8,10 @@ import hashlib
 import os
 import re
 import sys
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from thesis_repro import InputError
 
@@ -66,7 +68,9 @@ class Profile:
     world: dict  # sizes of the embedded world, as arguments of `world.write`
 
 
-def _world(sequences, frames, train_images, validation_images):
+def _world(
+    sequences: int, frames: int | None, train_images: int, validation_images: int
+) -> dict[str, Any]:
     """Sizes of the embedded world. frames: of each sequence; None for its whole drive, 41 to
     132 frames.
     """
@@ -169,21 +173,21 @@ class Settings:
     seed: int = SEED
 
     @property
-    def uses_shipped_model(self):
+    def uses_shipped_model(self) -> bool:
         """Whether the shipped model makes the label maps: there are real frames, but no real
         images to train on.
         """
         return self.cityscapes_is_embedded and not self.kitti_is_embedded
 
     @property
-    def figures_in_git(self):
+    def figures_in_git(self) -> bool:
         """Whether the figures folder is the one in git, which holds the figures of the default
         run.
         """
         return self.figures == ROOT / "figures"
 
     @property
-    def data_note(self):
+    def data_note(self) -> str:
         """One line for captions that names the data and the sizes of the run."""
         odometry = (
             "embedded world (rendered)" if self.kitti_is_embedded else "the user's KITTI folder"
@@ -200,11 +204,11 @@ class Settings:
         )
         return f"odometry: {odometry}; {labels}; profile {self.profile}{sizes}"
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"run {self.run}; results: {_from_root(self.build)}"
 
 
-def read_settings(environment=None):
+def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
     """Return the settings that the THESIS_REPRO_ variables of an environment (default: os.environ)
     give.
 
@@ -224,7 +228,7 @@ def read_settings(environment=None):
     build = Path(values.get("BUILD", ROOT / "build")).absolute()
     figures = Path(values.get("FIGURES", ROOT / "figures")).absolute()
     world = build / f"world-{profile}"
-    folders = {
+    folders: dict[str, Path] = {
         name: Path(values[name]).expanduser().absolute()
         for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC")
         if name in values
@@ -237,14 +241,12 @@ def read_settings(environment=None):
             raise InputError(f"{name}={values[name]}: has a character that shells treat specially")
         check_outside(f"{name}={values[name]}", Path(values[name]), folders.values())
     readers = {"WIDTHS": read_widths, "FRAMES": read_frames}
-    sizes = replace(
-        PROFILES[profile],
-        **{
-            name.lower(): readers[name](text) if name in readers else number(name, text)
-            for name, text in values.items()
-            if name in SIZES
-        },
-    )
+    changed: dict[str, Any] = {
+        name.lower(): readers[name](text) if name in readers else number(name, text)
+        for name, text in values.items()
+        if name in SIZES
+    }
+    sizes = replace(PROFILES[profile], **changed)
     run = _run_name(folders, profile, sizes)
     return Settings(
         profile=profile,
@@ -264,7 +266,7 @@ def read_settings(environment=None):
     )
 
 
-def check_outside(name, path, data):
+def check_outside(name: str, path: Path, data: Iterable[Path]) -> None:
     """Raise InputError if an output lies in or below one of the paths given as data, which are only
     read. name: how the user gave the output.
     """
@@ -273,7 +275,7 @@ def check_outside(name, path, data):
             raise InputError(f"{name}: lies in {folder}, which is data and only read; name another")
 
 
-def _run_name(folders, profile, sizes):
+def _run_name(folders: dict[str, Path], profile: str, sizes: Profile) -> str:
     """Name of the run: its data, its profile, and the sizes that differ from the profile's."""
     data = [] if folders.keys() & {"KITTI", "CITYSCAPES"} else ["embedded"]
     for name, folder in folders.items():
@@ -290,7 +292,7 @@ def _run_name(folders, profile, sizes):
     return "-".join(parts)
 
 
-def _changed_sizes(profile, sizes):
+def _changed_sizes(profile: str, sizes: Profile) -> dict[str, str]:
     """The sizes that differ from the profile's, as text by name ("image size")."""
     texts = {}
     for name in map(str.lower, SIZES):
@@ -301,7 +303,7 @@ def _changed_sizes(profile, sizes):
     return texts
 
 
-def number(name, text, limits=None):
+def number(name: str, text: str | int, limits: tuple[int, int, int] | None = None) -> int:
     """Return the whole number in the text of setting `name`. Raises InputError if its limits
     (default: LIMITS[name]) do not allow it. Notebooks check the numbers of their knobs with it.
     """
@@ -316,14 +318,14 @@ def number(name, text, limits=None):
     return value
 
 
-def read_frames(text):
+def read_frames(text: str) -> int | None:
     """Return the number of frames in a text, or None for "all". Raises InputError for a bad
     number.
     """
     return None if text == "all" else number("FRAMES", text)
 
 
-def read_widths(text):
+def read_widths(text: str) -> tuple[int, ...]:
     """Return the dilation widths, pixels, in a text such as "1-3,10", sorted. Raises InputError
     for another text.
     """
@@ -347,7 +349,7 @@ def read_widths(text):
     return tuple(numbers)
 
 
-def scheduler_address(text):
+def scheduler_address(text: str | None) -> str | None:
     """Return the address of a Dask scheduler, or None if there is none. Raises InputError for any
     other text, for which Dask would start a new cluster or read a file."""
     if text is not None and not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d{1,5}", text):
@@ -357,12 +359,13 @@ def scheduler_address(text):
     return text
 
 
-def cores():
+def cores() -> int:
     """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    # cpu_count may give None, but not on the systems that lack sched_getaffinity
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()  # type: ignore[return-value]
 
 
-def _from_root(path):
+def _from_root(path: Path) -> Path:
     return path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
 
 

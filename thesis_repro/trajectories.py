@@ -17,7 +17,7 @@ MAX_DIFFERENCE = 0.01  # seconds between a pose and its frame, evo's default
 MIN_MATCHED = 0.3, 0.1
 
 
-def _read_numbers(path, columns, comments=None):
+def _read_numbers(path: str | Path, columns: int, comments: str | None = None) -> np.ndarray:
     try:
         # some editors begin a file with a byte order mark
         with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
@@ -38,7 +38,7 @@ def read_times(path: str | Path) -> np.ndarray:
     return times
 
 
-def _check_increase(path, times):
+def _check_increase(path: str | Path, times: np.ndarray) -> None:
     steps_back = np.flatnonzero(np.diff(times) <= 0)
     if len(steps_back):
         raise InputError(
@@ -132,5 +132,5 @@ def read_tum(
     return np.array(numbers), np.array(trajectory.poses_se3)[nearest]
 
 
-def _write_rows(path, rows):
+def _write_rows(path: str | Path, rows: np.ndarray) -> None:
     write_text(path, "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in rows))

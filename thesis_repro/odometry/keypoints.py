@@ -62,7 +62,7 @@ def detect(
 
 
 @lru_cache
-def _orb(max_keypoints):
+def _orb(max_keypoints: int) -> cv2.ORB:
     return cv2.ORB_create(max_keypoints)
 
 
@@ -154,7 +154,7 @@ class SharedKeypoints:
         return detect(frame, settings, mask, self._corners[2])
 
 
-def _key(points):
+def _key(points: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(points).view(np.int64).ravel()
 
 

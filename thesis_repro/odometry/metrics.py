@@ -45,7 +45,7 @@ def shifted(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
     return motion @ estimated
 
 
-def _differences(estimated, true):
+def _differences(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Position differences of the aligned paths (see `rmse`) from frame 1 on, (n - 1, 3)."""
     estimated, true = checked(estimated, true)
     positions = estimated[1:, :3, 3] - estimated[1, :3, 3]
@@ -130,7 +130,7 @@ def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     }
 
 
-def _evo_paths(estimated, true):
+def _evo_paths(estimated: np.ndarray, true: np.ndarray) -> tuple[PosePath3D, ...]:
     checked(estimated, true)
     return tuple(
         PosePath3D(poses_se3=list(np.array(poses, np.float64))) for poses in (true, estimated)

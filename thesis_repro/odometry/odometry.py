@@ -37,7 +37,7 @@ class Step:
     current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     # tracked into the next frame
     keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
-    motion: Motion = Motion()
+    motion: Any = Motion()  # a RefinedMotion if it was refined
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres
     updated: bool = False  # whether this step moved the pose
     flags: list[str] = field(default_factory=list)
@@ -203,7 +203,7 @@ class Odometry:
         """
         settings = self.settings
         if step.images is not None and step.scale > settings.scale_gate and self._in_doubt(step):
-            self._use_all_keypoints(step)
+            self._use_all_keypoints(step, *step.images)
         step.images, motion = None, step.motion
         if step.points:
             if motion.rotation is None:
@@ -227,7 +227,7 @@ class Odometry:
         step.pose = self.pose
         return step
 
-    def _in_doubt(self, step):
+    def _in_doubt(self, step: Step) -> bool:
         motion = step.motion
         if motion.rotation is None or _by_chance(motion.inliers):
             return True
@@ -244,8 +244,7 @@ class Odometry:
             motion = replace(measured_motion, translation=motion.translation)
         return not is_consistent(motion, step.scale, self.prior)
 
-    def _use_all_keypoints(self, step):
-        previous_frame, frame = step.images
+    def _use_all_keypoints(self, step: Step, previous_frame: np.ndarray, frame: np.ndarray) -> None:
         points = keypoints.detect(previous_frame, self.settings)
         if len(points):
             current, was_tracked = keypoints.track(
@@ -259,12 +258,12 @@ class Odometry:
             step.flags.append(ALL_KEYPOINTS)
             self.estimate(step)
 
-    def _normalised(self, step):
+    def _normalised(self, step: Step) -> tuple[np.ndarray, ...]:
         return tuple(
             pose.normalise(points, self.intrinsics) for points in (step.current, step.previous)
         )
 
-    def _check_consistency(self, step):
+    def _check_consistency(self, step: Step) -> None:
         started = time.perf_counter()
         current, previous = self._normalised(step)
         step.motion, self.prior, flag = check_consistency(
@@ -274,7 +273,7 @@ class Odometry:
             step.flags.append(flag)
         step.seconds["pose"] += time.perf_counter() - started
 
-    def _check_parallax(self, step):
+    def _check_parallax(self, step: Step) -> None:
         """Flag a step without parallax: its points do not tell in which direction it went, or
         whether it was a zoom.
         """
@@ -283,13 +282,13 @@ class Odometry:
         if np.quantile(distances, 0.95) < MAX_TRACKING_ERROR / self.intrinsics[0, 0]:
             step.flags.append("zoom" if abs(zoom - 1) > MIN_ZOOM else "no parallax")
 
-    def _moved(self, motion, scale):
+    def _moved(self, motion: Any, scale: float) -> np.ndarray:
         moved, rotation = np.eye(4), self.pose[:3, :3]
         moved[:3, :3] = rotation @ motion.rotation
         moved[:3, 3] = self.pose[:3, 3] + scale * (rotation @ motion.translation)
         return moved
 
-    def _check(self, frame, scale, mask):
+    def _check(self, frame: np.ndarray, scale: float, mask: np.ndarray | None) -> None:
         if frame.dtype != np.uint8 or frame.ndim != 2:
             raise InputError(
                 f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
@@ -333,7 +332,7 @@ class Essential:
         return inliers
 
 
-def _essential(step, settings, intrinsics):
+def _essential(step: Step, settings: OdometrySettings, intrinsics: np.ndarray) -> Essential:
     started = time.perf_counter()
     order: np.ndarray | slice = slice(None)
     if settings.shuffle_seed is not None:
@@ -347,7 +346,7 @@ def _essential(step, settings, intrinsics):
     return Essential(current, previous, order, *result, time.perf_counter() - started)
 
 
-def _by_chance(inliers):
+def _by_chance(inliers: np.ndarray) -> bool:
     # With PySLAM's threshold, two unrelated frames have 7 inliers among 20 points, 9 among 100, 12
     # among 300, and 24 to 43 among 1600. In consecutive real frames, 45 to 85 % of the points are
     # inliers.

@@ -124,7 +124,9 @@ def recover_pose(
     return int(votes[best]), rotation, translation.ravel()
 
 
-def _triangulate_and_count(current, previous, rotation, translation):
+def _triangulate_and_count(
+    current: np.ndarray, previous: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> int:
     projection = np.hstack([rotation, translation])
     points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T.copy(), previous.T.copy())
     with np.errstate(divide="ignore", invalid="ignore"):

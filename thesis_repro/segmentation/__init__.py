@@ -5,6 +5,7 @@ maps and their quality.
 import os
 import platform
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from thesis_repro import console
@@ -40,13 +41,13 @@ os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itsel
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
 
 
-def arithmetic():
+def arithmetic() -> dict[str, str | None]:
     """Return the settings that decide how TensorFlow rounds, for the record of results."""
     return {name: os.environ.get(name) for name in ARITHMETIC}
 
 
 @contextmanager
-def quietly():
+def quietly() -> Iterator[None]:
     """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level;
     errors are raised.
 

@@ -15,7 +15,7 @@ NOTHING = 255
 NOISE_STD = (10**0.5 / 255, 50**0.5 / 255)
 
 
-def transform_list(size, fill_mask=NOTHING):
+def transform_list(size: int, fill_mask: int = NOTHING) -> list:
     """Return the transforms of A.3 for images of size x size, for `albumentations.Compose`.
 
     The appendix transforms one-hot masks of 35 float channels. All transforms resample masks by
@@ -66,15 +66,16 @@ class Augmenter:
     thread.
     """
 
-    def __init__(self, transforms):
-        """transforms: a list of transforms or an `albumentations.Compose`."""
+    def __init__(self, transforms: list | A.Compose) -> None:
         self._compose = transforms if isinstance(transforms, A.Compose) else A.Compose(transforms)
 
-    def to_dict(self):
+    def to_dict(self) -> dict:
         """Return the transforms and their settings in Albumentations' format (JSON values)."""
         return A.to_dict(self._compose)
 
-    def __call__(self, image, label, seed):
+    def __call__(
+        self, image: np.ndarray, label: np.ndarray, seed: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Augment one image (height, width[, channels]) uint8 and its label map (height, width)
         uint8.
         """
@@ -85,12 +86,12 @@ class Augmenter:
         return result["image"].reshape(label.shape[:2] + image.shape[2:]), label
 
 
-def training_augmenter(size):
+def training_augmenter(size: int) -> Augmenter:
     """Return the augmenter of the training set, with the appendix's transform list."""
     return Augmenter(transform_list(size))
 
 
-def validation_augmenter():
+def validation_augmenter() -> Augmenter:
     """Return the augmenter of the validation set: only a blur, by a mistake in the appendix.
 
     Between the two sets, A.3 draws Figure 3.1, which leaves `transform` set to the last one drawn,
@@ -99,7 +100,9 @@ def validation_augmenter():
     return Augmenter([A.Blur(blur_limit=3, p=1)])
 
 
-def augment_set(images, labels, augmenter, seed):
+def augment_set(
+    images: np.ndarray, labels: np.ndarray, augmenter: Augmenter, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Augment every image of a set once (A.3): images (n, size, size, channels) and labels (n,
     size, size), uint8.
 
@@ -114,12 +117,12 @@ def augment_set(images, labels, augmenter, seed):
     return augmented_images, augmented_labels
 
 
-def image_seed(seed, index, epoch=0):
+def image_seed(seed: int, index: int, epoch: int = 0) -> int:
     """Return the seed of one image, independent of the order in which images are augmented."""
     return int(np.random.SeedSequence((seed, epoch, index)).generate_state(1)[0])
 
 
-def one_hot(label_maps, n_classes):
+def one_hot(label_maps: np.ndarray, n_classes: int) -> np.ndarray:
     """Return label maps (..., height, width) one-hot encoded, float32 (..., n_classes); NOTHING
     becomes zeros.
     """

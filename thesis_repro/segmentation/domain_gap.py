@@ -1,11 +1,11 @@
 """The gap between domains (Section 4.1): the quality of label maps, by class."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from thesis_repro import cityscapes
+from thesis_repro import cityscapes, kitti
 from thesis_repro.segmentation import prediction, quality
 
 IMAGES = 100  # most images of a domain
@@ -19,7 +19,7 @@ class Gap(NamedTuple):
     classes: pd.DataFrame
 
 
-def measure(models, domains):
+def measure(models: dict[str, Any], domains: dict[str, list[cityscapes.Pair]]) -> Gap:
     """Measure models on domains; return a Gap.
 
     models: Keras models by name; domains: lists of `cityscapes.Pair` by name. The images are
@@ -51,7 +51,7 @@ def measure(models, domains):
     return Gap(pd.DataFrame(scores), pd.concat(classes, ignore_index=True))
 
 
-def labelled_frames(drives):
+def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
     """Return evenly spread frames of `kitti.Sequence`s with their exact label maps (labels_0);
     none for real data.
     """

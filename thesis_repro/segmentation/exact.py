@@ -8,7 +8,15 @@ Division and square root are exact to the last bit on every processor (IEEE 754)
 import tensorflow as tf
 
 
-def batch_normalization(x, mean, variance, offset, scale, variance_epsilon, name=None):
+def batch_normalization(
+    x: tf.Tensor,
+    mean: tf.Tensor,
+    variance: tf.Tensor,
+    offset: tf.Tensor | None,
+    scale: tf.Tensor | None,
+    variance_epsilon: float,
+    name: str | None = None,
+) -> tf.Tensor:
     """Return scale * (x - mean) / sqrt(variance + variance_epsilon) + offset.
 
     The arguments are those of `tf.nn.batch_normalization`; offset and scale may be None.

@@ -8,6 +8,7 @@ import ctypes
 import math
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import psutil
 import tensorflow as tf
@@ -22,7 +23,7 @@ CGROUP = Path("/sys/fs/cgroup")  # a container's memory limit and use, which psu
 MALLOC_OPTIONS = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 2**28}
 
 
-def keep_freed():
+def keep_freed() -> None:
     """Make the C library keep freed memory for the next batch instead of returning it to the
     system.
 
@@ -35,7 +36,7 @@ def keep_freed():
             ctypes.CDLL(None).mallopt(option, value)
 
 
-def available():
+def available() -> int:
     """Return the bytes that this process can still allocate, on the machine or within its
     container's limit.
     """
@@ -46,7 +47,7 @@ def available():
     return free
 
 
-def needed(model, batch_size):
+def needed(model: Any, batch_size: int) -> int:
     """Return the least bytes that a training step takes: the outputs of all layers, and some of
     their gradients.
     """
@@ -56,7 +57,7 @@ def needed(model, batch_size):
     return int(GRADIENTS * batch_size * FLOAT * values)
 
 
-def require(model, batch_size):
+def require(model: Any, batch_size: int) -> None:
     """Raise InputError if a training batch cannot fit into the available memory."""
     need, room = needed(model, batch_size), available()
     if need > room and not tf.config.list_physical_devices("GPU"):

@@ -1,9 +1,11 @@
 """Label maps for images and whole sequences (A.7)."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,14 +23,14 @@ CALL = 4
 PART = 256
 
 
-def load_shipped():
+def load_shipped() -> Any:
     """Return the model in the package, for users without a trained model; weights/README.md
     describes it.
     """
     return training.load_model(SHIPPED)
 
 
-def predict(model, images, batch_size=16):
+def predict(model: Any, images: np.ndarray, batch_size: int = 16) -> np.ndarray:
     """Return label maps (n, size, size) uint8 for images (n, size, size, channels) uint8 of the
     model's input size.
 
@@ -45,7 +47,9 @@ def predict(model, images, batch_size=16):
     return labels
 
 
-def write_label_maps(model, paths, output_dir, batch_size=16):
+def write_label_maps(
+    model: Any, paths: list[Path], output_dir: str | Path, batch_size: int = 16
+) -> int:
     """Write the label map of each image as output_dir/NAME.png: 320x320, 8 bit, Cityscapes ids
     (A.7.2).
 
@@ -66,7 +70,9 @@ def write_label_maps(model, paths, output_dir, batch_size=16):
     return missing
 
 
-def _open(weights, paths, output_dir, batch_size):
+def _open(
+    weights: str, paths: list[Path], output_dir: str | Path, batch_size: int
+) -> list[list[tuple[Path, Path]]]:
     """Make the folder of label maps a stage; return its incomplete batches of (image, label
     map) paths.
     """
@@ -89,7 +95,7 @@ def _open(weights, paths, output_dir, batch_size):
     return [batch for batch in batches if not all(files.is_whole(target) for _, target in batch)]
 
 
-def _arithmetic():
+def _arithmetic() -> dict[str, Any]:
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
     return results.made_with("tensorflow", "keras", "opencv-python-headless") | {
         "code": results.code("segmentation/prediction"),
@@ -97,7 +103,9 @@ def _arithmetic():
     }
 
 
-def _write_batches(model, batches, done):
+def _write_batches(
+    model: Any, batches: list[list[tuple[Path, Path]]], done: Callable[[int], Any]
+) -> None:
     """Predict and write batches of (image, label map) paths; done: called with the length of
     each written batch.
     """
@@ -111,7 +119,7 @@ def _write_batches(model, batches, done):
             done(len(batch))
 
 
-def _write(pair, label_map):
+def _write(pair: tuple[Path, Path], label_map: np.ndarray) -> None:
     target = pair[1]
     if not files.is_whole(target):  # an existing file may have been corrected by hand
         files.write_png(
@@ -119,7 +127,12 @@ def _write(pair, label_map):
         )
 
 
-def spread_label_maps(run, model_file, sequences, batch_size=16):
+def spread_label_maps(
+    run: Callable,
+    model_file: str | Path,
+    sequences: list[tuple[list[Path], Path]],
+    batch_size: int = 16,
+) -> int:
     """Write the label maps of many sequences on many workers; processors of one kind give
     `write_label_maps`' bits.
 
@@ -168,7 +181,9 @@ def spread_label_maps(run, model_file, sequences, batch_size=16):
 _load_once = lru_cache(maxsize=1)(training.load_model)
 
 
-def _write_part(model_file, folder, record, batches):
+def _write_part(
+    model_file: Path, folder: Path, record: dict[str, Any], batches: list[list[tuple[Path, Path]]]
+) -> str | None:
     """Write some batches of a sequence, here or on another machine; return the reason of a
     failure, or None.
     """
@@ -183,7 +198,7 @@ def _write_part(model_file, folder, record, batches):
 
 
 @lru_cache(maxsize=4)
-def _compiled(model):
+def _compiled(model: Any) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function from uint8 images to uint8 label maps, with the bits of `model.predict` and
     argmax.
 
@@ -194,11 +209,11 @@ def _compiled(model):
     signature = tf.TensorSpec((None, *model.input_shape[1:]), tf.uint8)
 
     @tf.function(input_signature=[signature])
-    def call(images):
+    def call(images: tf.Tensor) -> tf.Tensor:
         probabilities = model(tf.cast(images, tf.float32), training=False)
         return tf.cast(tf.argmax(probabilities, axis=-1, output_type=tf.int32), tf.uint8)
 
-    def run(images):
+    def run(images: np.ndarray) -> np.ndarray:
         step = len(images) if tf.config.list_physical_devices("GPU") else CALL
         return np.concatenate(
             [call(images[start : start + step]).numpy() for start in range(0, len(images), step)]

@@ -3,6 +3,7 @@ Cityscapes benchmark.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,7 +31,7 @@ class Quality:
     confusion: np.ndarray  # (35, 35) pixels: true class, predicted class
 
 
-def quality(model, images, labels, batch_size=16):
+def quality(model: Any, images: np.ndarray, labels: np.ndarray, batch_size: int = 16) -> Quality:
     """Measure a model on images (n, size, size, channels) and true label maps (n, size, size), both
     uint8.
 
@@ -47,7 +48,7 @@ def quality(model, images, labels, batch_size=16):
     scores = training.metrics()
 
     @tf.function(reduce_retracing=True)
-    def run(batch_images, batch_labels):
+    def run(batch_images: tf.Tensor, batch_labels: tf.Tensor) -> tuple[list, tf.Tensor]:
         probabilities = model(tf.cast(batch_images, tf.float32), training=False)
         true = tf.one_hot(batch_labels, N_CLASSES)
         predicted = tf.argmax(probabilities, axis=-1, output_type=tf.int32)
@@ -60,10 +61,11 @@ def quality(model, images, labels, batch_size=16):
         batch_scores.append([float(value) for value in values])
         confusion += confusion_matrix(true, predicted.numpy())
     mean_iou, accuracy, classes = cityscapes_scores(confusion)
-    return Quality(*np.mean(batch_scores, axis=0), mean_iou, accuracy, classes, confusion)
+    iou_score, f1_score = np.mean(batch_scores, axis=0)
+    return Quality(iou_score, f1_score, mean_iou, accuracy, classes, confusion)
 
 
-def confusion_matrix(true, predicted):
+def confusion_matrix(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Return pixel counts by true class (rows) and predicted class (columns); pixels without a
     class do not count.
     """
@@ -72,7 +74,7 @@ def confusion_matrix(true, predicted):
     return np.bincount(pairs, minlength=N_CLASSES**2).reshape(N_CLASSES, N_CLASSES)
 
 
-def cityscapes_scores(confusion):
+def cityscapes_scores(confusion: np.ndarray) -> tuple[float, float, pd.DataFrame]:
     """Return mean IoU, pixel accuracy and a table by class, as the Cityscapes benchmark defines
     them.
 

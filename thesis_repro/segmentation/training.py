@@ -6,10 +6,12 @@ import io
 import json
 import zipfile
 import zlib
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import h5py
 import keras
@@ -25,12 +27,12 @@ from thesis_repro.segmentation import augmentation, exact  # noqa: F401
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
 
 
-def total_loss():
+def total_loss() -> Any:
     """Return the sum of weighted Dice loss and focal loss (Equation 3.8, weights of Table 3.2)."""
     return sm.losses.DiceLoss(class_weights=CLASS_WEIGHTS) + sm.losses.CategoricalFocalLoss()
 
 
-def fused_loss(loss):
+def fused_loss(loss: Any) -> Callable:
     """Return the same loss (true masks, probabilities), compiled together with its gradient.
 
     The library's loss has many operations, and each reads and writes 35 values a pixel. The
@@ -39,14 +41,14 @@ def fused_loss(loss):
     """
 
     @tf.function(jit_compile=not tf.config.list_physical_devices("GPU"))
-    def value_and_gradient(true, predicted):
+    def value_and_gradient(true: tf.Tensor, predicted: tf.Tensor) -> tuple:
         with tf.GradientTape() as tape:
             tape.watch(predicted)
             value = tf.reduce_mean(loss(true, predicted))  # Keras' losses return one value a pixel
         return value, tape.gradient(value, predicted)
 
     @tf.custom_gradient
-    def compiled(true, predicted):
+    def compiled(true: tf.Tensor, predicted: tf.Tensor) -> tuple:
         value, gradient = value_and_gradient(true, predicted)
         return value, lambda upstream: (None, upstream * gradient)
 
@@ -55,14 +57,14 @@ def fused_loss(loss):
     return compiled
 
 
-def metrics():
+def metrics() -> list:
     """Return the library's IoU and F1 scores: means over all 35 classes of a batch; absent
     classes score 1.
     """
     return [sm.metrics.IOUScore(threshold=0.5), sm.metrics.FScore(threshold=0.5)]
 
 
-def strategy():
+def strategy() -> tf.distribute.Strategy:
     """Return a `tf.distribute` strategy that shares each batch between all GPUs, or the default
     one.
     """
@@ -79,7 +81,13 @@ class Batches:
     the same batches.
     """
 
-    def __init__(self, sets, batch_size, seed=None, augmenter=None):
+    def __init__(
+        self,
+        sets: list[tuple[np.ndarray, np.ndarray]],
+        batch_size: int,
+        seed: Any = None,
+        augmenter: augmentation.Augmenter | None = None,
+    ) -> None:
         """sets: (images, label maps) pairs; seed: None keeps their order.
 
         augmenter: if given, every epoch augments the first set again and uses the result instead of
@@ -106,22 +114,22 @@ class Batches:
             for index in range(len(images))
         ]
 
-    def __len__(self):
+    def __len__(self) -> int:
         return -(-len(self._places) // self.batch_size)
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield the batches of the current epoch: uint8 images and uint8 label maps."""
         epoch, order = self.epoch, np.arange(len(self._places))
         if self.seed is not None:
             order = np.random.default_rng((self.seed, epoch)).permutation(len(order))
         for start in range(0, len(order), self.batch_size):
             pairs = [
-                self._pair(*self._places[place], epoch)
+                self._pair(epoch, *self._places[place])
                 for place in order[start : start + self.batch_size]
             ]
             yield tuple(map(np.stack, zip(*pairs)))
 
-    def _pair(self, number, index, epoch):
+    def _pair(self, epoch: int, number: int, index: int) -> tuple[np.ndarray, ...]:
         if number and self.augmenter:
             images, labels = self.sets[0]
             return self.augmenter(
@@ -129,7 +137,7 @@ class Batches:
             )
         return tuple(array[index] for array in self.sets[number])
 
-    def dataset(self):
+    def dataset(self) -> tf.data.Dataset:
         """Return the batches as a `tf.data.Dataset` of float images and one-hot masks,
         prefetched during training.
         """
@@ -148,7 +156,7 @@ class Batches:
         return batches.apply(tf.data.experimental.assert_cardinality(len(self)))
 
 
-def made_from(model, batches, validation):
+def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, Any]:
     """Return everything that the training of a compiled model on Batches depends on, for its stage
     (JSON values).
 
@@ -167,7 +175,7 @@ def made_from(model, batches, validation):
         "optimizer": model.optimizer.get_config() | {"name": ""},
         "loss": float(np.asarray(model.loss(true, predicted)).mean()),
         "pixels": [
-            zlib.crc32(np.ascontiguousarray(array))
+            zlib.crc32(np.ascontiguousarray(array).data)
             for pair in (*batches.sets, *validation.sets)
             for array in pair
         ],
@@ -177,7 +185,7 @@ def made_from(model, batches, validation):
     }
 
 
-def weights_digest(model):
+def weights_digest(model: Any) -> str:
     """Return a digest of a model's weights, twelve letters."""
     return sha256(b"".join(variable.numpy().tobytes() for variable in model.variables)).hexdigest()[
         :12
@@ -196,7 +204,9 @@ class ResumableTraining(keras.callbacks.Callback):
 
     COUNTERS = ("wait", "best", "best_epoch", "stopped_epoch")
 
-    def __init__(self, folder, model, batches, others=()):
+    def __init__(
+        self, folder: str | Path, model: Any, batches: Batches, others: Collection = ()
+    ) -> None:
         """model: compiled, with a built optimizer; others: EarlyStopping and ModelCheckpoint, as
         given to `fit`.
 
@@ -220,11 +230,11 @@ class ResumableTraining(keras.callbacks.Callback):
                 variable.assign(value)
 
     @property
-    def history(self):
-        """A DataFrame with a row for each epoch: loss, metrics, and both on the validation set."""
+    def history(self) -> pd.DataFrame:
+        """A row for each epoch: loss, metrics, and both on the validation set."""
         return pd.DataFrame(self.rows)
 
-    def first_epoch(self, epochs):
+    def first_epoch(self, epochs: int) -> int:
         """Return the epoch to resume with, for `fit`; `epochs` if early stopping has ended the
         training.
         """
@@ -234,7 +244,7 @@ class ResumableTraining(keras.callbacks.Callback):
         )
         return epochs if stopped else min(len(self.rows), epochs)
 
-    def on_train_begin(self, logs=None):
+    def on_train_begin(self, logs: Any = None) -> None:
         self._open.enter_context(results.claimed(self.folder))
         # ModelCheckpoint itself writes in place
         self.model.save = partial(_save_atomically, self.model)
@@ -250,13 +260,13 @@ class ResumableTraining(keras.callbacks.Callback):
             )
         )
 
-    def on_epoch_begin(self, epoch, logs=None):
+    def on_epoch_begin(self, epoch: int, logs: Any = None) -> None:
         self.batches.epoch = epoch
 
-    def on_train_batch_end(self, batch, logs=None):
+    def on_train_batch_end(self, batch: int, logs: Any = None) -> None:
         self._bar.update()
 
-    def on_epoch_end(self, epoch, logs=None):
+    def on_epoch_end(self, epoch: int, logs: Any = None) -> None:
         self._bar.set_postfix_str(f"epoch {epoch + 1}, loss {logs['loss']:.3f}")
         self.rows.append(
             {"epoch": epoch + 1} | {name: float(value) for name, value in logs.items()}
@@ -276,16 +286,16 @@ class ResumableTraining(keras.callbacks.Callback):
             {f"{index}": variable.numpy() for index, variable in enumerate(self._variables)},
         )
 
-    def on_train_end(self, logs=None):
+    def on_train_end(self, logs: Any = None) -> None:
         self._open.close()
 
 
-def _save_atomically(model, path, **options):
+def _save_atomically(model: Any, path: str | Path, **options: Any) -> None:
     with files.atomic(path) as temporary:
         type(model).save(model, temporary, **options)
 
 
-def _check_unpacked_size(path):
+def _check_unpacked_size(path: Any) -> None:
     """Raise ValueError if a model file would unpack to far more bytes than weights can be
     compressed to.
     """
@@ -301,7 +311,7 @@ def _check_unpacked_size(path):
         raise ValueError(f"it would unpack to {sum(sizes) / 1e6:,.0f} MB")
 
 
-def load_model(path):
+def load_model(path: str | Path) -> Any:
     """Load a model saved by Keras, `.keras` or HDF5, for prediction: without loss and metrics.
 
     Code in the file is never executed: Keras' safe mode refuses it, and all layers that are not
@@ -320,7 +330,8 @@ def load_model(path):
             f"{path}: not a Keras model, truncated, or holds code ({reason}); build it from Keras' own "
             "layers, or copy it again"
         ) from None
-    inputs, outputs = getattr(model, "input_shape", ()), getattr(model, "output_shape", ())
+    inputs: tuple = getattr(model, "input_shape", ())
+    outputs = getattr(model, "output_shape", ())
     square = (
         len(inputs) == 4
         and inputs[1] is not None

@@ -1,5 +1,7 @@
 """The U-Net of appendix A.4, as Figure A.1 prints it."""
 
+from typing import Any
+
 from keras import Model, layers
 
 from thesis_repro import InputError
@@ -8,7 +10,12 @@ from thesis_repro.segmentation import exact  # noqa: F401
 DEPTH = 4  # encoder blocks; each halves the image
 
 
-def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
+def build_unet(
+    input_shape: tuple[int | None, int | None, int],
+    n_classes: int,
+    base_filters: int = 64,
+    corrected_blocks: bool = False,
+) -> Model:
     """Build the U-Net with a softmax over n_classes (A.4); its layer names are those of Figure A.1.
 
     input_shape: (height, width, channels); a height or width of None accepts any size.
@@ -43,7 +50,7 @@ def build_unet(input_shape, n_classes, base_filters=64, corrected_blocks=False):
     return Model(inputs, outputs, name="U-Net")
 
 
-def _conv_block(inputs, filters, number, corrected):
+def _conv_block(inputs: Any, filters: int, number: int, corrected: bool) -> Any:
     x = inputs
     for index in (number, number + 1):
         # the thesis's mistake: the second convolution reads the block's input
@@ -54,11 +61,11 @@ def _conv_block(inputs, filters, number, corrected):
     return x
 
 
-def _numbered(name, number):
+def _numbered(name: str, number: int) -> str:
     return f"{name}_{number}" if number else name
 
 
-def summary_rows(model):
+def summary_rows(model: Any) -> list[dict[str, Any]]:
     """Return a model's rows in the format of Figure A.1: dicts of layer, output_shape, params
     and connected_to.
     """

@@ -77,7 +77,7 @@ def _products() -> tuple[np.ndarray, np.ndarray]:
         (0, 0, 0),
     ]
 
-    def table(lower, higher):
+    def table(lower: list, higher: list) -> np.ndarray:
         return np.array([[higher.index(tuple(np.add(a, b))) for b in linear] for a in lower])
 
     return table(linear, quadratic), table(quadratic, cubic)

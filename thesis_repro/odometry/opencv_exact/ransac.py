@@ -52,7 +52,7 @@ def find_essential_matrix(
     with np.errstate(over="ignore"):
         rough = np.vstack([columns, (1 + x + y) * (1 + u + v)]).astype(np.float32)
 
-    def solve_exactly(sample):
+    def solve_exactly(sample: np.ndarray) -> tuple[int, np.ndarray | None, np.ndarray | None]:
         return _opencv_solution(columns, sample, threshold, probability, limit)
 
     # The best sample so far, `winner`, has between `low` and `high` inliers. The exact number
@@ -90,7 +90,9 @@ def find_essential_matrix(
     return _opencv(current, previous, threshold, probability) if solution is None else solution[1:]
 
 
-def _opencv(current, previous, threshold, probability):
+def _opencv(
+    current: np.ndarray, previous: np.ndarray, threshold: float, probability: float
+) -> tuple[np.ndarray | None, np.ndarray | None]:
     return cv2.findEssentialMat(
         current,
         previous,
@@ -102,7 +104,9 @@ def _opencv(current, previous, threshold, probability):
     )
 
 
-def _opencv_solution(columns, sample, threshold, probability, limit):
+def _opencv_solution(
+    columns: np.ndarray, sample: np.ndarray, threshold: float, probability: float, limit: np.float32
+) -> tuple[int, np.ndarray | None, np.ndarray | None]:
     """OpenCV's best solution for a sample of five: number of inliers among all correspondences,
     matrix, mask.
     """
@@ -116,7 +120,7 @@ def _opencv_solution(columns, sample, threshold, probability, limit):
     return int(inliers[best]), stack[3 * best : 3 * best + 3].copy(), masks[best].reshape(-1, 1)
 
 
-def _samples_needed(probability, outliers):
+def _samples_needed(probability: float, outliers: float) -> int:
     """Number of samples among which one is free of outliers with the given probability
     (`outliers`: their share).
     """

@@ -158,7 +158,13 @@ def refine(
     return rotation, heading if heading @ translation >= 0 else -heading
 
 
-def _rounds(motion, current, previous, support, threshold):
+def _rounds(
+    motion: tuple[np.ndarray, np.ndarray],
+    current: np.ndarray,
+    previous: np.ndarray,
+    support: np.ndarray,
+    threshold: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """A motion (rotation, translation) fitted to its support (N booleans), and again to the
     points near the result.
     """
@@ -171,7 +177,13 @@ def _rounds(motion, current, previous, support, threshold):
     return motion
 
 
-def _deviations(rotation, translation, current, previous, scale):
+def _deviations(
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    current: np.ndarray,
+    previous: np.ndarray,
+    scale: float,
+) -> tuple[float, ...]:
     """Largest standard deviations (degrees) of rotation and heading, and the condition number of
     the normal equations.
 

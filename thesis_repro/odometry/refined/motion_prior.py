@@ -121,13 +121,13 @@ def is_consistent(motion: RefinedMotion, scale: float, prior: MotionPrior) -> bo
     )
 
 
-def _max_rotation(prior):
+def _max_rotation(prior: MotionPrior) -> float:
     return MAX_ROTATION_CHANGE if prior.scale else MAX_FIRST_ROTATION
 
 
-def _determined(motion):
+def _determined(motion: RefinedMotion) -> bool:
     return motion.rotation_std_deg < MAX_ROTATION_STD and motion.heading_std_deg < MAX_HEADING_STD
 
 
-def _degrees(cosine):
+def _degrees(cosine: float) -> float:
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
