@@ -148,6 +148,11 @@ def test_a_path_of_another_drive_is_reported():
 
 STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)
 TRAIN = np.choose(STREET // 8, [0, 2, 10]).astype(np.uint8)
+# both leave out columns with a higher contrast: every sixth one, or 24 beside each other
+STRIPS = np.where((np.arange(64) % 6 == 0) & (np.arange(64) < 33), 0, 255).astype(
+    np.uint8
+) * np.ones((48, 1), np.uint8)
+AREA = np.where(np.arange(64) < 24, 0, 255).astype(np.uint8) * np.ones((48, 1), np.uint8)
 HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
 
 
@@ -165,6 +170,8 @@ HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
         ("masks", 0 * HALF, 4, {}, "--invert"),
         ("masks", HALF | 255, 4, {}, "100.0%"),
         ("masks", HALF, 4, {"flat": True}, "--invert"),
+        ("masks", STRIPS, 4, {"flat": True}, "--invert"),
+        ("masks", AREA, 4, {"flat": True}, None),
     ],
 )
 def test_implausible_masks_are_one_line_with_the_option(

@@ -11,6 +11,9 @@ from thesis_repro.files import write_text
 MAX_POSITION = 1e9  # metres
 ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
 QUATERNION_TOLERANCE = 0.01  # of its length; files have few digits
+# A camera turned by 180 degrees about x looks down or back; more likely w comes first, and the path
+# starts at the identity.
+MAX_FIRST_X = 0.99
 MAX_DIFFERENCE = 0.01  # seconds between a pose and its frame, evo's default
 # Matched poses of a file with times: least share of those within the common time, and of all. A
 # file of keyframes may cover more frames than an excerpt has.
@@ -108,6 +111,7 @@ def read_tum(
     bad_lines = np.flatnonzero(
         (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > QUATERNION_TOLERANCE)
         | (np.abs(rows[:, 1:4]).max(axis=1) > MAX_POSITION)
+        | (np.abs(rows[0, 4]) > MAX_FIRST_X)
     )
     if len(bad_lines):
         raise InputError(

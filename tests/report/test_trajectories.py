@@ -185,6 +185,7 @@ FILES = [
     ({"ours/07.tum": tum(np.array), "ours/07.txt": "1"}, "07.t"),
     ({"ours/07.tum": tum(lambda rows: rows * [1000, 1, 1, 1, 1, 1, 1, 1])}, "07.tum: 1 of 160"),
     ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1, 1, 1, 1, 0])}, "07.tum, pose 1"),
+    ({"ours/07.tum": tum(lambda rows: rows[:, [0, 1, 2, 3, 7, 4, 5, 6]])}, "07.tum, pose 1"),
     ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1e300, 1, 1, 1, 1])}, "07.tum, pose 2"),
     ({"ours/07.tum": tum(doubled)}, "07.tum, line 6"),
     ({"ours/07.tum": tum(np.array), "kitti/sequences/07/times.txt": TIMES + "16\n"}, "times.txt"),

@@ -7,7 +7,7 @@ import platform
 import sys
 from contextlib import contextmanager
 
-from thesis_repro import console
+from thesis_repro import InputError, console
 
 # Settings that give the same bits on every processor, together with `exact`.
 ARITHMETIC = {
@@ -50,8 +50,11 @@ def quietly():
     """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level;
     errors are raised.
 
-    The message that there is no GPU is hidden too.
+    The message that there is no GPU is hidden too. Raises InputError under python -OO, which one of
+    the libraries cannot be imported with.
     """
+    if sys.flags.optimize > 1:
+        raise InputError("python -OO: the segmentation's libraries need docstrings; use python -O")
     with console.quiet():
         yield
         if not any(map(os.path.exists, GPUS)):
