@@ -17,6 +17,8 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
     frame = tiny_kitti / IMAGES / "000001.png"
     frame.write_bytes(frame.read_bytes()[:100])
     cv2.imwrite(str(tiny_kitti / IMAGES / "000003.png"), np.zeros((9, 9), np.uint8))
+    # frames of the right camera only
+    shutil.copytree(tiny_kitti / IMAGES, tiny_kitti / "sequences/12/image_1")
     (tiny_kitti / "sequences/00/times.txt").write_text("0\n0.1\n0.1\n0.2\n")
     (tiny_kitti / "poses/00.txt").write_text("1 0 0 0 0 2 0 0 0 0 1 0\n" * 4)
     cv2.imwrite(str(tiny_cityscapes / "valannot/street_0.png"), np.full((16, 32), 200, np.uint8))
@@ -29,6 +31,7 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
         "000001.png",
         "000003.png: 9x9",
         "00.txt, line 1",
+        "sequences/12: ",
         "times.txt, line 3",
         "street_0.png: label id 200",
         "street_1.png: 8x8",

@@ -76,8 +76,10 @@ def folders_with_frames(parent: Path) -> list[Path]:
 
 
 def has_frames(folder: Path) -> bool:
-    """Whether a folder is that of a sequence, or holds images itself."""
-    return images_of(folder) != folder or bool(images(folder))
+    """Whether a folder is that of a sequence, or holds images itself. A sequence with frames of the
+    right camera only counts, so that its lack of others is reported.
+    """
+    return images_of(folder) != folder or bool(images(folder)) or (folder / "image_1").is_dir()
 
 
 def folder_of(root: str | Path) -> Path:

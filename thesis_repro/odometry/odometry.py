@@ -136,7 +136,7 @@ class Odometry:
         """
         frame = np.asarray(frame)  # cv2.imread returns None for a missing file
         mask = mask if mask is None else np.asarray(mask)
-        need(f"frame {self.count}: scale", scale, Real)
+        need(f"frame {self.count}: scale", np.asarray(scale)[()], Real)
         self._check(frame, scale, mask)
         step = Step(frame=self.count, scale=float(scale))
         self.count += 1
