@@ -17,6 +17,8 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
     frame = tiny_kitti / IMAGES / "000001.png"
     frame.write_bytes(frame.read_bytes()[:100])
     cv2.imwrite(str(tiny_kitti / IMAGES / "000003.png"), np.zeros((9, 9), np.uint8))
+    # frames of the right camera only
+    shutil.copytree(tiny_kitti / IMAGES, tiny_kitti / "sequences/12/image_1")
     (tiny_kitti / "sequences/00/times.txt").write_text("0\n0.1\n0.1\n0.2\n")
     (tiny_kitti / "poses/00.txt").write_text("1 0 0 0 0 2 0 0 0 0 1 0\n" * 4)
     cv2.imwrite(str(tiny_cityscapes / "valannot/street_0.png"), np.full((16, 32), 200, np.uint8))
@@ -29,6 +31,7 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
         "000001.png",
         "000003.png: 9x9",
         "00.txt, line 1",
+        "sequences/12: ",
         "times.txt, line 3",
         "street_0.png: label id 200",
         "street_1.png: 8x8",
@@ -144,10 +147,17 @@ def test_a_path_of_another_drive_is_reported():
 
     assert path_oddities("00", drive(0), drive(0)) == [] != path_oddities("00", drive(1), drive(0))
     assert len(path_oddities("00", np.linalg.inv(drive(0)), drive(0))) == 1
+    upside_down = np.diag([1, -1, -1, 1]) @ drive(0)  # also if a file has w first
+    assert len(path_oddities("00", upside_down, drive(0))) == 1
 
 
 STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)
 TRAIN = np.choose(STREET // 8, [0, 2, 10]).astype(np.uint8)
+# both leave out columns with a higher contrast: every sixth one, or 24 beside each other
+STRIPS = np.where((np.arange(64) % 6 == 0) & (np.arange(64) < 33), 0, 255).astype(
+    np.uint8
+) * np.ones((48, 1), np.uint8)
+AREA = np.where(np.arange(64) < 24, 0, 255).astype(np.uint8) * np.ones((48, 1), np.uint8)
 HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
 
 
@@ -165,6 +175,8 @@ HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
         ("masks", 0 * HALF, 4, {}, "--invert"),
         ("masks", HALF | 255, 4, {}, "100.0%"),
         ("masks", HALF, 4, {"flat": True}, "--invert"),
+        ("masks", STRIPS, 4, {"flat": True}, "--invert"),
+        ("masks", AREA, 4, {"flat": True}, None),
     ],
 )
 def test_implausible_masks_are_one_line_with_the_option(

@@ -33,6 +33,33 @@ def test_bad_input_is_one_line_in_a_notebook():
     assert tr.InputError("frames: none")._render_traceback_() == ["InputError: frames: none"]
 
 
+CAMERA = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
+MAP, FRAME = np.full((8, 8), 7, np.uint8), np.eye(96, 128, dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    "call, named",
+    [
+        (lambda: tr.keypoint_mask(np.zeros((8, 8, 35), np.uint8), (16, 32), 3), "label map"),
+        (lambda: tr.keypoint_mask(MAP + 30, (16, 32), 3), "label map"),
+        (lambda: tr.keypoint_mask(MAP, (16, 32, 3), 3), "size"),
+        (lambda: tr.keypoint_mask(MAP, (16, 32.0), 3), "size"),
+        (lambda: tr.keypoint_mask(MAP, (16, 0), 3), "size"),
+        (lambda: tr.keypoint_mask(MAP, (16, 32), 3, {"ids": "train"}), "settings"),
+        (lambda: tr.Odometry(CAMERA.T), "intrinsics"),
+        (lambda: tr.Odometry(-CAMERA), "intrinsics"),
+        (lambda: tr.Odometry(np.eye(3)).step(FRAME), "intrinsics"),
+        (lambda: tr.Odometry(CAMERA, [MAP]), "settings"),
+        (lambda: tr.Odometry(CAMERA, start=2 * np.eye(4)), "start"),
+        (lambda: tr.Odometry(CAMERA, start=np.eye(4) + np.eye(4, k=-1)[::-1]), "start"),
+        (lambda: tr.Sequence("kitti", 7), "sequence"),
+    ],
+)
+def test_wrong_arguments_are_named(call, named):
+    with pytest.raises(tr.InputError, match=named):
+        call()
+
+
 def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, capsys):
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (tmp_path / "world").symlink_to(small_world)

@@ -161,6 +161,7 @@ def test_label_masks_and_written_masks_equal_the_filter(labelled, tmp_path):
         ("movable", -1),
         ("margin", -3),
         ("keep", "most"),
+        ("symmetric", "no"),
     ],
 )
 def test_wrong_settings_are_named(setting, value):

@@ -48,6 +48,14 @@ class InputError(ValueError):
         return [f"InputError: {self}"]
 
 
+def need(name: str, value: object, kind: Any) -> None:
+    """Raise InputError unless an argument of a public function is of a kind: a type, or "A | B"."""
+    if not isinstance(value, kind):
+        raise InputError(
+            f"{name}: must be {getattr(kind, '__name__', kind)}, not {type(value).__name__}"
+        )
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -190,9 +190,12 @@ def study(options: Any) -> int:
         raise InputError(
             "no masks: name a folder of label maps with --labels, or of masks with --masks"
         )
-    has_labels = any(kind == "labels" for kind, _ in options.sources)
+    kinds = {kind for kind, _ in options.sources}
+    has_labels = "labels" in kinds
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
+    if options.invert and "masks" not in kinds:
+        raise InputError("--invert: needs --masks DIR")
     # one of any width, if masks have none
     all_widths = (options.controls or 1,) if options.keep == "static" else ALL_WIDTHS
     names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
@@ -370,11 +373,11 @@ def _masks(options: Any, sequence: Any) -> Any:
     settings = _mask_settings(options, options.labels)
     if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
         raise InputError("--labels DIR, --dilation W: give both or neither")
+    if options.invert and not options.masks:
+        raise InputError("--invert: needs --masks DIR")
     if options.labels:
         width = 1 if options.dilation is None else options.dilation
         return LabelMasks(options.labels, sequence, width, settings)
-    if options.invert and not options.masks:
-        raise InputError("--invert: needs --masks DIR")
     return MaskFolder(options.masks, sequence, options.invert) if options.masks else None
 
 

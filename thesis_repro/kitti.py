@@ -10,7 +10,7 @@ from statistics import median_low
 
 import numpy as np
 
-from thesis_repro import InputError, kitti_raw
+from thesis_repro import InputError, kitti_raw, need
 from thesis_repro.files import images, numbers_of, read_gray
 from thesis_repro.trajectories import read_poses, read_times
 
@@ -76,8 +76,10 @@ def folders_with_frames(parent: Path) -> list[Path]:
 
 
 def has_frames(folder: Path) -> bool:
-    """Whether a folder is that of a sequence, or holds images itself."""
-    return images_of(folder) != folder or bool(images(folder))
+    """Whether a folder is that of a sequence, or holds images itself. A sequence with frames of the
+    right camera only counts, so that its lack of others is reported.
+    """
+    return images_of(folder) != folder or bool(images(folder)) or (folder / "image_1").is_dir()
 
 
 def folder_of(root: str | Path) -> Path:
@@ -150,6 +152,7 @@ class Sequence:
         camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence
         without ground truth; the default is one metre a frame.
         """
+        need("sequence", name, str | Path)
         self.root, self.folder, self.poses_path = locate(root, name)
         self.name, self.speed = self.folder.name, speed
         frame_folder = images_of(self.folder, camera)
@@ -396,7 +399,9 @@ def is_camera_matrix(matrix: np.ndarray) -> bool:
     return min(fx, fy) > 0 and np.array_equal(matrix, [[fx, 0, u], [0, fy, v], [0, 0, 1]])
 
 
-def check_camera(path: Path, intrinsics: np.ndarray, frame: Path, size: tuple[int, int]) -> None:
+def check_camera(
+    path: Path | str, intrinsics: np.ndarray, frame: Path | str, size: tuple[int, int]
+) -> None:
     """Raise InputError if frames of (height, width) are too small or do not fit the camera
     matrix.
     """

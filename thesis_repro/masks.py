@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from thesis_repro import InputError, results
+from thesis_repro import InputError, need, results
 from thesis_repro.cityscapes import ID, N_CLASSES, read_label_map
 from thesis_repro.files import is_whole, listed, numbers_of, progress, read_gray, write_png
 from thesis_repro.kitti import Sequence, check_size
@@ -68,10 +68,15 @@ class MaskSettings:
             isinstance(threshold, Real) and threshold >= 0 for threshold in self.canny
         ):
             raise InputError(f"canny={self.canny}: must be two numbers from 0 on, such as (5, 15)")
-        for name, known in (("boundaries", BOUNDARIES), ("keep", KEEP), ("ids", IDS)):
+        for name, known in (
+            ("boundaries", BOUNDARIES),
+            ("keep", KEEP),
+            ("ids", IDS),
+            ("symmetric", (False, True)),
+        ):
             if getattr(self, name) not in known:
                 raise InputError(
-                    f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(known)}"
+                    f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(map(str, known))}"
                 )
         for name in self.classes:
             if name not in ID:
@@ -175,8 +180,12 @@ def keypoint_mask(
     """Keypoint mask of one frame from its label map: `dilate(edges(...))` without the
     `forbidden` pixels.
 
-    Raises InputError unless the label map is (h, w) uint8 label ids.
+    Raises InputError unless the label map is (h, w) uint8 label ids, and for another kind of size
+    or settings.
     """
+    need("settings", settings, MaskSettings)
+    if np.shape(size) != (2,) or not all(isinstance(side, Integral) and side > 0 for side in size):
+        raise InputError(f"size: must be (height, width) of the frame in pixels, not {size}")
     label_map = np.asarray(label_map)
     if label_map.ndim != 2 or label_map.dtype != np.uint8 or not label_map.size:
         raise InputError(
@@ -250,6 +259,7 @@ class LabelMasks:
         dilation_width: int,
         settings: MaskSettings = MaskSettings(),
     ) -> None:
+        need("settings", settings, MaskSettings)
         self.paths, self.frame_paths = (
             _paths_by_frame(folder, sequence, "label map"),
             sequence.frame_paths,

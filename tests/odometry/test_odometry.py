@@ -445,6 +445,7 @@ def test_a_killed_pass_resumes_with_the_same_bits(drive, tmp_path, monkeypatch):
         ("detector", "fast"),
         ("max_keypoints", -1),
         ("threshold", 0.0),
+        ("fallback", "no"),
     ],
 )
 def test_wrong_settings_are_named(setting, value):
@@ -462,6 +463,9 @@ def test_wrong_frames_and_masks_are_named(drive):
         (frame[:80], 0.4),
         (frame / 255, 0.4),
         (frame, float("nan")),
+        (frame, None),
+        (None, 0.4),  # of cv2.imread, for a missing file
+        (frame, 0.4, frame.tolist()),
     ):
         with pytest.raises(InputError, match="frame 1"):
             follower.step(*arguments)

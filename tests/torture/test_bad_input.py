@@ -156,6 +156,8 @@ REFUSED = [
     for line in f"""
 {ODOMETRY} --labels labels -> --labels
 {ODOMETRY} --dilation 3 -> --dilation
+{LABELLED} --invert -> --invert
+{STUDY} --invert -> --invert
 {ODOMETRY} --camera image_9 -> 'image_9'
 {ODOMETRY} --plot out/path.doc -> path.doc
 {ODOMETRY} --tum out/path.txt -> --tum out/path.txt

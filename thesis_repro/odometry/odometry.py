@@ -3,12 +3,13 @@
 import time
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from thesis_repro import InputError
-from thesis_repro.kitti import is_camera_matrix
+from thesis_repro import InputError, need
+from thesis_repro.kitti import check_camera, is_camera_matrix
 from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
 from thesis_repro.odometry.refined.fit import RefinedMotion, fit, measured, smaller_rotation
@@ -99,6 +100,7 @@ class Odometry:
         frame, 4x4. shared: keypoints shared with other runs. Raises InputError for another matrix,
         and for a start that is no pose.
         """
+        need("settings", settings, OdometrySettings)
         self.intrinsics = np.asarray(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
@@ -107,7 +109,11 @@ class Odometry:
                 "intrinsics: must be (fx, 0, u), (0, fy, v), (0, 0, 1) in pixels, not "
                 f"{self.intrinsics.tolist()}"
             )
-        if self.pose.shape != (4, 4) or not are_poses(self.pose[None]).all():
+        if (
+            self.pose.shape != (4, 4)
+            or not are_poses(self.pose[None]).all()
+            or not np.array_equal(self.pose[3], [0, 0, 0, 1])
+        ):
             raise InputError("start: must be a pose, 4x4: a right-handed rotation and a position")
         self.prior = MotionPrior()  # used by the refined estimator and the fallback only
         self.keypoints: Any = shared or keypoints  # both have `detect` and `track`
@@ -128,8 +134,11 @@ class Odometry:
         """Track the points into this frame and detect new keypoints. Returns a Step without a
         motion.
         """
-        step = Step(frame=self.count, scale=float(scale))
+        frame = np.asarray(frame)  # cv2.imread returns None for a missing file
+        mask = mask if mask is None else np.asarray(mask)
+        need(f"frame {self.count}: scale", np.asarray(scale)[()], Real)
         self._check(frame, scale, mask)
+        step = Step(frame=self.count, scale=float(scale))
         self.count += 1
         if self.previous is not None:
             step.scale += self.gap
@@ -294,6 +303,7 @@ class Odometry:
                 f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
                 "the odometry needs 8-bit gray, (height, width)"
             )
+        check_camera("intrinsics", self.intrinsics, f"frame {self.count}", frame.shape)
         if not np.isfinite(scale) or scale < 0:
             raise InputError(f"frame {self.count}: scale {scale} is not a distance in metres")
         if mask is not None and (mask.shape != frame.shape or mask.dtype != np.uint8):

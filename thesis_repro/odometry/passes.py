@@ -3,7 +3,7 @@ tracking.
 """
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 import pandas as pd
 
-from thesis_repro import console, results
+from thesis_repro import InputError, console, results
 from thesis_repro.files import progress
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import keypoints
@@ -108,8 +108,11 @@ def run(
     """Run the odometry over a kitti.Sequence. Returns a Result.
 
     masks: see Masks. description: text of the progress bar; None for no bar.
-    Raises InputError if a frame cannot be read, or if a mask and its frame differ in size.
+    Raises InputError if a frame cannot be read, if a mask and its frame differ in size, and if
+    there are fewer masks than frames.
     """
+    if isinstance(masks, Sized) and len(masks) < len(sequence):
+        raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
     return _run(sequence, {"": (settings, masks)}, None, description, None)[""]
 
 

@@ -76,6 +76,7 @@ class OdometrySettings:
             ("levels", 0, 10),
             ("shuffle_seed", 0, 2**32 - 1),
             ("scale_gate", 0, math.inf),
+            ("fallback", False, True),
         ):
             value, is_float = getattr(self, name), types[name] is float
             if value is None and types[name] is not int and not is_float:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from thesis_repro import console
+from thesis_repro import InputError, console
 
 # Settings that give the same bits on every processor, together with `exact`.
 ARITHMETIC = {
@@ -51,8 +51,11 @@ def quietly() -> Iterator[None]:
     """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level;
     errors are raised.
 
-    The message that there is no GPU is hidden too.
+    The message that there is no GPU is hidden too. Raises InputError under python -OO, which one of
+    the libraries cannot be imported with.
     """
+    if sys.flags.optimize > 1:
+        raise InputError("python -OO: the segmentation's libraries need docstrings; use python -O")
     with console.quiet():
         yield
         if not any(map(os.path.exists, GPUS)):
