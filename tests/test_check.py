@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, check, files, results
-from thesis_repro.check import check_cityscapes, check_kitti, mask_oddities, oddities, path_oddities
+from thesis_repro import InputError, check, files, oddities, results
+from thesis_repro.check import check_cityscapes, check_kitti
 from thesis_repro.cli import main
 from thesis_repro.kitti import Sequence
 from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
@@ -129,12 +129,12 @@ def poses(*rows):
     ],
 )
 def test_implausible_data_is_one_line_with_the_number(tiny_kitti, path, text, seen):
-    assert oddities(Sequence(tiny_kitti, "00")) == []
+    assert oddities.of_sequence(Sequence(tiny_kitti, "00")) == []
     if text:
         (tiny_kitti / path).write_text(text)
     else:
         shutil.copy(tiny_kitti / IMAGES / "000001.png", tiny_kitti / path)
-    (line,) = oddities(Sequence(tiny_kitti, "00"))
+    (line,) = oddities.of_sequence(Sequence(tiny_kitti, "00"))
     assert seen in line
 
 
@@ -145,10 +145,14 @@ def test_a_path_of_another_drive_is_reported():
             pose[:3, :3] = cv2.Rodrigues(np.array([0, angle, 0]))[0]
         return path
 
-    assert path_oddities("00", drive(0), drive(0)) == [] != path_oddities("00", drive(1), drive(0))
-    assert len(path_oddities("00", np.linalg.inv(drive(0)), drive(0))) == 1
+    assert (
+        oddities.of_path("00", drive(0), drive(0))
+        == []
+        != oddities.of_path("00", drive(1), drive(0))
+    )
+    assert len(oddities.of_path("00", np.linalg.inv(drive(0)), drive(0))) == 1
     upside_down = np.diag([1, -1, -1, 1]) @ drive(0)  # also if a file has w first
-    assert len(path_oddities("00", upside_down, drive(0))) == 1
+    assert len(oddities.of_path("00", upside_down, drive(0))) == 1
 
 
 STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)
@@ -196,7 +200,7 @@ def test_implausible_masks_are_one_line_with_the_option(
         if kind == "masks"
         else LabelMasks(folder, sequence, 3, MaskSettings(**options))
     )
-    line, odd = mask_oddities(made, sequence)
+    line, odd = oddities.of_masks(made, sequence)
     assert "%" in line and [seen in text for text in odd] == ([True] if seen else [])
 
 
@@ -206,13 +210,13 @@ def test_masks_of_other_frames_and_other_names_of_files(tiny_kitti, tmp_path):
     for path in sequence.frame_paths:
         files.write_png(folder / f"{path.name}.png", HALF)
     made = MaskFolder(folder, sequence)
-    assert mask_oddities(made, sequence)[1] == []
+    assert oddities.of_masks(made, sequence)[1] == []
     assert np.array_equal(MaskFolder(folder, sequence, invert=True)[2], 255 - HALF)
     assert np.array_equal(
         MaskFolder(made.paths[0], sequence)[3], read_mask(made.paths[0], sequence.size)
     )
     cv2.imwrite(str(sequence.frame_paths[0]), np.zeros((48, 64), np.uint8))
-    assert len(mask_oddities(made, sequence)[1]) == 1
+    assert len(oddities.of_masks(made, sequence)[1]) == 1
     # the mask of one frame is not one for all frames
     files.write_png(tmp_path / "unfinished" / "000000.png", HALF)
     with pytest.raises(InputError, match="000001.png"):

@@ -124,7 +124,7 @@ def masks(options: Any) -> None:
 
 def odometry(options: Any) -> None:
     """run the visual odometry on one sequence and print its errors, number of keypoints and time"""
-    from thesis_repro import check, kitti, odometry
+    from thesis_repro import kitti, oddities, odometry
     from thesis_repro.odometry import metrics
     from thesis_repro.report import texts
     from thesis_repro.trajectories import write_kitti_poses, write_tum
@@ -153,8 +153,8 @@ def odometry(options: Any) -> None:
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
     if sequence.has_truth:
-        _warn(check.path_oddities(sequence.name, result.poses, sequence.poses))
-    _warn(check.step_oddities(sequence.name, result.failed, len(sequence)))
+        _warn(oddities.of_path(sequence.name, result.poses, sequence.poses))
+    _warn(oddities.of_steps(sequence.name, result.failed, len(sequence)))
     record = texts.run_record(result, sequence)
     if options.video:
         from thesis_repro.report import video
@@ -234,7 +234,7 @@ def evaluate(options: Any) -> None:
     """compare trajectories with the ground truth: the thesis's RMSE and MAE, ATE, RPE, KITTI's
     t_rel and r_rel
     """
-    from thesis_repro import check
+    from thesis_repro import oddities
     from thesis_repro.kitti import true_path
     from thesis_repro.report import style, trajectories
 
@@ -247,7 +247,7 @@ def evaluate(options: Any) -> None:
         matching["max_difference"] = options.t_max_diff
     for sequence, files in sequences.items():
         truth, times = true_path(options.kitti, sequence)
-        _warn(check.truth_oddities(sequence, truth, times))
+        _warn(oddities.of_truth(sequence, truth, times))
         paths = {
             name: trajectories.read(file, times, options.frames, **matching)
             for name, file in files.items()
@@ -255,7 +255,7 @@ def evaluate(options: Any) -> None:
         truth = truth[: options.frames]
         for name, (matched, poses) in paths.items():
             _warn(
-                check.path_oddities(
+                oddities.of_path(
                     name, poses, truth[matched], options.align not in ("sim3", "scale")
                 )
             )
@@ -298,12 +298,12 @@ def _sequence(options: Any) -> Any:
 
 def _print_oddities(sequence: Any, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
-    from thesis_repro import check
+    from thesis_repro import oddities
 
-    warnings = check.oddities(sequence)
+    warnings = oddities.of_sequence(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
-            line, mask_warnings = check.mask_oddities(masks, sequence)
+            line, mask_warnings = oddities.of_masks(masks, sequence)
             console.log.info(line)
             warnings += mask_warnings
     return warnings

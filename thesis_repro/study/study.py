@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro import InputError, check, results
+from thesis_repro import InputError, oddities, results
 from thesis_repro.kitti import Sequence
 from thesis_repro.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
@@ -107,7 +107,7 @@ class Study:
                 write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
     def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
-        """Return the warnings of `check.step_oddities` and `check.path_oddities` for one run with
+        """Return the warnings of `oddities.of_steps` and `oddities.of_path` for one run with
         all keypoints of each sequence.
         """
         baselines = runs[
@@ -117,12 +117,12 @@ class Study:
         lines = [
             line
             for run in baselines.itertuples()
-            for line in check.step_oddities(run.sequence, run.flagged, run.frames)
+            for line in oddities.of_steps(run.sequence, run.flagged, run.frames)
         ]
         return lines + [
             line
             for (name, _), poses in runner.run_poses(baselines, folder / "runs").items()
-            for line in check.path_oddities(name, poses, true[name])
+            for line in oddities.of_path(name, poses, true[name])
         ]
 
     def first_jobs(self) -> list[jobs.Job]:
