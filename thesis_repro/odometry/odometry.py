@@ -85,8 +85,8 @@ class Odometry:
 
     `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since
     the previous frame in metres, and an optional mask of the same size (keypoints are forbidden
-    where it is 0). It returns a Step. It calls `observe`, `estimate` and `compose`. Only `estimate`
-    is expensive, and it uses no state of earlier steps.
+    where it is 0). It returns a Step. It calls `observe`, `estimate` and `compose`. `estimate` uses
+    no state of earlier steps. With settings.fallback, `compose` may estimate a step anew.
     """
 
     def __init__(
