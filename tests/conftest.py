@@ -3,7 +3,6 @@
 import fcntl
 import os
 import signal
-import subprocess
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads 
 import cv2
 import numpy as np
 import pytest
-from waiting import wait_for
+import trials
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
@@ -69,13 +68,11 @@ def kill_when():
     """
 
     def start(command, condition):
-        process = subprocess.Popen(
-            list(map(str, command)), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True
-        )
-        wait_for(lambda: process.poll() is not None or condition(), 600)
+        process = trials.start(command, ROOT)
+        trials.wait_for(lambda: process.poll() is not None or condition(), 600)
         assert process.returncode is None, "it ended before it could be killed"
-        os.killpg(process.pid, signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL
+        trials.kill(process)
+        assert process.returncode == -signal.SIGKILL
 
     return start
 

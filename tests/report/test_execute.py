@@ -11,7 +11,7 @@ from pathlib import Path
 import nbformat
 import psutil
 import pytest
-from waiting import wait_for
+from trials import wait_for
 
 from thesis_repro.settings import ROOT
 

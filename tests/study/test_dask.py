@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from waiting import wait_for
+from trials import wait_for
 
 from thesis_repro import InputError, console
 from thesis_repro.kitti import Sequence
