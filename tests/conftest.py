@@ -4,7 +4,6 @@ import fcntl
 import os
 import signal
 from contextlib import contextmanager
-from pathlib import Path
 
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
@@ -14,8 +13,7 @@ import numpy as np
 import pytest
 import trials
 
-ROOT = Path(__file__).resolve().parent.parent
-SHARED = ROOT.parent / "shared"
+SHARED = trials.ROOT.parent / "shared"
 # fixtures that take seconds
 SLOW_FIXTURES = {
     "small_world",
@@ -68,7 +66,7 @@ def kill_when():
     """
 
     def start(command, condition):
-        process = trials.start(command, ROOT)
+        process = trials.start(command, trials.ROOT)
         trials.wait_for(lambda: process.poll() is not None or condition(), 600)
         assert process.returncode is None, "it ended before it could be killed"
         trials.kill(process)

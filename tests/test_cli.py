@@ -14,13 +14,13 @@ import pytest
 
 import thesis_repro as tr
 from thesis_repro import cli
-from thesis_repro.cli import main
 from thesis_repro.options import build_parser
+from thesis_repro.settings import ROOT
 from thesis_repro.trajectories import read_poses
 
 
 def run(command, *options):
-    return main([command, *map(str, options)])
+    return cli.main([command, *map(str, options)])
 
 
 PARSER = build_parser(cli.COMMANDS)
@@ -108,9 +108,6 @@ def test_without_ground_truth_there_are_no_errors(
     summary = json.loads(capsys.readouterr().out)
     assert summary["rmse_m"] is None and summary["mae_m"] is None
     assert (cv2.imread("path.png") is not None) == ("--plot" in options)
-
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_public_names():

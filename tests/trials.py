@@ -18,8 +18,8 @@ import pandas as pd
 
 from thesis_repro import console, files
 from thesis_repro.segmentation import ARITHMETIC
+from thesis_repro.settings import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 # what thesis_repro.segmentation has set in this process
 SET_BY_TESTS = {"SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE", "TF_CPP_MIN_LOG_LEVEL", *ARITHMETIC}
 

@@ -26,7 +26,6 @@ from thesis_repro.segmentation.unet import build_unet
 pytestmark = pytest.mark.slow
 
 
-ROOT = Path(__file__).parents[2]
 SIZE = 16
 
 
@@ -185,7 +184,8 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
 
 def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_when):
     code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
+        "from thesis_repro import segmentation; import test_training as t; "
         f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)"
     )
     kill_when([sys.executable, "-c", code], (tmp_path / "state.npz").exists)
@@ -201,15 +201,19 @@ def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_whe
 
 def test_several_devices_share_each_batch(tmp_path):
     code = (
-        "import sys; import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
+        "import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
         "tf.config.set_logical_device_configuration(cpu, [tf.config.LogicalDeviceConfiguration()] * 2); "
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+        "import test_training as t; "
         f"folder, two = t.Path({str(tmp_path)!r}), tf.distribute.MirroredStrategy(['CPU:0', 'CPU:1']); "
         "t.train(folder, 2, strategy=two); "
         "assert t.training.ResumableTraining(folder, *t.prepared(strategy=two)[:2]).first_epoch(3) == 2"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parent,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     history = pd.read_csv(tmp_path / "history.csv")
@@ -307,7 +311,7 @@ def digest():
 def test_one_core_and_all_give_the_same_bits():
     code = (
         "from thesis_repro import segmentation; import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
-        "import test_same_bits; print(test_same_bits.digest())"
+        "import test_training; print(test_training.digest())"
     )
     one_core = subprocess.run(
         [sys.executable, "-c", code],

@@ -28,11 +28,14 @@ def test_corrected_blocks_and_base_filters():
     }
 
     assert len(rows) == 41 + 3 * 9
-    assert rows["conv2d"]["connected_to"] == "input_2[0][0]"
-    assert rows["conv2d_1"]["connected_to"] == "activation[0][0]"
-    assert rows["conv2d_17"]["connected_to"] == "activation_16[0][0]"
-    assert rows["conv2d_9"]["output_shape"] == "(None, 4, 4, 128)"
-    assert rows["conv2d_18"]["output_shape"] == "(None, 64, 64, 5)"
+    for layer, column, text in (
+        ("conv2d", "connected_to", "input_2[0][0]"),
+        ("conv2d_1", "connected_to", "activation[0][0]"),
+        ("conv2d_17", "connected_to", "activation_16[0][0]"),
+        ("conv2d_9", "output_shape", "(None, 4, 4, 128)"),
+        ("conv2d_18", "output_shape", "(None, 64, 64, 5)"),
+    ):
+        assert rows[layer][column] == text
 
 
 def test_a_size_that_cannot_be_halved_four_times():

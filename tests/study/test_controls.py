@@ -204,7 +204,6 @@ def test_the_null_distribution_agrees_with_order_statistics():
 
 def test_tracks_of_a_known_motion_have_small_residuals_and_cover_fields():
     street = Street(3)
-    street.size = street.images[0].shape
     corner = np.zeros(street.size, np.uint8)
     corner[60:100, 380:440] = 255
     table = ablations.tracks(

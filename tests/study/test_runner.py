@@ -9,9 +9,7 @@ import pytest
 
 from thesis_repro import InputError, masks, odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks, MaskSettings
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.odometry import ROTATION_COLUMNS
 from thesis_repro.segmentation import prediction, training
 from thesis_repro.study import compare, controls, runner, thesis_tables, timing
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
@@ -37,7 +35,7 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     folder, _, summary = finished
     assert len(summary) == 10
     sequence = Sequence(small_world / "kitti", "01")
-    alone = odometry.run(sequence, masks=LabelMasks(small_labels / "01", sequence, 15))
+    alone = odometry.run(sequence, masks=masks.LabelMasks(small_labels / "01", sequence, 15))
     row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
     expected = metrics.errors(alone.poses, sequence.poses) | metrics.step_errors(
         alone.poses, sequence.poses
@@ -56,7 +54,7 @@ def test_kittis_errors_need_paths_of_100_metres(frames, t_rel):
     true = np.tile(np.eye(4), (frames, 1, 1))
     true[:, 2, 3] = np.arange(frames)
     columns = np.c_[1.02 * true[:, :3, 3], true[:, :3, :3].reshape(-1, 9)]
-    table = pd.DataFrame(columns, columns=[*"xyz", *ROTATION_COLUMNS])
+    table = pd.DataFrame(columns, columns=[*"xyz", *odometry.odometry.ROTATION_COLUMNS])
     measured = runner.measures(table.assign(detected=9.0, flag=""), true)
     assert measured["t_rel"] == pytest.approx(t_rel, nan_ok=True)
     assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
@@ -150,14 +148,18 @@ def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_
 
     thesis = keypoints()
     assert thesis["masked"] != thesis["exact-boundaries"]
-    exact = keypoints(MaskSettings("exact"))  # the same folder: the first results are replaced
+    exact = keypoints(
+        masks.MaskSettings("exact")
+    )  # the same folder: the first results are replaced
     assert exact["masked"] == exact["exact-boundaries"] == thesis["exact-boundaries"]
-    chosen = MaskSettings(
+    chosen = masks.MaskSettings(
         "exact", symmetric=True, classes=("road", "building"), movable=3, margin=20
     )
     few = keypoints(chosen)
     sequence = opened(small_world, 4)[0]
-    alone = odometry.run(sequence, masks=LabelMasks(small_labels / "00", sequence, 10, chosen))
+    alone = odometry.run(
+        sequence, masks=masks.LabelMasks(small_labels / "00", sequence, 10, chosen)
+    )
     assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
 
 

@@ -1,26 +1,20 @@
 """Each tool runs on tiny input, and the numbers behind its results are right."""
 
 import json
-import sys
-from pathlib import Path
 
+import bench
+import evidence
 import keras
+import moving
 import numpy as np
 import pandas as pd
 import pytest
+import train_shipped
 
 from thesis_repro import InputError, odometry
 from thesis_repro.kitti import Sequence
 from thesis_repro.study import compare, jobs
 from thesis_repro.study.sources import Source
-
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
-
-import bench  # noqa: E402
-import evidence  # noqa: E402
-import moving  # noqa: E402
-import train_shipped  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
