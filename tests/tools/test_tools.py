@@ -1,7 +1,5 @@
 """Each tool runs on tiny input, and the numbers behind its results are right."""
 
-import json
-
 import bench
 import evidence
 import keras
@@ -25,7 +23,7 @@ def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypat
     table = bench.measure(Sequence(small_world / "kitti", "00").subset(5))
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
     assert (table["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
-    assert len(json.loads(table.to_json(orient="records"))) == 6
+    assert table.to_json(orient="records").count('"ratio"') == 5
 
 
 def test_muon_treats_convolutions_as_matrices():
@@ -54,21 +52,21 @@ def test_a_view_looks_like_that_of_another_camera():
 
 
 @pytest.mark.torture
-def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path):
+def test_the_training_writes_a_model_and_its_card(camvid_real, tmp_path, monkeypatch):
+    for name, value in (
+        ("COMMON", train_shipped.COMMON._replace(epochs=1)),
+        ("LAST", train_shipped.LAST._replace(epochs=1)),
+        ("EPOCH", 1),
+    ):
+        monkeypatch.setattr(train_shipped, name, value)
     kitti_semantic = camvid_real.parent / "kitti_semantic"
     arguments = [
         str(camvid_real),
         str(kitti_semantic),
         str(camvid_real.parent / "kitti_pseudo"),
         str(tmp_path),
-        "--epochs",
-        "1",
-        "--last-epochs",
-        "1",
-        "--steps",
-        "1",
     ]
-    assert train_shipped.main(arguments) == 0
+    train_shipped.main(arguments)
     model = keras.models.load_model(tmp_path / "streets.keras", compile=False)
     assert (
         model.output_shape == (None, 320, 320, 35)
