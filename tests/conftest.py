@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import trials
 
-SHARED = trials.ROOT.parent / "shared"
 # fixtures that take seconds
 SLOW_FIXTURES = {
     "small_world",
@@ -35,7 +34,7 @@ def pytest_collection_modifyitems(items):
 
 
 def _real_data(*parts):
-    folder = SHARED.joinpath(*parts)
+    folder = trials.ROOT.parent.joinpath("shared", *parts)
     if not folder.is_dir():
         pytest.skip(f"no real data: ../shared/{'/'.join(parts)} does not exist")
     return folder

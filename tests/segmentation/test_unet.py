@@ -1,13 +1,10 @@
-import json
-from importlib import resources
-
 import pytest
 
 from thesis_repro import InputError
+from thesis_repro.report.captions import REPORTED
 from thesis_repro.segmentation.unet import build_unet, summary_rows
 
-REPORTED = resources.files("thesis_repro.report").joinpath("reported.json")
-FIGURE = json.loads(REPORTED.read_text())["figure_a1_model_summary"]
+FIGURE = REPORTED["figure_a1_model_summary"]
 
 
 def test_every_row_of_figure_a1():

@@ -174,10 +174,9 @@ def test_shuffling_is_reported_as_a_factor():
     assert compare.shuffle_spread(runs)["factor"].tolist() == [3.0]
 
 
-ELEVEN = [f"{number:02d}" for number in range(11)]
-
-
-def parts_of(error, sequences=ELEVEN, widths=range(1, 16), repetitions=5, noise=0.0):
+def parts_of(
+    error, sequences=(*EIGHT, "08", "09", "10"), widths=range(1, 16), repetitions=5, noise=0.0
+):
     """(masked, baseline) runs with errors error(sequence, width); width is None for all
     keypoints.
     """
