@@ -216,7 +216,7 @@ lab: setup
 
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
-	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}" --output build/bench.json
+	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}"
 
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)

@@ -3,9 +3,7 @@
 import fcntl
 import os
 import signal
-import subprocess
 from contextlib import contextmanager
-from pathlib import Path
 
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
@@ -13,10 +11,8 @@ from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads 
 import cv2
 import numpy as np
 import pytest
-from waiting import wait_for
+import trials
 
-ROOT = Path(__file__).resolve().parent.parent
-SHARED = ROOT.parent / "shared"
 # fixtures that take seconds
 SLOW_FIXTURES = {
     "small_world",
@@ -38,7 +34,7 @@ def pytest_collection_modifyitems(items):
 
 
 def _real_data(*parts):
-    folder = SHARED.joinpath(*parts)
+    folder = trials.ROOT.parent.joinpath("shared", *parts)
     if not folder.is_dir():
         pytest.skip(f"no real data: ../shared/{'/'.join(parts)} does not exist")
     return folder
@@ -69,13 +65,11 @@ def kill_when():
     """
 
     def start(command, condition):
-        process = subprocess.Popen(
-            list(map(str, command)), cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True
-        )
-        wait_for(lambda: process.poll() is not None or condition(), 600)
+        process = trials.start(command, trials.ROOT)
+        trials.wait_for(lambda: process.poll() is not None or condition(), 600)
         assert process.returncode is None, "it ended before it could be killed"
-        os.killpg(process.pid, signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL
+        trials.kill(process)
+        assert process.returncode == -signal.SIGKILL
 
     return start
 

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from logging.handlers import MemoryHandler
@@ -136,6 +136,14 @@ def report_error(error: Exception) -> int:
         raise error
     print(f"error: {one_line(line)}", file=sys.stderr)
     return 1
+
+
+def run_main(main: Callable[[], object]) -> None:
+    """Call the function of a program, and end the process with `report_error` if it fails."""
+    try:
+        main()
+    except Exception as error:
+        sys.exit(report_error(error))
 
 
 # The log

@@ -7,7 +7,6 @@ counts. Prints a table and writes it as JSON. A slow machine is no error.
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -24,13 +23,16 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, console, masks, odometry
+from thesis_repro import console, masks, odometry
 from thesis_repro.files import write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
+from thesis_repro.segmentation import prediction
+from thesis_repro.settings import ROOT
 from thesis_repro.study import controls, timing
 from thesis_repro.study.sources import Source
 
+FRAMES = 40  # from the sequence's start
 REPEATS = 3
 WIDTHS = range(1, 17)  # dilation widths in pixels; with all keypoints, 17 runs
 FIRST_USE = "from thesis_repro.odometry import odometry; odometry.warm_up(refined=True)"
@@ -145,8 +147,7 @@ def compile_cost():
     """
 
     def clock():
-        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return usage.ru_utime + usage.ru_stime
+        return os.times().children_user + os.times().children_system
 
     with tempfile.TemporaryDirectory() as cache:
         work = partial(
@@ -160,66 +161,46 @@ def compile_cost():
 
 def measure(sequence):
     """Return a table with a row for each measurement, its reference and their ratio."""
-    from thesis_repro.segmentation import prediction
-
-    rows = []
-
-    def add(what, unit, pair, against):
-        measured, reference = map(float, pair)
-        rows.append(
-            {
-                "what": what,
-                "unit": unit,
-                "measured": measured,
-                "against": against,
-                "reference": reference,
-                "ratio": measured / reference,
-            }
-        )
-
     # loads compiled code
     odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})
     with timing.opencv_threads(1):
         step, refined, bare = step_cost(sequence)
-        add("a step of the odometry", "ms", (step, bare), "its bare OpenCV calls")
-        add("a refined step", "ms", (refined, step), "a step")
-        *pair, same = shared_cost(sequence.subset(12))
-        add(
-            f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits",
-            "ms a frame",
-            pair,
-            "one by one",
-        )
+        together, alone, same = shared_cost(sequence.subset(12))
         with tempfile.TemporaryDirectory() as labels:
             prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, labels)
-            add(
+            shared_masks, single_masks = mask_cost(sequence, Path(labels))
+    first, second = compile_cost()
+    in_one_pass = f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits"
+    table = pd.DataFrame(
+        [
+            ("a step of the odometry", "ms", step, "its bare OpenCV calls", bare),
+            ("a refined step", "ms", refined, "a step", step),
+            (in_one_pass, "ms a frame", together, "one by one", alone),
+            (
                 "masks and controls made together",
                 "ms a mask",
-                mask_cost(sequence, Path(labels)),
+                shared_masks,
                 "one by one",
-            )
-    add("first use, compiling", "s", compile_cost(), "second use")
-    return pd.DataFrame(rows)
+                single_masks,
+            ),
+            ("first use, compiling", "s", first, "second use", second),
+        ],
+        columns=["what", "unit", "measured", "against", "reference"],
+    )
+    return table.assign(ratio=table["measured"] / table["reference"])
 
 
-def main(arguments=None):
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--kitti", required=True, type=Path, help="KITTI odometry folder (sequences, poses)"
     )
-    parser.add_argument("--sequence", default="00")
-    parser.add_argument("--frames", default=40, type=int, help="frames from its start (40)")
-    parser.add_argument("--output", type=Path, default=Path("bench.json"))
-    options = parser.parse_args(arguments)
-    try:
-        table = measure(Sequence(options.kitti, options.sequence).subset(options.frames))
-    except InputError as error:
-        return console.report_error(error)
-    write_text(options.output, table.to_json(orient="records", indent=1) + "\n")
+    options = parser.parse_args()
+    table = measure(Sequence(options.kitti, "00").subset(FRAMES))
+    write_text(ROOT / "build" / "bench.json", table.to_json(orient="records", indent=1) + "\n")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, OpenCV {cv2.__version__}")
     print(table.to_string(index=False, float_format="{:.3g}".format))
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console.run_main(main)

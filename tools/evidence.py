@@ -9,6 +9,7 @@ those of the package on the sequences that they have. A stopped run resumes.
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 import failures
@@ -68,11 +69,13 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
             raise InputError(
                 f"{source.folder}: holds no folder of label maps of {', '.join(names)}"
             )
-
-    def run(planned):
-        sources = [Source(labels), *others]
-        return runner.run(planned, sequences, sources, build / "odometry", processes=processes)
-
+    run = partial(
+        runner.run,
+        sequences=sequences,
+        sources=[Source(labels), *others],
+        folder=build / "odometry",
+        processes=processes,
+    )
     runs = _runs(run, sequences, repetitions)
     other_runs = {
         source: run(
@@ -218,25 +221,21 @@ def _tracks(sequences, labels):
 
 
 def main():
-    """Write the evidence with the settings of the environment, and return the exit status."""
-    try:
-        # all frames, unless FRAMES is set
-        settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})
-        with results.claimed(BUILD), console.logged(BUILD, "tables, plots and findings") as run:
-            write(
-                settings.kitti,
-                FOLDER,
-                BUILD,
-                settings.sizes.frames,
-                settings.sizes.repetitions,
-                settings.jobs,
-                named([("labels", Path(path)) for path in sys.argv[1:]], [], masks.MaskSettings()),
-            )
-            run.end(f"tables, plots and findings: {FOLDER}")
-    except Exception as error:
-        return console.report_error(error)
-    return 0
+    """Write the evidence with the settings of the environment."""
+    # all frames, unless FRAMES is set
+    settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})
+    with results.claimed(BUILD), console.logged(BUILD, "tables, plots and findings") as run:
+        write(
+            settings.kitti,
+            FOLDER,
+            BUILD,
+            settings.sizes.frames,
+            settings.sizes.repetitions,
+            settings.jobs,
+            named([("labels", Path(path)) for path in sys.argv[1:]], [], masks.MaskSettings()),
+        )
+        run.end(f"tables, plots and findings: {FOLDER}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console.run_main(main)

@@ -10,7 +10,6 @@ camera's direction does not disturb the estimate of a motion between two frames.
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import cv2
@@ -108,20 +107,16 @@ def table(root, labels, build, repetitions=REPETITIONS, frames=None):
     return pd.DataFrame(rows)
 
 
-def main(arguments=None):
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kitti", type=Path, required=True, metavar="ROOT")
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR")
-    options = parser.parse_args(arguments)
-    try:
-        measured = table(options.kitti, options.labels.absolute(), ROOT / "build" / "moving")
-        note = NOTE.format(labels=options.labels.name, repetitions=REPETITIONS)
-        style.save_table(measured, ROOT / "figures" / "kitti_excerpts", "moving", note)
-        print(style.markdown(measured))
-    except InputError as error:
-        return console.report_error(error)
-    return 0
+    options = parser.parse_args()
+    measured = table(options.kitti, options.labels.absolute(), ROOT / "build" / "moving")
+    note = NOTE.format(labels=options.labels.name, repetitions=REPETITIONS)
+    style.save_table(measured, ROOT / "figures" / "kitti_excerpts", "moving", note)
+    print(style.markdown(measured))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console.run_main(main)

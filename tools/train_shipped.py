@@ -7,7 +7,6 @@ can be measured on them, and with all pairs, which gives the model. A stopped tr
 """
 
 import argparse
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -111,20 +110,20 @@ class Views(training.Batches):
     and the epoch.
     """
 
-    def __init__(self, sources, phase, steps):
-        self.sources, self.phase, self.steps, self.epoch = sources, phase, steps, 0
+    def __init__(self, sources, phase):
+        self.sources, self.phase, self.epoch = sources, phase, 0
         # `dataset` reads the shape
         self.sets = [(np.empty((0, phase.size, phase.size, 1), np.uint8), None)]
         self.light = augmentation.Augmenter(LIGHT)
 
     def __len__(self):
-        return self.steps
+        return EPOCH
 
     def __iter__(self):
         random = np.random.default_rng((SEED, self.phase.size, self.epoch))
         size, batch_size, _, shares = self.phase
         names, ends = np.array(list(shares)), np.cumsum(list(shares.values()))
-        for _ in range(self.steps):
+        for _ in range(EPOCH):
             # evenly spaced, to mix every batch
             places = (np.arange(batch_size) + random.random()) / batch_size
             pairs = []
@@ -176,23 +175,20 @@ def weighted_loss(weights):
     return cross_entropy_and_dice
 
 
-def train(camvid, kitti_semantic, pseudo, folder, common=COMMON, last=LAST, steps=EPOCH):
+def train(camvid, kitti_semantic, pseudo, folder):
     """Train in a folder; return (twin, model), which share all but the last phase, and KITTI's
     held-out pairs.
     """
-    pairs = cityscapes.pairs(kitti_semantic, "train")
+    roots = {"camvid": camvid, "kitti": kitti_semantic, "pseudo": pseudo}
+    sets = {name: cityscapes.pairs(root, "train") for name, root in roots.items()}
+    pairs = sets["kitti"]
     if len(pairs) <= len(HELD_OUT):
         raise InputError(
             f"{kitti_semantic}: {len(pairs)} training pairs; more than {len(HELD_OUT)} are needed"
         )
     held_out = [pairs[index] for index in HELD_OUT]
     world_images = [world.render_image("train", index, 0.5) for index in range(WORLD_IMAGES)]
-    all_sources = {
-        "camvid": _read(cityscapes.pairs(camvid, "train")),
-        "kitti": _read(pairs),
-        "pseudo": _read(cityscapes.pairs(pseudo, "train")),
-        "world": world_images,
-    }
+    all_sources = {name: _read(pairs) for name, pairs in sets.items()} | {"world": world_images}
     training_sources = all_sources | {
         "kitti": _read([pair for pair in pairs if pair not in held_out])
     }
@@ -214,13 +210,15 @@ def train(camvid, kitti_semantic, pseudo, folder, common=COMMON, last=LAST, step
     made_from = {
         "code": results.code("segmentation/unet"),
         "tool": results.content(Path(__file__)),
-        "phases": [common, last],
-        "steps": steps,
-        "images": results.listing([pair.image for pair in pairs]),
+        "phases": [COMMON, LAST],
+        "steps": EPOCH,
+        "images": results.listing(
+            [file for pairs in sets.values() for pair in pairs for file in pair[1:]]
+        ),
     }
 
     def fit(name, sources, phase, rate):
-        batches = Views(sources, phase, steps)
+        batches = Views(sources, phase)
         loss = weighted_loss(class_weights(sources, phase.shares))
         model.compile(optimizer, training.fused_loss(loss))
         resumable = training.ResumableTraining(
@@ -236,19 +234,19 @@ def train(camvid, kitti_semantic, pseudo, folder, common=COMMON, last=LAST, step
         )
 
     def cosine(epoch):
-        return LEARNING_RATE * 0.5 * (1 + np.cos(np.pi * (epoch + 0.5) / last.epochs))
+        return LEARNING_RATE * 0.5 * (1 + np.cos(np.pi * (epoch + 0.5) / LAST.epochs))
 
     def warm_up(epoch):
         return LEARNING_RATE * (0.5 if epoch == 0 else 1)
 
-    fit("common", training_sources | {"pseudo": trusted}, common, warm_up)
+    fit("common", training_sources | {"pseudo": trusted}, COMMON, warm_up)
     variables = model.variables + optimizer.variables
     state = [variable.numpy() for variable in variables]
-    fit("twin", training_sources, last, cosine)
+    fit("twin", training_sources, LAST, cosine)
     twin = _finished(model)
     for variable, value in zip(variables, state, strict=True):
         variable.assign(value)
-    fit("model", all_sources, last, cosine)
+    fit("model", all_sources, LAST, cosine)
     return twin, _finished(model), held_out
 
 
@@ -292,52 +290,31 @@ def main(arguments=None):
     parser.add_argument(
         "output", type=Path, help="folder for the state of the training, the model and its card"
     )
-    parser.add_argument(
-        "--epochs", type=int, default=COMMON.epochs, help=f"in the common phase ({COMMON.epochs})"
-    )
-    parser.add_argument(
-        "--last-epochs", type=int, default=LAST.epochs, help=f"in the last phase ({LAST.epochs})"
-    )
-    parser.add_argument("--steps", type=int, default=EPOCH, help=f"in an epoch ({EPOCH})")
     options = parser.parse_args(arguments)
-    try:
-        validation = cityscapes.pairs(options.camvid, "val")
-        common, last = (
-            COMMON._replace(epochs=options.epochs),
-            LAST._replace(epochs=options.last_epochs),
-        )
-        twin, model, held_out = train(
-            options.camvid,
-            options.kitti_semantic,
-            options.pseudo,
-            options.output,
-            common,
-            last,
-            options.steps,
-        )
-        file = options.output / prediction.SHIPPED.name
-        with files.atomic(file) as temporary:
-            model.save(temporary)
-        template = jinja2.Environment(
-            undefined=jinja2.StrictUndefined, trim_blocks=True
-        ).from_string(Path(__file__).with_name("model_card.md.j2").read_text(encoding="utf-8"))
-        files.write_text(
-            options.output / "README.md",
-            template.render(
-                file=file.name,
-                parameters=model.count_params(),
-                steps=options.steps,
-                phases=(common, last),
-                held_out=[pair.name for pair in held_out],
-                camvid=measured(model, validation),
-                kitti=measured(twin, held_out),
-            ),
-        )
-    except InputError as error:
-        return console.report_error(error)
+    validation = cityscapes.pairs(options.camvid, "val")
+    twin, model, held_out = train(
+        options.camvid, options.kitti_semantic, options.pseudo, options.output
+    )
+    file = options.output / prediction.SHIPPED.name
+    with files.atomic(file) as temporary:
+        model.save(temporary)
+    template = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
+        Path(__file__).with_name("model_card.md.j2").read_text(encoding="utf-8")
+    )
+    files.write_text(
+        options.output / "README.md",
+        template.render(
+            file=file.name,
+            parameters=model.count_params(),
+            steps=EPOCH,
+            phases=(COMMON, LAST),
+            held_out=[pair.name for pair in held_out],
+            camvid=measured(model, validation),
+            kitti=measured(twin, held_out),
+        ),
+    )
     print(f"written: {file}, and its card beside it")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console.run_main(main)

@@ -9,8 +9,6 @@ its weights, the quality of its label maps, the ratios of errors with their inte
 of Table 4.2. A stopped run resumes.
 """
 
-import sys
-
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
 # isort: split
@@ -19,7 +17,7 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from thesis_repro import InputError, cityscapes, console, files, kitti, results
+from thesis_repro import cityscapes, console, files, kitti, results
 from thesis_repro.report.trainings import TABLE
 from thesis_repro.segmentation import domain_gap, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
@@ -103,14 +101,9 @@ def run(settings, sequences, sources):
     ]
     folder = settings.build / "trainings/odometry"
     runs = runner.run(listed, sequences, sources, folder, processes=settings.jobs)
-    for source in sources:
-        listed += jobs.keypoint_control_jobs(
-            compare.keypoints_left(compare.of_source(runs, source.name)),
-            sequences,
-            settings.sizes.repetitions,
-            source=source.name,
-            width=jobs.CONTROL_WIDTH,
-        )
+    listed += runner.keypoint_controls(
+        runs, sequences, sources, settings.sizes.repetitions, jobs.CONTROL_WIDTH
+    )
     return runner.run(listed, sequences, sources, folder, processes=settings.jobs)
 
 
@@ -163,7 +156,6 @@ def main():
         [sequence.subset(settings.sizes.frames) for sequence in sequences],
         [source for source, _ in trained],
     )
-    files.write_text(settings.build / "trainings/runs.csv", runs.to_csv(index=False))
     comparison = compare.comparisons(runs)
     table = pd.DataFrame(
         row for source, facts in trained for row in rows(runs, comparison, source, facts)
@@ -173,7 +165,4 @@ def main():
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (InputError, OSError) as error:
-        sys.exit(console.report_error(error))
+    console.run_main(main)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from paths import winding
+from made_up import winding
 from scipy.spatial.transform import Rotation
 
 from thesis_repro import InputError

@@ -127,31 +127,27 @@ def test_keypoints_have_opencvs_bits(drive, mask):
         "nothing": np.zeros_like(frame),
         "specks": (np.random.RandomState(0).rand(*frame.shape) < 0.02).astype(np.uint8),
     }
-    # the second has many corners of equal strength
-    for image in (frame, frame // 64 * 64, np.full_like(frame, 7)):
-        corners = keypoints.find_corners(image, THESIS.block_size)
-        for distance in (0, 1, 2.4, 3, 7):
-            for limit in (10, 2000, 0):
-                settings = replace(THESIS, min_distance=distance, max_keypoints=limit)
-                expected = cv2.goodFeaturesToTrack(
-                    image,
-                    limit,
-                    THESIS.quality,
-                    distance,
-                    mask=masks.get(mask),
-                    blockSize=THESIS.block_size,
-                )
-                np.testing.assert_array_equal(
-                    keypoints.detect(image, settings, masks.get(mask), corners),
-                    np.empty((0, 2)) if expected is None else expected[:, 0],
-                )
-    expected = cv2.goodFeaturesToTrack(frame, 2000, 0.05, 3, mask=masks.get(mask), blockSize=9)
-    detected = keypoints.SharedKeypoints().detect(
-        frame, replace(THESIS, quality=0.05, block_size=9), masks.get(mask)
-    )
-    np.testing.assert_array_equal(
-        detected, np.empty((0, 2)) if expected is None else expected[:, 0]
-    )
+    # the second image has many corners of equal strength
+    cases = [
+        (image, replace(THESIS, min_distance=distance, max_keypoints=limit))
+        for image in (frame, frame // 64 * 64, np.full_like(frame, 7))
+        for distance in (0, 1, 2.4, 3, 7)
+        for limit in (10, 2000, 0)
+    ]
+    shared = keypoints.SharedKeypoints()
+    for image, settings in [*cases, (frame, replace(THESIS, quality=0.05, block_size=9))]:
+        expected = cv2.goodFeaturesToTrack(
+            image,
+            settings.max_keypoints,
+            settings.quality,
+            settings.min_distance,
+            mask=masks.get(mask),
+            blockSize=settings.block_size,
+        )
+        np.testing.assert_array_equal(
+            shared.detect(image, settings, masks.get(mask)),
+            np.empty((0, 2)) if expected is None else expected[:, 0],
+        )
 
 
 def test_tracks_have_opencvs_bits(drive):
@@ -175,25 +171,31 @@ def test_a_mask_in_the_detector_fills_the_limit_and_a_filter_does_not(drive):
     assert len(inside) == 500 and 100 < len(filtered) < 400
 
 
-@pytest.mark.parametrize("kind", ["plain", "swapped", "few", "noisy", "still", "nonsense"])
+# {kind: the matched points (previous, current) of a step, changed}
+CHANGED_MATCHES = {
+    "plain": lambda random, previous, current: (previous, current),
+    "swapped": lambda random, previous, current: (current, previous),
+    "few": lambda random, previous, current: (previous[:30], current[:30]),
+    "noisy": lambda random, previous, current: (
+        previous,
+        current + random.normal(0, 3e-3, current.shape),
+    ),
+    "still": lambda random, previous, current: (
+        previous,
+        previous + random.normal(0, 1e-5, current.shape),
+    ),
+    "nonsense": lambda random, previous, current: (random.permutation(previous), current),
+}
+
+
+@pytest.mark.parametrize("kind", CHANGED_MATCHES)
 def test_the_pose_vote_has_opencvs_bits(drive, kind):
     random = np.random.RandomState(1)
     for index in range(3):
         points = keypoints.detect(drive.frame(index), THESIS)
         tracked, success = keypoints.track(drive.frame(index), drive.frame(index + 1), points)
-        previous, current = (
-            pose.normalise(side[success], drive.intrinsics) for side in (points, tracked)
-        )
-        if kind == "swapped":
-            previous, current = current, previous
-        elif kind == "few":
-            previous, current = previous[:30], current[:30]
-        elif kind == "noisy":
-            current = current + random.normal(0, 3e-3, current.shape)
-        elif kind == "still":
-            current = previous + random.normal(0, 1e-5, current.shape)
-        elif kind == "nonsense":
-            previous = random.permutation(previous)
+        matches = (pose.normalise(side[success], drive.intrinsics) for side in (points, tracked))
+        previous, current = CHANGED_MATCHES[kind](random, *matches)
         matrix, _, problem = pose.essential_matrix(current, previous, THESIS.threshold)
         assert problem == ""
         votes, rotation, translation, _ = cv2.recoverPose(

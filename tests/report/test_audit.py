@@ -1,11 +1,16 @@
-"""The audit's rows, and the measurements that are joined to them."""
+"""The audit's rows and the measurements that are joined to them; the gap between domains, and the
+recorded trainings.
+"""
+
+from types import SimpleNamespace
 
 import made_up
 import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro.report import audit
+from thesis_repro import results
+from thesis_repro.report import audit, gap, style, trainings
 from thesis_repro.study import ablations, compare
 
 
@@ -151,3 +156,93 @@ def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
                 compared.loc[(method, line.estimator, "rmse"), ["ratio", "low", "high", "n"]]
             )
         assert len(lines) >= 2
+
+
+# The gap between domains, on made-up scores
+
+OWN, SHIPPED = "the model of this run", "the model in the package"
+VALIDATION, STREETS = "validation images", "KITTI's street scenes"
+
+
+# of two models on two domains; the second domain of the first model has no sky
+SCORES = pd.DataFrame(
+    [
+        (OWN, VALIDATION, 20, 2, 0.6, 0.9),
+        (OWN, STREETS, 7, 1, 0.3, float("nan")),
+        (SHIPPED, VALIDATION, 20, 2, 0.5, 0.8),
+        (SHIPPED, STREETS, 7, 2, 0.4, 0.7),
+    ],
+    columns=["model", "domain", "images", "classes", "mean_iou", "sky_recall"],
+).assign(accuracy=0.7)
+CLASSES = pd.DataFrame(
+    [
+        {
+            "model": row.model,
+            "domain": row.domain,
+            "class": name,
+            "id": number,
+            "share": 0.5,
+            "iou": iou,
+        }
+        for row in SCORES.itertuples()
+        for name, number, iou in (("road", 7, 0.8), ("sky", 23, 0.7))[: row.classes]
+    ]
+)
+
+
+def test_the_table_shows_each_model_and_domain():
+    table = gap.table(SimpleNamespace(scores=SCORES, classes=CLASSES)).set_index("measure")
+    assert list(table) == [
+        f"{OWN}: {VALIDATION}",
+        f"{OWN}: {STREETS}",
+        f"{SHIPPED}: {VALIDATION}",
+        f"{SHIPPED}: {STREETS}",
+    ]
+    scores = table[f"{OWN}: {VALIDATION}"]
+    assert scores[["images", "classes present", "mean IoU over these", "IoU: sky"]].tolist() == [
+        20,
+        2,
+        0.6,
+        0.7,
+    ]
+    assert pd.isna(table.loc["IoU: sky", f"{OWN}: {STREETS}"])
+    assert table.index.is_unique
+
+
+def test_the_quality_of_label_maps_is_recorded(tmp_path):
+    assert gap.label_map_quality(tmp_path) == []
+    style.save_table(SCORES.assign(used=SCORES["model"] == SHIPPED), tmp_path, gap.RECORD, "note")
+    rows = gap.label_map_quality(tmp_path)
+    assert [
+        (row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows
+    ] == [(VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]
+
+
+# A run is told whether its network is the recorded one
+
+RECORDED = trainings.read()["network"].iloc[0]
+
+
+@pytest.mark.parametrize(
+    "network, in_git, named",
+    [
+        (RECORDED, True, [RECORDED]),
+        ("0" * 12, True, [RECORDED, "0" * 12, "trainings.csv"]),
+        ("0" * 12, False, []),
+        (None, True, []),
+    ],
+)
+def test_the_networks_are_compared(tmp_path, network, in_git, named):
+    if network:
+        results.stage(tmp_path / "labels" / "00", model=network)
+    note = trainings.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
+    assert bool(note) == bool(named) and all(name in note for name in named)
+    assert ("XLA_FLAGS" in note) == (len(named) > 1)
+
+
+def test_the_summary_spans_all_trainings():
+    for training in trainings.summary():
+        rows = trainings.read().query("estimator == @training['estimator']")
+        low, high = training["ranges"]["se3_ratio"]
+        assert len(training["verdicts"]) == len(rows) > 1
+        assert (rows["se3_low"] <= high).all() and rows["se3_ratio"].between(low, high).all()

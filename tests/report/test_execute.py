@@ -11,7 +11,7 @@ from pathlib import Path
 import nbformat
 import psutil
 import pytest
-from waiting import wait_for
+from trials import wait_for
 
 from thesis_repro.settings import ROOT
 
@@ -35,15 +35,17 @@ COMMAND = [
 
 @pytest.fixture
 def start(tmp_path):
-    """start(*cells): start nbconvert, as the Makefile does, on a notebook of these cells."""
+    """start(*cells): start nbconvert, as the Makefile does, on a notebook of these cells; command:
+    another command that does so.
+    """
 
-    def started(*cells):
+    def started(*cells, command=COMMAND):
         cells = [nbformat.v4.new_code_cell(cell) for cell in cells]
         nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "one.ipynb")
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         # processes in the background of a shell script ignore SIGINT
         return subprocess.Popen(
-            COMMAND,
+            command,
             cwd=tmp_path,
             env=environment,
             stdout=subprocess.PIPE,
@@ -105,14 +107,10 @@ WAITING = (
 )
 
 
-def test_a_notebook_ends_when_make_is_killed(tmp_path):
-    nbformat.write(
-        nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(WAITING)]), tmp_path / "one.ipynb"
-    )
+def test_a_notebook_ends_when_make_is_killed(start, tmp_path):
     # a shell in the place of make, and the one of its recipe
     recipe = f"bash -c '{shlex.join(COMMAND)} 2>/dev/null; :' & wait; :"
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen(["bash", "-c", recipe], cwd=tmp_path, env=environment)
+    process = start(WAITING, command=["bash", "-c", recipe])
     wait_for((tmp_path / "pid").is_file)
     time.sleep(0.5)
     kernel = psutil.Process(int((tmp_path / "pid").read_text()))

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from evo.cli import entry_points
-from paths import winding
+from made_up import winding
 
 from thesis_repro import InputError
 from thesis_repro.cli import main

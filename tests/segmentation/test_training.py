@@ -1,4 +1,11 @@
+"""The training: its loss and batches, resuming, the same bits on any processor and number of cores,
+and the memory that it needs.
+"""
+
+import hashlib
 import json
+import os
+import platform
 import subprocess
 import sys
 import time
@@ -13,11 +20,12 @@ import segmentation_models as sm
 import tensorflow as tf
 
 from thesis_repro import InputError
-from thesis_repro.segmentation import augmentation, training
+from thesis_repro.segmentation import augmentation, memory, training
+from thesis_repro.segmentation.unet import build_unet
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[2]
+
 SIZE = 16
 
 
@@ -176,7 +184,8 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
 
 def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_when):
     code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
+        "from thesis_repro import segmentation; import test_training as t; "
         f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)"
     )
     kill_when([sys.executable, "-c", code], (tmp_path / "state.npz").exists)
@@ -192,15 +201,19 @@ def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_whe
 
 def test_several_devices_share_each_batch(tmp_path):
     code = (
-        "import sys; import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
+        "import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
         "tf.config.set_logical_device_configuration(cpu, [tf.config.LogicalDeviceConfiguration()] * 2); "
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_training as t; "
+        "import test_training as t; "
         f"folder, two = t.Path({str(tmp_path)!r}), tf.distribute.MirroredStrategy(['CPU:0', 'CPU:1']); "
         "t.train(folder, 2, strategy=two); "
         "assert t.training.ResumableTraining(folder, *t.prepared(strategy=two)[:2]).first_epoch(3) == 2"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parent,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     history = pd.read_csv(tmp_path / "history.csv")
@@ -270,3 +283,70 @@ def test_the_appendixs_hdf5_loads(trained, tmp_path):
     )
     assert with_loss.evaluate(x, y, verbose=0) == pytest.approx(model.evaluate(x, y, verbose=0))
     assert np.array_equal(training.load_model(tmp_path / "model.hdf5")(x), model(x))
+
+
+# equal with and without AVX-512, and with the caches of an AMD and an Intel processor
+RECORDED = "67eee48bed51"
+
+
+def digest():
+    """Return a digest of the weights after two epochs and of the predictions."""
+    random = np.random.default_rng(0)
+    images = random.integers(0, 256, (6, 96, 96, 1), np.uint8)
+    labels = random.integers(0, 35, (6, 12, 12), np.uint8).repeat(8, 1).repeat(8, 2)
+    keras.utils.set_random_seed(0)
+    model = build_unet((96, 96, 1), 35, 4)
+    model.compile(keras.optimizers.Adam(), training.fused_loss(training.total_loss()))
+    model.fit(
+        training.Batches([(images, labels)], 3, 0).dataset(), epochs=2, shuffle=False, verbose=0
+    )
+    values = [*model.get_weights(), model.predict(images, verbose=0)]
+    return hashlib.sha256(b"".join(value.tobytes() for value in values)).hexdigest()
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
+    reason="needs two cores and a system that can restrict a process to one",
+)
+def test_one_core_and_all_give_the_same_bits():
+    code = (
+        "from thesis_repro import segmentation; import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
+        "import test_training; print(test_training.digest())"
+    )
+    one_core = subprocess.run(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parent,
+        check=True,
+    )
+    assert one_core.stdout.split()[-1] == digest()
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="recorded on x86_64")
+def test_every_x86_processor_gives_the_recorded_bits():
+    assert digest()[:12] == RECORDED
+
+
+def test_a_batch_that_cannot_fit_is_refused(monkeypatch):
+    model = build_unet((64, 64, 1), 35, 4)
+    monkeypatch.setattr(memory, "available", lambda: memory.needed(model, 3) - 1)
+    memory.require(model, 2)
+    with pytest.raises(InputError, match="batch_size=3:"):
+        memory.require(model, 3)
+
+
+def test_a_containers_limit_is_read(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "CGROUP", tmp_path)
+    free = memory.available()
+    (tmp_path / "memory.current").write_text(f"{2**20}\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    assert memory.available() > free / 2
+    (tmp_path / "memory.max").write_text(f"{2**27}\n")
+    assert memory.available() == 2**27 - 2**20
+
+
+def test_memory_needed_by_the_thesiss_batch():
+    # 600 channels at full size are kept for the gradients
+    row = 16 * 320 * 320 * 4  # bytes of one channel at full size in a batch of 16
+    assert 600 * row < memory.needed(build_unet((320, 320, 1), 35), 16) < 20e9

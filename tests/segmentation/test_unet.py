@@ -1,13 +1,10 @@
-import json
-from importlib import resources
-
 import pytest
 
 from thesis_repro import InputError
+from thesis_repro.report.captions import REPORTED
 from thesis_repro.segmentation.unet import build_unet, summary_rows
 
-REPORTED = resources.files("thesis_repro.report").joinpath("reported.json")
-FIGURE = json.loads(REPORTED.read_text())["figure_a1_model_summary"]
+FIGURE = REPORTED["figure_a1_model_summary"]
 
 
 def test_every_row_of_figure_a1():
@@ -28,11 +25,14 @@ def test_corrected_blocks_and_base_filters():
     }
 
     assert len(rows) == 41 + 3 * 9
-    assert rows["conv2d"]["connected_to"] == "input_2[0][0]"
-    assert rows["conv2d_1"]["connected_to"] == "activation[0][0]"
-    assert rows["conv2d_17"]["connected_to"] == "activation_16[0][0]"
-    assert rows["conv2d_9"]["output_shape"] == "(None, 4, 4, 128)"
-    assert rows["conv2d_18"]["output_shape"] == "(None, 64, 64, 5)"
+    for layer, column, text in (
+        ("conv2d", "connected_to", "input_2[0][0]"),
+        ("conv2d_1", "connected_to", "activation[0][0]"),
+        ("conv2d_17", "connected_to", "activation_16[0][0]"),
+        ("conv2d_9", "output_shape", "(None, 4, 4, 128)"),
+        ("conv2d_18", "output_shape", "(None, 64, 64, 5)"),
+    ):
+        assert rows[layer][column] == text
 
 
 def test_a_size_that_cannot_be_halved_four_times():

@@ -7,13 +7,12 @@ import sys
 import threading
 from collections import Counter
 from functools import partial
-from pathlib import Path
 
 import pandas as pd
 import pytest
-from waiting import wait_for
+from trials import ROOT, contents, wait_for
 
-from thesis_repro import InputError, console
+from thesis_repro import InputError
 from thesis_repro.kitti import Sequence
 from thesis_repro.study import runner
 from thesis_repro.study.jobs import first_jobs
@@ -21,7 +20,6 @@ from thesis_repro.study.workers import open_pool
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
 FRAMES, CHECKPOINT = 12, 4
 # loaded by the workers: makes them slow enough to be killed in a pass, and logs the frames that
 # they read
@@ -214,13 +212,6 @@ def test_label_maps_of_workers_have_the_bits_of_one_process(
     assert (
         main([*map(str, command), "--output", str(tmp_path / "spread"), "--dask", scheduler]) == 0
     )
-
-    def contents(folder):
-        return {
-            path.relative_to(folder): path.read_bytes()
-            for path in folder.rglob("*.*")
-            if path.name != console.LOG
-        }
 
     assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)
     assert contents(tmp_path / "spread") == contents(tmp_path / "alone")

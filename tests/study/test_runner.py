@@ -1,14 +1,16 @@
+"""The runs of a study: resuming, failures, their settings and their times."""
+
 import shutil
+import time
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro import InputError, odometry
+from thesis_repro import InputError, masks, odometry
 from thesis_repro.kitti import Sequence
-from thesis_repro.masks import LabelMasks, MaskSettings
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.odometry import ROTATION_COLUMNS
+from thesis_repro.segmentation import prediction, training
 from thesis_repro.study import compare, controls, runner, thesis_tables, timing
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
@@ -33,7 +35,7 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     folder, _, summary = finished
     assert len(summary) == 10
     sequence = Sequence(small_world / "kitti", "01")
-    alone = odometry.run(sequence, masks=LabelMasks(small_labels / "01", sequence, 15))
+    alone = odometry.run(sequence, masks=masks.LabelMasks(small_labels / "01", sequence, 15))
     row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
     expected = metrics.errors(alone.poses, sequence.poses) | metrics.step_errors(
         alone.poses, sequence.poses
@@ -52,7 +54,7 @@ def test_kittis_errors_need_paths_of_100_metres(frames, t_rel):
     true = np.tile(np.eye(4), (frames, 1, 1))
     true[:, 2, 3] = np.arange(frames)
     columns = np.c_[1.02 * true[:, :3, 3], true[:, :3, :3].reshape(-1, 9)]
-    table = pd.DataFrame(columns, columns=[*"xyz", *ROTATION_COLUMNS])
+    table = pd.DataFrame(columns, columns=[*"xyz", *odometry.odometry.ROTATION_COLUMNS])
     measured = runner.measures(table.assign(detected=9.0, flag=""), true)
     assert measured["t_rel"] == pytest.approx(t_rel, nan_ok=True)
     assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
@@ -146,14 +148,18 @@ def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_
 
     thesis = keypoints()
     assert thesis["masked"] != thesis["exact-boundaries"]
-    exact = keypoints(MaskSettings("exact"))  # the same folder: the first results are replaced
+    exact = keypoints(
+        masks.MaskSettings("exact")
+    )  # the same folder: the first results are replaced
     assert exact["masked"] == exact["exact-boundaries"] == thesis["exact-boundaries"]
-    chosen = MaskSettings(
+    chosen = masks.MaskSettings(
         "exact", symmetric=True, classes=("road", "building"), movable=3, margin=20
     )
     few = keypoints(chosen)
     sequence = opened(small_world, 4)[0]
-    alone = odometry.run(sequence, masks=LabelMasks(small_labels / "00", sequence, 10, chosen))
+    alone = odometry.run(
+        sequence, masks=masks.LabelMasks(small_labels / "00", sequence, 10, chosen)
+    )
     assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
 
 
@@ -189,3 +195,67 @@ def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitt
     )
     without_truth = first_jobs([Sequence(tiny_kitti, "00")], {"thesis": (5,)}, tested=5)
     assert "true-labels" not in {job.method for job in without_truth}
+
+
+# The time of a frame, stage by stage; the timed steps are the steps of a real run
+
+
+@pytest.fixture(scope="module")
+def model(small_model):
+    return training.load_model(small_model)
+
+
+@pytest.fixture
+def sequence(small_world, monkeypatch):
+    monkeypatch.setattr(timing, "FRAMES", 2)
+    return Sequence(small_world / "kitti", "00")
+
+
+def test_a_slow_stage_shows_in_its_row(sequence, model, monkeypatch):
+    keypoint_mask = masks.keypoint_mask
+    monkeypatch.setattr(
+        masks, "keypoint_mask", lambda *given: (keypoint_mask(*given), time.sleep(0.5))[0]
+    )
+    table = timing.measure(sequence, model, width=5)
+    assert (
+        list(table.columns) == ["method", "stage", "milliseconds"]
+        and (table["milliseconds"] > 0).all()
+    )
+    stages_of = table.groupby("method")["stage"].agg(list)
+    assert stages_of["masked, width 5"] == list(timing.STAGES)
+    assert stages_of["all keypoints"] == [
+        stage for stage in timing.STAGES if stage not in ("segmentation", "mask")
+    ]
+    slow = table.set_index(["method", "stage"])["milliseconds"]
+    assert slow["masked, width 5", "mask"] > 500 > slow.drop(("masked, width 5", "mask")).max()
+
+
+def test_timed_steps_equal_the_steps_of_a_run(sequence, model, tmp_path, monkeypatch):
+    steps = []
+    step = odometry.Odometry.step
+    monkeypatch.setattr(
+        odometry.Odometry, "step", lambda *given: steps.append(step(*given)) or steps[-1]
+    )
+    timing.measure(sequence, model, 5)
+    short = sequence.subset(5)
+    prediction.write_label_maps(model, short.frame_paths, tmp_path)
+    made = masks.LabelMasks(tmp_path, short, 5)
+    for timed, expected in (
+        (steps[:10:2], odometry.run(short)),
+        (steps[1:10:2], odometry.run(short, masks=made)),
+    ):
+        assert np.array_equal([timed_step.pose for timed_step in timed], expected.poses)
+        assert [timed_step.detected for timed_step in timed] == expected.frames["detected"].tolist()
+
+
+def test_too_few_frames_are_refused(sequence, model):
+    with pytest.raises(InputError, match="sequence 00: 3 frames"):
+        timing.measure(sequence.subset(3), model)
+
+
+def test_recorded_timings_are_kept(tmp_path):
+    path = tmp_path / "timings" / "seconds.csv"
+    first, second = (pd.DataFrame({"sequence": ["00"], "seconds": [value]}) for value in (1.5, 2.5))
+    assert timing.recorded(first, path, keep=True)[[*first]].equals(first)  # nothing was recorded
+    assert timing.recorded(second, path, keep=True)[[*first]].equals(first)
+    assert timing.recorded(second, path, keep=False)[[*first]].equals(second)

@@ -220,11 +220,8 @@ def test_a_broken_file_is_named(words, path, content, folder, inside):
     )
 
 
-@pytest.mark.parametrize("words, named", REFUSED)
-def test_a_wrong_option_is_named(words, named, inside):
-    trials.refused(inside(words.split()), named)
-
-
-@pytest.mark.parametrize("words, named", MISUSED)
-def test_a_misused_option_is_named(words, named, inside):
-    trials.refused(inside(shlex.split(words)), named, code=2)
+@pytest.mark.parametrize(
+    "words, named, code", [*((*case, 1) for case in REFUSED), *((*case, 2) for case in MISUSED)]
+)
+def test_a_wrong_option_is_named(words, named, code, inside):
+    trials.refused(inside(shlex.split(words)), named, code)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from trials import contents
 
 from thesis_repro import InputError, cityscapes, kitti
 from thesis_repro.cityscapes import ID
@@ -27,14 +28,6 @@ def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("world") / "out"
     dataset.write(folder, **SMALL)
     return folder
-
-
-def contents(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }  # the list's order depends on the run
 
 
 def test_layouts_are_read_by_the_readers_of_real_data(out):

@@ -10,7 +10,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -260,16 +259,12 @@ def _made(executed: list[Path] | None = None, in_git: bool = False) -> dict[str,
     return made
 
 
-def main() -> int:
-    try:
-        settings = read_settings()
-        update(settings)
-    except Exception as error:
-        return console.report_error(error)
+def main() -> None:
+    settings = read_settings()
+    update(settings)
     if note := trainings.network_note(settings):
         print(note)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console.run_main(main)

@@ -21,8 +21,8 @@ from thesis_repro.files import listed, progress, write_text
 from thesis_repro.kitti import Sequence
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
-from thesis_repro.study import controls, workers
-from thesis_repro.study.jobs import Job, in_passes
+from thesis_repro.study import compare, controls, workers
+from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, keypoint_control_jobs
 from thesis_repro.study.sources import Source
 
 # pattern of the file names, one for each unfinished pass
@@ -89,6 +89,32 @@ def run(
     runs = pd.DataFrame(rows)
     runs.attrs = {"made": len(rows) - finished, "kept": finished, "failed": len(jobs) - len(rows)}
     return runs
+
+
+def keypoint_controls(
+    runs: pd.DataFrame,
+    sequences: Iterable[Sequence],
+    sources: Iterable[Source],
+    repetitions: int,
+    width: int,
+    estimators: Iterable[str] = tuple(ESTIMATORS),
+) -> list[Job]:
+    """Return the `keypoint_control_jobs` of each source, from runs with its masks.
+
+    width: pixels, of the masks from label maps that leave as many keypoints.
+    """
+    return [
+        job
+        for source in sources
+        for job in keypoint_control_jobs(
+            compare.keypoints_left(compare.of_source(runs, source.name)),
+            sequences,
+            repetitions,
+            estimators,
+            source.name,
+            width if source.kind == "labels" else None,
+        )
+    ]
 
 
 def _run_passes(

@@ -9,7 +9,7 @@ import pandas as pd
 from thesis_repro import InputError, oddities, results
 from thesis_repro.kitti import Sequence
 from thesis_repro.settings import MOST_REPETITIONS
-from thesis_repro.study import compare, jobs, runner, sources
+from thesis_repro.study import jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 from thesis_repro.trajectories import write_kitti_poses, write_tum
 
@@ -164,17 +164,14 @@ class Study:
                 )
             if self.tested:
                 made = runs.attrs["made"]
-                for source in self.sources:
-                    keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
-                    width = None if source.kind == "masks" else self.tested
-                    study_jobs += jobs.keypoint_control_jobs(
-                        keypoints,
-                        self.opened,
-                        self.repetitions,
-                        self.estimators,
-                        source.name,
-                        width,
-                    )
+                study_jobs += runner.keypoint_controls(
+                    runs,
+                    self.opened,
+                    self.sources,
+                    self.repetitions,
+                    self.tested,
+                    self.estimators,
+                )
                 runs = run(study_jobs)
                 # the second call counts the runs of the first one as kept
                 runs.attrs["made"] += made

@@ -1,10 +1,13 @@
-"""Run commands as a user does, each as a process, and check how they end and what they leave."""
+"""Run commands as a user does, each as a process, wait for them, and check how they end and what
+they leave.
+"""
 
 import fnmatch
 import os
 import signal
 import subprocess
 import sys
+import time
 import zipfile
 from contextlib import suppress
 from hashlib import sha256
@@ -15,8 +18,8 @@ import pandas as pd
 
 from thesis_repro import console, files
 from thesis_repro.segmentation import ARITHMETIC
+from thesis_repro.settings import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 # what thesis_repro.segmentation has set in this process
 SET_BY_TESTS = {"SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE", "TF_CPP_MIN_LOG_LEVEL", *ARITHMETIC}
 
@@ -59,6 +62,13 @@ def start(command, where, before=None, **changes):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+
+
+def wait_for(condition, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"waited {seconds} s"
+        time.sleep(0.005)
 
 
 def finish(process):
