@@ -151,8 +151,8 @@ def test_a_path_of_another_drive_is_reported():
         != oddities.of_path("00", drive(1), drive(0))
     )
     assert len(oddities.of_path("00", np.linalg.inv(drive(0)), drive(0))) == 1
-    upside_down = np.diag([1, -1, -1, 1]) @ drive(0)  # also if a file has w first
-    assert len(oddities.of_path("00", upside_down, drive(0))) == 1
+    # upside down, as if a file has w first
+    assert len(oddities.of_path("00", np.diag([1, -1, -1, 1]) @ drive(0), drive(0))) == 1
 
 
 STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)

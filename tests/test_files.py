@@ -95,8 +95,7 @@ def test_output_to_a_link_replaces_its_target(tmp_path):
 def test_output_to_streams_and_into_folders_of_results_is_refused(tmp_path):
     files.check_output(tmp_path / "a" / "b.txt")
     os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results" / console.RECORD).touch()
+    files.write_text(tmp_path / "results" / console.RECORD, "")
     for path in (tmp_path / "pipe", "-", "/dev/stdout", tmp_path / "results" / "a" / "b.txt"):
         with pytest.raises(InputError, match=f"{path}: "):
             files.check_output(Path(path))

@@ -179,8 +179,10 @@ def train(camvid, kitti_semantic, pseudo, folder):
     """Train in a folder; return (twin, model), which share all but the last phase, and KITTI's
     held-out pairs.
     """
-    roots = {"camvid": camvid, "kitti": kitti_semantic, "pseudo": pseudo}
-    sets = {name: cityscapes.pairs(root, "train") for name, root in roots.items()}
+    sets = {
+        name: cityscapes.pairs(root, "train")
+        for name, root in (("camvid", camvid), ("kitti", kitti_semantic), ("pseudo", pseudo))
+    }
     pairs = sets["kitti"]
     if len(pairs) <= len(HELD_OUT):
         raise InputError(
