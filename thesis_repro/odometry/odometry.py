@@ -288,7 +288,7 @@ class Odometry:
         """
         current, previous = (side.compress(step.inliers, axis=0) for side in self._normalised(step))
         distances, zoom = pose.rotation_and_zoom(current, previous)
-        if np.quantile(distances, 0.95) < MAX_TRACKING_ERROR / self.intrinsics[0, 0]:
+        if (distances < MAX_TRACKING_ERROR / self.intrinsics[0, 0]).mean() >= 0.95:
             step.flags.append("zoom" if abs(zoom - 1) > MIN_ZOOM else "no parallax")
 
     def _moved(self, motion: Any, scale: float) -> np.ndarray:
