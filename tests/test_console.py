@@ -113,10 +113,11 @@ def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeyp
         results.listing([tmp_path / "pipe"])
 
 
-def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, capsys):
-    folder = tmp_path / "a"
+def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, capsys, monkeypatch):
+    folder = results.stage(tmp_path / "a", size=3)
+    monkeypatch.chdir(folder)
     for size in (3, 4, 5):
-        results.stage(folder, size=size)
+        results.stage(".", size=size)  # "." has no name
         files.write_text(folder / "in" / "result", f"result of {size}")
         (folder / "link").symlink_to("/nowhere")
         (folder / ".env").write_text(f"by hand, {size}")

@@ -15,6 +15,7 @@ import numpy as np
 from thesis_repro import (
     InputError,
     cityscapes,
+    console,
     files,
     kitti,
     oddities,
@@ -223,7 +224,4 @@ def main(path: Path) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(Path(sys.argv[1])))
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    console.run_main(lambda: sys.exit(main(Path(sys.argv[1]))))

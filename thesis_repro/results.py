@@ -79,8 +79,9 @@ def _move_aside(folder: Path, changed: str) -> None:
     paths = [path for path in paths if path.name != LOG]
     if len(paths) < 2:  # there is only the record
         return
-    number = 1
-    while (aside := folder.with_name(f"{folder.name}.old-{number}")).exists():
+    # beside the folder itself, not beside a link to it, which may lie on another disk
+    place, number = folder.resolve(), 1
+    while (aside := place.with_name(f"{place.name}.old-{number}")).exists():
         number += 1
     aside.mkdir()
     for path in paths:

@@ -115,8 +115,7 @@ def test_figures_and_tables_of_a_study(done, study):
     links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
     assert {"sources.webp", "paths-01.pdf", "errors.tex"} <= set(links)
     assert all((folder / link).is_file() for link in links)
-    sources = report.figure_sources(study)
-    assert len(sources.axes) == 3 * len(study.sources)
+    assert len(report.figure_sources(study).axes) == 3 * len(study.sources)
     for path in folder.glob("paths/*/01/net/masked-07-0.txt"):
         path.unlink()  # as if the run had failed
     # all keypoints, by hand, ground truth
