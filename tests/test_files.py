@@ -96,7 +96,13 @@ def test_output_to_streams_and_into_folders_of_results_is_refused(tmp_path):
     files.check_output(tmp_path / "a" / "b.txt")
     os.mkfifo(tmp_path / "pipe")
     files.write_text(tmp_path / "results" / console.RECORD, "")
-    for path in (tmp_path / "pipe", "-", "/dev/stdout", tmp_path / "results" / "a" / "b.txt"):
+    for path in (
+        tmp_path / "pipe",
+        "-",
+        "/dev/null",
+        "/dev/stdout",
+        tmp_path / "results" / "a" / "b.txt",
+    ):
         with pytest.raises(InputError, match=f"{path}: "):
             files.check_output(Path(path))
 

@@ -223,7 +223,7 @@ def check_output(path: Path) -> None:
     results around it.
     """
     # renaming a file cannot replace a device, a pipe or an open stream
-    is_stream = str(path).startswith(("/dev/", "/proc/")) or path.name == "-"
+    is_stream = str(path).startswith(("/dev/std", "/dev/fd/", "/proc/")) or path.name == "-"
     folders = (path.resolve() if path.is_symlink() else path.absolute()).parents
     parent = next(folder for folder in folders if folder.exists())
     is_file = path.is_file() or not path.exists()
