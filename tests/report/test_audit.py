@@ -243,6 +243,7 @@ def test_the_networks_are_compared(tmp_path, network, in_git, named):
 def test_the_summary_spans_all_trainings():
     for training in trainings.summary():
         rows = trainings.read().query("estimator == @training['estimator']")
-        low, high = training["ranges"]["se3_ratio"]
-        assert len(training["verdicts"]) == len(rows) > 1
-        assert (rows["se3_low"] <= high).all() and rows["se3_ratio"].between(low, high).all()
+        low, middle, high = training["ranges"]["se3_ratio"]
+        assert training["count"] == sum(training["verdicts"].values()) == len(rows) > 1
+        assert rows["se3_ratio"].between(low, high).all() and {low, high} <= set(rows["se3_ratio"])
+        assert (rows["se3_ratio"] <= middle).sum() == (rows["se3_ratio"] >= middle).sum()

@@ -22,20 +22,20 @@ def read() -> pd.DataFrame:
 def summary() -> list[dict[str, Any]]:
     """Return what the trainings give, one dict for each estimator.
 
-    verdicts: of each training. ranges: {column: (lowest, highest)} over the trainings, for columns
-    that the estimator has.
+    count: of trainings. verdicts: {verdict: number of trainings that give it}, the commonest first.
+    ranges: {column: (lowest, median, highest)} over the trainings, for columns that the estimator
+    has.
     """
-    return [
-        {
-            "estimator": estimator,
-            "verdicts": rows["verdict"].tolist(),
-            "ranges": {
-                name: (rows[name].min(), rows[name].max())
-                for name in rows.select_dtypes("number").dropna(axis="columns")
-            },
-        }
-        for estimator, rows in read().groupby("estimator", sort=False)
-    ]
+    trainings = []
+    for estimator, rows in read().groupby("estimator", sort=False):
+        numbers = rows.select_dtypes("number").dropna(axis="columns")
+        low, middle, high = numbers.min(), numbers.median(), numbers.max()
+        ranges = {name: (low[name], middle[name], high[name]) for name in numbers}
+        verdicts = rows["verdict"].value_counts().to_dict()
+        trainings.append(
+            {"estimator": estimator, "count": len(rows), "verdicts": verdicts, "ranges": ranges}
+        )
+    return trainings
 
 
 def network_note(settings: Settings) -> str:
@@ -51,9 +51,9 @@ def network_note(settings: Settings) -> str:
     if network == recorded:
         return f"The network of this run is the recorded one, to the bit ({network})."
     return (
-        f"The network of this run ({network}) is not the recorded one ({recorded}): a notebook was "
-        "edited, or sums were rounded otherwise, as on a GPU, on a processor other than x86 with AVX2, "
-        "or with other values of TF_ENABLE_ONEDNN_OPTS, ONEDNN_MAX_CPU_ISA, XLA_FLAGS or "
-        "TF_NUM_INTRAOP_THREADS. By rounding, numbers differ as between the trainings in "
-        f"{TABLE.relative_to(ROOT)}."
+        f"The network of this run ({network}) is not the recorded one ({recorded}). Causes: a notebook "
+        "was edited; TensorFlow or Keras have another version; a GPU was used; the processor is not "
+        "x86, or has no AVX2; TF_ENABLE_ONEDNN_OPTS, ONEDNN_MAX_CPU_ISA, XLA_FLAGS or "
+        "TF_NUM_INTRAOP_THREADS were set. If only sums were rounded otherwise, numbers differ as "
+        f"between the trainings in {TABLE.relative_to(ROOT)}."
     )

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from thesis_repro import InputError, console
 
-# Settings that give the same bits on every processor, together with `exact`.
+# Settings that give the same bits on x86 processors with AVX2, together with `exact.same_bits`.
 ARITHMETIC = {
     # TensorFlow splits sums among its threads, so the rounding depends on their number. A fixed
     # number gives the same bits on any number of cores. More threads than cores cost little; fewer

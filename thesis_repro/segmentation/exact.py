@@ -1,31 +1,57 @@
-"""Batch normalisation with the same bits on every processor; an import puts it in place.
+"""Batch normalisation with the same bits on every processor, for the networks that ask for it.
 
-TensorFlow's `tf.nn.batch_normalization`, which Keras' layer calls, takes 1 / sqrt(variance) with
-the instruction RSQRTPS. That is an approximation, and Intel and AMD approximate differently.
-Division and square root are exact to the last bit on every processor (IEEE 754).
+TensorFlow computes 1 / v and 1 / sqrt(v) with the instructions RCPPS and RSQRTPS. These are
+approximations, and Intel and AMD approximate differently. Keras' layer for batch normalisation asks
+for 1 / sqrt(variance). Division and square root are exact to the last bit on every processor
+(IEEE 754).
 """
 
+from functools import partial
+from typing import Any
+
+import keras
 import tensorflow as tf
 
 
-def batch_normalization(
-    x: tf.Tensor,
-    mean: tf.Tensor,
-    variance: tf.Tensor,
-    offset: tf.Tensor | None,
-    scale: tf.Tensor | None,
-    variance_epsilon: float,
-    name: str | None = None,
-) -> tf.Tensor:
-    """Return scale * (x - mean) / sqrt(variance + variance_epsilon) + offset.
+def same_bits(model: Any) -> Any:
+    """Let the batch normalisation of one model divide exactly; return the model.
 
-    The arguments are those of `tf.nn.batch_normalization`; offset and scale may be None.
+    Only this object changes: its weights, its configuration and its file stay Keras' own, and a
+    copy that Keras loads from the file normalises as Keras does. Call it before the model is
+    compiled or run. Layers with other settings than Keras' defaults (another axis or precision,
+    synchronised or renormalised) and those of a model within the model stay as they are.
     """
-    # TensorFlow turns 1 / sqrt(v), but not sqrt(1 / v), into the approximation
-    factor = tf.sqrt(1 / (variance + variance_epsilon))
-    factor = factor if scale is None else factor * scale
-    shift = -mean * factor if offset is None else offset - mean * factor
-    return x * factor + shift
+    for layer in model.layers:
+        if type(layer) is keras.layers.BatchNormalization and _has_usual_settings(layer):
+            layer.call = partial(_normalize, layer)
+    return model
 
 
-tf.nn.batch_normalization = batch_normalization
+def _has_usual_settings(layer: keras.layers.BatchNormalization) -> bool:
+    unusual = layer.renorm or layer.synchronized or not (layer.scale and layer.center)
+    return layer.axis == -1 and layer.compute_dtype == "float32" and not unusual
+
+
+def _normalize(
+    layer: keras.layers.BatchNormalization,
+    inputs: tf.Tensor,
+    training: bool | None = None,
+    mask: tf.Tensor | None = None,
+) -> tf.Tensor:
+    """Return gamma * (inputs - mean) / sqrt(variance + epsilon) + beta.
+
+    In training, mean and variance are those of the batch, and the layer's moving averages follow
+    them; otherwise they are the moving averages.
+    """
+    if mask is not None:  # no network here masks pixels
+        return type(layer).call(layer, inputs, training, mask)
+    mean, variance = layer.moving_mean, layer.moving_variance
+    if training and layer.trainable:
+        mean, variance = keras.ops.moments(inputs, axes=list(range(len(inputs.shape) - 1)))
+        for average, new in ((layer.moving_mean, mean), (layer.moving_variance, variance)):
+            average.assign(average * layer.momentum + new * (1 - layer.momentum))
+    # TensorFlow rewrites 1 / sqrt(v), sqrt(1 / v) and a / sqrt(v) to the approximations. It leaves
+    # divide_no_nan as it is.
+    deviation = tf.sqrt(variance + layer.epsilon)
+    factor = tf.math.divide_no_nan(tf.convert_to_tensor(layer.gamma), deviation)
+    return inputs * factor + (layer.beta - mean * factor)

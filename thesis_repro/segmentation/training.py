@@ -22,7 +22,8 @@ import tensorflow as tf
 
 from thesis_repro import InputError, files, results, segmentation
 from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
-from thesis_repro.segmentation import augmentation, exact  # noqa: F401
+from thesis_repro.segmentation import augmentation
+from thesis_repro.segmentation.exact import same_bits
 
 MODEL, HISTORY, STATE = "model.keras", "history.csv", "state.npz"
 
@@ -347,4 +348,4 @@ def load_model(path: str | Path) -> Any:
         raise InputError(
             f"{path}: holds weights that are not finite, from a failed training; train again"
         )
-    return model
+    return same_bits(model)

@@ -5,7 +5,7 @@ from typing import Any
 from keras import Model, layers
 
 from thesis_repro import InputError
-from thesis_repro.segmentation import exact  # noqa: F401
+from thesis_repro.segmentation.exact import same_bits
 
 DEPTH = 4  # encoder blocks; each halves the image
 
@@ -47,7 +47,7 @@ def build_unet(
         x = layers.Concatenate(name=_numbered("concatenate", step))([x, skip])
         x = _conv_block(x, filters, 2 * (DEPTH + 1 + step), corrected_blocks)
     outputs = layers.Conv2D(n_classes, 1, activation="softmax", name=f"conv2d_{4 * DEPTH + 2}")(x)
-    return Model(inputs, outputs, name="U-Net")
+    return same_bits(Model(inputs, outputs, name="U-Net"))
 
 
 def _conv_block(inputs: Any, filters: int, number: int, corrected: bool) -> Any:

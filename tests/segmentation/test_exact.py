@@ -1,0 +1,179 @@
+"""No operation of the networks is computed by an approximate instruction, on any x86 processor.
+
+TensorFlow's graph optimiser decides which operations run, and Eigen computes some of them by RCPPS
+and RSQRTPS, which Intel and AMD make differently. So these tests read the optimised graphs, and a
+machine of one maker tells what a machine of the other would do. `tools/emulated.py` compares the
+results with those of an emulator.
+"""
+
+from collections import Counter
+
+import keras
+import numpy as np
+import pytest
+import tensorflow as tf
+from tensorflow.python.eager import context
+
+from thesis_repro.segmentation import prediction, training
+from thesis_repro.segmentation.exact import same_bits
+from thesis_repro.segmentation.unet import build_unet
+
+pytestmark = pytest.mark.slow
+
+# Operations that move values, handle variables, or compute with whole numbers; and those on data
+# sets, whose names say so
+MOVING = set(
+    """_Arg _DeviceArg _Retval _EagerConst _Send _Recv ArgMax AssignVariableOp BroadcastTo Cast
+    ConcatOffset ConcatV2 Const GatherV2 Greater Identity MakeIterator NoOp OneHot Pack
+    PartitionedCall Prod PyFunc RandomShuffle Range ReadVariableOp Reshape Shape ShapeN Slice Squeeze
+    StridedSlice VarHandleOp VarIsInitializedOp""".split()
+)
+ON_DATA = ("Dataset", "Iterator", "Optional")
+# Operations that add, multiply, compare, divide by a / b or take square roots, in Eigen or oneDNN.
+# IEEE 754 fixes each of these to the bit. The library of TensorFlow 2.21 holds RCPPS and RSQRTPS in
+# 139 functions (objdump -d libtensorflow_cc.so.2). They belong to Reciprocal, Inv and Rsqrt, to
+# Softmax, FusedBatchNorm and LRN without oneDNN, to Atan, Atan2, Erfc, Ndtri, Bessel functions and
+# logarithms of complex numbers, and to optimisers in C++, but to none of these names. A new name
+# goes here only if that is true of it, and if `tools/emulated.py` still finds equal bits.
+EXACT = set(
+    """Add AddN AddV2 AssignAddVariableOp AssignSubVariableOp BiasAdd BiasAddGrad DivNoNan Mean Mul Neg
+    Pow RealDiv Relu ReluGrad Sqrt SqrtGrad Square SquaredDifference Sub Sum _MklNativeConv2D
+    _MklNativeConv2DBackpropFilter _MklNativeConv2DBackpropFilterWithBias
+    _MklNativeConv2DBackpropInput _MklNativeFusedConv2D _MklNativeMaxPool _MklNativeMaxPoolGrad
+    _MklSoftmax""".split()
+)
+
+
+# XLA compiles the loss. It divides exactly (a test below shows it), and its logarithm is a
+# polynomial. Its Rsqrt is approximate.
+EXACT_IN_XLA = set(
+    """BroadcastGradientArgs DynamicStitch Fill FloorMod GreaterEqual LessEqual Log Maximum Minimum
+    Reciprocal SelectV2 Tile ZerosLike""".split()
+)
+
+
+def operations(step):
+    """Count the operations of all graphs that TensorFlow runs during a call, after its optimiser.
+
+    The names of those that XLA compiles begin with "XLA ".
+    """
+    context.context().enable_run_metadata()
+    try:
+        step()
+        metadata = context.context().export_run_metadata()
+    finally:
+        context.context().disable_run_metadata()
+    names = Counter()
+    for function in metadata.function_graphs:
+        for graph in function.partition_graphs:  # the last form of a graph, with oneDNN's kernels
+            names.update(name for node in graph.node for name in parts(node))
+            for called in graph.library.function:
+                compiler = "XLA " if called.attr["_XlaMustCompile"].b else ""
+                names.update(compiler + name for node in called.node_def for name in parts(node))
+    return names
+
+
+def parts(node):
+    """Return the name of an operation, and the names of those that the optimiser fused into it."""
+    if node.op == "_UnaryOpsComposition":
+        return [name.decode() for name in node.attr["op_names"].list.s]
+    fused = [name.decode() for name in node.attr["fused_ops"].list.s]
+    return [node.op, *fused]
+
+
+def inexact(names):
+    """Return the names that are not known to be exact."""
+    known = MOVING | EXACT | {f"XLA {name}" for name in MOVING | EXACT | EXACT_IN_XLA}
+    return {name for name in names.keys() - known if not any(word in name for word in ON_DATA)}
+
+
+def steps(model):
+    """Yield a training step, a validation step and predictions of a model."""
+    size = model.input_shape[1]
+    random = np.random.default_rng(0)
+    images = random.integers(0, 256, (2, *model.input_shape[1:]), np.uint8)
+    labels = random.integers(0, 35, (2, size // 8, size // 8), np.uint8).repeat(8, 1).repeat(8, 2)
+    batches = training.Batches([(images, labels)], 2, 0)
+    loss = training.fused_loss(training.total_loss())
+    model.compile(keras.optimizers.Adam(), loss, metrics=training.metrics())
+    yield lambda: model.fit(batches.dataset(), shuffle=False, verbose=0)
+    yield lambda: model.evaluate(batches.dataset(), verbose=0)
+    yield lambda: model.predict(images.astype(np.float32), verbose=0)
+    yield lambda: prediction.predict(model, images)
+
+
+@pytest.mark.parametrize(
+    "network", [lambda: build_unet((128, 128, 1), 35, 8), prediction.load_shipped]
+)
+def test_the_networks_use_exact_operations_only(network):
+    for step in steps(network()):
+        names = operations(step)
+        assert names["DivNoNan"] and names["Sqrt"]  # the batch normalisation is among them
+        assert inexact(names) == set()
+
+
+def as_keras_has_it(x, mean, variance, offset, scale, epsilon):
+    return tf.nn.batch_normalization(x, mean, variance, offset, scale, epsilon)
+
+
+def as_version_0_8_had_it(x, mean, variance, offset, scale, epsilon):
+    factor = tf.sqrt(1 / (variance + epsilon)) * scale
+    return x * factor + (offset - mean * factor)
+
+
+def as_a_quotient(x, mean, variance, offset, scale, epsilon):
+    return (x - mean) * (scale / tf.sqrt(variance + epsilon)) + offset
+
+
+@pytest.mark.parametrize(
+    ("formula", "approximate"),
+    [(as_keras_has_it, "Rsqrt"), (as_version_0_8_had_it, "Reciprocal"), (as_a_quotient, "Rsqrt")],
+)
+def test_approximate_operations_are_found(formula, approximate):
+    normalize = tf.function(formula)
+    values = [tf.ones((2, 4, 4, 8)), *[tf.fill((8,), 2.0)] * 4, tf.constant(0.001)]
+    assert inexact(operations(lambda: normalize(*values))) == {approximate}
+
+
+def test_other_models_keep_keras_own_batch_normalisation():
+    ours = build_unet((32, 32, 1), 35, 2)
+    copy = keras.models.clone_model(ours)
+    copy.set_weights(ours.get_weights())
+    assert copy.to_json() == ours.to_json()
+    image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 1)).astype(np.float32)
+    assert inexact(operations(lambda: ours.predict(image, verbose=0))) == set()
+    assert inexact(operations(lambda: copy.predict(image, verbose=0))) == {"Rsqrt"}
+    assert np.allclose(ours(image), copy(image), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "options", [{"axis": 1}, {"synchronized": True}, {"dtype": "mixed_float16"}, {"scale": False}]
+)
+def test_layers_with_unusual_settings_stay_as_they_are(options):
+    layer = keras.layers.BatchNormalization(**options)
+    model = keras.Sequential([keras.Input((8, 8, 4)), layer])
+    assert same_bits(model) is model and "call" not in vars(layer)
+
+
+def test_the_moving_averages_follow_the_batches():
+    image = np.random.default_rng(0).normal(3, 2, (4, 8, 8, 4)).astype(np.float32)
+    plain = keras.Sequential([keras.Input((8, 8, 4)), keras.layers.BatchNormalization()])
+    exact = same_bits(keras.models.clone_model(plain))
+    for _ in range(3):
+        outputs = [model(image, training=True).numpy() for model in (plain, exact)]
+    assert outputs[1] == pytest.approx(outputs[0], abs=1e-5)
+    for one, other in zip(plain.get_weights(), exact.get_weights(), strict=True):
+        assert np.array_equal(one, other)
+    assert exact(image).numpy() == pytest.approx(plain(image).numpy(), abs=1e-5)
+
+
+def test_xla_divides_exactly():
+    values = np.random.default_rng(0).uniform(0.01, 5000, 4096).astype(np.float32)
+
+    @tf.function(jit_compile=True)
+    def compiled(v):
+        return 1 / v, tf.math.reciprocal(v), tf.sqrt(1 / v), 3 / v
+
+    expected = (1 / values, 1 / values, np.sqrt(1 / values), np.float32(3) / values)
+    for ours, exact in zip(compiled(tf.constant(values)), expected, strict=True):
+        assert np.array_equal(ours, exact)
