@@ -117,7 +117,7 @@ NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 ifneq (,$(filter figures,$(MAKECMDGOALS)))
 # $(shell) does not see exported variables in older versions of make, so they are passed on.
 RUN := $(shell $(foreach name,PROFILE KITTI CITYSCAPES KITTI_SEMANTIC BUILD FIGURES JOBS DASK_SCHEDULER $(SIZES),THESIS_REPRO_$(name)='$(subst ','\'',$(THESIS_REPRO_$(name)))') \
-         $(if $(INSTALLED),$(BIN)/python,$(PYTHON)) -m thesis_repro.settings)
+         $(if $(INSTALLED),$(BIN)/python,$(PYTHON)) -m thesis_repro.running.settings)
 ifeq (,$(RUN))
 $(error the settings above are wrong)
 endif
@@ -129,18 +129,18 @@ endif
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # A change of the page does not rerun the notebooks.
-SOURCES := $(shell find thesis_repro -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html.j2' \
+SOURCES := $(shell find thesis_repro street_world notebooks/drawing -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html.j2' \
              -not -name 'page.css' -not -name 'captions.json')
 
 figures: $(EXECUTED)
 	@$(BIN)/python -m thesis_repro.report.page
-	@$(BIN)/python -m thesis_repro.settings figures
+	@$(BIN)/python -m thesis_repro.running.settings figures
 	@for notebook in $(EXECUTED); do [ -e $$notebook ] || exit 1; done
 
 # This file is rewritten only if a byte of the data has changed. Then the notebooks run again.
 $(RUN)/checked: .venv/ready FORCE
 	@mkdir -p $(@D)
-	@$(if $(strip $(DATA_OPTIONS)),$(BIN)/python -m thesis_repro.check $@,[ -e $@ ] || touch $@)
+	@$(if $(strip $(DATA_OPTIONS)),$(BIN)/python -m thesis_repro.checks.check $@,[ -e $@ ] || touch $@)
 
 FORCE:
 
@@ -185,7 +185,7 @@ $(filter $(RUN)/notebooks/08_%,$(EXECUTED)): notebooks/07_visual_odometry.ipynb
 ifeq (,$(THESIS_REPRO_KITTI))
 $(filter $(RUN)/notebooks/05_%,$(EXECUTED)): $(RUN)/drives
 $(RUN)/drives: $(filter $(RUN)/notebooks/01_%,$(EXECUTED)) $(RUN)/checked
-	@nice $(BIN)/python -m thesis_repro.world && \
+	@nice $(BIN)/python -m street_world && \
 	  nice $(BIN)/python -m thesis_repro odometry --kitti $(dir $(RUN))world-$(PROFILE)/kitti --sequence 00 --estimator refined >/dev/null || true
 	@touch $@
 endif
@@ -209,8 +209,8 @@ lint: setup
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
 LAB := $(if $(THESIS_REPRO_BUILD),$(THESIS_REPRO_BUILD),build)/lab
 lab: setup
-	@mkdir -p "$(LAB)" && for notebook in notebooks/*.ipynb; do \
-	  [ -e "$(LAB)/$${notebook##*/}" ] || cp "$$notebook" "$(LAB)" || exit 1; done
+	@mkdir -p "$(LAB)" && for name in notebooks/*.ipynb notebooks/drawing; do \
+	  [ -e "$(LAB)/$${name##*/}" ] || cp -r "$$name" "$(LAB)" || exit 1; done
 	@echo "the notebooks are copies in $(LAB); delete one to get it anew"
 	@$(BIN)/jupyter lab "$(LAB)" --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate $(if $(filter 0,$(shell id -u)),--allow-root)
 

@@ -91,8 +91,8 @@ def small_world(tmp_path_factory):
     """A small embedded world: two sequences of 12 frames and a few street images. Tests must
     not change it.
     """
-    from thesis_repro.settings import PROFILES
-    from thesis_repro.world import dataset
+    from street_world import dataset
+    from thesis_repro.running.settings import PROFILES
 
     with _shared_folder(tmp_path_factory, "small_world") as folder:  # rendered once
         dataset.write(folder, **PROFILES["smoke"].world, seed=0)
@@ -104,7 +104,7 @@ def small_labels(small_world, tmp_path_factory):
     """Exact label maps of the small world, 320x320, one folder a sequence, laid out as notebook
     5 does.
     """
-    from thesis_repro import results
+    from thesis_repro.running import results
 
     with _shared_folder(tmp_path_factory, "small_labels") as root:
         for path in (
@@ -123,7 +123,7 @@ def small_labels(small_world, tmp_path_factory):
 @pytest.fixture(scope="session")
 def small_model(tmp_path_factory):
     """The thesis's network at 64x64 with 4 filters, untrained, as a file."""
-    from thesis_repro.cityscapes import N_CLASSES
+    from thesis_repro.data.cityscapes import N_CLASSES
     from thesis_repro.segmentation.unet import build_unet
 
     path = tmp_path_factory.mktemp("model") / "model.keras"

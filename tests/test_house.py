@@ -6,20 +6,37 @@ import re
 from functools import cache
 from pathlib import Path
 
-PACKAGE = Path(__file__).resolve().parent.parent / "thesis_repro"
-# {folder or module: folders it must not import}; nothing may import `tools`, which is not installed
-NOT_IMPORTED = {
-    "odometry": {"segmentation", "world", "study", "report"},
-    "masks": {"odometry", "segmentation", "world", "study", "report"},
-    "segmentation": {"study", "report"},
-    "world": {"study", "report"},
-    "study": {"report"},
+ROOT = Path(__file__).resolve().parent.parent
+BASE = {"errors", "running"}
+METHOD = BASE | {"data", "masks", "odometry", "segmentation"}
+# {room: the other rooms that it may import}; a room is a folder or a module of thesis_repro
+ALLOWED = {
+    "errors": set(),
+    "running": {"errors"},
+    "data": BASE,
+    "masks": BASE | {"data"},
+    "odometry": BASE | {"data"},
+    "segmentation": BASE | {"data"},
+    "checks": BASE | {"data", "masks"},
+    "study": METHOD | {"checks"},
+    "report": METHOD | {"study"},
+    "command": METHOD | {"checks", "study", "report", "street_world"},
+    "street_world": BASE | {"data"},
+    "drawing": METHOD | {"study", "report"},
+    "__init__": {"errors"},  # the face: other names are imported on first use
+    "__main__": {"command"},
 }
-PATHS = sorted(PACKAGE.rglob("*.py"))
-FOLDERS = {
-    ".".join(path.parent.relative_to(PACKAGE).parts) for path in PACKAGE.rglob("*/__init__.py")
+# {dotted name, without thesis_repro: path}
+MODULES = {
+    ".".join(path.relative_to(folder).with_suffix("").parts): path
+    for folder, pattern in (
+        (ROOT / "thesis_repro", "**/*.py"),
+        (ROOT, "street_world/*.py"),
+        (ROOT / "notebooks", "drawing/*.py"),
+    )
+    for path in sorted(folder.glob(pattern))
 }
-MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in PATHS}
+FOLDERS = {name.removesuffix(".__init__") for name in MODULES if name.endswith(".__init__")}
 
 
 @cache
@@ -37,33 +54,38 @@ def imported_names(tree):
 
 
 def imports(tree, folder=None):
-    """The package's modules that a module in a folder imports, as dotted names without
-    `thesis_repro`.
-    """
-    inner = {
-        name.removeprefix("thesis_repro.")
-        for name in imported_names(tree)
-        if name.startswith("thesis_repro.")
-    }
+    """The modules that a module in a folder imports, named as in MODULES."""
+    names = {name.removeprefix("thesis_repro.") for name in imported_names(tree)}
     # outside a folder, its name means its __init__; inside, it is part of a neighbour's name
-    return inner & MODULES.keys() | {
-        f"{name}.__init__" for name in inner & FOLDERS if name != folder
+    return names & MODULES.keys() | {
+        f"{name}.__init__" for name in names & FOLDERS if name != folder
     }
 
 
-def test_folders_import_only_allowed_folders():
-    wrong = [
-        f"{name} imports {other}"
-        for name, path in MODULES.items()
-        for other in imports(tree_of(path))
-        if other.split(".")[0] in NOT_IMPORTED.get(name.split(".")[0], ())
-    ]
-    wrong += [
-        f"{name} imports tools"
-        for name, path in MODULES.items()
-        if any(other.split(".")[0] == "tools" for other in imported_names(tree_of(path)))
-    ]
+def test_rooms_import_only_rooms_below_them():
+    wrong = []
+    for name, path in MODULES.items():
+        room = name.split(".")[0]
+        for other in imports(tree_of(path)):
+            if other.split(".")[0] not in ALLOWED[room] | {room}:
+                wrong.append(f"{name} imports {other}")
+        wrong += [f"{name} imports {other}" for other in tools(tree_of(path))]
     assert wrong == []
+
+
+def tools(tree):
+    """What a module imports from the folder tools, which is not installed."""
+    names = {path.stem for path in (ROOT / "tools").glob("*.py")} | {"tools"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in names)
+        elif isinstance(node, ast.ImportFrom) and node.module in names:
+            yield node.module
+
+
+def test_newcomers_see_few_names():
+    names = [path.name for path in (ROOT / "thesis_repro").iterdir()]
+    assert len([name for name in names if not name.startswith("_")]) <= 12
 
 
 def test_no_circular_imports():
@@ -77,17 +99,26 @@ def test_no_circular_imports():
 
 def test_imports_are_found():
     tree = ast.parse(
-        "from thesis_repro.study import runner\nimport numpy\n"
+        "from thesis_repro.study import runner\nimport numpy, street_world\n"
         "from thesis_repro.report.style import BLUE\n"
     )
-    assert imports(tree) == {"study.__init__", "study.runner", "report.style"}
-    assert imports(tree, "study") == {"study.runner", "report.style"}
+    assert imports(tree) == {
+        "study.__init__",
+        "study.runner",
+        "report.style",
+        "street_world.__init__",
+    }
+    assert imports(tree, "study") == {"study.runner", "report.style", "street_world.__init__"}
+    assert list(tools(ast.parse("import evidence\nfrom bench import measure"))) == [
+        "evidence",
+        "bench",
+    ]
 
 
 def test_no_file_is_read_with_code_in_it():
     # ruff forbids unsafe functions (pyproject.toml), but not these arguments
     assert [
         path.name
-        for path in PATHS
+        for path in MODULES.values()
         if re.search("allow_pickle=True|safe_mode=False", path.read_text())
     ] == []

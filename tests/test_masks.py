@@ -2,9 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, masks
-from thesis_repro.cityscapes import ID
-from thesis_repro.kitti import Sequence
+from thesis_repro import masks
+from thesis_repro.data.cityscapes import ID
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskSettings
 
 SIZE = (376, 1240)

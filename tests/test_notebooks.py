@@ -13,8 +13,8 @@ import sys
 import nbformat
 import pytest
 
+from thesis_repro.running.settings import ROOT, read_settings
 from thesis_repro.segmentation.prediction import SHIPPED
-from thesis_repro.settings import ROOT, read_settings
 
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
 TABLES = ["table_3_1", "table_3_2", "table_4_1", "table_4_2", "table_4_3"]

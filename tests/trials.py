@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from thesis_repro import console, files
+from thesis_repro.running import console, files
+from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import ARITHMETIC
-from thesis_repro.settings import ROOT
 
 # what thesis_repro.segmentation has set in this process
 SET_BY_TESTS = {"SM_FRAMEWORK", "NO_ALBUMENTATIONS_UPDATE", "TF_CPP_MIN_LOG_LEVEL", *ARITHMETIC}

@@ -1,3 +1,3 @@
-from thesis_repro.cli import main
+from thesis_repro.command.cli import main
 
 raise SystemExit(main())

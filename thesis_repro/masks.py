@@ -13,10 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from thesis_repro import InputError, need, results
-from thesis_repro.cityscapes import ID, N_CLASSES, read_label_map
-from thesis_repro.files import is_whole, listed, numbers_of, progress, read_gray, write_png
-from thesis_repro.kitti import Sequence, check_size
+from thesis_repro.data.cityscapes import ID, N_CLASSES, read_label_map
+from thesis_repro.data.kitti import Sequence, check_size
+from thesis_repro.errors import InputError, need
+from thesis_repro.running import results
+from thesis_repro.running.files import is_whole, listed, numbers_of, progress, read_gray, write_png
 
 BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
 CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a boundary up to two pixels away

@@ -23,12 +23,13 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import console, masks, odometry
-from thesis_repro.files import write_text
-from thesis_repro.kitti import Sequence
+from thesis_repro import masks, odometry
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
+from thesis_repro.running import console
+from thesis_repro.running.files import write_text
+from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
-from thesis_repro.settings import ROOT
 from thesis_repro.study import controls, timing
 from thesis_repro.study.sources import Source
 

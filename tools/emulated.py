@@ -20,7 +20,9 @@ import threading
 from collections import Counter
 from pathlib import Path
 
-from thesis_repro import InputError, console, segmentation
+from thesis_repro import segmentation
+from thesis_repro.errors import InputError
+from thesis_repro.running import console
 
 EMULATOR = "qemu-x86_64"
 APPROXIMATE = re.compile(r"\bv?r(?:cp|sqrt)(?:14|28)?[ps][sd]\b")  # in QEMU's log of instructions

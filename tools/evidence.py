@@ -12,18 +12,21 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import failures
-import label_quality
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, console, kitti, masks, results
-from thesis_repro.cityscapes import read_label_map
-from thesis_repro.files import write_text
+import failures
+import label_quality
+from thesis_repro import masks
+from thesis_repro.data import kitti
+from thesis_repro.data.cityscapes import read_label_map
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.report import audit, comparison, style, texts
+from thesis_repro.running import console, results
+from thesis_repro.running.files import write_text
+from thesis_repro.running.settings import PREFIX, ROOT, read_settings
 from thesis_repro.segmentation import prediction
-from thesis_repro.settings import PREFIX, ROOT, read_settings
 from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
 from thesis_repro.study.sources import Source, named
 

@@ -7,7 +7,7 @@ import re
 import pandas as pd
 
 from thesis_repro.report import captions, style, texts
-from thesis_repro.settings import ROOT
+from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
 REAL, RENDERED = "real frames", "embedded world (rendered)"

@@ -16,11 +16,14 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, console, kitti, masks
-from thesis_repro.cityscapes import ID, read_label_map
+from thesis_repro import masks
+from thesis_repro.data import kitti
+from thesis_repro.data.cityscapes import ID, read_label_map
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.report import style, texts
-from thesis_repro.settings import ROOT, cores
+from thesis_repro.running import console
+from thesis_repro.running.settings import ROOT, cores
 from thesis_repro.study import ablations, compare, jobs, runner
 from thesis_repro.study.sources import Source
 

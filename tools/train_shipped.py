@@ -21,10 +21,12 @@ import numpy as np
 import tensorflow as tf
 from keras import ops
 
-from thesis_repro import InputError, cityscapes, console, files, results
+from street_world import dataset as world
+from thesis_repro.data import cityscapes
+from thesis_repro.errors import InputError
+from thesis_repro.running import console, files, results
 from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.world import dataset as world
 
 BASE_FILTERS, WORLD_IMAGES, SEED = 16, 100, 0
 EPOCH = 100  # steps

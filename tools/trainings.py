@@ -17,12 +17,13 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from thesis_repro import cityscapes, console, files, kitti, results
+from thesis_repro.data import cityscapes, kitti
 from thesis_repro.report.trainings import TABLE
-from thesis_repro.segmentation import domain_gap, memory, prediction, quality, training
+from thesis_repro.running import console, files, results
+from thesis_repro.running.settings import read_settings
+from thesis_repro.segmentation import memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.settings import read_settings
-from thesis_repro.study import compare, jobs, runner, thesis_tables, workers
+from thesis_repro.study import compare, domain_gap, jobs, runner, thesis_tables, workers
 from thesis_repro.study.sources import Source
 
 SEEDS = range(10)  # the first one is the default run's

@@ -5,7 +5,7 @@ import pytest
 from made_up import winding
 from scipy.spatial.transform import Rotation
 
-from thesis_repro import InputError
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 
 

@@ -8,8 +8,9 @@ import pandas as pd
 import pytest
 from street import Street, Stripes
 
-from thesis_repro import InputError, odometry
-from thesis_repro.kitti import Sequence
+from thesis_repro import odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskFolder
 from thesis_repro.odometry import THESIS, Odometry, keypoints, metrics, pose
 

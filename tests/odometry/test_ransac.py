@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from thesis_repro import odometry
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, pose
 from thesis_repro.odometry.opencv_exact import ransac, rounding
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from street import Street
 
 from thesis_repro import odometry
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, metrics, pose
 from thesis_repro.odometry.odometry import ALL_KEYPOINTS
 from thesis_repro.odometry.refined import fit as refine

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro import results
 from thesis_repro.report import audit, gap, style, trainings
+from thesis_repro.running import results
 from thesis_repro.study import ablations, compare
 
 

@@ -13,7 +13,7 @@ import psutil
 import pytest
 from trials import wait_for
 
-from thesis_repro.settings import ROOT
+from thesis_repro.running.settings import ROOT
 
 pytestmark = pytest.mark.slow
 

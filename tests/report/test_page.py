@@ -17,7 +17,7 @@ import nbformat
 import pytest
 
 from thesis_repro.report import captions, page
-from thesis_repro.settings import ROOT, read_settings
+from thesis_repro.running.settings import ROOT, read_settings
 
 SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><path d="M0 0"/></svg>'
 CSV = 'sequence,RMSE (m),change (%),"change (%), thesis"\n00,0.5,-3.25,1.0\n01,12.0,4.5,\nsequences improved,,1.0,0.0\n'

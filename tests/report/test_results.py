@@ -5,7 +5,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro.report import chapter4, comparison, tables, texts
+from drawing import chapter4
+from thesis_repro.report import comparison, tables, texts
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS

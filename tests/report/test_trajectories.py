@@ -10,11 +10,11 @@ import pytest
 from evo.cli import entry_points
 from made_up import winding
 
-from thesis_repro import InputError
-from thesis_repro.cli import main
+from thesis_repro.command.cli import main
+from thesis_repro.data.trajectories import write_kitti_poses, write_tum
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.report import trajectories
-from thesis_repro.trajectories import write_kitti_poses, write_tum
 
 EVO = {
     "none": [],

@@ -8,9 +8,12 @@ import keras
 import numpy as np
 import pytest
 
-from thesis_repro import InputError, cityscapes, files, kitti, results
-from thesis_repro.segmentation import domain_gap, prediction, quality, training
+from thesis_repro.data import cityscapes, kitti
+from thesis_repro.errors import InputError
+from thesis_repro.running import files, results
+from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
+from thesis_repro.study import domain_gap
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,6 @@ import time
 from copy import copy
 from pathlib import Path
 
-import emulated
 import keras
 import numpy as np
 import pandas as pd
@@ -19,7 +18,8 @@ import pytest
 import segmentation_models as sm
 import tensorflow as tf
 
-from thesis_repro import InputError
+import emulated
+from thesis_repro.errors import InputError
 from thesis_repro.segmentation import augmentation, memory, training
 from thesis_repro.segmentation.unet import build_unet
 

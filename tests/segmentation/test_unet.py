@@ -1,6 +1,6 @@
 import pytest
 
-from thesis_repro import InputError
+from thesis_repro.errors import InputError
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.segmentation.unet import build_unet, summary_rows
 

@@ -9,7 +9,7 @@ import pytest
 from street import Street, Stripes
 
 from thesis_repro import masks
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.study import ablations, compare, controls, runner, thesis_tables
 from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, reduced_jobs

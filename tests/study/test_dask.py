@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from trials import ROOT, contents, wait_for
 
-from thesis_repro import InputError
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.study import runner
 from thesis_repro.study.jobs import first_jobs
 from thesis_repro.study.workers import open_pool
@@ -26,7 +26,7 @@ FRAMES, CHECKPOINT = 12, 4
 PRELOAD = """
 import os, time
 from thesis_repro.odometry import passes
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
 
 def slow(self, index, original=Sequence.frame):
     with open({log!r}, "a") as file:
@@ -197,7 +197,7 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(
 def test_label_maps_of_workers_have_the_bits_of_one_process(
     workers, scheduler, small_world, small_model, tmp_path, monkeypatch
 ):
-    from thesis_repro.cli import main
+    from thesis_repro.command.cli import main
     from thesis_repro.segmentation import prediction
 
     monkeypatch.setattr(prediction, "PART", 4)

@@ -7,8 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis_repro import InputError, masks, odometry
-from thesis_repro.kitti import Sequence
+from thesis_repro import masks, odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.segmentation import prediction, training
 from thesis_repro.study import compare, controls, runner, thesis_tables, timing

@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 from evo.tools import file_interface
 
-from thesis_repro import InputError
-from thesis_repro.cli import main
-from thesis_repro.kitti import Sequence
+from thesis_repro.command.cli import main
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.masks import LabelMasks, write_masks
 from thesis_repro.report import study as report
 from thesis_repro.study import compare, runner

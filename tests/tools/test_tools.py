@@ -1,16 +1,17 @@
 """Each tool runs on tiny input, and the numbers behind its results are right."""
 
-import bench
-import evidence
 import keras
-import moving
 import numpy as np
 import pandas as pd
 import pytest
-import train_shipped
 
-from thesis_repro import InputError, odometry
-from thesis_repro.kitti import Sequence
+import bench
+import evidence
+import moving
+import train_shipped
+from thesis_repro import odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.study import compare, jobs
 from thesis_repro.study.sources import Source
 

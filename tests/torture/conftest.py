@@ -14,7 +14,7 @@ from trials import thesis
 TRAINING = f"""
 import sys
 sys.path.insert(0, {str(Path(__file__).parents[1] / "segmentation")!r})
-from thesis_repro import console, results
+from thesis_repro.running import console, results
 from thesis_repro.segmentation import training
 import test_training
 try:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import trials
 
-from thesis_repro.cli import main
+from thesis_repro.command.cli import main
 from thesis_repro.masks import forget_edges
 
 pytestmark = pytest.mark.slow

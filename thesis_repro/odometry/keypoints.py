@@ -8,8 +8,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from thesis_repro.compiled import fast
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
+from thesis_repro.running.compiled import fast
 
 WINDOW, LEVELS = THESIS.window, THESIS.levels
 TRACKER = {

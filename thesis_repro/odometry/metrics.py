@@ -13,7 +13,7 @@ from evo.main_ape import ape
 from evo.main_rpe import rpe as evo_rpe
 from scipy.spatial.transform import Rotation
 
-from thesis_repro import InputError
+from thesis_repro.errors import InputError
 
 
 def rmse(estimated: np.ndarray, true: np.ndarray) -> float:

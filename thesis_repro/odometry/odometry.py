@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from thesis_repro import InputError, need
-from thesis_repro.kitti import check_camera, is_camera_matrix
+from thesis_repro.data.kitti import check_camera, is_camera_matrix
+from thesis_repro.data.trajectories import are_poses
+from thesis_repro.errors import InputError, need
 from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
 from thesis_repro.odometry.refined.fit import RefinedMotion, fit, measured, smaller_rotation
 from thesis_repro.odometry.refined.guided import ransac_with_prior
 from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency, is_consistent
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.trajectories import are_poses
 
 TIMED_PARTS = ("detect", "track", "essential", "pose")
 ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]

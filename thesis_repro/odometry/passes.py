@@ -11,13 +11,14 @@ from typing import Protocol
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, console, results
-from thesis_repro.files import progress
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import keypoints
 from thesis_repro.odometry.odometry import FRAME_COLUMNS, ROTATION_COLUMNS, Odometry, Step
 from thesis_repro.odometry.refined.motion_prior import MotionPrior
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
+from thesis_repro.running import console, results
+from thesis_repro.running.files import progress
 
 CHECKPOINT = 300  # frames
 # Runs with the same KEYPOINT_SETTINGS share keypoints. If ESSENTIAL_SETTINGS agree too, they share

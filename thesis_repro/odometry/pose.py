@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import ransac
+from thesis_repro.running.compiled import fast, inner
 
 PROBABILITY = 0.999  # of RANSAC
 MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farther points do not vote

@@ -4,7 +4,7 @@ import math
 import numbers
 from dataclasses import dataclass, fields
 
-from thesis_repro import InputError
+from thesis_repro.errors import InputError
 
 CHOICES = {
     "detector": ("shi-tomasi", "orb"),

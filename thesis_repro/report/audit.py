@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from thesis_repro.cityscapes import LABELS
+from thesis_repro.data.cityscapes import LABELS
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import ablations, compare, thesis_tables
 

@@ -18,8 +18,8 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import ExecutePreprocessor
 from traitlets import Unicode
 
-from thesis_repro import console, results
-from thesis_repro.settings import PREFIX
+from thesis_repro.running import console, results
+from thesis_repro.running.settings import PREFIX
 
 
 class Execution(ExecutePreprocessor):

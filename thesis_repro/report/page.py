@@ -18,10 +18,10 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from thesis_repro import console, results
-from thesis_repro.files import listed, write_text
 from thesis_repro.report import captions, tables, texts, trainings
-from thesis_repro.settings import ROOT, Settings, read_settings
+from thesis_repro.running import console, results
+from thesis_repro.running.files import listed, write_text
+from thesis_repro.running.settings import ROOT, Settings, read_settings
 
 PAGE, GALLERY = "index.html", "README.md"
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}

@@ -10,16 +10,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from thesis_repro import InputError, results
-from thesis_repro.files import write_text
+from thesis_repro.data.trajectories import read_poses
+from thesis_repro.errors import InputError
 from thesis_repro.masks import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
+from thesis_repro.running import results
+from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, controls
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS, Source
 from thesis_repro.study.study import PATHS, Study
-from thesis_repro.trajectories import read_poses
 
 
 def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[str] = ()) -> Path:

@@ -15,8 +15,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from PIL import ExifTags, Image
 
-from thesis_repro.cityscapes import LABELS, colorize
-from thesis_repro.files import atomic, write_text
+from thesis_repro.data.cityscapes import LABELS, colorize
+from thesis_repro.running.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
 matplotlib.rcParams.update(

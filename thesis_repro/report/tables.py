@@ -12,7 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from thesis_repro.report.captions import REPORTED
-from thesis_repro.settings import Settings
+from thesis_repro.running.settings import Settings
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
 

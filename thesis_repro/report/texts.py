@@ -15,7 +15,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import Result, metrics
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS

@@ -7,9 +7,9 @@ from typing import Any
 
 import pandas as pd
 
-from thesis_repro import results
-from thesis_repro.files import listed
-from thesis_repro.settings import ROOT, Settings
+from thesis_repro.running import results
+from thesis_repro.running.files import listed
+from thesis_repro.running.settings import ROOT, Settings
 
 TABLE = ROOT / "figures" / "trainings.csv"
 

@@ -12,11 +12,11 @@ import pandas as pd
 from evo import EvoException
 from matplotlib.figure import Figure
 
-from thesis_repro import InputError
-from thesis_repro.files import listed
+from thesis_repro.data.trajectories import read_poses, read_tum
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.report.style import TRUTH, line_style, new_figure
-from thesis_repro.trajectories import read_poses, read_tum
+from thesis_repro.running.files import listed
 
 # keys of a row of `evaluate`, and their column names in a table
 COLUMNS = {

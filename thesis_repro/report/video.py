@@ -10,9 +10,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from thesis_repro import InputError, console
-from thesis_repro.files import atomic, progress
-from thesis_repro.kitti import FRAME_TIME, Sequence
+from thesis_repro.data.kitti import FRAME_TIME, Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import (
     THESIS,
     Odometry,
@@ -24,6 +23,8 @@ from thesis_repro.odometry import (
 )
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.report.style import BASELINE, TRUTH
+from thesis_repro.running import console
+from thesis_repro.running.files import atomic, progress
 
 # colours as blue, green, red
 KEPT, DISCARDED, OUTLINE = (255, 140, 30), (60, 60, 230), (0, 220, 255)

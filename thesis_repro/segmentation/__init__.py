@@ -8,7 +8,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from thesis_repro import InputError, console
+from thesis_repro.errors import InputError
+from thesis_repro.running import console
 
 # Settings that give the same bits on x86 processors with AVX2, together with `exact.same_bits`.
 ARITHMETIC = {

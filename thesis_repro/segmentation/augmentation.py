@@ -5,7 +5,7 @@ import warnings
 import albumentations as A
 import numpy as np
 
-from thesis_repro.files import progress
+from thesis_repro.running.files import progress
 
 # a pixel without a class: one-hot encoding gives zeros, like the border in the appendix
 NOTHING = 255

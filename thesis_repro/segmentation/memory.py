@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import tensorflow as tf
 
-from thesis_repro import InputError
+from thesis_repro.errors import InputError
 
 FLOAT = 4  # bytes
 # peak memory over the sum of all outputs; 1.5 to 1.9 were measured on U-Nets of 16 to 64 filters

@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 import tensorflow as tf
 
-from thesis_repro import InputError, console, files, results, segmentation
-from thesis_repro.cityscapes import read_image
+from thesis_repro import segmentation
+from thesis_repro.data.cityscapes import read_image
+from thesis_repro.errors import InputError
+from thesis_repro.running import console, files, results
 from thesis_repro.segmentation import memory, training
 
 SIZE = 320  # height and width of written label maps, pixels

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from thesis_repro import InputError, files
-from thesis_repro.cityscapes import LABELS, N_CLASSES
+from thesis_repro.data.cityscapes import LABELS, N_CLASSES
+from thesis_repro.errors import InputError
+from thesis_repro.running import files
 from thesis_repro.segmentation import training
 
 # The ids that the Cityscapes benchmark evaluates; pixels of all other ids are ignored.

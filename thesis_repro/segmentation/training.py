@@ -20,8 +20,10 @@ import pandas as pd
 import segmentation_models as sm
 import tensorflow as tf
 
-from thesis_repro import InputError, files, results, segmentation
-from thesis_repro.cityscapes import CLASS_WEIGHTS, N_CLASSES
+from thesis_repro import segmentation
+from thesis_repro.data.cityscapes import CLASS_WEIGHTS, N_CLASSES
+from thesis_repro.errors import InputError
+from thesis_repro.running import files, results
 from thesis_repro.segmentation import augmentation
 from thesis_repro.segmentation.exact import same_bits
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from keras import Model, layers
 
-from thesis_repro import InputError
+from thesis_repro.errors import InputError
 from thesis_repro.segmentation.exact import same_bits
 
 DEPTH = 4  # encoder blocks; each halves the image

@@ -14,14 +14,15 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import masks, odometry, results
-from thesis_repro.cityscapes import ID, read_label_map
-from thesis_repro.files import progress, write_text
-from thesis_repro.kitti import Sequence
+from thesis_repro import masks, odometry
+from thesis_repro.data.cityscapes import ID, read_label_map
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.odometry.pose import normalise
+from thesis_repro.running import results
+from thesis_repro.running.files import progress, write_text
 from thesis_repro.study import workers
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import CONTROL_WIDTH

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings, dilate
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import SharedKeypoints

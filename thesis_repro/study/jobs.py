@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from thesis_repro.kitti import Sequence
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, OdometrySettings
 from thesis_repro.study import controls
 from thesis_repro.study.sources import Source

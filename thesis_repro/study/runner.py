@@ -16,11 +16,13 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, console, odometry, results
-from thesis_repro.files import listed, progress, write_text
-from thesis_repro.kitti import Sequence
+from thesis_repro import odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import poses_of
+from thesis_repro.running import console, results
+from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare, controls, workers
 from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, keypoint_control_jobs
 from thesis_repro.study.sources import Source

@@ -9,11 +9,13 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TypeAlias
 
-from thesis_repro import InputError, masks, results
-from thesis_repro.cityscapes import read_label_map
-from thesis_repro.files import glance, listed
-from thesis_repro.kitti import Sequence, check_size
+from thesis_repro import masks
+from thesis_repro.data.cityscapes import read_label_map
+from thesis_repro.data.kitti import Sequence, check_size
+from thesis_repro.errors import InputError
 from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
+from thesis_repro.running import results
+from thesis_repro.running.files import glance, listed
 
 KINDS = {"labels": "label maps", "masks": "masks"}
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both have `paths`, the files that they read

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro import InputError, oddities, results
-from thesis_repro.kitti import Sequence
-from thesis_repro.settings import MOST_REPETITIONS
+from thesis_repro.checks import oddities
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.trajectories import write_kitti_poses, write_tum
+from thesis_repro.errors import InputError
+from thesis_repro.running import results
+from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
-from thesis_repro.trajectories import write_kitti_poses, write_tum
 
 PATHS = "paths"  # folder of the estimated paths
 

@@ -16,10 +16,12 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import InputError, masks, odometry, results
-from thesis_repro.files import progress, write_text
-from thesis_repro.kitti import Sequence
-from thesis_repro.settings import cores
+from thesis_repro import masks, odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
+from thesis_repro.running import results
+from thesis_repro.running.files import progress, write_text
+from thesis_repro.running.settings import cores
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import by_name, masks_of

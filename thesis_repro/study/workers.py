@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from thesis_repro import InputError, console
-from thesis_repro.settings import scheduler_address
+from thesis_repro.errors import InputError
+from thesis_repro.running import console
+from thesis_repro.running.settings import scheduler_address
 
 TIMEOUT = 8  # seconds that a scheduler has to answer
 

@@ -1,6 +1,6 @@
 """Terms of the Sampson distance, for the RANSAC search and for the refined estimator."""
 
-from thesis_repro.compiled import inner
+from thesis_repro.running.compiled import inner
 
 
 @inner

@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from thesis_repro.compiled import fast, inner
+from thesis_repro.running.compiled import fast, inner
 
 SAMPLE_SIZE = 5
 MIN_INDEPENDENCE = 1e-8  # of five epipolar constraints; with less, no solution is trusted

@@ -20,10 +20,10 @@ import math
 import cv2
 import numpy as np
 
-from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
 from thesis_repro.odometry.opencv_exact.rounding import solve
+from thesis_repro.running.compiled import fast, inner
 
 MAX_SAMPLES = 1000
 MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole search

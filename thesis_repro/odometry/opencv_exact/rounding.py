@@ -8,8 +8,8 @@ estimate from the conditioning of each step, in units of ROUNDING, times SAFETY_
 
 import numpy as np
 
-from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import five_point
+from thesis_repro.running.compiled import fast, inner
 
 ROUNDING = 2.0**-52  # of a number of size 1
 # Among 200,000 solutions of real and degenerate scenes, no difference was larger than 1.4 times the

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numba import types
 
-from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
+from thesis_repro.running.compiled import fast, inner
 
 MAX_ITERATIONS = 10
 REFINE_ROUNDS = 3

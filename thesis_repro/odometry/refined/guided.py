@@ -8,11 +8,11 @@ angles.
 
 import numpy as np
 
-from thesis_repro.compiled import fast, inner
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
 from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, OPENCV_SEED, draw
 from thesis_repro.odometry.opencv_exact.rounding import solve
+from thesis_repro.running.compiled import fast, inner
 
 
 def ransac_with_prior(

@@ -1,0 +1,94 @@
+"""Figures of chapter 3 and of masks: label maps, their edges and masks on a frame."""
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from thesis_repro.data.cityscapes import Label
+from thesis_repro.masks import dilate
+from thesis_repro.report import style
+from thesis_repro.report.style import BLUE, ORANGE, SKY
+
+
+def figure_3_03(
+    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, label: Label
+) -> Figure:
+    """Figure 3.3: intersection and union of a prediction and its label map for one class (Equation
+    3.1).
+
+    image: (h, w) gray or (h, w, 3) RGB.
+    """
+    true, predicted = label_map == label.id, prediction == label.id
+    intersection, union = (true & predicted).sum(), (true | predicted).sum()
+    figure, axes = style.new_figure(1, 3, height=2.9)
+    dimmed = np.dstack([image] * 3)[..., :3] // 3 + 150
+    for panel, areas, title in (
+        (axes[0], {BLUE: true}, f"label map: {true.sum():,} pixels"),
+        (axes[1], {BLUE: predicted}, f"prediction: {predicted.sum():,} pixels"),
+        (
+            axes[2],
+            {ORANGE: true & ~predicted, SKY: predicted & ~true, BLUE: true & predicted},
+            f"IoU = {intersection:,} / {union:,} = {intersection / max(union, 1):.2f}",
+        ),
+    ):
+        picture = dimmed.copy()
+        for color, area in areas.items():
+            picture[area] = 255 * np.array(to_rgb(color))
+        style.show_image(panel, picture, title)
+    figure.legend(
+        handles=[
+            Patch(color=BLUE, label="intersection"),
+            Patch(color=ORANGE, label="only in the label map"),
+            Patch(color=SKY, label="only in the prediction"),
+        ],
+        title=f"class {label.name}; the three colours together are the union",
+        title_fontsize=8,
+        loc="outside lower center",
+        ncols=3,
+    )
+    return figure
+
+
+def figure_3_06(
+    frame: np.ndarray,
+    label_map: np.ndarray,
+    edge_image: np.ndarray,
+    mask: np.ndarray,
+    dilation_width: int,
+) -> Figure:
+    """Figure 3.6: a frame, its predicted label map, the Canny edges of the label map, and the
+    edges dilated.
+    """
+    return style.pictures(
+        frame,
+        {
+            "frame": frame,
+            "predicted label map": style.label_colors(label_map, frame),
+            # thin lines would drop out where the picture is reduced
+            "Canny edges (5, 15) of the label map, drawn wider": dilate(edge_image, 5),
+            f"edges dilated by {dilation_width}x{dilation_width}": mask,
+        },
+        columns=2,
+        label_maps=[label_map],
+    )
+
+
+def figure_masks(
+    frame: np.ndarray,
+    masks: dict[str, np.ndarray],
+    keypoints: dict[str, np.ndarray],
+    true_edges: np.ndarray | None = None,
+) -> Figure:
+    """Figure "masks": one frame with several masks. The kept area is light; true boundaries are
+    drawn on it.
+
+    masks: {title: (h, w)}. keypoints: {title: (n, 2)}. true_edges: (h, w), 255 on boundaries, or
+    None if unknown.
+    """
+    edges = np.zeros_like(frame) if true_edges is None else dilate(true_edges, 3)
+    pictures = {
+        title: style.with_edges(np.where(mask > 0, frame // 2 + 127, frame // 3), edges)
+        for title, mask in masks.items()
+    }
+    return style.pictures(frame, pictures, keypoints, columns=2)

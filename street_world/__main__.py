@@ -1,0 +1,21 @@
+"""`python -m street_world` renders the drives of the current settings, as notebook 5 does."""
+
+import street_world
+from thesis_repro.running import console
+from thesis_repro.running.settings import read_settings
+
+
+def main() -> None:
+    settings = read_settings()
+    street_world.write(
+        settings.world,
+        **settings.sizes.world,
+        seed=settings.seed,
+        jobs=settings.jobs,
+        only="kitti",
+        replace=not settings.cityscapes_is_embedded,
+    )
+
+
+if __name__ == "__main__":
+    console.run_main(main)

@@ -1,0 +1,231 @@
+"""The embedded world: rendered street drives with exact poses and label maps, written in the two
+real file layouts.
+
+OUT/kitti has the layout of the KITTI odometry benchmark, plus sequences/NN/labels_0 with the exact
+label maps. OUT/cityscapes has the layout of Cityscapes and shows other streets than the sequences.
+Each picture depends only on the seed and its own name, so neither the number of processes nor an
+interruption changes a byte.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed, effective_n_jobs
+
+from street_world import drives, street, textures
+from thesis_repro.data import kitti, trajectories
+from thesis_repro.running import console, results
+from thesis_repro.running.files import is_whole, progress, write_png, write_text
+
+SEQUENCES = tuple(drives.DRIVES)
+BASELINE = 0.537  # metres between KITTI's cameras, for P1 and P3 of the calibration file
+IMAGE_SIZE = (512, 1024)  # height and width of the training images at scale 1
+CITIES = {
+    "train": ("birkenstadt", "fuchsheim", "morgental", "silberau", "tannfeld"),
+    "val": ("nebelburg", "quellheim"),
+}
+
+
+@lru_cache(maxsize=2)
+def _drive(name: str, frames: int, seed: int) -> tuple[street.Street, np.ndarray, np.ndarray]:
+    """Return a sequence's street, camera-to-world poses in it, (frames, 4, 4), and metres
+    driven, (frames,).
+    """
+    track, poses, driven = drives.way(name, frames, seed)
+    rng = np.random.default_rng((seed, drives.STREET, int(name)))
+    return street.build(rng, textures.build(seed), track, drives.DRIVES[name].style), poses, driven
+
+
+def render_frame(
+    name: str, index: int, frames: int | None = None, scale: float = 0.5, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Render frame `index` of a sequence: image and label map, both uint8 (height, width).
+
+    frames: length of the sequence, on which the street depends; None for the whole drive.
+    """
+    plan = drives.DRIVES[name]
+    scenery, poses, driven = _drive(name, frames or plan.frames, seed)
+    size, intrinsics = drives.scaled_camera(name, scale)
+    image, labels = scenery.view(poses[index], intrinsics, size, index, driven[index])
+    rng = np.random.default_rng((seed, drives.SENSOR, int(name), index))
+    return _expose(rng, image, plan.level, plan.noise), labels
+
+
+def render_image(
+    split: str, index: int, scale: float = 0.5, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Render training or validation image `index` ("train", "val"): image and label map, both
+    uint8 (height, width).
+    """
+    rng = np.random.default_rng((seed, drives.IMAGE, ("train", "val").index(split), index))
+    plan = drives.DRIVES[SEQUENCES[int(rng.integers(0, len(SEQUENCES)))]]
+    bend = rng.uniform(-70, 70)
+    pieces = (
+        (float(rng.uniform(8, 40)), 0.0),
+        (float(rng.uniform(15, 40)), bend if rng.random() < 0.6 else 0.0),
+        (300.0, 0.0),
+    )
+    sky = (rng.uniform(120, 190), rng.uniform(175, 235))
+    style = dataclasses.replace(
+        plan.style,
+        leaders=(),
+        crossing=None,
+        sky=sky,
+        sunny=bool(rng.random() < 0.65),
+        sun=(rng.uniform(-np.pi, np.pi), rng.uniform(0.45, 1.0)),
+        persons=rng.uniform(0.05, 0.25),
+        traffic=rng.uniform(0.01, 0.05),
+        trees=rng.uniform(0.1, 0.9),
+    )
+    track = drives.Track(pieces, -drives.BEHIND, drives.AHEAD)
+    scenery = street.build(rng, textures.build(seed), track, style)
+    x, z, heading = track.at(rng.uniform(0, 12), plan.lane * rng.uniform(-0.3, 1.2))
+    camera = drives.poses_of(
+        [(x, -rng.uniform(1.2, 1.9), z)],
+        [(heading, 0, 0) + np.radians(rng.uniform((-14, -2.5, -1), (14, 2, 1)))],
+    )[0]
+    height, width = round(IMAGE_SIZE[0] * scale), round(IMAGE_SIZE[1] * scale)
+    focal = width * rng.uniform(0.6, 1.0)
+    intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+    image, labels = scenery.view(camera, intrinsics, (height, width), int(rng.integers(0, 30)))
+    return _expose(rng, image, rng.uniform(88, 122), rng.uniform(1.2, 3.0)), labels
+
+
+def _expose(rng: np.random.Generator, image: np.ndarray, level: float, noise: float) -> np.ndarray:
+    """Return an 8-bit picture with automatic exposure, vignette and sensor noise.
+
+    level: mean gray value that the exposure aims at; noise: standard deviation at gray value 120.
+    """
+    mean = float(np.mean(image, dtype=np.float64))
+    # The gain is rounded, so that machines whose sums round differently use the same one.
+    gain = round((level / max(mean, 1.0)) ** 0.8 * (1 + 0.01 * rng.standard_normal()) * 512) / 512
+    rows, columns = image.shape
+    y = np.linspace(-1, 1, rows, dtype=np.float32)[:, None]
+    x = np.linspace(-1, 1, columns, dtype=np.float32)[None]
+    picture = image * np.float32(gain) * (1 - np.float32(0.06) * (x * x + y * y))
+    # Photon noise grows with the square root of the light.
+    sigma = np.float32(noise) * np.sqrt(np.float32(0.25) + np.maximum(picture, 0) / np.float32(160))
+    picture = picture + sigma * rng.standard_normal(image.shape, dtype=np.float32)
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+
+def write(
+    out: str | Path,
+    *,
+    sequences: Sequence[str] = SEQUENCES,
+    frames: int | None = None,
+    scale: float = 1.0,
+    train_images: int = 100,
+    validation_images: int = 20,
+    seed: int = 0,
+    jobs: int = -1,
+    replace: bool = False,
+    only: str | None = None,
+) -> tuple[int, int]:
+    """Write the embedded world to OUT/kitti and OUT/cityscapes; resumes a stopped run.
+
+    sequences: names among 00 to 10; frames: frames of each sequence, None for its whole drive (41
+    to 132); scale: of KITTI's image size, and of 1024x512 for the training images; jobs: number of
+    processes, -1 for one a core.
+    replace: move an embedded world of other parameters aside first (see `results.stage`). A
+    complete world of the same parameters is kept.
+    only: "kitti" or "cityscapes", to write one of the two.
+    Returns (number of pictures rendered, number of pictures in total).
+    Raises InputError for a folder that holds other files or is in use by another run, and for a
+    world of other parameters.
+    """
+    out = Path(out)
+    parameters: dict[str, Any] = {
+        "sequences": list(sequences),
+        "frames": frames,
+        "scale": scale,
+        "train_images": train_images,
+        "validation_images": validation_images,
+        "seed": seed,
+    }
+    with results.claimed(out):
+        results.stage(out, replace=replace, code=results.code("world"), **parameters)
+        pictures = [
+            picture
+            for picture in _pictures(out, **parameters)
+            if only in (None, picture[1].relative_to(out).parts[0])
+        ]
+        missing = [picture for picture in pictures if not all(map(is_whole, picture[1:]))]
+        workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
+        with progress(
+            description="rendering the embedded world", total=len(missing), unit="picture"
+        ) as bar:
+            # compiles the rasteriser once, for all worker processes
+            bar.update(_write_pictures(missing[:1]))
+            # Ten at a time, because pictures of one sequence share its street.
+            work = (
+                delayed(_write_pictures)(missing[k : k + 10]) for k in range(1, len(missing), 10)
+            )
+            for count in Parallel(
+                n_jobs=workers, return_as="generator_unordered", initializer=console.end_with_parent
+            )(work):
+                bar.update(count)
+        for name in sequences if only != "cityscapes" else ():
+            if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # written last
+                _write_sequence_texts(out, name, frames or drives.DRIVES[name].frames, scale, seed)
+    return len(missing), len(pictures)
+
+
+def _pictures(
+    root: Path,
+    sequences: Sequence[str],
+    frames: int | None,
+    scale: float,
+    train_images: int,
+    validation_images: int,
+    seed: int,
+) -> Iterator[tuple[Callable, Path, Path]]:
+    """Yield (function that renders it, image path, label map path) for every picture of a world."""
+    for name in sequences:
+        folder = root / "kitti" / "sequences" / name
+        for index in range(frames or drives.DRIVES[name].frames):
+            picture = f"{index:06d}.png"
+            yield (
+                partial(render_frame, name, index, frames, scale, seed),
+                folder / "image_0" / picture,
+                folder / "labels_0" / picture,
+            )
+    for split, count in (("train", train_images), ("val", validation_images)):
+        for index in range(count):
+            city, number = CITIES[split][index % len(CITIES[split])], index // len(CITIES[split])
+            stem = f"{city}_{number:06d}_000000"
+            yield (
+                partial(render_image, split, index, scale, seed),
+                root / "cityscapes" / "leftImg8bit" / split / city / f"{stem}_leftImg8bit.png",
+                root / "cityscapes" / "gtFine" / split / city / f"{stem}_gtFine_labelIds.png",
+            )
+
+
+def _write_pictures(pictures: list[tuple[Callable, Path, Path]]) -> int:
+    for render, image_path, label_path in pictures:
+        image, labels = render()
+        write_png(label_path, labels)
+        write_png(image_path, image)
+    return len(pictures)
+
+
+def _write_sequence_texts(root: Path, name: str, frames: int, scale: float, seed: int) -> None:
+    """Write calib.txt, times.txt and the ground-truth poses of one sequence."""
+    folder = root / "kitti" / "sequences" / name
+    _, intrinsics = drives.scaled_camera(name, scale)
+    lines = []
+    for camera in range(4):
+        projection = np.c_[intrinsics, [-BASELINE * intrinsics[0, 0] * (camera % 2), 0, 0]]
+        lines.append(f"P{camera}: " + " ".join(f"{value:.12e}" for value in projection.ravel()))
+    write_text(folder / "calib.txt", "\n".join(lines) + "\n")
+    write_text(
+        folder / "times.txt", "".join(f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames))
+    )
+    _, poses, _ = drives.way(name, frames, seed)
+    trajectories.write_kitti_poses(
+        root / "kitti" / "poses" / f"{name}.txt", drives.relative_to_first(poses)
+    )

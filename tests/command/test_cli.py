@@ -1,0 +1,193 @@
+"""The ways in: the command line, the public names, the example and the numbers of the README."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import thesis_repro as tr
+from thesis_repro.command import cli
+from thesis_repro.command.options import build_parser
+from thesis_repro.data.trajectories import read_poses
+from thesis_repro.running.settings import ROOT
+
+
+def run(command, *options):
+    return cli.main([command, *map(str, options)])
+
+
+PARSER = build_parser(cli.COMMANDS)
+COMMANDS = next(action for action in PARSER._actions if action.dest == "command").choices
+
+
+def test_the_console_script_prints_the_version():
+    script = Path(sys.executable).with_name("thesis-repro")
+    assert script.is_file(), "install the package: make setup"
+    outputs = [
+        subprocess.run([*command, "--version"], capture_output=True, text=True, check=True).stdout
+        for command in ([script], [sys.executable, "-m", "thesis_repro"])
+    ]
+    assert outputs[0] == outputs[1] == f"thesis-repro {metadata.version('thesis-repro')}\n"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_shows_two_valid_examples_and_takes_no_abbreviations(name):
+    examples = [shlex.split(line) for line in COMMANDS[name].epilog.splitlines()[1:]]
+    assert len(examples) == 2 and not COMMANDS[name].allow_abbrev and not PARSER.allow_abbrev
+    assert [PARSER.parse_args(words).command for _, *words in examples] == [name, name]
+
+
+def test_forms_of_widths_and_frames():
+    for words, widths in (
+        (["1-3,10"], {1, 2, 3, 10}),
+        (["5", "10"], {5, 10}),
+        (["1-2", "4"], {1, 2, 4}),
+    ):
+        options = PARSER.parse_args(["study", "--kitti", "a", "--output", "b", "--widths", *words])
+        assert set().union(*options.widths) == widths
+    for text, frames in (("all", None), ("40", 40)):
+        assert PARSER.parse_args(["evaluate", "a.txt", "--frames", text]).frames == frames
+
+
+def test_written_masks_give_the_same_path_as_label_maps(small_world, small_labels, tmp_path):
+    where = ["--kitti", small_world / "kitti", "--sequence", "00"]
+    labels = ["--labels", small_labels / "00", "--dilation"]
+    corrected = "--boundaries exact --symmetric --without-movable --classes road --margin 4"
+    paths = []
+    for name, options in (
+        ("thesis", []),
+        ("corrected", corrected.split()),
+        ("inverse", ["--keep", "inverse"]),
+    ):
+        masks, one, two = tmp_path / name, tmp_path / "masks.txt", tmp_path / "labels.txt"
+        assert run("masks", *where, *labels, 5, *options, "--output", masks) == 0
+        assert run("odometry", *where, "--masks", masks, "--output", one) == 0
+        assert run("odometry", *where, *labels, 5, *options, "--output", two) == 0
+        assert one.read_bytes() == two.read_bytes()
+        paths.append(one.read_bytes())
+    assert len(set(paths)) == len(paths)
+    both = tmp_path / "both"
+    assert run("masks", *where, *labels, "1-2", "--frames", 5, "--output", both) == 0
+    for name in ("mask1", "mask2"):
+        assert len(list((both / name).glob("*.png"))) == 5
+
+
+def test_the_odometry_writes_poses_and_prints_a_summary(small_world, tmp_path, capsys):
+    poses, tum, kitti = tmp_path / "poses.txt", tmp_path / "path.tum", small_world / "kitti"
+    command = ["odometry", "--kitti", kitti, "--sequence", "00", "--json", "--frames", 8]
+    keypoints = []
+    for options in (
+        [],
+        ["--labels", kitti / "sequences/00/labels_0", "--dilation", 3],
+        ["--max-keypoints", 50],
+    ):
+        assert run(*command, "--output", poses, "--tum", tum, *options) == 0
+        out, err = capsys.readouterr()
+        summary = json.loads(out)
+        assert summary["frames"] == len(read_poses(poses)) == 8 and summary["rmse_m"] > 0
+        assert str(poses) in err and str(tum) in err
+        keypoints.append(summary["mean_keypoints"])
+    assert keypoints[0] > keypoints[1] and keypoints[2] == 50
+    assert len(tum.read_text().splitlines()) == 8
+
+
+@pytest.mark.parametrize("options", [["--plot", "path.png"], ["--speed", "7"]])
+def test_without_ground_truth_there_are_no_errors(
+    tiny_kitti, options, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tiny_kitti / "poses/00.txt").unlink()
+    assert run("odometry", "--kitti", tiny_kitti, "--sequence", "0", "--json", *options) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["rmse_m"] is None and summary["mae_m"] is None
+    assert (cv2.imread("path.png") is not None) == ("--plot" in options)
+
+
+def test_public_names():
+    assert set(tr.__all__) <= set(dir(tr)) and not hasattr(tr, "mistyped")
+    assert (
+        tr.THESIS == tr.OdometrySettings() and tr.Sequence.__module__ == "thesis_repro.data.kitti"
+    )
+    assert tr.keypoint_mask(np.full((8, 8), 7, np.uint8), (16, 32), 3).shape == (16, 32)
+    assert tr.build_unet((32, 32, 1), 35, 2).output_shape == (None, 32, 32, 35)
+
+
+def test_tensorflow_is_loaded_on_first_use():
+    code = (
+        "import sys, thesis_repro as tr; tr.Sequence, tr.keypoint_mask, tr.Odometry, tr.THESIS, tr.run; "
+        "assert 'tensorflow' not in sys.modules and 'keras' not in sys.modules; tr.build_unet; "
+        "assert 'keras' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+
+
+def test_bad_input_is_one_line_in_a_notebook():
+    assert tr.InputError("frames: none")._render_traceback_() == ["InputError: frames: none"]
+
+
+def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, capsys):
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (tmp_path / "world").symlink_to(small_world)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "labels").symlink_to(small_world / "kitti/sequences/00/labels_0")
+    names = {}
+    exec(example, names)
+    assert len(names["baseline"].poses) == len(names["masked"].poses) == 12
+    assert names["masked"].frames["detected"].mean() < names["baseline"].frames["detected"].mean()
+    assert len(example.splitlines()) <= 14 and capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["README.md", "docs/answer.md"])
+def test_ratios_in_texts_are_in_recorded_tables(text):
+    """Each "1.09 (95 % CI 0.98-1.32)" is in one line of a table that `make figures` does not
+    rewrite, rounded to two digits.
+    """
+    ratios = re.findall(
+        r"(\d+\.\d\d) \(95 % CI (\d+\.\d\d)-(\d+\.\d\d)\)", (ROOT / text).read_text()
+    )
+    recorded = [
+        ROOT / "figures/trainings.csv",
+        *(ROOT / "figures/kitti_excerpts").glob("*.[cm][sd]*"),
+    ]
+    rows = [
+        {f"{float(number):.2f}" for number in re.findall(r"\d+\.\d+", line)}
+        for path in recorded
+        for line in path.read_text().splitlines()
+    ]
+    assert (
+        ratios and [ratio for ratio in ratios if not any(set(ratio) <= row for row in rows)] == []
+    )
+
+
+CAMERA = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
+MAP, FRAME = np.full((8, 8), 7, np.uint8), np.eye(96, 128, dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    "call, named",
+    [
+        (lambda: tr.keypoint_mask(np.zeros((8, 8, 35), np.uint8), (16, 32), 3), "label map"),
+        (lambda: tr.keypoint_mask(MAP + 30, (16, 32), 3), "label map"),
+        (lambda: tr.keypoint_mask(MAP, (16, 32, 3), 3), "size"),
+        (lambda: tr.keypoint_mask(MAP, (16, 32.0), 3), "size"),
+        (lambda: tr.keypoint_mask(MAP, (16, 0), 3), "size"),
+        (lambda: tr.keypoint_mask(MAP, (16, 32), 3, {"ids": "train"}), "settings"),
+        (lambda: tr.Odometry(CAMERA.T), "intrinsics"),
+        (lambda: tr.Odometry(-CAMERA), "intrinsics"),
+        (lambda: tr.Odometry(np.eye(3)).step(FRAME), "intrinsics"),
+        (lambda: tr.Odometry(CAMERA, [MAP]), "settings"),
+        (lambda: tr.Odometry(CAMERA, start=2 * np.eye(4)), "start"),
+        (lambda: tr.Odometry(CAMERA, start=np.eye(4) + np.eye(4, k=-1)[::-1]), "start"),
+        (lambda: tr.Sequence("kitti", 7), "sequence"),
+    ],
+)
+def test_wrong_arguments_are_named(call, named):
+    with pytest.raises(tr.InputError, match=named):
+        call()

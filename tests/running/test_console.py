@@ -1,0 +1,281 @@
+"""Folders of results: their inputs, locks and checkpoints; logs, signals, errors of the machine in
+one line; caches of compiled code.
+"""
+
+import ctypes
+import errno
+import fcntl
+import logging
+import os
+import shutil
+import signal
+import warnings
+
+import numpy as np
+import pytest
+
+from thesis_repro import odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
+from thesis_repro.running import compiled, console, files, results
+
+
+def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
+    folder = results.stage(tmp_path / "a", data="one", size=3)
+    files.write_text(folder / "result", "kept")
+    assert (
+        results.stage(tmp_path / "a", size=3, data="one") == folder and (folder / "result").exists()
+    )
+    before = results.made_from(folder)
+    results.stage(tmp_path / "a", data="other", size=3)
+    assert not (folder / "result").exists() and results.made_from(folder) != before
+    with pytest.raises(InputError, match="a: .*size"):
+        results.stage(folder, replace=False, data="other", size=4)
+    assert results.record(folder) == {"data": "other", "size": 3}
+
+
+def test_a_folder_with_other_files_is_refused_and_kept(tmp_path):
+    (tmp_path / "letter.txt").write_text("mine")
+    with pytest.raises(InputError, match=str(tmp_path)):
+        results.stage(tmp_path, data="one")
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+    (tmp_path / results.RECORD).write_text("[1, 2")  # a damaged record
+    with pytest.raises(InputError, match="made-from.json: "):
+        results.stage(tmp_path, data="one")
+
+
+def test_a_checkpoint_is_read_back_and_holds_no_code(tmp_path):
+    file = tmp_path / "state.npz"
+    assert results.resume(file) is None
+    results.store(file, {"epoch": 3}, {"0": np.eye(2), "job": np.arange(3)})
+    job, arrays = results.resume(file)
+    assert (
+        job == {"epoch": 3}
+        and np.array_equal(arrays["0"], np.eye(2))
+        and np.array_equal(arrays["job"], [0, 1, 2])
+    )
+    np.savez(file, job="{}", **{"array 0": np.array([object()])})  # a pickle
+    with pytest.raises(InputError, match="state.npz: "):
+        results.resume(file)
+    results.store(file, {}, {"0": np.zeros(1000)})
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(InputError, match="state.npz: "):
+        results.resume(file)
+
+
+def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "_PACKAGE", tmp_path / "package")
+    plain = {
+        "__init__": "",
+        "room____init__": "",
+        "house": "def f():\n    return 1\n",
+        "garden": "x = 1\n",
+        "room__table": "import beside\nfrom package.room import chair\n",
+        "room__chair": "from package import house\n",
+    }
+    (tmp_path / "beside.py").touch()  # another package beside this one
+
+    def version(place="room", **changed):
+        for name, text in {**plain, **changed}.items():
+            files.write_text(
+                tmp_path / "package" / f"{name.replace('__', '/', name != '__init__')}.py", text
+            )
+        results.code.cache_clear()
+        return results.code(place)
+
+    first = version()
+    assert version(house='# why\ndef f():\n    """What."""\n    return 1\n') == first
+    assert version(house="def f():\n    return 2\n") != first
+    assert version(room__chair="from package import house\nx = 2\n") != first
+    assert version(garden="x = 2\n") == first
+    assert version("room/table", house="def f():\n    return 2\n") != version("room/table")
+    with pytest.raises(ImportError, match="attic"):
+        version("attic")
+    results.code.cache_clear()
+
+
+def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeypatch):
+    monkeypatch.setenv("THESIS_REPRO_BUILD", str(tmp_path / "build"))
+    monkeypatch.setattr(results, "SETTLED", -1)
+    paths = [tmp_path / "a", tmp_path / "b"]
+    for path in paths:
+        path.write_text("12")
+    first = results.listing(paths)
+    (tmp_path / "elsewhere").mkdir()
+    assert results.listing([shutil.copy(path, tmp_path / "elsewhere") for path in paths]) == first
+    date = paths[1].stat().st_mtime_ns
+    paths[1].write_text("21")  # the same length and date
+    os.utime(paths[1], ns=(date, date))
+    changed = results.listing(paths)
+    assert changed != first
+    monkeypatch.setattr(results, "_sha256", None)  # nothing may be read
+    assert results.listing(paths) == changed
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe: "):
+        results.listing([tmp_path / "pipe"])
+
+
+def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, capsys, monkeypatch):
+    folder = results.stage(tmp_path / "a", size=3)
+    monkeypatch.chdir(folder)
+    for size in (3, 4, 5):
+        results.stage(".", size=size)  # "." has no name
+        files.write_text(folder / "in" / "result", f"result of {size}")
+        (folder / "link").symlink_to("/nowhere")
+        (folder / ".env").write_text(f"by hand, {size}")
+    results.stage(folder, size=5)
+    for path, size in ((folder, 5), (tmp_path / "a.old-1", 3), (tmp_path / "a.old-2", 4)):
+        assert results.record(path) == {"size": size} and (path / "link").is_symlink()
+        assert (path / "in" / "result").read_text() == f"result of {size}"
+        assert (path / ".env").read_text() == f"by hand, {size}"
+    assert capsys.readouterr().err.count("a.old-2") == 1
+    results.stage(results.stage(tmp_path / "empty", size=1), size=2)
+    assert not (tmp_path / "empty.old-1").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "frame,x\n0,1.0\n1,2", "frame,x\n0,1.0\n1,two\n", "frame,x\n0,1.0\n"]
+)
+def test_a_damaged_table_is_not_kept(tmp_path, text):
+    for content, whole in (("frame,x\n0,1.0\n1,2.0\n", True), (text, False)):
+        (tmp_path / "a.csv").write_text(content)
+        assert (results.kept_table(tmp_path / "a.csv", rows=2) is not None) == whole
+    assert results.kept_table(tmp_path / "b.csv") is None
+
+
+def test_a_folder_is_locked_by_one_process(tmp_path):
+    folder = tmp_path / "out"
+    with results.claimed(folder), results.claimed(folder):  # one process may lock it twice
+        results.stage(folder, size=3)
+        other = os.open(folder, os.O_RDONLY)  # as in another process
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    for attempt in (lambda: results.claimed(folder).__enter__(), lambda: results.stage(folder)):
+        with pytest.raises(InputError, match="out: "):
+            attempt()
+    os.close(other)
+    assert not results._held
+
+
+def test_a_failed_run_leaves_no_empty_folders(tmp_path):
+    with pytest.raises(ZeroDivisionError), results.claimed(tmp_path / "a" / "b"):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file: "), results.claimed(tmp_path / "file"):
+        pass
+
+
+def test_temporary_files_of_a_killed_run_are_deleted(tmp_path):
+    folder = results.stage(tmp_path / "out", size=3)
+    (folder / "in").mkdir()
+    temporary, hidden = files.temporary_path(folder / "in" / "a.png"), folder / "in" / ".hidden"
+    temporary.touch()
+    hidden.touch()
+    results.stage(folder, size=3)
+    assert not temporary.exists() and hidden.exists()
+    # a run that was killed while it wrote its record
+    other = tmp_path / "other"
+    other.mkdir()
+    files.temporary_path(other / results.RECORD).touch()
+    assert [path.name for path in results.stage(other, size=3).iterdir()] == [results.RECORD]
+
+
+def test_a_killed_move_of_old_results_is_finished_and_the_log_stays(tmp_path, monkeypatch):
+    folder = results.stage(tmp_path / "out", size=3)
+    results.stage(folder / "in", size=3)
+    for path in (folder / "result", folder / "in" / "result"):
+        files.write_text(path, "old")
+    (folder / console.LOG).touch()
+    with monkeypatch.context() as patch:
+        rename = type(folder).rename
+
+        def killed(path, target):
+            rename(path, target)
+            raise KeyboardInterrupt
+
+        patch.setattr(type(folder), "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            results.stage(folder, size=4)
+    assert results.record(folder) == {"size": 3}
+    results.stage(folder, size=4)
+    assert {path.name for path in folder.iterdir()} == {results.RECORD, console.LOG}
+    assert len(list(tmp_path.glob("out.old-*/**/result"))) == 2
+
+
+# as numpy raises it
+NOT_CLOSED = ValueError("Can't close the ZIP file")
+NOT_CLOSED.__context__ = OSError(errno.ENOSPC, "x", "a.npz")
+
+
+@pytest.mark.parametrize(
+    "error, says",
+    [
+        (PermissionError(errno.EACCES, "x", "a.png"), "a.png"),
+        (OSError("Can't write data (error message = 'No space left on device')"), "No space left"),
+        (NOT_CLOSED, "a.npz"),
+        (MemoryError(), "memory"),
+        (RuntimeError("can't start new thread"), "memory"),
+        (InputError("a.png: truncated"), "a.png"),
+    ],
+)
+def test_errors_of_the_machine_are_one_line(error, says, capsys):
+    assert console.report_error(error) == 1
+    line = capsys.readouterr().err
+    assert line.startswith("error: ") and says in line and line.count("\n") == 1
+    with pytest.raises(ZeroDivisionError):  # unexpected errors are raised
+        console.report_error(ZeroDivisionError("1/0"))
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_full_disk_names_the_file_and_not_the_temporary_file(tmp_path, named):
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        with files.atomic(tmp_path / "a.txt") as temporary:
+            raise OSError(errno.ENOSPC, "x", str(temporary) if named else None)
+    assert caught.value.filename == str(tmp_path / "a.txt") and list(tmp_path.iterdir()) == []
+
+
+def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
+    warnings.simplefilter("always")  # pytest restores the filters
+    with pytest.raises(InputError), console.logged(tmp_path / "out", "thesis-repro study") as run:
+        results.stage(tmp_path / "out", size=3)
+        warnings.warn("odd", stacklevel=1)
+        console.log.warning("sequence 00 failed")
+        run.end("3 runs")
+        raise InputError("bad")
+    printed = capsys.readouterr()
+    assert printed.out.startswith("3 runs\n") and printed.err == "warning: sequence 00 failed\n"
+    lines = (tmp_path / "out" / console.LOG).read_text().splitlines()
+    assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
+    assert any("WARNING" in line and "odd" in line for line in lines)
+    handlers = logging.getLogger("thesis_repro").handlers
+    assert not any(isinstance(handler, console._LogFile) for handler in handlers)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_that_compiled_code_loses_stops_at_the_next_frame(tiny_kitti, number):
+    """Exceptions are lost in callbacks of C, as while Numba compiles."""
+    # shells start background jobs with SIGINT ignored, which `stoppable` respects
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with pytest.raises(KeyboardInterrupt), console.stoppable():
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
+        with pytest.raises(KeyboardInterrupt):
+            odometry.run(Sequence(tiny_kitti, "00"))
+    assert len(odometry.run(Sequence(tiny_kitti, "00")).poses) == 4
+
+
+def test_caches_of_compiled_code_are_deleted_when_a_file_has_changed(tmp_path):
+    cache, module = tmp_path / "room" / "__pycache__" / "old.nbi", tmp_path / "neighbour.py"
+    cache.parent.mkdir(parents=True)
+    deleted = []
+    # dates older than the cache's; neither an equal nor a new date says anything about the bytes
+    for text, date in (("1", 1), ("1", 2), ("2", 2), ("2", 2)):
+        module.write_text(text)
+        os.utime(module, (date, date))
+        cache.touch()
+        compiled.forget_stale(tmp_path)
+        deleted.append(not cache.exists())
+    assert deleted == [True, False, True, False]
+    compiled.forget_stale(tmp_path / "nothing")

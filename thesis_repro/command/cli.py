@@ -1,0 +1,460 @@
+"""The command line: thesis-repro COMMAND, or python -m thesis_repro COMMAND."""
+
+import json
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from thesis_repro.command.options import MASK_OPTIONS, build_parser
+from thesis_repro.errors import InputError
+from thesis_repro.running import console
+from thesis_repro.running.settings import PROFILES, SEED, check_outside
+
+# options that name an output file: its content, and the endings that its name may have (none given:
+# any)
+OUTPUT_FILES = {
+    "output": ("poses in KITTI format", ()),
+    "tum": ("poses in TUM format", ()),
+    "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
+    "video": ("video", (".webm",)),
+}
+
+
+# The commands, see COMMANDS. Their docstrings are shown by --help. Each imports its libraries
+# itself, so that --help is fast.
+
+
+def synthesize(options: Any) -> None:
+    """write the embedded world, a rendered street, in the folder layouts of KITTI and Cityscapes"""
+    import street_world
+
+    with console.logged(options.out, options.command_line) as run:
+        new, total = street_world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
+        run.end(
+            f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
+            f"{total:,} images with their label maps",
+            total - new,
+        )
+
+
+def check_data(options: Any) -> int:
+    """check folders of KITTI, Cityscapes or KITTI's street scenes: their content, damage, and
+    what can be run
+    """
+    from thesis_repro.checks import check
+
+    roots = options.kitti, options.cityscapes, options.kitti_semantic
+    if not any(roots):
+        raise InputError(
+            "no folder to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic"
+        )
+    return 0 if check.report(*roots, options.deep) else 1
+
+
+def predict(options: Any) -> None:
+    """predict label maps (Cityscapes ids as 8-bit PNG, 320x320, named like the frames) for
+    images or sequences
+    """
+    from thesis_repro.segmentation import quietly
+    from thesis_repro.study import workers
+
+    images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
+    # the name of a link, not of what it points to, because `study` looks for this name
+    names = [Path(os.path.abspath(folder)).name for folder, _ in images]
+    if len(set(names)) < len(names):
+        raise InputError("--images: two folders have the same name; use two commands")
+    # sequences of a KITTI folder always get subfolders, even if there is only one
+    has_subfolders = [folder for folder, _ in images] != options.images[:1]
+    sequences = [
+        (paths[: options.frames], options.folder / name if has_subfolders else options.folder)
+        for name, (_, paths) in zip(names, images)
+    ]
+    _check_outputs(
+        options, *options.images, *(paths[0].parent for paths, _ in sequences), options.model
+    )
+    with quietly():  # this import takes seconds, so the files are checked first
+        from thesis_repro.segmentation import prediction, training
+    model_file = options.model or prediction.SHIPPED
+    with console.logged(options.folder, options.command_line) as run:
+        if options.dask:
+            with workers.open_pool(1, options.dask) as pool:
+                new = prediction.spread_label_maps(pool.run, model_file, sequences)
+        else:
+            model = training.load_model(model_file)
+            new = sum(
+                prediction.write_label_maps(model, paths, output) for paths, output in sequences
+            )
+        total = sum(len(paths) for paths, _ in sequences)
+        run.end(
+            "\n".join(f"{output}: {len(paths)} label maps" for paths, output in sequences),
+            total - new,
+        )
+
+
+def masks(options: Any) -> None:
+    """write the keypoint masks of a sequence (appendix A.8): 8-bit PNG images, 255 keeps
+    keypoints, 0 ignores them
+    """
+    from thesis_repro.masks import LabelMasks, write_masks
+
+    sequence, settings = _sequence(options), _mask_settings(options)
+    if not options.dilation and settings.keep != "static":
+        raise InputError("--dilation W: needed for masks from boundaries")
+    mask_sets = [
+        LabelMasks(options.labels, sequence, width, settings)
+        for width in sorted(set().union(*options.dilation or [(1,)]))
+    ]
+    _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
+    _warn(_print_oddities(sequence, mask_sets))
+    for label_masks in mask_sets:
+        width = label_masks.dilation_width
+        folder = options.folder if len(mask_sets) == 1 else options.folder / f"mask{width}"
+        write_masks(label_masks, folder)
+        print(f"{folder}: {len(label_masks)} masks{f' of width {width}' * bool(options.dilation)}")
+
+
+def odometry(options: Any) -> None:
+    """run the visual odometry on one sequence and print its errors, number of keypoints and time"""
+    from thesis_repro import odometry
+    from thesis_repro.checks import oddities
+    from thesis_repro.data import kitti
+    from thesis_repro.data.trajectories import write_kitti_poses, write_tum
+    from thesis_repro.odometry import metrics
+    from thesis_repro.report import texts
+
+    changes = {
+        field.name: vars(options)[field.name]
+        for field in fields(odometry.OdometrySettings)
+        if vars(options).get(field.name) is not None
+    }
+    settings = replace(odometry.THESIS, **changes)
+    sequence = _sequence(options)
+    masks = _masks(options, sequence)
+    _check_outputs(
+        options,
+        sequence.poses_path,
+        *kitti.texts_of(sequence.folder, sequence.frame_paths[0].parent),
+        options.masks,
+        options.labels,
+        sequence.folder,
+        sequence.frame_paths[0].parent,
+    )
+    _warn(_print_oddities(sequence, [masks] if masks else []))
+    result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
+    if options.output:
+        write_kitti_poses(options.output, result.poses)
+    if options.tum:
+        write_tum(options.tum, result.poses, sequence.times)
+    if sequence.has_truth:
+        _warn(oddities.of_path(sequence.name, result.poses, sequence.poses))
+    _warn(oddities.of_steps(sequence.name, result.failed, len(sequence)))
+    record = texts.run_record(result, sequence)
+    if options.video:
+        from thesis_repro.report import video
+
+        video.write_video(options.video, sequence, settings, masks)
+    if options.plot:
+        from thesis_repro.report import style, trajectories
+
+        truth = sequence.poses if sequence.has_truth else None
+        poses = result.poses if truth is None else metrics.shifted(result.poses, truth)
+        drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
+        style.write_figure(drawing, options.plot)
+    _print(
+        options,
+        record,
+        "run.txt.j2",
+        sequence=sequence,
+        speed=options.speed,
+        length=metrics.RELATIVE_LENGTH,
+    )
+
+
+def study(options: Any) -> int:
+    """compare your own label maps or masks with all keypoints and with controls, in tables,
+    figures and a page
+    """
+    from thesis_repro.data import kitti
+    from thesis_repro.running import results
+    from thesis_repro.running.settings import ALL_WIDTHS, cores
+    from thesis_repro.study import sources
+    from thesis_repro.study.study import Study
+
+    if not options.sources:
+        raise InputError(
+            "no masks: name a folder of label maps with --labels, or of masks with --masks"
+        )
+    kinds = {kind for kind, _ in options.sources}
+    has_labels = "labels" in kinds
+    if options.widths and not has_labels:
+        raise InputError("--widths: only masks from label maps (--labels) have a width")
+    if options.invert and "masks" not in kinds:
+        raise InputError("--invert: needs --masks DIR")
+    # one of any width, if masks have none
+    all_widths = (options.controls or 1,) if options.keep == "static" else ALL_WIDTHS
+    names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
+    planned = Study(
+        options.kitti.absolute(),
+        tuple(names or kitti.sequences(options.kitti)),
+        sources.named(
+            options.sources, options.name, _mask_settings(options, has_labels), options.invert
+        ),
+        tuple(sorted(set().union(*options.widths or [all_widths] if has_labels else []))),
+        options.controls,
+        tuple(dict.fromkeys(options.estimator)),
+        options.repetitions,
+        options.frames,
+    )
+    planned.check()
+    folder = options.folder.absolute()
+    _check_outputs(options, *(source.folder for source in planned.sources))
+    # this import takes seconds, so the input is checked first
+    from thesis_repro.report import study
+
+    with console.logged(folder, options.command_line) as run, results.claimed(folder):
+        warnings = [
+            line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)
+        ]
+        warnings = _warn(warnings)
+        summary = planned.run(folder, options.jobs or cores(), options.dask)
+        warnings += _warn(planned.path_oddities(summary, folder))
+        counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
+        failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
+        run.end(f"{len(summary):,} runs{failed}; open {page} in a browser", counts["kept"])
+    return 1 if failed else 0
+
+
+def evaluate(options: Any) -> None:
+    """compare trajectories with the ground truth: the thesis's RMSE and MAE, ATE, RPE, KITTI's
+    t_rel and r_rel
+    """
+    from thesis_repro.checks import oddities
+    from thesis_repro.data.kitti import true_path
+    from thesis_repro.report import style, trajectories
+
+    sequences = trajectories.by_sequence(options.poses, options.kitti, options.sequence)
+    if options.plot and len(sequences) > 1:
+        raise InputError("--plot: shows only one sequence; name it with --sequence")
+    _check_outputs(options, *options.poses)
+    rows, matching = [], {"offset": options.t_offset}
+    if options.t_max_diff is not None:
+        matching["max_difference"] = options.t_max_diff
+    for sequence, files in sequences.items():
+        truth, times = true_path(options.kitti, sequence)
+        _warn(oddities.of_truth(sequence, truth, times))
+        paths = {
+            name: trajectories.read(file, times, options.frames, **matching)
+            for name, file in files.items()
+        }
+        truth = truth[: options.frames]
+        for name, (matched, poses) in paths.items():
+            _warn(
+                oddities.of_path(
+                    name, poses, truth[matched], options.align not in ("sim3", "scale")
+                )
+            )
+        rows += trajectories.evaluate(paths, truth, options.align, sequence)
+    if options.plot:
+        drawing = trajectories.figure(
+            trajectories.aligned(paths, truth, options.align),
+            truth,
+            f"sequence {sequence}",
+            {name: matched for name, (matched, _) in paths.items()},
+        )
+        style.write_figure(drawing, options.plot)
+    rows += list(trajectories.means(rows))
+    _print(
+        options,
+        rows,
+        "evaluate.txt.j2",
+        alignment=options.align,
+        table=trajectories.table(rows, options.align),
+    )
+
+
+COMMANDS = {
+    function.__name__.replace("_", "-"): function
+    for function in (synthesize, check_data, predict, masks, odometry, study, evaluate)
+}
+
+
+# Helpers of several commands
+
+
+def _sequence(options: Any) -> Any:
+    from thesis_repro.data.kitti import Sequence
+
+    sequence = Sequence(
+        options.kitti, options.sequence, options.camera, getattr(options, "speed", None)
+    )
+    return sequence.subset(options.frames)
+
+
+def _print_oddities(sequence: Any, mask_sets: Iterable) -> list[str]:
+    """Print what masks of a sequence hold, and return warnings of doubtful input."""
+    from thesis_repro.checks import oddities
+
+    warnings = oddities.of_sequence(sequence)
+    for masks in mask_sets:
+        with suppress(InputError):  # a file that cannot be read is reported when it is used
+            line, mask_warnings = oddities.of_masks(masks, sequence)
+            console.log.info(line)
+            warnings += mask_warnings
+    return warnings
+
+
+def _warn(lines: Iterable[str]) -> list[str]:
+    """Print warnings, "place: fault", and return them. One fault of several places is one line."""
+    places: dict[str, list[str]] = {}
+    for line in lines:
+        place, _, fault = line.partition(": ")
+        places.setdefault(fault, []).append(place)
+    merged = [f"{', '.join(names)}: {fault}" for fault, names in places.items()]
+    for line in merged:
+        console.log.warning(line)
+    return merged
+
+
+def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
+    """Yield (folder, its images) for a folder of images, a sequence, or each sequence of a KITTI
+    folder or of a folder of sequences.
+
+    Raises InputError if there are no images, or if frames of a sequence are missing.
+    """
+    from thesis_repro.data import kitti
+    from thesis_repro.running import files
+
+    folders = [root]
+    if root.is_dir() and not kitti.has_frames(root):
+        parent = kitti.folder_of(root)
+        folders = kitti.folders_with_frames(parent if parent.is_dir() else root) or [root]
+    for folder in folders:
+        image_folder = kitti.images_of(folder)
+        paths = files.images(image_folder)
+        if not paths:
+            raise InputError(f"{image_folder}: holds no PNG or JPEG images")
+        if image_folder != folder:
+            kitti.check_numbering(paths)
+        yield folder, paths
+
+
+def _mask_settings(options: Any, has_labels: bool = True) -> Any:
+    from thesis_repro.masks import MaskSettings
+
+    settings = MaskSettings(
+        options.boundaries,
+        options.symmetric,
+        tuple(options.classes),
+        options.without_movable,
+        options.margin,
+        options.keep,
+        options.ids,
+    )
+    if not has_labels and settings != MaskSettings():
+        raise InputError(
+            f"{', '.join(MASK_OPTIONS)}: need --labels DIR, label maps to make masks from"
+        )
+    for name in ("boundaries", "symmetric", "classes", "dilation", "widths"):
+        value = vars(options).get(name)
+        if settings.keep == "static" and value not in (None, [], vars(MaskSettings).get(name)):
+            raise InputError(f"--{name}: --keep static uses no boundaries; leave it out")
+    return settings
+
+
+def _masks(options: Any, sequence: Any) -> Any:
+    """The masks that --masks or --labels name, or None."""
+    from thesis_repro.masks import LabelMasks, MaskFolder
+
+    settings = _mask_settings(options, options.labels)
+    if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
+        raise InputError("--labels DIR, --dilation W: give both or neither")
+    if options.invert and not options.masks:
+        raise InputError("--invert: needs --masks DIR")
+    if options.labels:
+        width = 1 if options.dilation is None else options.dilation
+        return LabelMasks(options.labels, sequence, width, settings)
+    return MaskFolder(options.masks, sequence, options.invert) if options.masks else None
+
+
+def _output_files(options: Any) -> dict[str, Path]:
+    return {name: vars(options)[name] for name in OUTPUT_FILES if vars(options).get(name)}
+
+
+def _check_outputs(options: Any, *inputs: Path | None) -> None:
+    """Raise InputError, before anything runs, if an output cannot be written or would overwrite
+    or mix with inputs.
+    """
+    from thesis_repro.running.files import check_output
+
+    data = [path for path in (vars(options).get("kitti"), *inputs) if path]
+    # a sequence given alone belongs to the folder above sequences/
+    data += [
+        above.parent
+        for path in data
+        for above in path.resolve().parents
+        if above.name == "sequences"
+    ]
+    folder, used = vars(options).get("folder"), set()
+    if folder:
+        check_outside(f"--output {folder}", folder, data)
+        if any(path.resolve().is_relative_to(folder.resolve()) for path in data):
+            raise InputError(f"--output {folder}: holds input of this command; name another folder")
+    for name, path in _output_files(options).items():
+        endings = OUTPUT_FILES[name][1]
+        if endings and path.suffix.lower() not in endings:
+            raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
+        check_output(path)
+        check_outside(f"--{name} {path}", path, data)
+        if path.resolve() in used:
+            raise InputError(f"--{name} {path}: is another output of this command; name another")
+        used.add(path.resolve())
+
+
+def _print(options: Any, record: Any, template: str, **values: Any) -> None:
+    """Print a result as JSON or with a template, and name the written files on standard error."""
+    from thesis_repro.report import texts
+
+    text = (
+        json.dumps(record)
+        if vars(options).get("json")
+        else texts.render(template, record=record, **values).rstrip()
+    )
+    outputs = _output_files(options)
+    print(text)
+    for name, path in outputs.items():
+        console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:  # it was closed
+            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))
+    options = build_parser(COMMANDS).parse_args(arguments)
+    options.command_line = shlex.join(
+        ["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)]
+    )
+    try:
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise InputError("the working folder was deleted; change to another one") from None
+        with console.stoppable():
+            console.need_addresses(4 if options.function is predict else 2)
+            code = options.function(options) or 0
+            sys.stdout.flush()
+            return code
+    except BrokenPipeError:  # the reader of the output has ended, such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    except Exception as error:
+        return console.report_error(error)
+    except KeyboardInterrupt as stop:
+        with suppress(OSError):  # the terminal may be gone
+            print("stopped; run the same command again to resume", file=sys.stderr)
+        return 128 + (stop.args[0] if stop.args else signal.SIGINT)

@@ -1,0 +1,1 @@
+"""The data: KITTI sequences, raw drives, files of poses, and pairs of images and label maps."""

@@ -1,0 +1,219 @@
+"""Cityscapes: the table of labels, and pairs of images and label maps in the official or the
+thesis's flat layout.
+"""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from thesis_repro.errors import InputError
+from thesis_repro.running.files import listed, progress, read_color, read_gray, read_ids
+
+
+class Label(NamedTuple):
+    """A row of Tables 3.1 and 3.2: name, id, weight in the Dice loss, and colour (red, green,
+    blue).
+    """
+
+    name: str
+    id: int
+    weight: float
+    color: tuple
+
+
+# Tables 3.1 and 3.2, with the colours of the Cityscapes scripts. "background" is in the tables
+# only: the network has 35 outputs, and no label map holds id 35 (audit row 9).
+LABELS = tuple(
+    Label(*row)
+    for row in [
+        ("unlabeled", 0, 1.0, (0, 0, 0)),
+        ("ego vehicle", 1, 1.0, (0, 0, 0)),
+        ("rectification border", 2, 1.0, (0, 0, 0)),
+        ("out of roi", 3, 1.0, (0, 0, 0)),
+        ("static", 4, 1.0, (0, 0, 0)),
+        ("dynamic", 5, 1.0, (111, 74, 0)),
+        ("ground", 6, 1.0, (81, 0, 81)),
+        ("road", 7, 0.7, (128, 64, 128)),
+        ("sidewalk", 8, 1.1, (244, 35, 232)),
+        ("parking", 9, 2.2, (250, 170, 160)),
+        ("rail track", 10, 2.9, (230, 150, 140)),
+        ("building", 11, 0.8, (70, 70, 70)),
+        ("wall", 12, 2.2, (102, 102, 156)),
+        ("fence", 13, 2.2, (190, 153, 153)),
+        ("guard rail", 14, 4.0, (180, 165, 180)),
+        ("bridge", 15, 2.5, (150, 100, 100)),
+        ("tunnel", 16, 3.4, (150, 120, 90)),
+        ("pole", 17, 1.0, (153, 153, 153)),
+        ("pole group", 18, 5.0, (153, 153, 153)),
+        ("traffic light", 19, 2.5, (250, 170, 30)),
+        ("traffic sign", 20, 2.3, (220, 220, 0)),
+        ("vegetation", 21, 0.9, (107, 142, 35)),
+        ("terrain", 22, 1.0, (152, 251, 152)),
+        ("sky", 23, 1.2, (70, 130, 180)),
+        ("person", 24, 2.0, (220, 20, 60)),
+        ("rider", 25, 3.0, (255, 0, 0)),
+        ("car", 26, 1.0, (0, 0, 142)),
+        ("truck", 27, 2.3, (0, 0, 70)),
+        ("bus", 28, 2.3, (0, 60, 100)),
+        ("caravan", 29, 3.4, (0, 0, 90)),
+        ("trailer", 30, 3.5, (0, 0, 110)),
+        ("train", 31, 2.3, (0, 80, 100)),
+        ("motorcycle", 32, 3.2, (0, 0, 230)),
+        ("bicycle", 33, 2.3, (119, 11, 32)),
+        ("license plate", 34, 0.5, (0, 0, 142)),
+        ("background", 35, 0.5, (0, 0, 0)),
+    ]
+)
+N_CLASSES = 35  # Figure A.1: ids 0 to 34
+CLASS_WEIGHTS = np.array([label.weight for label in LABELS[:N_CLASSES]], np.float32)
+COLORS = np.array([label.color for label in LABELS], np.uint8)
+ID = {label.name: label.id for label in LABELS}
+# Many networks are trained with Cityscapes' train ids: 0 to 18 in this order, and 255 for all other
+# labels.
+TRAINED = (
+    "road",
+    "sidewalk",
+    "building",
+    "wall",
+    "fence",
+    "pole",
+    "traffic light",
+    "traffic sign",
+    "vegetation",
+    "terrain",
+    "sky",
+    "person",
+    "rider",
+    "car",
+    "truck",
+    "bus",
+    "train",
+    "motorcycle",
+    "bicycle",
+)
+LABEL_OF_TRAIN_ID = np.full(256, 255, np.uint8)
+LABEL_OF_TRAIN_ID[: len(TRAINED)] = [ID[name] for name in TRAINED]
+LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
+
+
+class Pair(NamedTuple):
+    """An image and its label map; a missing file is None. `name` is the common part of both
+    file names.
+    """
+
+    name: str
+    image: Any  # Path or None
+    label: Any  # Path or None
+
+
+def colorize(label_map: np.ndarray) -> np.ndarray:
+    """Colour image (height, width, 3), red, green, blue, of a label map (height, width)."""
+    return COLORS[np.minimum(label_map, len(COLORS) - 1)]
+
+
+def pairs(root: str | Path, split: str, limit: int | None = None) -> list[Pair]:
+    """Pairs of image and label map of one split ("train" or "val"), sorted by name.
+
+    limit: largest number of pairs; None for all. They are spread evenly over the split, because it
+    is sorted by city. The appendix pairs two unsorted directory listings by position (A.2); this
+    function pairs equal names.
+    Raises InputError if a folder is missing, a split is empty, or an image has no label map.
+    """
+    split_pairs = listing(root, split)
+    for pair in split_pairs:
+        check_complete(pair)
+    if limit is not None and limit < len(split_pairs):
+        split_pairs = [split_pairs[index * len(split_pairs) // limit] for index in range(limit)]
+    return split_pairs
+
+
+def listing(root: str | Path, split: str) -> list[Pair]:
+    """Pairs of one split, sorted by name, including incomplete pairs. Raises InputError if there
+    are no images.
+
+    Reads the official layout (leftImg8bit, gtFine) and the appendix's flat layout (train,
+    trainannot).
+    """
+    root = Path(root)
+    if (root / "leftImg8bit").is_dir():
+        image_folder, label_folder, pattern = (
+            root / "leftImg8bit" / split,
+            root / "gtFine" / split,
+            "*/*",
+        )
+        image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
+    elif (root / split).is_dir():
+        image_folder, label_folder, pattern = root / split, root / f"{split}annot", "*"
+        image_end = label_end = ".png"
+    else:
+        raise InputError(
+            f"{root}: must be a folder that holds leftImg8bit and gtFine, or {split} and {split}annot"
+        )
+    images = {
+        path.name.removesuffix(image_end): path
+        for path in listed(image_folder, pattern + image_end)
+    }
+    labels = {
+        path.name.removesuffix(label_end): path
+        for path in listed(label_folder, pattern + label_end)
+    }
+    if not images:
+        raise InputError(f"{image_folder}: no PNG images")
+    return [Pair(name, images.get(name), labels.get(name)) for name in sorted(images | labels)]
+
+
+def check_complete(pair: Pair) -> None:
+    """Raise InputError if the image or the label map is missing."""
+    if pair.label is None:
+        raise InputError(f"{pair.image}: has no label map")
+    if pair.image is None:
+        raise InputError(f"{pair.label}: has no image")
+
+
+def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> np.ndarray:
+    """Read an image and resize it bilinearly (A.2.1): uint8 (height, width, channels).
+
+    channels: 1 for gray, as in the thesis; 3 for red, green, blue.
+    """
+    image = read_gray(path) if channels == 1 else read_color(path)
+    return cv2.resize(image, (width, height)).reshape(height, width, channels)
+
+
+def read_label_map(path: str | Path, train_ids: bool = False) -> np.ndarray:
+    """Read a label map (height, width) of Cityscapes label ids, uint8. train_ids: translate train
+    ids to label ids.
+
+    Raises InputError if a number is no valid id, and as `read_ids` does.
+    """
+    ids = read_ids(path)
+    label_map = LABEL_OF_TRAIN_ID[ids] if train_ids else ids
+    if label_map.max() < N_CLASSES:
+        return label_map
+    invalid = ids[label_map >= N_CLASSES].max()
+    raise InputError(
+        f"{path}: holds {invalid}, which is no train id (0 to 18, 255); leave out --ids train"
+        if train_ids
+        else f"{path}: label id {invalid} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
+        "--ids train for train ids (0 to 18, 255)"
+    )
+
+
+def load(
+    image_pairs: Collection[Pair], size: int, channels: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size),
+    both uint8 (A.2).
+
+    Label maps are resized by nearest neighbour, so that no new ids appear.
+    """
+    images = np.empty((len(image_pairs), size, size, channels), np.uint8)
+    labels = np.empty((len(image_pairs), size, size), np.uint8)
+    for index, pair in enumerate(progress(image_pairs, "reading images", unit="image")):
+        images[index] = read_image(pair.image, size, size, channels)
+        labels[index] = cv2.resize(
+            read_label_map(pair.label), (size, size), interpolation=cv2.INTER_NEAREST
+        )
+    return images, labels

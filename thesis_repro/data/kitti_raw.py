@@ -1,0 +1,122 @@
+"""KITTI's raw drives, read as they are downloaded ("synced and rectified"): calibration, times
+and poses of a folder such as 2011_09_26/2011_09_26_drive_0005_sync.
+
+The three calibration files lie in the folder of the day, beside the drives. A drive may also be a
+link. `kitti.Sequence` reads the frames. Poses follow KITTI's development kit (Geiger et al., Vision
+meets robotics: The KITTI dataset, 2013).
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from thesis_repro.errors import InputError
+from thesis_repro.running.files import listed
+
+# left gray, left colour, then the right ones; frames and time stamps lie in them
+IMAGE_FOLDERS = ("image_00", "image_02", "image_01", "image_03")
+FRAMES, TIMES, OXTS = "data", "timestamps.txt", "oxts/data"
+EARTH_RADIUS = 6378137.0  # metres
+
+
+def is_drive(folder: str | Path) -> bool:
+    """Return whether a folder is a raw drive: it has the measurements of the OXTS, a GPS with
+    inertial sensors.
+    """
+    return (Path(folder) / OXTS).is_dir()
+
+
+def calibration(folder: str | Path, name: str = "cam_to_cam") -> Path:
+    """Calibration file "cam_to_cam", "velo_to_cam" or "imu_to_velo" of a drive's day."""
+    return Path(folder).resolve().parent / f"calib_{name}.txt"
+
+
+def files(folder: str | Path) -> list[Path]:
+    """Files that the poses of a drive are made from, beside the calibration of its cameras."""
+    names = "imu_to_velo", "velo_to_cam"
+    return [*(calibration(folder, name) for name in names), *_measurements(folder)]
+
+
+def _measurements(folder: str | Path) -> list[Path]:
+    return listed(Path(folder) / OXTS, "*.txt")
+
+
+def read_times(path: str | Path) -> np.ndarray:
+    """Times since the first frame, (n,), seconds, from a file of time stamps. Raises InputError
+    unless they increase.
+    """
+    try:
+        stamps = np.array(_text(Path(path)).strip().splitlines(), "datetime64[ns]")
+    except ValueError as error:
+        raise InputError(f"{path}: must hold one time stamp a line: {error}") from None
+    times = (stamps - stamps[:1]) / np.timedelta64(1, "s")
+    if not len(times) or not (np.diff(times) > 0).all():
+        raise InputError(f"{path}: must hold time stamps that increase, one line a frame")
+    return times
+
+
+def read_poses(folder: str | Path) -> np.ndarray:
+    """Camera-to-world poses of the rectified left gray camera, (n, 4, 4), metres; the first one
+    is the identity.
+
+    Raises InputError, naming the file, if a calibration or a measurement is missing or malformed.
+    """
+    to_camera = np.eye(4)  # inertial unit to laser scanner to camera 0 to its rectified frame
+    for name, rotation, translation in (
+        ("imu_to_velo", "R", "T"),
+        ("velo_to_cam", "R", "T"),
+        ("cam_to_cam", "R_rect_00", None),
+    ):
+        step, path = np.eye(4), calibration(folder, name)
+        step[:3, :3] = _numbers(path, rotation, 9).reshape(3, 3)
+        step[:3, 3] = _numbers(path, translation, 3) if translation else 0
+        to_camera = step @ to_camera
+    measured = np.array([_numbers(path, None, 30)[:6] for path in _measurements(folder)])
+    if not len(measured):
+        raise InputError(f"{Path(folder) / OXTS}: holds no measurements, one file a frame")
+    poses = _imu_poses(measured)
+    return to_camera @ np.linalg.inv(poses[0]) @ poses @ np.linalg.inv(to_camera)
+
+
+def _imu_poses(measured: np.ndarray) -> np.ndarray:
+    """Poses of the inertial unit, (n, 4, 4), in metres east, north and up.
+
+    measured: (n, 6), latitude and longitude (degrees), altitude (metres), roll, pitch and yaw
+    (radians). Mercator's projection has the scale of the first latitude.
+    """
+    from scipy.spatial.transform import Rotation  # takes 0.4 s to load
+
+    latitude, longitude = np.radians(measured[:, 0]), np.radians(measured[:, 1])
+    radius = EARTH_RADIUS * np.cos(latitude[0])
+    poses = np.tile(np.eye(4), (len(measured), 1, 1))
+    poses[:, 0, 3] = radius * longitude
+    poses[:, 1, 3] = radius * np.log(np.tan(np.pi / 4 + latitude / 2))
+    poses[:, 2, 3] = measured[:, 2]
+    poses[:, :3, 3] -= poses[0, :3, 3]  # metres from here, not from Greenwich, keep more digits
+    # yaw, then pitch, then roll, each about the axes that the earlier ones have turned
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", measured[:, :2:-1]).as_matrix()
+    return poses
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be read: {reason}") from None
+
+
+def _numbers(path: Path, key: str | None, count: int) -> np.ndarray:
+    """Return the `count` numbers of a file, or of its line `key`."""
+    lines = _text(path).splitlines()
+    texts = [
+        line.removeprefix(f"{key}:") for line in lines if not key or line.startswith(f"{key}:")
+    ]
+    try:
+        numbers = np.array(texts[0].split(), np.float64)
+    except (ValueError, IndexError):
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        what = f"a line '{key}:' of" if key else "a line of"
+        raise InputError(f"{path}: must hold {what} {count} finite numbers")
+    return numbers

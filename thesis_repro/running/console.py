@@ -1,0 +1,312 @@
+"""What a run says and how it ends: the log, the summary, signals, and one-line errors for a lack
+of space or memory.
+
+This module imports only the standard library, so it still works if there is too little memory for
+other packages.
+"""
+
+import ctypes
+import errno
+import logging
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from logging.handlers import MemoryHandler
+from pathlib import Path
+from typing import Any
+
+from thesis_repro.errors import InputError, one_line
+
+LOG = "log.txt"
+RECORD = "made-from.json"  # in every folder of results, see `results.stage`
+# what a user can do about a system error, by its number
+ROOM, ACCESS = (
+    "make room on its disk, or name a folder on another",
+    "name a folder that you may write to",
+)
+REMEDIES = {
+    errno.ENOSPC: ROOM,
+    errno.EDQUOT: ROOM,
+    errno.EFBIG: "allow larger files (ulimit -f)",
+    errno.EROFS: ACCESS,
+    errno.EACCES: ACCESS,
+    errno.EPERM: ACCESS,
+    errno.EMFILE: "allow more open files (ulimit -n)",
+    errno.EIO: "check its disk, or the connection to it",
+}
+NO_MEMORY = "memory ran out; free some, or use fewer processes (--jobs, JOBS), and start again"
+WORKER_KILLED = (
+    "a process was killed, most likely because memory ran out; start again with fewer processes (--jobs, "
+    "JOBS) to resume"
+)
+# texts of libraries' own errors
+NO_MEMORY_TEXTS = (
+    "MemoryError",
+    "nsufficient memory",
+    "annot allocate memory",
+    "nable to allocate",
+    "bad_alloc",
+    "ut of memory",
+    "ResourceExhausted",
+    "failed to map segment",
+    "can't start new thread",
+)
+
+
+class _Printer(logging.Handler):
+    """Prints messages and warnings on standard error, where they do not mix with results."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno < logging.ERROR and not hasattr(record, "printed"):
+            prefix = "warning: " if record.levelno == logging.WARNING else ""
+            print(prefix + one_line(record.getMessage()), file=sys.stderr, flush=True)
+
+
+log = logging.getLogger("thesis_repro")
+log.addHandler(_Printer())
+log.setLevel(logging.INFO)
+log.propagate = False
+
+
+def explain(error: BaseException | None) -> str | None:
+    """Return one line for an InputError or for a lack of space, permission or memory; None for any
+    other error.
+
+    The line names the file, if it is known, and says what to do. The causes of the error are
+    searched too.
+    """
+    if isinstance(error, InputError):
+        return str(error)
+    while error is not None:
+        number, path, text = (
+            number_of(error),
+            getattr(error, "filename", None),
+            f"{type(error).__name__}: {error}",
+        )
+        if number == errno.ENOMEM or any(words in text for words in NO_MEMORY_TEXTS):
+            return NO_MEMORY
+        if text.startswith("TerminatedWorkerError"):  # of joblib
+            return WORKER_KILLED
+        if (
+            number in REMEDIES
+            or isinstance(error, OSError)
+            and path is not None
+            and number is not None
+        ):
+            return f"{path or 'a file'}: {os.strerror(number)}; {REMEDIES.get(number, 'check the path')}"
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def number_of(error: BaseException) -> int | None:
+    """Return the system's number of an error, or None. HDF5 and other libraries give the
+    system's text only.
+    """
+    numbers = (
+        number
+        for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        if os.strerror(number) in str(error)
+    )
+    return getattr(error, "errno", None) or next(numbers, None)
+
+
+def need_addresses(gigabytes: int) -> None:
+    """Raise InputError if `ulimit -v` is too low. Some libraries would then end the process
+    without a message.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < gigabytes * 2**30:
+        raise InputError(
+            f"ulimit -v {limit // 1024}: too little memory; allow {gigabytes * 2**20} or more"
+        )
+
+
+def report_error(error: Exception) -> int:
+    """Print the error that ends a command, and return the exit status. Raises an error that
+    `explain` does not know.
+    """
+    line = explain(error)
+    if line is None:
+        raise error
+    print(f"error: {one_line(line)}", file=sys.stderr)
+    return 1
+
+
+def run_main(main: Callable[[], object]) -> None:
+    """Call the function of a program, and end the process with `report_error` if it fails."""
+    try:
+        main()
+    except Exception as error:
+        sys.exit(report_error(error))
+
+
+# The log
+
+
+class _LogFile(MemoryHandler):
+    """The log of a run. It is written once the folder holds results, so a refused run leaves no
+    files.
+    """
+
+    target: Any  # the FileHandler; of a MemoryHandler it may be None
+
+    def __init__(self, folder: Path, has_results: bool) -> None:
+        super().__init__(
+            1,
+            target=logging.FileHandler(folder / LOG, delay=True, encoding="utf-8"),
+            flushOnClose=False,
+        )
+        self.target.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+        # a full disk is reported when results are written
+        self.target.handleError = lambda record: None
+        self.folder, self.has_results, self.warnings, self.started = (
+            folder,
+            has_results,
+            0,
+            time.monotonic(),
+        )
+
+    def shouldFlush(self, record: logging.LogRecord) -> bool:
+        self.warnings += record.levelno == logging.WARNING
+        self.has_results = (
+            self.has_results
+            or (self.folder / RECORD).exists()
+            or any(self.folder.glob(f"*/{RECORD}"))
+        )
+        return self.has_results
+
+    def end(self, text: str, reused: int = 0) -> None:
+        """Print a summary of the run, its time, the number of results reused from an earlier
+        run, and its warnings.
+        """
+        seconds = timedelta(seconds=round(time.monotonic() - self.started))
+        reused_text = f"from an earlier run: {reused:,}; " if reused else ""
+        text += f"\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}"
+        print(text, flush=True)
+        for line in text.splitlines():
+            log.info(line, extra={"printed": True})
+
+
+@contextmanager
+def logged(folder: str | Path, title: str, has_results: bool = False) -> Iterator[_LogFile]:
+    """Log into a folder what `log` prints, Python's warnings, and the error that ends the block.
+
+    title: the first line. has_results: write the log at once, not only when results appear.
+    """
+    handler = _LogFile(Path(folder), has_results)
+    loggers = log, logging.getLogger("py.warnings")
+    for logger in loggers:
+        logger.addHandler(handler)
+    logging.captureWarnings(True)
+    log.info(title, extra={"printed": True})
+    try:
+        yield handler
+    except Exception as error:
+        reason = explain(error)
+        log.error(reason or type(error).__name__, exc_info=reason is None)
+        raise
+    except BaseException as error:
+        log.error("stopped: %r", error)
+        raise
+    finally:
+        logging.captureWarnings(False)
+        for logger in loggers:
+            logger.removeHandler(handler)
+        with suppress(OSError):
+            handler.target.close()
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Hide what libraries' own code prints on standard output and error within the block."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    originals = os.dup(1), os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(null, stream)
+        yield
+    finally:
+        sys.stdout.flush()
+        for stream, original in enumerate(originals, 1):
+            os.dup2(original, stream)
+        for descriptor in (*originals, null):
+            os.close(descriptor)
+
+
+# The end of a process
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that worker processes end too.
+
+    They raise KeyboardInterrupt with the signal's number. An ignored signal (nohup) stays ignored.
+    The exception is lost in a callback of compiled code, such as Numba's compiler; then
+    `check_stop` raises it again.
+    """
+
+    def stop(number: int, _: object) -> None:
+        _stops.append(number)
+        raise KeyboardInterrupt(number)
+
+    handlers = {
+        number: signal.getsignal(number)
+        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+    }
+    for number in handlers:
+        signal.signal(number, stop)
+    try:
+        yield
+        check_stop()
+    finally:
+        _stops.clear()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+_stops: list[int] = []  # numbers of the signals that arrived within `stoppable`
+
+
+def check_stop() -> None:
+    """Raise KeyboardInterrupt if a signal to stop has arrived (see `stoppable`)."""
+    if _stops:
+        raise KeyboardInterrupt(_stops[0])
+
+
+def end_with_parent() -> None:
+    """Let the system kill this worker process when its parent ends, even if the parent is
+    killed (Linux only).
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+        if os.getppid() == 1:
+            os._exit(1)  # the parent has ended already
+
+
+def interrupt_without(*ancestors: int) -> None:
+    """Send SIGTERM to this process when it or one of the `ancestors` (process ids) loses its
+    parent, even if that was killed (Linux only). A thread looks once a second.
+    """
+
+    def parents() -> list[str]:
+        stats = (Path(f"/proc/{process}/stat").read_text() for process in (os.getpid(), *ancestors))
+        return [stat.rpartition(")")[2].split()[1] for stat in stats]
+
+    def watch() -> None:
+        with suppress(OSError):
+            at_start = parents()
+            while parents() == at_start:
+                time.sleep(1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    if Path("/proc/self/stat").exists():
+        threading.Thread(target=watch, daemon=True).start()

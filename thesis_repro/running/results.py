@@ -1,0 +1,361 @@
+"""Folders of results: which inputs they were made from, who works in them, and how a stopped job
+resumes.
+
+A *stage* is a folder of results with a record of their inputs (`stage`). Its lock keeps other runs
+out (`claimed`). A *checkpoint* is one file from which a long job resumes (`store`, `resume`). A
+*digest* stands for the content of an input and has twelve hexadecimal digits.
+"""
+
+import ast
+import fcntl
+import hashlib
+import importlib.metadata
+import json
+import os
+import sqlite3
+import stat
+import time
+import zipfile
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from functools import lru_cache
+from modulefinder import ModuleFinder
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from thesis_repro.errors import InputError
+from thesis_repro.running import console
+from thesis_repro.running.console import LOG, RECORD
+from thesis_repro.running.files import TEMPORARY, atomic, progress, write_text
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
+    """Prepare a folder for results that are made from `inputs` (JSON values), and return its path.
+
+    Results that an earlier run made from the same inputs stay. Temporary files of killed runs are
+    deleted. Results of other inputs are moved to a new folder beside it, FOLDER.old-1, or
+    InputError is raised if `replace` is False. Raises InputError also if another run uses the
+    folder, and if most of its inputs have other names (results of another kind).
+    """
+    folder = Path(folder)
+    with claimed(folder):
+        inputs, earlier = json.loads(json.dumps(inputs, default=str)), record(folder)
+        names = [path.name for path in folder.iterdir()]
+        if earlier is None and not all(name == LOG or TEMPORARY.fullmatch(name) for name in names):
+            raise InputError(
+                f"{folder}: holds files that this project did not make; choose an empty or new folder"
+            )
+        if earlier is not None and earlier != inputs:
+            changed = ", ".join(
+                sorted(key for key in inputs | earlier if inputs.get(key) != earlier.get(key))
+            )
+            if not replace:
+                raise InputError(
+                    f"{folder}: holds results of other settings ({changed}); name another folder"
+                )
+            if 2 * len(earlier.keys() & inputs.keys()) <= len(earlier.keys() | inputs.keys()):
+                raise InputError(
+                    f"{folder}: holds results of another kind, made from {', '.join(sorted(earlier))}; "
+                    "choose another folder"
+                )
+            _move_aside(folder, changed)
+        sweep(folder)
+        if earlier != inputs:
+            write_text(folder / RECORD, json.dumps(inputs, indent=1, sort_keys=True))
+    return folder
+
+
+def _move_aside(folder: Path, changed: str) -> None:
+    """Move all that is in a folder of results into a new folder beside it. Nothing is deleted,
+    because a user may have changed or added files.
+    """
+    # the record goes last, so that a killed move can be repeated; the log is being written
+    paths = sorted(folder.glob("*"), key=lambda path: path.name == RECORD)
+    paths = [path for path in paths if path.name != LOG]
+    if len(paths) < 2:  # there is only the record
+        return
+    # beside the folder itself, not beside a link to it, which may lie on another disk
+    place, number = folder.resolve(), 1
+    while (aside := place.with_name(f"{place.name}.old-{number}")).exists():
+        number += 1
+    aside.mkdir()
+    for path in paths:
+        path.rename(aside / path.name)
+    console.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
+
+
+def record(folder: str | Path) -> Any:
+    """Return the inputs of the results in a stage's folder as a dict, or None if the folder is
+    not a stage.
+    """
+    path = Path(folder) / RECORD
+    if not path.is_file():
+        return None
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError):
+        raise InputError(f"{path}: is damaged; delete its folder") from None
+
+
+def made_from(folder: str | Path) -> str:
+    """Return a digest of the inputs of the results in a stage's folder."""
+    return content(Path(folder) / RECORD)
+
+
+def check_worker(folder: str | Path, made_from: dict[str, Any], **here: Any) -> None:
+    """Raise InputError if this worker sees another record in a stage's folder, or has other inputs.
+
+    made_from: the record that the main process sees. here: inputs as this worker has them, such as
+    package versions.
+    """
+    if record(folder) != made_from:
+        raise InputError(
+            f"{folder}: this worker sees other files there; all workers need the same folders under the "
+            "same paths"
+        )
+    if made_from | here != made_from:
+        raise InputError(
+            "this worker has another model, or another version of thesis_repro or its packages; give all "
+            "workers the same, and restart them"
+        )
+
+
+def sweep(folder: str | Path) -> None:
+    """Delete the temporary files of killed runs in and below a folder. The caller must hold its
+    lock.
+    """
+    for path in Path(folder).rglob(".*"):
+        if TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+_held: set[tuple[int, int]] = set()  # device and inode of each path that this process has locked
+
+
+@contextmanager
+def claimed(folder: str | Path) -> Iterator[None]:
+    """Create a folder if needed, and lock it until the block ends. Raises InputError if another
+    process has locked it.
+
+    Folders that were created here and are still empty at the end are removed.
+    """
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; name a folder for the results")
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(folder):
+            yield
+    finally:
+        with suppress(OSError):
+            for path in new:
+                path.rmdir()
+
+
+@contextmanager
+def locked(path: str | Path) -> Iterator[None]:
+    """Lock an existing folder or file until the block ends. The same process may lock it again
+    within the block.
+    """
+    status = os.stat(path)
+    key = status.st_dev, status.st_ino
+    if key in _held:
+        yield
+        return
+    descriptor = os.open(path, os.O_RDONLY)  # the lock ends with the process, even if it is killed
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{path}: another run uses it; wait, or name another folder") from None
+        except OSError:
+            pass  # the file system has no locks
+        _held.add(key)
+        yield
+    finally:
+        _held.discard(key)
+        os.close(descriptor)
+
+
+TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
+
+
+def kept_table(path: str | Path, rows: int | None = None, **options: Any) -> pd.DataFrame | None:
+    """Return the table that an earlier run wrote to a CSV file, or None if there is none or it is
+    damaged.
+
+    Damaged means empty, cut off, with another number of rows than `rows`, or with text outside
+    TEXT_COLUMNS.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    with suppress(ValueError, UnicodeError):  # pandas' errors are ValueErrors
+        table = pd.read_csv(path, **options)
+        numeric = all(
+            name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table
+        )
+        if numeric and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
+            return table
+    console.log.warning(f"{path}: is damaged and will be made again")
+    return None
+
+
+# Checkpoints
+
+
+def store(path: str | Path, job: Any, arrays: dict[str, Any]) -> None:
+    """Write a checkpoint: `job` (JSON values) and arrays by name."""
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.savez(
+            file, job=json.dumps(job), **{f"array {name}": array for name, array in arrays.items()}
+        )
+
+
+def resume(path: str | Path) -> Any:
+    """Return (job, arrays) of a checkpoint that `store` wrote, or None if there is no file.
+
+    Raises InputError for a damaged file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as checkpoint:
+            arrays = {
+                name.removeprefix("array "): checkpoint[name]
+                for name in checkpoint.files
+                if name != "job"
+            }
+            return json.loads(str(checkpoint["job"])), arrays
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        raise InputError(f"{path}: is damaged; delete it to start from the beginning") from None
+
+
+# Digests
+
+
+@lru_cache
+def code(*places: str) -> str:
+    """Return a digest of the code of folders ("odometry") or modules ("study/controls") of this
+    package.
+
+    The modules of this package that they import are included. Comments and docstrings are not.
+    """
+    digest = hashlib.sha256()
+    for path in _modules(places):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if (
+                isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
+                and ast.get_docstring(node) is not None
+            ):
+                node.body = node.body[1:]
+        digest.update(f"{path.relative_to(_PACKAGE)}{ast.dump(tree)}".encode())
+    return digest.hexdigest()[:12]
+
+
+class _PackageFinder(ModuleFinder):
+    """Finds the imported modules of this package, but not those of other packages."""
+
+    def find_module(self, name: str, path: Any, parent: Any = None) -> Any:
+        if path is None and name != _PACKAGE.name:
+            raise ImportError(name)
+        return super().find_module(name, path, parent)
+
+
+def _modules(places: Iterable[str]) -> list[Path]:
+    """Files of folders or modules of this package and of all its modules that they import,
+    sorted.
+    """
+    finder: Any = _PackageFinder([str(_PACKAGE.parent)])  # its types lack __file__
+    for place in places:
+        for path in sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"]:
+            finder.import_hook(".".join(path.relative_to(_PACKAGE.parent).with_suffix("").parts))
+    return sorted({Path(module.__file__) for module in finder.modules.values() if module.__file__})
+
+
+def made_with(*packages: str) -> dict[str, Any]:
+    """Return the versions of packages that results depend on."""
+    return {"versions": {name: importlib.metadata.version(name) for name in packages}}
+
+
+def listing(paths: Iterable[str | Path]) -> str:
+    """Return one digest of the names and contents of files."""
+    files = [Path(path) for path in paths]
+    lines = [f"{path.name}:{digest}\n" for path, digest in zip(files, contents(files), strict=True)]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
+
+
+def content(path: str | Path) -> str:
+    """Return a digest of the bytes of one file."""
+    return contents([path])[0]
+
+
+# seconds; a younger file may change again without a new date, so its digest is not remembered
+SETTLED = 0.1
+
+
+def contents(paths: Iterable[str | Path]) -> list[str]:
+    """Return digests of the bytes of files, in order. Raises InputError for a path that is not a
+    regular file.
+
+    The digests are remembered in the build folder. A file is read again only if its path, size,
+    dates or inode differ.
+    """
+    files = [Path(path).absolute() for path in paths]
+    identities = {path: _identity(path) for path in files}
+    keys = {
+        path: (json.dumps(str(path)), json.dumps(identity)) for path, identity in identities.items()
+    }
+    digests = {}
+    with suppress(OSError, sqlite3.Error), _digest_database() as database:
+        query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
+        rows = ((path, database.execute(query, key).fetchone()) for path, key in keys.items())
+        digests = {path: row[0] for path, row in rows if row}
+    unknown = [path for path in keys if path not in digests]
+    with ThreadPoolExecutor(4) as pool:
+        read = pool.map(_sha256, unknown)
+        digests |= zip(unknown, progress(read, "reading the data once", len(unknown), unit="file"))
+    settled = [
+        path for path in unknown if max(identities[path][1:3]) < time.time_ns() - SETTLED * 1e9
+    ]
+    with suppress(OSError, sqlite3.Error), _digest_database() as database:
+        database.executemany(
+            "INSERT OR REPLACE INTO digests VALUES (?, ?, ?)",
+            [(*keys[path], digests[path]) for path in settled],
+        )
+    return [digests[path][:12] for path in files]
+
+
+def _identity(path: Path) -> tuple[int, ...]:
+    status = os.stat(path)
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: is not a file; data must be in files")
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
+
+
+@contextmanager
+def _digest_database() -> Iterator[sqlite3.Connection]:
+    """Open the database of digests. The caller ignores its errors and then reads the files
+    again.
+    """
+    folder = Path(os.environ.get("THESIS_REPRO_BUILD") or _PACKAGE.parent / "build")
+    folder.mkdir(parents=True, exist_ok=True)
+    with closing(sqlite3.connect(folder / "digests.sqlite", timeout=2)) as database, database:
+        database.execute(
+            "CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)"
+        )
+        yield database
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

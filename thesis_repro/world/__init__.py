@@ -1,7 +1,0 @@
-"""The embedded world: rendered street drives with exact poses and label maps, in the layouts of
-the real data.
-"""
-
-from thesis_repro.world.dataset import write
-
-__all__ = ["write"]
