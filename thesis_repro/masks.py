@@ -324,7 +324,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             **asdict(masks.settings),
             dilation_width=masks.dilation_width,
             frames=results.listing(masks.frame_paths),
-            code=results.code("masks"),
+            code=results.code("thesis_repro.masks"),
             **results.made_with("opencv-python-headless"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):

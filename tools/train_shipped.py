@@ -212,7 +212,7 @@ def train(camvid, kitti_semantic, pseudo, folder):
     )
     optimizer.build(model.trainable_variables)
     made_from = {
-        "code": results.code("segmentation/unet"),
+        "code": results.code("thesis_repro.segmentation.unet"),
         "tool": results.content(Path(__file__)),
         "phases": [COMMON, LAST],
         "steps": EPOCH,

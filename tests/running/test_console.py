@@ -63,35 +63,90 @@ def test_a_checkpoint_is_read_back_and_holds_no_code(tmp_path):
         results.resume(file)
 
 
-def test_the_digest_of_code_ignores_comments_and_follows_imports(tmp_path, monkeypatch):
+HOUSE = {
+    "house": "def f():\n    return 1\n",
+    "garden": "x = 1\n",
+    "room/__init__": "",
+    "room/table": "import beside\nfrom package.room import chair\n",
+    "room/chair": "from package import house\ny = house.f()\n",
+    "room/words": "text = 'unread'\n",
+}
+
+
+@pytest.fixture
+def version(tmp_path, monkeypatch):
+    """version(module, {file: code}): the digest of the code of a made-up package."""
     monkeypatch.setattr(results, "_PACKAGE", tmp_path / "package")
-    plain = {
-        "__init__": "",
-        "room____init__": "",
-        "house": "def f():\n    return 1\n",
-        "garden": "x = 1\n",
-        "room__table": "import beside\nfrom package.room import chair\n",
-        "room__chair": "from package import house\n",
-    }
+    monkeypatch.setattr(results, "PROJECT", ("package",))
     (tmp_path / "beside.py").touch()  # another package beside this one
 
-    def version(place="room", **changed):
-        for name, text in {**plain, **changed}.items():
-            files.write_text(
-                tmp_path / "package" / f"{name.replace('__', '/', name != '__init__')}.py", text
-            )
+    def digest(module="package.room.table", changed=None):
+        for name, text in {**HOUSE, **(changed or {})}.items():
+            files.write_text(tmp_path / "package" / f"{name}.py", text)
         results.code.cache_clear()
-        return results.code(place)
+        return results.code(module)
 
-    first = version()
-    assert version(house='# why\ndef f():\n    """What."""\n    return 1\n') == first
-    assert version(house="def f():\n    return 2\n") != first
-    assert version(room__chair="from package import house\nx = 2\n") != first
-    assert version(garden="x = 2\n") == first
-    assert version("room/table", house="def f():\n    return 2\n") != version("room/table")
-    with pytest.raises(ImportError, match="attic"):
-        version("attic")
+    yield digest
     results.code.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"house": '"""What it is."""\n\n# why\ndef f():\n    """What."""\n    return 1\n'},
+        {"garden": "x = 2\n"},
+        {"room/chair": "y = house.f()\nfrom package import house, garden\n", "garden": ""},
+        # moved to another module
+        {"house": "", "room/chair": "from package import house\ny = house.f()\n" + HOUSE["house"]},
+    ],
+)
+def test_words_and_places_of_code_do_not_change_its_digest(version, changed):
+    assert version(changed=changed) == version()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"house": "def f():\n    return 2\n"},
+        {"room/chair": "from package import house\ny = house.f()\nz = 2\n"},
+        {"room/table": "import beside\nfrom package.room import chair, words\n"},
+    ],
+)
+def test_changed_code_changes_its_digest(version, changed):
+    assert version(changed=changed) != version()
+
+
+def test_other_messages_do_not_change_the_digest_of_code(version):
+    code = (
+        "def g(x):\n    if x:\n        raise InputError(f'{x}: bad')\n    console.log.info('so')\n"
+    )
+    same = "def g(x):\n    if x:\n        raise InputError('worse')\n    console.log.info('not')\n"
+    other = code.replace("if x", "if not x")
+    digests = [version(changed={"room/chair": text}) for text in (code, same, other)]
+    assert digests[0] == digests[1] != digests[2]
+    with pytest.raises(ImportError, match="attic"):
+        version("package.attic")
+
+
+DATA = {"cityscapes", "kitti", "kitti_raw", "trajectories"}
+
+
+@pytest.mark.parametrize(
+    ("modules", "rooms"),
+    [
+        (["masks"], {"data", "masks"}),
+        (["odometry", "study.jobs"], {"data", "masks", "odometry", "running", "study"}),
+        (["segmentation.training"], {"data", "segmentation"}),
+        (["segmentation.prediction"], {"data", "segmentation"}),
+    ],
+)
+def test_the_rooms_that_results_come_from(modules, rooms):
+    names = results.source_modules(*[f"thesis_repro.{name}" for name in modules])
+    parts = [name.split(".")[1:] for name in names]
+    assert {part[0] for part in parts} == rooms
+    assert {part[1] for part in parts if part[0] == "data"} <= DATA
+    assert {part[1] for part in parts if part[0] == "running"} <= {"compiled"}
+    assert {part[1] for part in parts if part[0] == "study"} <= {"jobs", "controls", "sources"}
 
 
 def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeypatch):

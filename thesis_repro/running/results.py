@@ -20,7 +20,6 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
-from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any
 
@@ -242,44 +241,96 @@ def resume(path: str | Path) -> Any:
 # Digests
 
 
+PROJECT = ("thesis_repro", "street_world")
+# Rooms that no number comes from: messages, files, folders and options. How loops are compiled can
+# change a number.
+NO_NUMBERS = ("thesis_repro.errors", "thesis_repro.running", "thesis_repro.command")
+EXCEPT = ("thesis_repro.running.compiled",)
+
+
 @lru_cache
-def code(*places: str) -> str:
-    """Return a digest of the code of folders ("odometry") or modules ("study/controls") of this
-    package.
+def code(*modules: str) -> str:
+    """Return a digest of the code that results come from: of modules ("thesis_repro.masks"), and of
+    all modules of this project that they import.
 
-    The modules of this package that they import are included. Comments and docstrings are not.
+    Code counts, but not its place: not its module, its order there, imports, comments, docstrings,
+    and what errors and the log say. Modules that no number comes from are left out (NO_NUMBERS).
     """
-    digest = hashlib.sha256()
-    for path in _modules(places):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
-            if (
-                isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
-                and ast.get_docstring(node) is not None
-            ):
-                node.body = node.body[1:]
-        digest.update(f"{path.relative_to(_PACKAGE)}{ast.dump(tree)}".encode())
-    return digest.hexdigest()[:12]
+    pieces = []
+    for tree in _sources(modules).values():
+        _drop_words(tree)
+        pieces += [ast.dump(statement) for statement in tree.body]
+    return hashlib.sha256("\n".join(sorted(pieces)).encode()).hexdigest()[:12]
 
 
-class _PackageFinder(ModuleFinder):
-    """Finds the imported modules of this package, but not those of other packages."""
-
-    def find_module(self, name: str, path: Any, parent: Any = None) -> Any:
-        if path is None and name != _PACKAGE.name:
-            raise ImportError(name)
-        return super().find_module(name, path, parent)
+def source_modules(*modules: str) -> list[str]:
+    """Return the modules whose code decides results of the given ones, sorted."""
+    return sorted(_sources(modules))
 
 
-def _modules(places: Iterable[str]) -> list[Path]:
-    """Files of folders or modules of this package and of all its modules that they import,
-    sorted.
-    """
-    finder: Any = _PackageFinder([str(_PACKAGE.parent)])  # its types lack __file__
-    for place in places:
-        for path in sorted((_PACKAGE / place).glob("*.py")) or [_PACKAGE / f"{place}.py"]:
-            finder.import_hook(".".join(path.relative_to(_PACKAGE.parent).with_suffix("").parts))
-    return sorted({Path(module.__file__) for module in finder.modules.values() if module.__file__})
+def _sources(modules: Iterable[str]) -> dict[str, ast.Module]:
+    trees: dict[str, ast.Module] = {}
+    waiting = list(modules)
+    while waiting:
+        name = waiting.pop()
+        if name in trees or (name.startswith(NO_NUMBERS) and name not in EXCEPT):
+            continue
+        path = _file(name)
+        if path is None:
+            raise ImportError(f"{name}: no such module of this project")
+        trees[name] = ast.parse(path.read_text(encoding="utf-8"))
+        waiting += _imported(trees[name])
+    return trees
+
+
+def _imported(tree: ast.Module) -> list[str]:
+    """Return the modules of this project that a module imports."""
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inner = [f"{node.module}.{alias.name}" for alias in node.names]
+            modules = [name for name in inner if _file(name)]
+            names += modules
+            if len(modules) < len(inner):  # some names are functions of the package itself
+                names.append(node.module)
+    return [name for name in names if _file(name)]
+
+
+def _file(module: str) -> Path | None:
+    """Return the source file of a module or package of this project, or None for any other name."""
+    if module.partition(".")[0] not in PROJECT:
+        return None
+    place = _PACKAGE.parent.joinpath(*module.split("."))
+    for path in (place.with_suffix(".py"), place / "__init__.py"):
+        if path.is_file():
+            return path
+    return None
+
+
+def _drop_words(tree: ast.Module) -> None:
+    """Drop imports, docstrings and the arguments of errors and log messages from a syntax tree."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and _says_something(node.func):
+            node.args = []
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+            node.body = [statement for statement in node.body if not _is_no_code(statement)]
+
+
+def _says_something(function: ast.expr) -> bool:
+    if isinstance(function, ast.Name):
+        return function.id == "InputError"
+    return isinstance(function, ast.Attribute) and ast.unparse(function).startswith("console.log.")
+
+
+def _is_no_code(statement: ast.stmt) -> bool:
+    """Say whether a statement is an import or a text that stands alone."""
+    if isinstance(statement, (ast.Import, ast.ImportFrom)):
+        return True
+    if not isinstance(statement, ast.Expr) or not isinstance(statement.value, ast.Constant):
+        return False
+    return isinstance(statement.value.value, str)
 
 
 def made_with(*packages: str) -> dict[str, Any]:

@@ -100,7 +100,7 @@ def _open(
 def _arithmetic() -> dict[str, Any]:
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
     return results.made_with("tensorflow", "keras", "opencv-python-headless") | {
-        "code": results.code("segmentation/prediction"),
+        "code": results.code("thesis_repro.segmentation.prediction"),
         "arithmetic": segmentation.arithmetic(),
     }
 

@@ -95,7 +95,7 @@ def _measure(
     results.stage(
         folder,
         options=options,
-        code=results.code("study/ablations"),
+        code=results.code("thesis_repro.study.ablations"),
         **results.made_with("opencv-python-headless", "numpy", "numba"),
         sequence=results.listing(sequence.files),
         labels=results.listing([labels / path.name for path in sequence.frame_paths]),
