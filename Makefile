@@ -83,7 +83,7 @@ help:
 	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each)"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts; LABELS='/path /path' adds label maps"
-	@echo "make trainings   after make figures: train three more networks, and compare masks from all four"
+	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (half an hour)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
 	@echo "make setup       only install the pinned packages into .venv; GPU=1 adds CUDA for an NVIDIA GPU"

@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections import Counter
 from pathlib import Path
 
 from thesis_repro import segmentation
@@ -25,6 +24,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.running import console
 
 EMULATOR = "qemu-x86_64"
+DIGEST = re.compile("[0-9a-f]{12}")
 APPROXIMATE = re.compile(r"\bv?r(?:cp|sqrt)(?:14|28)?[ps][sd]\b")  # in QEMU's log of instructions
 
 
@@ -48,18 +48,17 @@ def digest() -> str:
     return hashlib.sha256(b"".join(value.tobytes() for value in values)).hexdigest()[:12]
 
 
-def emulated_digest(emulator: str) -> tuple[str, Counter]:
-    """Return the digest of an emulated process, and {(instruction, function): number of places}
-    for the approximate instructions that it has come to.
+def emulated_digest(emulator: str) -> tuple[str, list[str]]:
+    """Return the digest of an emulated process, and where it came to approximate instructions.
 
-    QEMU logs each piece of code once, when the process comes to it for the first time.
+    QEMU logs each piece of code when the process comes to it for the first time.
     """
-    code = "import emulated; print(emulated.digest())"
-    seen: Counter = Counter()
+    code = "import emulated; print(emulated.digest()); print(open('/proc/self/maps').read())"
+    places: list[tuple[str, int]] = []
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
         os.mkfifo(log)  # the log has gigabytes, so it is read while it is written
-        reader = threading.Thread(target=_count, args=(log, seen))
+        reader = threading.Thread(target=_read, args=(log, places))
         reader.start()
         output = subprocess.run(
             [emulator, "-cpu", "max", "-d", "in_asm", "-D", log, sys.executable, "-c", code],
@@ -69,18 +68,29 @@ def emulated_digest(emulator: str) -> tuple[str, Counter]:
             check=True,
         ).stdout
         reader.join()
-    return output.split()[-1], seen
+    lines = output.splitlines()
+    start = next(number for number, line in enumerate(lines) if DIGEST.fullmatch(line))
+    maps = [line for line in lines[start + 1 :] if line]
+    return lines[start], [f"{name} in {_place(address, maps)}" for name, address in places]
 
 
-def _count(log: Path, seen: Counter) -> None:
-    function = ""
+def _read(log: Path, places: list[tuple[str, int]]) -> None:
+    """Collect the approximate instructions of QEMU's log, and their addresses."""
     with open(log, errors="replace") as lines:
         for line in lines:
-            if line.startswith("IN:"):
-                function = line[3:].strip()
-            elif found := APPROXIMATE.search(line):
-                seen[found[0], function] += 1
-                print(line, function, file=sys.stderr)
+            instruction = APPROXIMATE.search(line)
+            if instruction:
+                places.append((instruction[0], int(line.partition(":")[0], 16)))
+
+
+def _place(address: int, maps: list[str]) -> str:
+    """Return the file and the offset in it of an address, from the lines of /proc/self/maps."""
+    for line in maps:
+        span, _, offset, _, _, *path = line.split(maxsplit=5)
+        first, end = (int(bound, 16) for bound in span.split("-"))
+        if first <= address < end and path:
+            return f"{Path(path[0]).name} at {address - first + int(offset, 16):#x}"
+    return "code that was made while running"
 
 
 def main() -> None:
@@ -89,11 +99,14 @@ def main() -> None:
         raise InputError(f"{EMULATOR}: not found; install it (Debian and Ubuntu: qemu-user)")
     native = digest()
     print(f"{native}   on this processor", flush=True)
-    emulated, seen = emulated_digest(emulator)
+    emulated, places = emulated_digest(emulator)
     print(f"{emulated}   emulated, where RCPPS and RSQRTPS are exact")
-    executed = ", ".join(f"{name} ({count} places)" for name, count in seen.items())
-    print(f"approximate instructions in the emulated code: {executed or 'none'}")
-    if native != emulated or seen:
+    print(
+        f"approximate instructions that the emulated training came to: {len(places)}",
+        *places,
+        sep="\n  ",
+    )
+    if native != emulated or places:
         raise InputError("the training depends on the processor's maker; see test_exact.py")
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from thesis_repro.report import audit, gap, style, trainings
 from thesis_repro.running import results
+from thesis_repro.running.settings import ROOT
 from thesis_repro.study import ablations, compare
 
 
@@ -247,3 +248,19 @@ def test_the_summary_spans_all_trainings():
         assert training["count"] == sum(training["verdicts"].values()) == len(rows) > 1
         assert rows["se3_ratio"].between(low, high).all() and {low, high} <= set(rows["se3_ratio"])
         assert (rows["se3_ratio"] <= middle).sum() == (rows["se3_ratio"] >= middle).sum()
+
+
+def test_the_readme_says_what_the_trainings_agree_on():
+    readme = (ROOT / "README.md").read_text()
+    for training in trainings.summary():
+        low, middle, high = training["ranges"]["se3_ratio"]
+        assert f"{low:.2f} to {high:.2f} times" in readme and f"(median {middle:.2f})" in readme
+    thesis, refined = trainings.summary()
+    low, middle, high = thesis["ranges"]["table_4_2_mean"]
+    assert f"{low:.1f} to {high:+.1f} % (median {middle:+.1f} %)" in readme
+    assert (thesis["count"], thesis["verdicts"]["higher"], refined["verdicts"]["higher"]) == (
+        10,
+        9,
+        8,
+    )
+    assert max(refined["ranges"]["controls_beaten"]) == 0
