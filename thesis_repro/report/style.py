@@ -3,7 +3,8 @@ Markdown.
 """
 
 from base64 import b64encode
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,28 +20,27 @@ from thesis_repro.data.cityscapes import LABELS, colorize
 from thesis_repro.running.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
-matplotlib.rcParams.update(
-    {
-        "font.size": 9,
-        "font.sans-serif": ["DejaVu Sans", "sans-serif"],  # each text of an SVG file lists them
-        "axes.titlesize": 9,
-        "axes.labelsize": 9,
-        "legend.fontsize": 8,
-        "legend.frameon": False,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "grid.color": "#dddddd",
-        "grid.linewidth": 0.6,
-        "lines.linewidth": 1.4,
-        "image.interpolation": "nearest",
-        "svg.fonttype": "none",
-        "text.parse_math": False,  # names of files and sequences may contain dollar signs
-        "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
-        "savefig.dpi": 160,
-    }
-)
+# of matplotlib, see `use`; what is not listed has matplotlib's default
+SETTINGS: dict[str, Any] = {
+    "font.size": 9,
+    "font.sans-serif": ["DejaVu Sans", "sans-serif"],  # each text of an SVG file lists them
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "image.interpolation": "nearest",
+    "svg.fonttype": "none",
+    "text.parse_math": False,  # names of files and sequences may contain dollar signs
+    "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
+    "savefig.dpi": 160,
+}
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
@@ -50,6 +50,25 @@ DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"
 # style of keypoints on a frame
 KEYPOINT: dict[str, Any] = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}
 EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges on a frame
+
+
+def use() -> None:
+    """Let matplotlib draw in this style from now on.
+
+    Programs and notebooks call it at their start. Settings of the user's own are reset to
+    matplotlib's defaults, so that figures look the same everywhere. Matplotlib reads its settings
+    when it makes a figure and again when it draws it.
+    """
+    matplotlib.rcdefaults()
+    matplotlib.rcParams.update(SETTINGS)
+
+
+@contextmanager
+def applied() -> Iterator[None]:
+    """Let matplotlib draw in this style within a block, and reset its settings afterwards."""
+    with matplotlib.rc_context():
+        use()
+        yield
 
 
 def line_style(index: int) -> dict[str, Any]:
