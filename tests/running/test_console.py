@@ -1,5 +1,5 @@
 """Folders of results: their inputs, locks and checkpoints; logs, signals, errors of the machine in
-one line; caches of compiled code.
+one line.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.running import compiled, console, files, results
+from thesis_repro.running import console, files, results
 
 
 def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
@@ -173,6 +173,7 @@ def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeyp
 def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, capsys, monkeypatch):
     folder = results.stage(tmp_path / "a", size=3)
     monkeypatch.chdir(folder)
+    console.print_messages()
     for size in (3, 4, 5):
         results.stage(".", size=size)  # "." has no name
         files.write_text(folder / "in" / "result", f"result of {size}")
@@ -293,6 +294,7 @@ def test_a_full_disk_names_the_file_and_not_the_temporary_file(tmp_path, named):
 
 def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
     warnings.simplefilter("always")  # pytest restores the filters
+    console.print_messages()
     with pytest.raises(InputError), console.logged(tmp_path / "out", "thesis-repro study") as run:
         results.stage(tmp_path / "out", size=3)
         warnings.warn("odd", stacklevel=1)
@@ -319,18 +321,3 @@ def test_a_signal_that_compiled_code_loses_stops_at_the_next_frame(tiny_kitti, n
         with pytest.raises(KeyboardInterrupt):
             odometry.run(Sequence(tiny_kitti, "00"))
     assert len(odometry.run(Sequence(tiny_kitti, "00")).poses) == 4
-
-
-def test_caches_of_compiled_code_are_deleted_when_a_file_has_changed(tmp_path):
-    cache, module = tmp_path / "room" / "__pycache__" / "old.nbi", tmp_path / "neighbour.py"
-    cache.parent.mkdir(parents=True)
-    deleted = []
-    # dates older than the cache's; neither an equal nor a new date says anything about the bytes
-    for text, date in (("1", 1), ("1", 2), ("2", 2), ("2", 2)):
-        module.write_text(text)
-        os.utime(module, (date, date))
-        cache.touch()
-        compiled.forget_stale(tmp_path)
-        deleted.append(not cache.exists())
-    assert deleted == [True, False, True, False]
-    compiled.forget_stale(tmp_path / "nothing")

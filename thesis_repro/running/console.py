@@ -59,6 +59,9 @@ NO_MEMORY_TEXTS = (
 )
 
 
+log = logging.getLogger("thesis_repro")
+
+
 class _Printer(logging.Handler):
     """Prints messages and warnings on standard error, where they do not mix with results."""
 
@@ -68,10 +71,20 @@ class _Printer(logging.Handler):
             print(prefix + one_line(record.getMessage()), file=sys.stderr, flush=True)
 
 
-log = logging.getLogger("thesis_repro")
-log.addHandler(_Printer())
-log.setLevel(logging.INFO)
-log.propagate = False
+def print_messages() -> None:
+    """Print the messages of this package from now on: in programs and notebooks.
+
+    Without it they go where a user of the package sends those of the logger "thesis_repro".
+    """
+    if not prints_messages():
+        log.addHandler(_Printer())
+    log.setLevel(logging.INFO)
+    log.propagate = False
+
+
+def prints_messages() -> bool:
+    """Return whether `print_messages` was called in this process."""
+    return any(isinstance(handler, _Printer) for handler in log.handlers)
 
 
 def explain(error: BaseException | None) -> str | None:
@@ -140,6 +153,7 @@ def report_error(error: Exception) -> int:
 
 def run_main(main: Callable[[], object]) -> None:
     """Call the function of a program, and end the process with `report_error` if it fails."""
+    print_messages()
     try:
         main()
     except Exception as error:
@@ -203,6 +217,8 @@ def logged(folder: str | Path, title: str, has_results: bool = False) -> Iterato
     loggers = log, logging.getLogger("py.warnings")
     for logger in loggers:
         logger.addHandler(handler)
+    level = log.level
+    log.setLevel(logging.INFO)
     logging.captureWarnings(True)
     log.info(title, extra={"printed": True})
     try:
@@ -216,6 +232,7 @@ def logged(folder: str | Path, title: str, has_results: bool = False) -> Iterato
         raise
     finally:
         logging.captureWarnings(False)
+        log.setLevel(level)
         for logger in loggers:
             logger.removeHandler(handler)
         with suppress(OSError):
