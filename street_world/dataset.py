@@ -148,7 +148,9 @@ def write(
         "seed": seed,
     }
     with results.claimed(out):
-        results.stage(out, replace=replace, code=results.code("street_world.dataset"), **parameters)
+        results.stage(
+            out, replace=replace, code=results.digest_of_code("street_world.dataset"), **parameters
+        )
         pictures = [
             picture
             for picture in _pictures(out, **parameters)

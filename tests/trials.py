@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from thesis_repro.running import console, files
+from thesis_repro.running import files
+from thesis_repro.running.folders import LOG
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import ARITHMETIC
 
@@ -112,7 +113,7 @@ def snapshot(where):
     ):
         with suppress(FileNotFoundError):
             status = path.lstat()
-            if path.name != console.LOG:
+            if path.name != LOG:
                 versions[path.relative_to(where)] = (
                     None if path.is_dir() else (status.st_size, status.st_mtime_ns)
                 )
@@ -149,7 +150,7 @@ def contents(folder):
     return {
         str(path.relative_to(folder)): sha256(_content(path)).hexdigest()
         for path in Path(folder).rglob("*")
-        if path.is_file() and path.name != console.LOG
+        if path.is_file() and path.name != LOG
     }
 
 

@@ -319,12 +319,12 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
     with results.claimed(folder):
         folder = results.stage(
             folder,
-            labels=results.listing(masks.paths),
+            labels=results.digest_of_files(masks.paths),
             size=masks.size,
             **asdict(masks.settings),
             dilation_width=masks.dilation_width,
-            frames=results.listing(masks.frame_paths),
-            code=results.code("thesis_repro.masks"),
+            frames=results.digest_of_files(masks.frame_paths),
+            code=results.digest_of_code("thesis_repro.masks"),
             **results.made_with("opencv-python-headless"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):

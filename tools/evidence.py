@@ -50,6 +50,7 @@ STREETS = {
 texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
 
 
+@style.applied()
 def write(root, folder, build, frames=None, repetitions=5, processes=1, others=()):
     """Run the missing jobs and write all tables, plots and findings into a folder.
 

@@ -212,11 +212,11 @@ def train(camvid, kitti_semantic, pseudo, folder):
     )
     optimizer.build(model.trainable_variables)
     made_from = {
-        "code": results.code("thesis_repro.segmentation.unet"),
-        "tool": results.content(Path(__file__)),
+        "code": results.digest_of_code("thesis_repro.segmentation.unet"),
+        "tool": results.digest_of_file(Path(__file__)),
         "phases": [COMMON, LAST],
         "steps": EPOCH,
-        "images": results.listing(
+        "images": results.digest_of_files(
             [file for pairs in sets.values() for pair in pairs for file in pair[1:]]
         ),
     }

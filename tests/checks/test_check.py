@@ -208,7 +208,7 @@ def test_implausible_masks_are_one_line_with_the_option(
 
 def test_masks_of_other_frames_and_other_names_of_files(tiny_kitti, tmp_path):
     sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
-    results.stage(folder, frames=results.listing(sequence.frame_paths))
+    results.stage(folder, frames=results.digest_of_files(sequence.frame_paths))
     for path in sequence.frame_paths:
         files.write_png(folder / f"{path.name}.png", HALF)
     made = MaskFolder(folder, sequence)

@@ -1,5 +1,6 @@
-"""KITTI's sequences, and its raw drives as they are downloaded: alone, as a folder of drives, or
-through a link.
+"""KITTI's sequences, and its raw drives as they are downloaded.
+
+Drives are read alone, as a folder of drives, or through a link.
 """
 
 import shutil

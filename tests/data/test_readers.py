@@ -1,5 +1,6 @@
-"""Any content of a file or setting is read to valid values or refused with one line that names
-it.
+"""Any content of a file or setting is read to valid values or refused.
+
+It is refused with one line that names it.
 """
 
 import re
@@ -44,8 +45,9 @@ def path(tmp_path_factory):
 
 
 def read(function, path, text, *arguments):
-    """Result of a reader for a file with this text; None if it raises InputError with the
-    file's name.
+    """Result of a reader for a file with this text.
+
+    None if it raises InputError with the file's name.
     """
     path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass"))
     try:

@@ -1,13 +1,16 @@
-"""Figures are drawn without a window, and closed after each test."""
+"""Figures are drawn without a window in the package's style, and closed after each test."""
 
 import matplotlib
 import matplotlib.pyplot as plt
 import pytest
 
+from thesis_repro.report import style
+
 matplotlib.use("Agg")
 
 
 @pytest.fixture(autouse=True)
-def closed():
-    yield
+def drawing():
+    with style.applied():
+        yield
     plt.close("all")

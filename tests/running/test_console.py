@@ -1,6 +1,4 @@
-"""Folders of results: their inputs, locks and checkpoints; logs, signals, errors of the machine in
-one line; caches of compiled code.
-"""
+"""Folders of results: their inputs, locks and checkpoints; logs, signals, errors in one line."""
 
 import ctypes
 import errno
@@ -17,7 +15,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.running import compiled, console, files, results
+from thesis_repro.running import console, files, folders, results
 
 
 def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
@@ -39,7 +37,7 @@ def test_a_folder_with_other_files_is_refused_and_kept(tmp_path):
     with pytest.raises(InputError, match=str(tmp_path)):
         results.stage(tmp_path, data="one")
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
-    (tmp_path / results.RECORD).write_text("[1, 2")  # a damaged record
+    (tmp_path / folders.RECORD).write_text("[1, 2")  # a damaged record
     with pytest.raises(InputError, match="made-from.json: "):
         results.stage(tmp_path, data="one")
 
@@ -75,7 +73,10 @@ HOUSE = {
 
 @pytest.fixture
 def version(tmp_path, monkeypatch):
-    """version(module, {file: code}): the digest of the code of a made-up package."""
+    """A function that gives the digest of the code of a made-up package.
+
+    Its arguments are a module and {file: code} of the files that differ from HOUSE.
+    """
     monkeypatch.setattr(results, "_PACKAGE", tmp_path / "package")
     monkeypatch.setattr(results, "PROJECT", ("package",))
     (tmp_path / "beside.py").touch()  # another package beside this one
@@ -83,11 +84,11 @@ def version(tmp_path, monkeypatch):
     def digest(module="package.room.table", changed=None):
         for name, text in {**HOUSE, **(changed or {})}.items():
             files.write_text(tmp_path / "package" / f"{name}.py", text)
-        results.code.cache_clear()
-        return results.code(module)
+        results.digest_of_code.cache_clear()
+        return results.digest_of_code(module)
 
     yield digest
-    results.code.cache_clear()
+    results.digest_of_code.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -155,24 +156,28 @@ def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeyp
     paths = [tmp_path / "a", tmp_path / "b"]
     for path in paths:
         path.write_text("12")
-    first = results.listing(paths)
+    first = results.digest_of_files(paths)
     (tmp_path / "elsewhere").mkdir()
-    assert results.listing([shutil.copy(path, tmp_path / "elsewhere") for path in paths]) == first
+    assert (
+        results.digest_of_files([shutil.copy(path, tmp_path / "elsewhere") for path in paths])
+        == first
+    )
     date = paths[1].stat().st_mtime_ns
     paths[1].write_text("21")  # the same length and date
     os.utime(paths[1], ns=(date, date))
-    changed = results.listing(paths)
+    changed = results.digest_of_files(paths)
     assert changed != first
     monkeypatch.setattr(results, "_sha256", None)  # nothing may be read
-    assert results.listing(paths) == changed
+    assert results.digest_of_files(paths) == changed
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="pipe: "):
-        results.listing([tmp_path / "pipe"])
+        results.digest_of_files([tmp_path / "pipe"])
 
 
 def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, capsys, monkeypatch):
     folder = results.stage(tmp_path / "a", size=3)
     monkeypatch.chdir(folder)
+    console.print_messages()
     for size in (3, 4, 5):
         results.stage(".", size=size)  # "." has no name
         files.write_text(folder / "in" / "result", f"result of {size}")
@@ -233,8 +238,8 @@ def test_temporary_files_of_a_killed_run_are_deleted(tmp_path):
     # a run that was killed while it wrote its record
     other = tmp_path / "other"
     other.mkdir()
-    files.temporary_path(other / results.RECORD).touch()
-    assert [path.name for path in results.stage(other, size=3).iterdir()] == [results.RECORD]
+    files.temporary_path(other / folders.RECORD).touch()
+    assert [path.name for path in results.stage(other, size=3).iterdir()] == [folders.RECORD]
 
 
 def test_a_killed_move_of_old_results_is_finished_and_the_log_stays(tmp_path, monkeypatch):
@@ -242,7 +247,7 @@ def test_a_killed_move_of_old_results_is_finished_and_the_log_stays(tmp_path, mo
     results.stage(folder / "in", size=3)
     for path in (folder / "result", folder / "in" / "result"):
         files.write_text(path, "old")
-    (folder / console.LOG).touch()
+    (folder / folders.LOG).touch()
     with monkeypatch.context() as patch:
         rename = type(folder).rename
 
@@ -255,7 +260,7 @@ def test_a_killed_move_of_old_results_is_finished_and_the_log_stays(tmp_path, mo
             results.stage(folder, size=4)
     assert results.record(folder) == {"size": 3}
     results.stage(folder, size=4)
-    assert {path.name for path in folder.iterdir()} == {results.RECORD, console.LOG}
+    assert {path.name for path in folder.iterdir()} == {folders.RECORD, folders.LOG}
     assert len(list(tmp_path.glob("out.old-*/**/result"))) == 2
 
 
@@ -285,14 +290,17 @@ def test_errors_of_the_machine_are_one_line(error, says, capsys):
 
 @pytest.mark.parametrize("named", [False, True])
 def test_a_full_disk_names_the_file_and_not_the_temporary_file(tmp_path, named):
-    with pytest.raises(OSError, match="No space left on device") as caught:
-        with files.atomic(tmp_path / "a.txt") as temporary:
-            raise OSError(errno.ENOSPC, "x", str(temporary) if named else None)
+    with (
+        pytest.raises(OSError, match="No space left on device") as caught,
+        files.atomic(tmp_path / "a.txt") as temporary,
+    ):
+        raise OSError(errno.ENOSPC, "x", str(temporary) if named else None)
     assert caught.value.filename == str(tmp_path / "a.txt") and list(tmp_path.iterdir()) == []
 
 
 def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
     warnings.simplefilter("always")  # pytest restores the filters
+    console.print_messages()
     with pytest.raises(InputError), console.logged(tmp_path / "out", "thesis-repro study") as run:
         results.stage(tmp_path / "out", size=3)
         warnings.warn("odd", stacklevel=1)
@@ -301,7 +309,7 @@ def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
         raise InputError("bad")
     printed = capsys.readouterr()
     assert printed.out.startswith("3 runs\n") and printed.err == "warning: sequence 00 failed\n"
-    lines = (tmp_path / "out" / console.LOG).read_text().splitlines()
+    lines = (tmp_path / "out" / folders.LOG).read_text().splitlines()
     assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
     assert any("WARNING" in line and "odd" in line for line in lines)
     handlers = logging.getLogger("thesis_repro").handlers
@@ -319,18 +327,3 @@ def test_a_signal_that_compiled_code_loses_stops_at_the_next_frame(tiny_kitti, n
         with pytest.raises(KeyboardInterrupt):
             odometry.run(Sequence(tiny_kitti, "00"))
     assert len(odometry.run(Sequence(tiny_kitti, "00")).poses) == 4
-
-
-def test_caches_of_compiled_code_are_deleted_when_a_file_has_changed(tmp_path):
-    cache, module = tmp_path / "room" / "__pycache__" / "old.nbi", tmp_path / "neighbour.py"
-    cache.parent.mkdir(parents=True)
-    deleted = []
-    # dates older than the cache's; neither an equal nor a new date says anything about the bytes
-    for text, date in (("1", 1), ("1", 2), ("2", 2), ("2", 2)):
-        module.write_text(text)
-        os.utime(module, (date, date))
-        cache.touch()
-        compiled.forget_stale(tmp_path)
-        deleted.append(not cache.exists())
-    assert deleted == [True, False, True, False]
-    compiled.forget_stale(tmp_path / "nothing")

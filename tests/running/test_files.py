@@ -10,7 +10,7 @@ from PIL import Image
 
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
-from thesis_repro.running import console, files
+from thesis_repro.running import files, folders
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
 
@@ -97,7 +97,7 @@ def test_output_to_a_link_replaces_its_target(tmp_path):
 def test_output_to_streams_and_into_folders_of_results_is_refused(tmp_path):
     files.check_output(tmp_path / "a" / "b.txt")
     os.mkfifo(tmp_path / "pipe")
-    files.write_text(tmp_path / "results" / console.RECORD, "")
+    files.write_text(tmp_path / "results" / folders.RECORD, "")
     for path in (
         tmp_path / "pipe",
         "-",

@@ -208,7 +208,7 @@ def main(path: Path) -> int:
                 if root
                 else []
             )
-        digest = results.listing(used_files)
+        digest = results.digest_of_files(used_files)
     if digest and path.is_file() and path.read_text(encoding="utf-8") == digest:
         return 0
     if not report(kitti_root, cityscapes_root, settings.kitti_semantic):

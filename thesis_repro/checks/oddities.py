@@ -81,7 +81,7 @@ def of_sequence(sequence: kitti.Sequence) -> list[str]:
     sizes = pd.Series({path: path.stat().st_size for path in sequence.frame_paths})
     # compressed frames seldom have equal sizes
     candidates = sizes.index[sizes.duplicated(keep=False)]
-    copies = candidates[pd.Series(results.contents(candidates), dtype=object).duplicated()]
+    copies = candidates[pd.Series(results.digests(candidates), dtype=object).duplicated()]
     if len(copies):
         lines.append(
             f"{prefix}{len(copies)} frames are copies of other frames, first {copies[0].name}; remove them"
@@ -225,7 +225,9 @@ def of_masks(source: Any, sequence: kitti.Sequence) -> tuple[str, list[str]]:
     record = results.record(folder) or {}
     present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)
     # A study may use only the first frames.
-    digests = [results.listing(paths) for paths in (sequence.frame_paths, frames, frames[:present])]
+    digests = [
+        results.digest_of_files(paths) for paths in (sequence.frame_paths, frames, frames[:present])
+    ]
     if record.get("frames", digests[0]) not in digests:
         faults.append("were made from other frames")
     elif "frames" not in record and present not in (1, len(sequence), len(frames)):

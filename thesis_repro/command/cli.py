@@ -164,8 +164,9 @@ def odometry(options: Any) -> None:
 
         truth = sequence.poses if sequence.has_truth else None
         poses = result.poses if truth is None else metrics.shifted(result.poses, truth)
-        drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
-        style.write_figure(drawing, options.plot)
+        with style.applied():
+            drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
+            style.write_figure(drawing, options.plot)
     _print(
         options,
         record,
@@ -261,13 +262,14 @@ def evaluate(options: Any) -> None:
             )
         rows += trajectories.evaluate(paths, truth, options.align, sequence)
     if options.plot:
-        drawing = trajectories.figure(
-            trajectories.aligned(paths, truth, options.align),
-            truth,
-            f"sequence {sequence}",
-            {name: matched for name, (matched, _) in paths.items()},
-        )
-        style.write_figure(drawing, options.plot)
+        with style.applied():
+            drawing = trajectories.figure(
+                trajectories.aligned(paths, truth, options.align),
+                truth,
+                f"sequence {sequence}",
+                {name: matched for name, (matched, _) in paths.items()},
+            )
+            style.write_figure(drawing, options.plot)
     rows += list(trajectories.means(rows))
     _print(
         options,
@@ -439,6 +441,7 @@ def main(arguments: list[str] | None = None) -> int:
     options.command_line = shlex.join(
         ["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)]
     )
+    console.print_messages()
     try:
         try:
             os.getcwd()

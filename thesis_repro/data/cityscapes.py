@@ -1,5 +1,6 @@
-"""Cityscapes: the table of labels, and pairs of images and label maps in the official or the
-thesis's flat layout.
+"""Cityscapes: the table of labels, and pairs of images and label maps.
+
+The pairs are in the official or the thesis's flat layout.
 """
 
 from collections.abc import Collection
@@ -14,14 +15,12 @@ from thesis_repro.running.files import listed, progress, read_color, read_gray, 
 
 
 class Label(NamedTuple):
-    """A row of Tables 3.1 and 3.2: name, id, weight in the Dice loss, and colour (red, green,
-    blue).
-    """
+    """A row of Tables 3.1 and 3.2."""
 
     name: str
     id: int
-    weight: float
-    color: tuple
+    weight: float  # in the Dice loss
+    color: tuple  # red, green, blue
 
 
 # Tables 3.1 and 3.2, with the colours of the Cityscapes scripts. "background" is in the tables
@@ -100,11 +99,9 @@ LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
 
 
 class Pair(NamedTuple):
-    """An image and its label map; a missing file is None. `name` is the common part of both
-    file names.
-    """
+    """An image and its label map; a missing file is None."""
 
-    name: str
+    name: str  # the common part of both file names
     image: Any  # Path or None
     label: Any  # Path or None
 
@@ -119,50 +116,46 @@ def pairs(root: str | Path, split: str, limit: int | None = None) -> list[Pair]:
 
     limit: largest number of pairs; None for all. They are spread evenly over the split, because it
     is sorted by city. The appendix pairs two unsorted directory listings by position (A.2); this
-    function pairs equal names.
-    Raises InputError if a folder is missing, a split is empty, or an image has no label map.
+    function pairs equal names. Raises InputError if a folder is missing, a split is empty, or an
+    image has no label map.
     """
     split_pairs = listing(root, split)
     for pair in split_pairs:
         check_complete(pair)
-    if limit is not None and limit < len(split_pairs):
-        split_pairs = [split_pairs[index * len(split_pairs) // limit] for index in range(limit)]
-    return split_pairs
+    count = len(split_pairs)
+    if limit is None or limit >= count:
+        return split_pairs
+    return [split_pairs[index * count // limit] for index in range(limit)]
 
 
 def listing(root: str | Path, split: str) -> list[Pair]:
-    """Pairs of one split, sorted by name, including incomplete pairs. Raises InputError if there
-    are no images.
+    """Pairs of one split, sorted by name, including incomplete pairs.
 
     Reads the official layout (leftImg8bit, gtFine) and the appendix's flat layout (train,
-    trainannot).
+    trainannot). Raises InputError if there are no images.
     """
     root = Path(root)
-    if (root / "leftImg8bit").is_dir():
-        image_folder, label_folder, pattern = (
-            root / "leftImg8bit" / split,
-            root / "gtFine" / split,
-            "*/*",
-        )
-        image_end, label_end = "_leftImg8bit.png", "_gtFine_labelIds.png"
+    if (root / "leftImg8bit").is_dir():  # one folder a city
+        image_folder = root / "leftImg8bit" / split
+        label_folder = root / "gtFine" / split
+        images = _by_name(image_folder, "*/*", "_leftImg8bit.png")
+        labels = _by_name(label_folder, "*/*", "_gtFine_labelIds.png")
     elif (root / split).is_dir():
-        image_folder, label_folder, pattern = root / split, root / f"{split}annot", "*"
-        image_end = label_end = ".png"
+        image_folder = root / split
+        images = _by_name(image_folder, "*", ".png")
+        labels = _by_name(root / f"{split}annot", "*", ".png")
     else:
         raise InputError(
             f"{root}: must be a folder that holds leftImg8bit and gtFine, or {split} and {split}annot"
         )
-    images = {
-        path.name.removesuffix(image_end): path
-        for path in listed(image_folder, pattern + image_end)
-    }
-    labels = {
-        path.name.removesuffix(label_end): path
-        for path in listed(label_folder, pattern + label_end)
-    }
     if not images:
         raise InputError(f"{image_folder}: no PNG images")
     return [Pair(name, images.get(name), labels.get(name)) for name in sorted(images | labels)]
+
+
+def _by_name(folder: Path, pattern: str, ending: str) -> dict[str, Path]:
+    """Return the files of a folder by their names without an ending."""
+    return {path.name.removesuffix(ending): path for path in listed(folder, pattern + ending)}
 
 
 def check_complete(pair: Pair) -> None:
@@ -178,25 +171,30 @@ def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> 
 
     channels: 1 for gray, as in the thesis; 3 for red, green, blue.
     """
-    image = read_gray(path) if channels == 1 else read_color(path)
-    return cv2.resize(image, (width, height)).reshape(height, width, channels)
+    read = read_gray if channels == 1 else read_color
+    image = cv2.resize(read(path), (width, height))
+    return image.reshape(height, width, channels)
 
 
 def read_label_map(path: str | Path, train_ids: bool = False) -> np.ndarray:
-    """Read a label map (height, width) of Cityscapes label ids, uint8. train_ids: translate train
-    ids to label ids.
+    """Read a label map (height, width) of Cityscapes label ids, uint8.
 
-    Raises InputError if a number is no valid id, and as `read_ids` does.
+    train_ids: translate train ids to label ids. Raises InputError if a number is no valid id, and
+    as `read_ids` does.
     """
     ids = read_ids(path)
-    label_map = LABEL_OF_TRAIN_ID[ids] if train_ids else ids
+    label_map = ids
+    if train_ids:
+        label_map = LABEL_OF_TRAIN_ID[ids]
     if label_map.max() < N_CLASSES:
         return label_map
     invalid = ids[label_map >= N_CLASSES].max()
+    if train_ids:
+        raise InputError(
+            f"{path}: holds {invalid}, which is no train id (0 to 18, 255); leave out --ids train"
+        )
     raise InputError(
-        f"{path}: holds {invalid}, which is no train id (0 to 18, 255); leave out --ids train"
-        if train_ids
-        else f"{path}: label id {invalid} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
+        f"{path}: label id {invalid} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
         "--ids train for train ids (0 to 18, 255)"
     )
 
@@ -204,16 +202,16 @@ def read_label_map(path: str | Path, train_ids: bool = False) -> np.ndarray:
 def load(
     image_pairs: Collection[Pair], size: int, channels: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read pairs at size x size: images (n, size, size, channels) and label maps (n, size, size),
-    both uint8 (A.2).
+    """Read pairs at size x size (A.2).
 
-    Label maps are resized by nearest neighbour, so that no new ids appear.
+    Returns images (n, size, size, channels) and label maps (n, size, size), both uint8. Label maps
+    are resized by nearest neighbour, so that no new ids appear.
     """
-    images = np.empty((len(image_pairs), size, size, channels), np.uint8)
-    labels = np.empty((len(image_pairs), size, size), np.uint8)
+    count, shape = len(image_pairs), (size, size)
+    images = np.empty((count, *shape, channels), np.uint8)
+    labels = np.empty((count, *shape), np.uint8)
     for index, pair in enumerate(progress(image_pairs, "reading images", unit="image")):
         images[index] = read_image(pair.image, size, size, channels)
-        labels[index] = cv2.resize(
-            read_label_map(pair.label), (size, size), interpolation=cv2.INTER_NEAREST
-        )
+        label_map = read_label_map(pair.label)
+        labels[index] = cv2.resize(label_map, shape, interpolation=cv2.INTER_NEAREST)
     return images, labels

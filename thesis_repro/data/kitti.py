@@ -43,14 +43,16 @@ FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times
 
 
 def sequences(root: str | Path) -> list[str]:
-    """Names of the sequences with frames and ground truth, in sorted order. Raises InputError if
-    there are none.
+    """Names of the sequences with frames and ground truth, in sorted order.
 
     00 to 10 are listed even without a file of poses, so that `Sequence` reports the missing file.
+    Raises InputError if there are none.
     """
-    names = [
-        name for name in with_frames(root) if name in FRAME_COUNTS or locate(root, name)[2].exists()
-    ]
+    names = []
+    for name in with_frames(root):
+        _, _, poses = locate(root, name)
+        if name in FRAME_COUNTS or poses.exists():
+            names.append(name)
     if not names:
         raise InputError(
             f"{folder_of(root)}: no sequence holds frames (image_0 or image_2) and ground truth"
@@ -59,10 +61,10 @@ def sequences(root: str | Path) -> list[str]:
 
 
 def with_frames(root: str | Path) -> list[str]:
-    """Names of all sequences with frames, in sorted order. (KITTI publishes no ground truth for 11
-    to 21.)
+    """Names of all sequences with frames, in sorted order.
 
-    Raises InputError if the folder has another layout.
+    KITTI publishes no ground truth for 11 to 21. Raises InputError if the folder has another
+    layout.
     """
     if not folder_of(root).is_dir():
         raise InputError(
@@ -77,39 +79,50 @@ def folders_with_frames(parent: Path) -> list[Path]:
 
 
 def has_frames(folder: Path) -> bool:
-    """Whether a folder is that of a sequence, or holds images itself. A sequence with frames of the
-    right camera only counts, so that its lack of others is reported.
+    """Whether a folder is that of a sequence, or holds images itself.
+
+    A sequence with frames of the right camera only counts, so that its lack of others is reported.
     """
-    return images_of(folder) != folder or bool(images(folder)) or (folder / "image_1").is_dir()
+    if images_of(folder) != folder or images(folder):
+        return True
+    return (folder / "image_1").is_dir()
 
 
 def folder_of(root: str | Path) -> Path:
-    """Folder of a root's sequences: the root itself if it holds raw drives, else root/sequences,
-    which may hold raw drives as well.
+    """Folder of a root's sequences.
+
+    It is the root itself if it holds raw drives, else root/sequences, which may hold raw drives as
+    well.
     """
     root = Path(root)
-    holds_drives = not (root / "sequences").is_dir() and any(
-        map(kitti_raw.is_drive, root.glob("*"))
-    )
-    return root if holds_drives else root / "sequences"
+    folder = root / "sequences"
+    if not folder.is_dir() and any(map(kitti_raw.is_drive, root.glob("*"))):
+        return root
+    return folder
 
 
 def images_of(folder: str | Path, camera: str | None = None) -> Path:
-    """Folder of a sequence's frames. Raises InputError if the camera is unknown or the folder is
-    missing.
+    """Folder of a sequence's frames.
 
     The default is the left camera's, gray or else colour. If neither exists, it is the sequence's
-    folder itself.
+    folder itself. Raises InputError if the camera is unknown or the folder is missing.
     """
+    folder = Path(folder)
     cameras, inner = IMAGE_FOLDERS, ""
     if kitti_raw.is_drive(folder):
         cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
-    if camera is not None and camera not in cameras:
-        raise InputError(f"camera {camera!r}: unknown; choose one of {', '.join(sorted(cameras))}")
-    candidates = [Path(folder) / name / inner for name in ([camera] if camera else cameras[:2])]
-    frame_folder = next(
-        (path for path in candidates if path.is_dir()), candidates[0] if camera else Path(folder)
-    )
+    if camera is not None:
+        if camera not in cameras:
+            known = ", ".join(sorted(cameras))
+            raise InputError(f"camera {camera!r}: unknown; choose one of {known}")
+        frame_folder = folder / camera / inner
+    else:
+        gray, color = (folder / name / inner for name in cameras[:2])
+        frame_folder = folder
+        if gray.is_dir():
+            frame_folder = gray
+        elif color.is_dir():
+            frame_folder = color
     if not frame_folder.is_dir():
         raise InputError(f"{frame_folder}: no such folder; it must hold the frames")
     return frame_folder
@@ -117,7 +130,9 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
 
 def camera_of(frame_folder: Path) -> str:
     """Name of the camera that took the frames in a folder, such as "image_0" or "image_02"."""
-    return (frame_folder.parent if frame_folder.name == kitti_raw.FRAMES else frame_folder).name
+    if frame_folder.name == kitti_raw.FRAMES:
+        return frame_folder.parent.name
+    return frame_folder.name
 
 
 def texts_of(folder: Path, frame_folder: Path) -> tuple[Path, Path]:
@@ -128,8 +143,9 @@ def texts_of(folder: Path, frame_folder: Path) -> tuple[Path, Path]:
 
 
 class Sequence:
-    """One odometry sequence in the official layout: sequences/NN/image_0, calib.txt, times.txt and
-    poses/NN.txt; or one raw drive (see kitti_raw).
+    """One odometry sequence in the official layout, or one raw drive (see kitti_raw).
+
+    The official layout is sequences/NN/image_0, calib.txt, times.txt and poses/NN.txt.
 
     Frames are PNG or JPEG files, numbered without gaps. Colour frames are read as gray. Without
     times.txt, `times` assumes ten frames a second, as in KITTI. Without a file of poses,
@@ -145,8 +161,9 @@ class Sequence:
         camera: str | None = None,
         speed: float | None = None,
     ) -> None:
-        """root: folder that holds sequences and poses. name: the sequence, "06" or "6".
+        """Find, read and check the files of a sequence, except its frames.
 
+        root: folder that holds sequences and poses. name: the sequence, "06" or "6".
         For a sequence outside of KITTI, root is None and name is a folder. The folder is a raw
         drive, or holds calib.txt, the frames (in image_0 or in the folder itself) and optionally
         times.txt and poses.txt.
@@ -159,36 +176,45 @@ class Sequence:
         frame_folder = images_of(self.folder, camera)
         self.frame_paths = images(frame_folder)
         if not self.frame_paths:
-            raise InputError(
-                f"{frame_folder}: holds no PNG or JPEG frames of the left camera, to which the ground "
-                "truth belongs (--camera image_1 takes the right one)"
-                if images_of(self.folder) == self.folder and (self.folder / "image_1").is_dir()
-                else f"{frame_folder}: holds no PNG or JPEG frames"
-            )
+            self._refuse_no_frames(frame_folder)
         check_numbering(self.frame_paths)
-        self.calibration_path, times = texts_of(self.folder, frame_folder)
+        self.calibration_path, times_path = texts_of(self.folder, frame_folder)
         self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
-        self.has_times = times.is_file()
-        self.times = times_of(times) if self.has_times else FRAME_TIME * np.arange(len(self))
-        check_count(times, len(self.times), self.frame_paths)
+        self.has_times = times_path.is_file()
+        self.times = FRAME_TIME * np.arange(len(self))
+        if self.has_times:
+            self.times = times_of(times_path)
+            check_count(times_path, len(self.times), self.frame_paths)
         self.has_truth = self.poses_path.exists()
         if self.has_truth:
             self._poses = truth_of(self.poses_path)
             check_count(self.poses_path, len(self._poses), self.frame_paths)
         if speed is not None:
-            if self.has_truth:
-                raise InputError(
-                    f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
-                )
-            if not self.has_times:
-                raise InputError(f"{times}: no such file; a speed needs the times of the frames")
-            if not 0 < speed <= MAX_SPEED:
-                raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s")
+            self._check_speed(speed, times_path)
+
+    def _refuse_no_frames(self, frame_folder: Path) -> None:
+        if images_of(self.folder) == self.folder and (self.folder / "image_1").is_dir():
+            raise InputError(
+                f"{frame_folder}: holds no PNG or JPEG frames of the left camera, to which the ground "
+                "truth belongs (--camera image_1 takes the right one)"
+            )
+        raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
+
+    def _check_speed(self, speed: float, times_path: Path) -> None:
+        if self.has_truth:
+            raise InputError(
+                f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
+            )
+        if not self.has_times:
+            raise InputError(f"{times_path}: no such file; a speed needs the times of the frames")
+        if not 0 < speed <= MAX_SPEED:
+            raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s")
 
     @property
     def poses(self) -> np.ndarray:
-        """Ground truth: camera-to-world poses, (n, 4, 4), metres. Raises InputError if there is
-        none.
+        """Ground truth: camera-to-world poses, (n, 4, 4), metres.
+
+        Raises InputError if there is none.
         """
         if not self.has_truth:
             raise InputError(f"{self.poses_path}: no such file; ground truth is needed")
@@ -196,20 +222,27 @@ class Sequence:
 
     @property
     def assumed_steps(self) -> np.ndarray:
-        """Step lengths without ground truth, (n,), metres: from the speed, or 1. The first one
-        is 0.
+        """Step lengths without ground truth, (n,), metres: from the speed, or 1.
+
+        The first one is 0.
         """
-        steps = np.ones(len(self) - 1) if self.speed is None else self.speed * np.diff(self.times)
+        steps = np.ones(len(self) - 1)
+        if self.speed is not None:
+            steps = self.speed * np.diff(self.times)
         return np.concatenate([[0.0], steps])
 
     @property
     def files(self) -> list[Path]:
-        """All files of the sequence: frames and calibration, and the files of times and poses
-        if they exist.
+        """All files of the sequence.
+
+        Frames and calibration, and the files of times and poses if they exist.
         """
+        paths = list(self.frame_paths)
         texts = *texts_of(self.folder, self.frame_paths[0].parent), self.poses_path
-        made_from = kitti_raw.files(self.folder) if kitti_raw.is_drive(self.folder) else []
-        return [*self.frame_paths, *filter(Path.is_file, texts), *made_from]
+        paths += filter(Path.is_file, texts)
+        if kitti_raw.is_drive(self.folder):
+            paths += kitti_raw.files(self.folder)
+        return paths
 
     @property
     def label_names(self) -> list[str]:
@@ -230,8 +263,9 @@ class Sequence:
         return size
 
     def frame(self, index: int) -> np.ndarray:
-        """Frame `index` as 8-bit gray, (height, width). Raises InputError if it is unreadable
-        or has another size.
+        """Frame `index` as 8-bit gray, (height, width).
+
+        Raises InputError if it is unreadable or has another size.
         """
         image = read_gray(self.frame_paths[index])
         check_size(self.frame_paths[index], image.shape, self.size)
@@ -252,8 +286,9 @@ class Sequence:
 
 
 def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]:
-    """Root, folder and poses of a sequence: a file, or the OXTS's folder of a raw drive. The
-    arguments are those of Sequence.
+    """Root, folder and poses of a sequence.
+
+    The poses are a file, or the OXTS's folder of a raw drive. The arguments are those of Sequence.
     """
     folder = Path(name).resolve()
     poses = folder / "poses.txt"
@@ -279,39 +314,46 @@ def name_of(root: str | Path, name: str) -> str:
 
 
 def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Ground truth of a sequence without reading its frames: poses, (n, 4, 4), and their times,
-    (n,), seconds.
+    """Ground truth of a sequence without reading its frames.
 
-    root, name: as in Sequence. Without times.txt, ten frames a second are assumed.
+    Returns poses, (n, 4, 4), and their times, (n,), seconds. root, name: as in Sequence. Without
+    times.txt, ten frames a second are assumed.
     """
     _, folder, path = locate(root, name)
-    frame_folder = images_of(folder) if kitti_raw.is_drive(folder) else folder
-    poses, path_of_times = truth_of(path), texts_of(folder, frame_folder)[1]
-    if not path_of_times.is_file():
+    poses = truth_of(path)
+    frame_folder = folder
+    if kitti_raw.is_drive(folder):
+        frame_folder = images_of(folder)
+    _, times_path = texts_of(folder, frame_folder)
+    if not times_path.is_file():
         return poses, FRAME_TIME * np.arange(len(poses))
-    times = times_of(path_of_times)
+    times = times_of(times_path)
     if len(times) != len(poses):
         raise InputError(
-            f"{path_of_times}: {len(times)} times for {len(poses)} poses in {path}; one a frame is needed"
+            f"{times_path}: {len(times)} times for {len(poses)} poses in {path}; one a frame is needed"
         )
     return poses, times
 
 
 def truth_of(path: Path) -> np.ndarray:
     """Ground truth, (n, 4, 4), from a file of poses, or from the folder of a raw drive's OXTS."""
-    return kitti_raw.read_poses(path.parents[1]) if path.is_dir() else read_poses(path)
+    if path.is_dir():
+        return kitti_raw.read_poses(path.parents[1])
+    return read_poses(path)
 
 
 def times_of(path: Path) -> np.ndarray:
     """Times, (n,), seconds, from a file of seconds, or from a raw drive's file of time stamps."""
-    return kitti_raw.read_times(path) if path.name == kitti_raw.TIMES else read_times(path)
+    if path.name == kitti_raw.TIMES:
+        return kitti_raw.read_times(path)
+    return read_times(path)
 
 
 def check_numbering(paths: list[Path]) -> None:
-    """Raise InputError if two frames have the same number, or if frames count by one and a number
-    is missing.
+    """Raise InputError if two frames have the same number, or if a number is missing.
 
-    Names that do not count by one are accepted, for example every fifth frame, or times.
+    A number can be missing only if frames count by one. Names that do not count by one are
+    accepted, for example every fifth frame, or times.
     """
     for (number, path), (next_number, next_path) in pairwise(zip(numbers_of(paths) or [], paths)):
         if number == next_number:
@@ -322,43 +364,57 @@ def check_numbering(paths: list[Path]) -> None:
 
 
 def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
-    """Paths of the missing frames, if the frames' numbers count by one; at most MAX_MISSING_NAMED.
+    """Paths of the missing frames, at most MAX_MISSING_NAMED.
 
-    count: the expected number of frames. If it is given, frames missing at the start and at the end
-    are found as well. Numbers start at 0 (as in KITTI), at 1, or at the number of the first of
-    `paths`.
+    There are none unless the frames' numbers count by one. count: the expected number of frames. If
+    it is given, frames missing at the start and at the end are found as well. Numbers start at 0
+    (as in KITTI), at 1, or at the number of the first of `paths`.
     """
     numbers = numbers_of(paths)
-    steps = [after - before for before, after in pairwise(numbers or [])]
-    if not numbers or steps and median_low(steps) != 1 or count is None and len(steps) < 2:
+    if not numbers:
         return []
-    first, end, present = numbers[0], numbers[-1] + 1, set(numbers)
+    steps = [after - before for before, after in pairwise(numbers)]
+    if steps and median_low(steps) != 1:
+        return []
+    if count is None and len(steps) < 2:
+        return []
+    first, end = numbers[0], numbers[-1] + 1
     if count is not None:
-        first = next((start for start in (0, 1) if start <= first and end <= start + count), first)
+        for start in (0, 1):
+            if start <= first and end <= start + count:
+                first = start
+                break
         end = max(end, first + count)
-    missing = list(
-        islice((number for number in range(first, end) if number not in present), MAX_MISSING_NAMED)
-    )
-    stem = paths[0].stem.rstrip("0123456789")
-    digits = min(len(path.stem) for path in paths) - len(stem)
-    return [paths[0].with_name(f"{stem}{number:0{digits}d}{paths[0].suffix}") for number in missing]
+    present = set(numbers)
+    missing = (number for number in range(first, end) if number not in present)
+    path = paths[0]
+    letters = path.stem.rstrip("0123456789")
+    digits = min(len(path.stem) for path in paths) - len(letters)
+    return [
+        path.with_name(f"{letters}{number:0{digits}d}{path.suffix}")
+        for number in islice(missing, MAX_MISSING_NAMED)
+    ]
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
     """Raise InputError unless a file has `count` lines for as many frames."""
-    if count != len(frame_paths):
-        missing = missing_frames(frame_paths, max(count, len(frame_paths)))
-        first = f" (the first missing: {missing[0].name})" if missing else ""
-        raise InputError(
-            f"{path}: {count} lines for {len(frame_paths)} frames{first}; one line a frame is needed"
-        )
+    if count == len(frame_paths):
+        return
+    missing = missing_frames(frame_paths, max(count, len(frame_paths)))
+    first = ""
+    if missing:
+        first = f" (the first missing: {missing[0].name})"
+    raise InputError(
+        f"{path}: {count} lines for {len(frame_paths)} frames{first}; one line a frame is needed"
+    )
 
 
 def check_size(
     path: Path, size: tuple[int, ...], expected: tuple[int, int], image: str = "the first frame"
 ) -> None:
-    """Raise InputError if an image has another size than expected. `image` names the image with
-    the expected size.
+    """Raise InputError if an image has another size than expected.
+
+    `image` names the image with the expected size.
     """
     if size != expected:
         raise InputError(
@@ -367,19 +423,21 @@ def check_size(
 
 
 def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
-    """Camera matrix (Equation 2.4), (3, 3), pixels: the first three columns of P0, or of P1 to P3
-    for another camera; of a raw drive's camera, of P_rect_00 to P_rect_03.
+    """Camera matrix (Equation 2.4), (3, 3), pixels.
 
-    Raises InputError if the line is missing, or if the camera has distortion or skew.
+    It is the first three columns of P0, or of P1 to P3 for another camera; of a raw drive's
+    camera, of P_rect_00 to P_rect_03. Raises InputError if the line is missing, or if the camera
+    has distortion or skew.
     """
-    key = f"P{camera[-1]}" if camera in IMAGE_FOLDERS else "P0"
-    if camera in kitti_raw.IMAGE_FOLDERS:
+    key = "P0"
+    if camera in IMAGE_FOLDERS:
+        key = f"P{camera[-1]}"
+    elif camera in kitti_raw.IMAGE_FOLDERS:
         key = f"P_rect_{camera[-2:]}"
     try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-        matrix = np.array(
-            [line.split()[1:] for line in lines if line.startswith(f"{key}:")][0], np.float64
-        )
+        text = Path(path).read_text(encoding="utf-8-sig")
+        lines = [line for line in text.splitlines() if line.startswith(f"{key}:")]
+        matrix = np.array(lines[0].split()[1:], np.float64)
         matrix = matrix.reshape(3, 4)[:, :3]
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
@@ -403,8 +461,9 @@ def is_camera_matrix(matrix: np.ndarray) -> bool:
 def check_camera(
     path: Path | str, intrinsics: np.ndarray, frame: Path | str, size: tuple[int, int]
 ) -> None:
-    """Raise InputError if frames of (height, width) are too small or do not fit the camera
-    matrix.
+    """Raise InputError if frames are too small or do not fit the camera matrix.
+
+    size: height and width.
     """
     height, width = size
     if min(size) < MIN_FRAME_SIDE:
@@ -412,11 +471,9 @@ def check_camera(
             f"{frame}: {width}x{height} pixels; each side needs {MIN_FRAME_SIDE} or more"
         )
     (fx, _, u), (_, fy, v), _ = intrinsics
-    if not (
-        0 <= u <= width
-        and 0 <= v <= height
-        and all(width / 100 < focal < width * 100 for focal in (fx, fy))
-    ):
+    center_fits = 0 <= u <= width and 0 <= v <= height
+    focal_lengths_fit = all(width / 100 < focal < width * 100 for focal in (fx, fy))
+    if not (center_fits and focal_lengths_fit):
         raise InputError(
             f"{path}: focal lengths {fx:g}, {fy:g} and centre {u:g}, {v:g} do not fit frames of "
             f"{width}x{height} pixels"

@@ -1,6 +1,6 @@
-"""KITTI's raw drives, read as they are downloaded ("synced and rectified"): calibration, times
-and poses of a folder such as 2011_09_26/2011_09_26_drive_0005_sync.
+"""KITTI's raw drives, read as they are downloaded ("synced and rectified").
 
+Read are calibration, times and poses of a folder such as 2011_09_26/2011_09_26_drive_0005_sync.
 The three calibration files lie in the folder of the day, beside the drives. A drive may also be a
 link. `kitti.Sequence` reads the frames. Poses follow KITTI's development kit (Geiger et al., Vision
 meets robotics: The KITTI dataset, 2013).
@@ -20,8 +20,9 @@ EARTH_RADIUS = 6378137.0  # metres
 
 
 def is_drive(folder: str | Path) -> bool:
-    """Return whether a folder is a raw drive: it has the measurements of the OXTS, a GPS with
-    inertial sensors.
+    """Return whether a folder is a raw drive.
+
+    It then has the measurements of the OXTS, a GPS with inertial sensors.
     """
     return (Path(folder) / OXTS).is_dir()
 
@@ -42,11 +43,13 @@ def _measurements(folder: str | Path) -> list[Path]:
 
 
 def read_times(path: str | Path) -> np.ndarray:
-    """Times since the first frame, (n,), seconds, from a file of time stamps. Raises InputError
-    unless they increase.
+    """Times since the first frame, (n,), seconds, from a file of time stamps.
+
+    Raises InputError unless they increase.
     """
+    lines = _text(Path(path)).strip().splitlines()
     try:
-        stamps = np.array(_text(Path(path)).strip().splitlines(), "datetime64[ns]")
+        stamps = np.array(lines, "datetime64[ns]")
     except ValueError as error:
         raise InputError(f"{path}: must hold one time stamp a line: {error}") from None
     times = (stamps - stamps[:1]) / np.timedelta64(1, "s")
@@ -56,26 +59,30 @@ def read_times(path: str | Path) -> np.ndarray:
 
 
 def read_poses(folder: str | Path) -> np.ndarray:
-    """Camera-to-world poses of the rectified left gray camera, (n, 4, 4), metres; the first one
-    is the identity.
+    """Camera-to-world poses of the rectified left gray camera, (n, 4, 4), metres.
 
-    Raises InputError, naming the file, if a calibration or a measurement is missing or malformed.
+    The first one is the identity. Raises InputError, naming the file, if a calibration or a
+    measurement is missing or malformed.
     """
-    to_camera = np.eye(4)  # inertial unit to laser scanner to camera 0 to its rectified frame
-    for name, rotation, translation in (
-        ("imu_to_velo", "R", "T"),
-        ("velo_to_cam", "R", "T"),
-        ("cam_to_cam", "R_rect_00", None),
-    ):
-        step, path = np.eye(4), calibration(folder, name)
-        step[:3, :3] = _numbers(path, rotation, 9).reshape(3, 3)
-        step[:3, 3] = _numbers(path, translation, 3) if translation else 0
-        to_camera = step @ to_camera
+    # inertial unit to laser scanner to camera 0 to its rectified frame
+    to_scanner = _rigid_motion(calibration(folder, "imu_to_velo"), "R", "T")
+    scanner_to_camera = _rigid_motion(calibration(folder, "velo_to_cam"), "R", "T")
+    rectify = _rigid_motion(calibration(folder, "cam_to_cam"), "R_rect_00")
+    to_camera = rectify @ (scanner_to_camera @ to_scanner)
     measured = np.array([_numbers(path, None, 30)[:6] for path in _measurements(folder)])
     if not len(measured):
         raise InputError(f"{Path(folder) / OXTS}: holds no measurements, one file a frame")
     poses = _imu_poses(measured)
     return to_camera @ np.linalg.inv(poses[0]) @ poses @ np.linalg.inv(to_camera)
+
+
+def _rigid_motion(path: Path, rotation: str, translation: str | None = None) -> np.ndarray:
+    """Return the 4x4 matrix of two lines of a calibration file; without the second, no shift."""
+    motion = np.eye(4)
+    motion[:3, :3] = _numbers(path, rotation, 9).reshape(3, 3)
+    if translation is not None:
+        motion[:3, 3] = _numbers(path, translation, 3)
+    return motion
 
 
 def _imu_poses(measured: np.ndarray) -> np.ndarray:
@@ -107,16 +114,15 @@ def _text(path: Path) -> str:
 
 
 def _numbers(path: Path, key: str | None, count: int) -> np.ndarray:
-    """Return the `count` numbers of a file, or of its line `key`."""
-    lines = _text(path).splitlines()
-    texts = [
-        line.removeprefix(f"{key}:") for line in lines if not key or line.startswith(f"{key}:")
-    ]
+    """Return the `count` numbers of a file's first line, or of its line `key`."""
+    prefix, name = "", "a line"
+    if key is not None:
+        prefix, name = f"{key}:", f"a line '{key}:'"
+    lines = [line for line in _text(path).splitlines() if line.startswith(prefix)]
     try:
-        numbers = np.array(texts[0].split(), np.float64)
+        numbers = np.array(lines[0].removeprefix(prefix).split(), np.float64)
     except (ValueError, IndexError):
         numbers = np.empty(0)
     if len(numbers) != count or not np.isfinite(numbers).all():
-        what = f"a line '{key}:' of" if key else "a line of"
-        raise InputError(f"{path}: must hold {what} {count} finite numbers")
+        raise InputError(f"{path}: must hold {name} of {count} finite numbers")
     return numbers

@@ -23,9 +23,8 @@ def _read_numbers(path: str | Path, columns: int, comments: str | None = None) -
         with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
             rows = np.loadtxt(file, np.float64, comments=comments, ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
-        ) from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be read: {reason}") from None
     if not rows.size or rows.shape[1] != columns or not np.isfinite(rows).all():
         raise InputError(f"{path}: must hold {columns} finite numbers a line, one line a frame")
     return rows
@@ -47,10 +46,10 @@ def _check_increase(path: str | Path, times: np.ndarray) -> None:
 
 
 def read_poses(path: str | Path) -> np.ndarray:
-    """Camera-to-world poses, (n, 4, 4), metres, from 12 numbers a line: the first three rows of
-    each pose.
+    """Camera-to-world poses, (n, 4, 4), metres, from 12 numbers a line.
 
-    Raises InputError if a line is not a right-handed rotation and a position.
+    These are the first three rows of each pose. Raises InputError if a line is not a right-handed
+    rotation and a position.
     """
     rows = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -64,14 +63,18 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 
 def are_poses(poses: np.ndarray) -> np.ndarray:
-    """Whether each of (n, 4, 4) is a right-handed rotation and a position in metres: (n,)
-    booleans.
+    """Whether each of (n, 4, 4) is a right-handed rotation and a position in metres.
+
+    Returns (n,) booleans.
     """
     rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
     with np.errstate(over="ignore", invalid="ignore"):
-        errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        is_rotation = (errors <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
-    return is_rotation & (np.abs(positions).max(axis=1) <= MAX_POSITION)
+        products = rotations @ rotations.transpose(0, 2, 1)
+        errors = np.abs(products - np.eye(3)).max(axis=(1, 2))
+        is_orthogonal = errors <= ROTATION_TOLERANCE
+        is_right_handed = np.linalg.det(rotations) > 0
+    is_near = np.abs(positions).max(axis=1) <= MAX_POSITION
+    return is_orthogonal & is_right_handed & is_near
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
@@ -80,57 +83,67 @@ def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
 
 
 def write_tum(path: str | Path, poses: np.ndarray, times: np.ndarray) -> None:
-    """Write poses (n, 4, 4) and times (n,), seconds, in TUM's format: time, position,
-    quaternion (x, y, z, w).
+    """Write poses (n, 4, 4) and times (n,), seconds, in TUM's format.
+
+    A line has the time, the position and the quaternion (x, y, z, w).
     """
     # takes 0.4 s to load, and every command loads this module
     from scipy.spatial.transform import Rotation
 
-    quaternions = Rotation.from_matrix(np.asarray(poses)[:, :3, :3]).as_quat(canonical=True)
-    _write_rows(path, np.column_stack([times, np.asarray(poses)[:, :3, 3], quaternions]))
+    poses = np.asarray(poses)
+    positions, rotations = poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3])
+    quaternions = rotations.as_quat(canonical=True)
+    _write_rows(path, np.column_stack([times, positions, quaternions]))
 
 
 def read_tum(
     path: str | Path, times: np.ndarray, offset: float = 0.0, max_difference: float = MAX_DIFFERENCE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read a file in TUM's format and match its poses to the frames' times (n,), seconds, with evo.
+    """Read a file in TUM's format and match its poses to the frames with evo.
 
-    offset: seconds, added to the file's times. max_difference: seconds between a pose and its
-    frame. Returns the indices of the matched frames, (m,), and their poses, (m, 4, 4). Raises
-    InputError for a line without a time after the line before, a position in metres and a unit
-    quaternion, and if too few poses are matched (MIN_MATCHED), as with another unit of time.
+    times: of the frames, (n,), seconds. offset: seconds, added to the file's times. max_difference:
+    seconds between a pose and its frame. Returns the indices of the matched frames, (m,), and their
+    poses, (m, 4, 4). Raises InputError for a line without a time after the line before, a position
+    in metres and a unit quaternion, and if too few poses are matched (MIN_MATCHED), as with another
+    unit of time.
     """
     from evo.core.sync import matching_time_indices  # takes 0.4 s to load
     from evo.core.trajectory import PoseTrajectory3D
 
     rows = _read_numbers(path, 8, "#")
-    _check_increase(path, rows[:, 0])
-    bad_lines = np.flatnonzero(
-        (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > QUATERNION_TOLERANCE)
-        | (np.abs(rows[:, 1:4]).max(axis=1) > MAX_POSITION)
-    )
+    stamps, positions, quaternions = rows[:, 0], rows[:, 1:4], rows[:, 4:]
+    _check_increase(path, stamps)
+    is_far = np.abs(positions).max(axis=1) > MAX_POSITION
+    lengths = np.linalg.norm(quaternions, axis=1)
+    is_no_unit = np.abs(lengths - 1) > QUATERNION_TOLERANCE
+    bad_lines = np.flatnonzero(is_far | is_no_unit)
     if len(bad_lines):
         raise InputError(
             f"{path}, pose {bad_lines[0] + 1}: must be a time, a position in metres and a unit "
             "quaternion (x, y, z, w)"
         )
-    trajectory = PoseTrajectory3D(rows[:, 1:4], np.roll(rows[:, 4:], 1, axis=1), rows[:, 0])
-    rows[:, 0] += offset
-    numbers, nearest = matching_time_indices(times, rows[:, 0], max_difference)
-    # how many of the one lie within the time of the other
-    shared = min(
-        np.count_nonzero((values >= others[0]) & (values <= others[-1]))
-        for values, others in ((times, rows[:, 0]), (rows[:, 0], times))
-    )
-    least = max(2, MIN_MATCHED[0] * shared, MIN_MATCHED[1] * min(len(rows), len(times)))
-    if len(numbers) < least:
+    w_first = np.roll(quaternions, 1, axis=1)
+    poses = np.array(PoseTrajectory3D(positions, w_first, stamps).poses_se3)
+    stamps = stamps + offset
+    numbers, nearest = matching_time_indices(times, stamps, max_difference)
+    if len(numbers) < _least_matched(times, stamps):
         raise InputError(
             f"{path}: {len(numbers)} of {len(rows)} poses are at the time of a frame, "
-            f"{times[0]:g} to {times[-1]:g} s; its times are {rows[0, 0]:.10g} to {rows[-1, 0]:.10g}; "
-            f"--t_offset {offset + times[0] - rows[0, 0]:.15g} takes its first pose for the first frame"
+            f"{times[0]:g} to {times[-1]:g} s; its times are {stamps[0]:.10g} to {stamps[-1]:.10g}; "
+            f"--t_offset {offset + times[0] - stamps[0]:.15g} takes its first pose for the first frame"
         )
-    return np.array(numbers), np.array(trajectory.poses_se3)[nearest]
+    return np.array(numbers), poses[nearest]
+
+
+def _least_matched(times: np.ndarray, stamps: np.ndarray) -> float:
+    """Return how many poses of a file with time stamps must match frames at times (MIN_MATCHED)."""
+    frames_within = np.count_nonzero((times >= stamps[0]) & (times <= stamps[-1]))
+    poses_within = np.count_nonzero((stamps >= times[0]) & (stamps <= times[-1]))
+    of_common = MIN_MATCHED[0] * min(frames_within, poses_within)
+    of_all = MIN_MATCHED[1] * min(len(stamps), len(times))
+    return max(2, of_common, of_all)
 
 
 def _write_rows(path: str | Path, rows: np.ndarray) -> None:
-    write_text(path, "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in rows))
+    lines = [" ".join(map(repr, numbers)) for numbers in rows.astype(float).tolist()]
+    write_text(path, "".join(f"{line}\n" for line in lines))

@@ -37,6 +37,7 @@ class Execution(ExecutePreprocessor):
     def preprocess(
         self, nb: Any, resources: Any = None, km: Any = None
     ) -> tuple[Any, dict[str, Any]]:
+        console.print_messages()
         # so that the kernel ends with this program, and this program with make: the parent of the
         # shell that runs it
         signal.signal(signal.SIGTERM, signal.default_int_handler)

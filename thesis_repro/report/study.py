@@ -23,6 +23,7 @@ from thesis_repro.study.sources import KINDS, Source
 from thesis_repro.study.study import PATHS, Study
 
 
+@style.applied()
 def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[str] = ()) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder, and return
     the page's path.

@@ -1,9 +1,11 @@
-"""The style of all figures and tables, and functions that write them as SVG or WebP, CSV and
-Markdown.
+"""The style of all figures and tables, and functions that write them.
+
+Figures are written as SVG or WebP, tables as CSV and Markdown.
 """
 
 from base64 import b64encode
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,35 +14,34 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
 from PIL import ExifTags, Image
 
 from thesis_repro.data.cityscapes import LABELS, colorize
 from thesis_repro.running.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
-matplotlib.rcParams.update(
-    {
-        "font.size": 9,
-        "font.sans-serif": ["DejaVu Sans", "sans-serif"],  # each text of an SVG file lists them
-        "axes.titlesize": 9,
-        "axes.labelsize": 9,
-        "legend.fontsize": 8,
-        "legend.frameon": False,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "grid.color": "#dddddd",
-        "grid.linewidth": 0.6,
-        "lines.linewidth": 1.4,
-        "image.interpolation": "nearest",
-        "svg.fonttype": "none",
-        "text.parse_math": False,  # names of files and sequences may contain dollar signs
-        "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
-        "savefig.dpi": 160,
-    }
-)
+# of matplotlib, see `use`; what is not listed has matplotlib's default
+SETTINGS: dict[Any, Any] = {
+    "font.size": 9,
+    "font.sans-serif": ["DejaVu Sans", "sans-serif"],  # each text of an SVG file lists them
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "image.interpolation": "nearest",
+    "svg.fonttype": "none",
+    "text.parse_math": False,  # names of files and sequences may contain dollar signs
+    "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
+    "savefig.dpi": 160,
+}
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
@@ -52,20 +53,42 @@ KEYPOINT: dict[str, Any] = {"s": 2.5, "color": "#00e5a0", "linewidths": 0}
 EDGE_COLOR = (255, 140, 0)  # red, green, blue of edges on a frame
 
 
+def use() -> None:
+    """Let matplotlib draw in this style from now on.
+
+    Programs and notebooks call it at their start. Settings of the user's own are reset to
+    matplotlib's defaults, so that figures look the same everywhere. Matplotlib reads its settings
+    when it makes a figure and again when it draws it.
+    """
+    matplotlib.rcdefaults()
+    matplotlib.rcParams.update(SETTINGS)
+
+
+@contextmanager
+def applied() -> Iterator[None]:
+    """Let matplotlib draw in this style within a block, and reset its settings afterwards."""
+    with matplotlib.rc_context():
+        use()
+        yield
+
+
 def line_style(index: int) -> dict[str, Any]:
-    """Return colour and dash of the index-th line of a figure. 28 styles differ; neighbours
-    also differ in dashes.
+    """Return colour and dash of the index-th line of a figure.
+
+    28 styles differ; neighbours also differ in dashes.
     """
     colors, dashes = (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK), ("-", "--", "-.", ":")
     return {"color": colors[index % len(colors)], "linestyle": dashes[index % len(dashes)]}
 
 
 def label_colors(label_map: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Return a label map in colours, enlarged to the frame's size for display. masks.py
-    enlarges in another way.
+    """Return a label map in colours, enlarged to the frame's size for display.
+
+    masks.py enlarges in another way.
     """
-    rows = np.arange(frame.shape[0]) * label_map.shape[0] // frame.shape[0]
-    columns = np.arange(frame.shape[1]) * label_map.shape[1] // frame.shape[1]
+    height, width = frame.shape[:2]
+    rows = np.arange(height) * label_map.shape[0] // height
+    columns = np.arange(width) * label_map.shape[1] // width
     return colorize(label_map[np.ix_(rows, columns)])
 
 
@@ -79,13 +102,13 @@ def new_figure(
 def frame_panels(
     frame: np.ndarray, rows: int = 1, columns: int = 1, width: float = PAGE_WIDTH
 ) -> tuple[plt.Figure, list[Any]]:
-    """Return a figure and a list of its axes, which have the shape of a frame and room for
-    titles.
+    """Return a figure and a list of its axes.
+
+    The axes have the shape of a frame and room for titles.
     """
-    height, length = frame.shape[:2]
-    figure, axes = new_figure(
-        rows, columns, rows * (width / columns * height / length + 0.27), width, squeeze=False
-    )
+    frame_height, frame_width = frame.shape[:2]
+    panel_height = width / columns * frame_height / frame_width + 0.27
+    figure, axes = new_figure(rows, columns, rows * panel_height, width, squeeze=False)
     return figure, list(axes.flat)
 
 
@@ -103,8 +126,9 @@ def pictures(
     columns: int = 1,
     label_maps: Collection[np.ndarray] = (),
 ) -> plt.Figure:
-    """Show pictures {title: picture} of a frame's shape, with keypoints {title: (n, 2)} and a
-    legend of label maps.
+    """Show pictures {title: picture} of a frame's shape.
+
+    keypoints: {title: (n, 2)}, shown on the picture. label_maps: of the classes in a legend.
     """
     figure, axes = frame_panels(frame, -(-len(pictures) // columns), columns)
     for panel, (title, picture) in zip(axes, pictures.items()):
@@ -135,7 +159,8 @@ def small_panels(
     """
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
-    figure = figure or plt.figure(figsize=(PAGE_WIDTH, rows * 1.65 + 0.6), layout="constrained")
+    if figure is None:
+        figure = plt.figure(figsize=(PAGE_WIDTH, rows * 1.65 + 0.6), layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
     for panel in panels[len(names) :]:
         panel.remove()
@@ -151,27 +176,28 @@ def small_panels(
 
 def legend_below(figure: Any, panels: Iterable[plt.Axes], columns: int) -> None:
     """Add a legend below the figure with each label of the panels once."""
-    handles = {
-        label: handle
-        for panel in panels
-        for handle, label in zip(*panel.get_legend_handles_labels())
-    }
+    handles: dict[str, Any] = {}
+    for panel in panels:
+        panel_handles, labels = panel.get_legend_handles_labels()
+        handles |= dict(zip(labels, panel_handles))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
 def class_legend(figure: plt.Figure, *label_maps: np.ndarray, also: Iterable[Any] = ()) -> None:
     """Add a legend of the classes in label maps below a figure, and make the figure higher.
+
     also: further handles.
     """
+    ids = np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps]))
     names: dict[tuple, list[str]] = {}  # some Cityscapes labels share a colour
-    for index in np.unique(np.concatenate([np.unique(label_map) for label_map in label_maps])):
+    for index in ids:
         names.setdefault(LABELS[index].color, []).append(LABELS[index].name)
-    handles: list[Any] = [
-        Patch(color=tuple(np.array(color) / 255), label=", ".join(labels))
-        for color, labels in names.items()
-    ]
+    handles: list[Any] = []
+    for color, labels in names.items():
+        handles.append(Patch(color=tuple(np.array(color) / 255), label=", ".join(labels)))
     handles += also
-    figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * -(-len(handles) // 5))
+    rows = -(-len(handles) // 5)
+    figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * rows)
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
 
 
@@ -187,9 +213,8 @@ def with_sliders(draw: Callable[..., plt.Figure], **sliders: Any) -> None:
     picture = Image(layout={"width": "720px"})
 
     def redraw(_: Any = None) -> None:
-        picture.value = print_figure(
-            draw(**{name: slider.value for name, slider in sliders.items()}), dpi=150
-        )
+        values = {name: slider.value for name, slider in sliders.items()}
+        picture.value = print_figure(draw(**values), dpi=150)
         plt.close()
 
     for slider in sliders.values():
@@ -200,20 +225,26 @@ def with_sliders(draw: Callable[..., plt.Figure], **sliders: Any) -> None:
 
 
 def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
-    """Make an axis (such as axes.yaxis) logarithmic, with a few round ticks and limits around
-    the positive values.
+    """Make an axis (such as axes.yaxis) logarithmic.
+
+    It gets a few round ticks, and limits around the positive values.
     """
     positive = np.asarray(values, float)
     positive = positive[np.isfinite(positive) & (positive > 0)]
-    low, high = (positive.min(), positive.max()) if len(positive) else (1, 1)
-    margin = max((high / low) ** 0.05, 1.1 if high < 1.1 * low else 1)
+    low, high = 1.0, 1.0
+    if len(positive):
+        low, high = positive.min(), positive.max()
+    least_margin = 1.1 if high < 1.1 * low else 1
+    margin = max((high / low) ** 0.05, least_margin)
     low, high = low / margin, high * margin
-    # within a factor of five, ticks at equal differences are rounder than ticks at equal ratios
-    locator = (
-        MaxNLocator(5)
-        if high < 5 * low
-        else LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,), numticks=6)
-    )
+    locator: Locator
+    if high < 5 * low:
+        # ticks at equal differences are rounder here than ticks at equal ratios
+        locator = MaxNLocator(5)
+    elif high < 100 * low:
+        locator = LogLocator(subs=(1, 2, 5), numticks=6)
+    else:
+        locator = LogLocator(subs=(1,), numticks=6)
     axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
     axis.set_major_locator(locator)
     axis.set_major_formatter("{x:g}")
@@ -221,10 +252,9 @@ def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
 
 
 def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
-    """Write folder/name.webp if the figure contains images, else folder/name.svg, with the data
-    note at the foot.
+    """Write folder/name.webp if the figure contains images, else folder/name.svg.
 
-    The note is also in the file's metadata.
+    The data note is at the foot of the figure and in the file's metadata.
     """
     # a tight box would move legends at the figure's edge onto the note, so their places are fixed
     figure.draw_without_rendering()
@@ -270,33 +300,36 @@ def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
 def save_all(
     figures: dict[str, plt.Figure], tables: dict[str, pd.DataFrame], folder: Path, note: str
 ) -> list[tuple[str, str]]:
-    """Write {name: figure} and {name: table}, except empty tables, and return (kind, name) of
-    each written one.
+    """Write {name: figure} and {name: table}, except empty tables.
+
+    Returns (kind, name) of each one that was written.
     """
-    tables = {name: table for name, table in tables.items() if len(table)}
+    written = []
     for name, figure in figures.items():
         save_figure(figure, folder, name, note)
         plt.close(figure)
+        written.append(("figure", name))
     for name, table in tables.items():
-        save_table(table, folder, name, note)
-    return [*(("figure", name) for name in figures), *(("table", name) for name in tables)]
+        if len(table):
+            save_table(table, folder, name, note)
+            written.append(("table", name))
+    return written
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """Return a pandas table as Markdown, with numbers aligned to the right and missing values
-    empty. Names are no HTML.
+    """Return a pandas table as Markdown.
+
+    Numbers are aligned to the right, and missing values are empty. Names are no HTML.
     """
     numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
     rows = [list(table.columns), ["---:" if right else ":---" for right in numeric]]
-    rows += [
-        [
-            ""
-            if pd.isna(value)
-            else f"{value:g}"
-            if isinstance(value, float)
-            else str(value).replace("<", "&lt;")
-            for value in row
-        ]
-        for row in table.itertuples(index=False)
-    ]
+    rows += [list(map(_cell, row)) for row in table.itertuples(index=False)]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _cell(value: Any) -> str:
+    if pd.isna(value):
+        return ""
+    if isinstance(value, float):
+        return f"{value:g}"
+    return str(value).replace("<", "&lt;")

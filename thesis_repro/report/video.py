@@ -22,7 +22,7 @@ from thesis_repro.odometry import (
     start_pose,
 )
 from thesis_repro.odometry.passes import Masks
-from thesis_repro.report.style import BASELINE, TRUTH
+from thesis_repro.report.style import BASELINE, TRUTH, applied
 from thesis_repro.running import console
 from thesis_repro.running.files import atomic, progress
 
@@ -120,6 +120,7 @@ def _describe(step: Step, true: np.ndarray | None, masked: bool) -> str:
     return "\n".join([*lines, *step.flags])
 
 
+@applied()
 def write_video(
     path: Path, sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None
 ) -> None:

@@ -1,7 +1,7 @@
-"""What a run says and how it ends: the log, the summary, signals, and one-line errors for a lack
-of space or memory.
+"""What a run says and how it ends: the log, the summary, signals, and one-line errors.
 
-This module imports only the standard library, so it still works if there is too little memory for
+The errors are those of bad input and of a lack of space or memory. This module imports only the
+standard library, so it still works if there is too little memory for
 other packages.
 """
 
@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from thesis_repro.errors import InputError, one_line
+from thesis_repro.running.folders import LOG, holds_results
 
-LOG = "log.txt"
-RECORD = "made-from.json"  # in every folder of results, see `results.stage`
 # what a user can do about a system error, by its number
 ROOM, ACCESS = (
     "make room on its disk, or name a folder on another",
@@ -59,6 +58,9 @@ NO_MEMORY_TEXTS = (
 )
 
 
+log = logging.getLogger("thesis_repro")
+
+
 class _Printer(logging.Handler):
     """Prints messages and warnings on standard error, where they do not mix with results."""
 
@@ -68,57 +70,73 @@ class _Printer(logging.Handler):
             print(prefix + one_line(record.getMessage()), file=sys.stderr, flush=True)
 
 
-log = logging.getLogger("thesis_repro")
-log.addHandler(_Printer())
-log.setLevel(logging.INFO)
-log.propagate = False
+def print_messages() -> None:
+    """Print the messages of this package from now on: in programs and notebooks.
+
+    Without it they go where a user of the package sends those of the logger "thesis_repro".
+    """
+    if not prints_messages():
+        log.addHandler(_Printer())
+    log.setLevel(logging.INFO)
+    log.propagate = False
+
+
+def prints_messages() -> bool:
+    """Return whether `print_messages` was called in this process."""
+    return any(isinstance(handler, _Printer) for handler in log.handlers)
 
 
 def explain(error: BaseException | None) -> str | None:
-    """Return one line for an InputError or for a lack of space, permission or memory; None for any
-    other error.
+    """Return one line for an InputError or for a lack of space, permission or memory.
 
-    The line names the file, if it is known, and says what to do. The causes of the error are
-    searched too.
+    Returns None for any other error. The line names the file, if it is known, and says what to do.
+    The causes of the error are searched too.
     """
     if isinstance(error, InputError):
         return str(error)
     while error is not None:
-        number, path, text = (
-            number_of(error),
-            getattr(error, "filename", None),
-            f"{type(error).__name__}: {error}",
-        )
-        if number == errno.ENOMEM or any(words in text for words in NO_MEMORY_TEXTS):
-            return NO_MEMORY
-        if text.startswith("TerminatedWorkerError"):  # of joblib
-            return WORKER_KILLED
-        if (
-            number in REMEDIES
-            or isinstance(error, OSError)
-            and path is not None
-            and number is not None
-        ):
-            return f"{path or 'a file'}: {os.strerror(number)}; {REMEDIES.get(number, 'check the path')}"
+        line = _explain_one(error)
+        if line is not None:
+            return line
         error = error.__cause__ or error.__context__
     return None
 
 
+def _explain_one(error: BaseException) -> str | None:
+    """Do what `explain` does, without the causes of the error."""
+    number, path = number_of(error), getattr(error, "filename", None)
+    text = f"{type(error).__name__}: {error}"
+    if number == errno.ENOMEM or any(words in text for words in NO_MEMORY_TEXTS):
+        return NO_MEMORY
+    if text.startswith("TerminatedWorkerError"):  # of joblib
+        return WORKER_KILLED
+    if number is None:
+        return None
+    if number in REMEDIES:
+        return f"{path or 'a file'}: {os.strerror(number)}; {REMEDIES[number]}"
+    if isinstance(error, OSError) and path is not None:
+        return f"{path or 'a file'}: {os.strerror(number)}; check the path"
+    return None
+
+
 def number_of(error: BaseException) -> int | None:
-    """Return the system's number of an error, or None. HDF5 and other libraries give the
-    system's text only.
+    """Return the system's number of an error, or None.
+
+    HDF5 and other libraries give the system's text only.
     """
-    numbers = (
-        number
-        for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        if os.strerror(number) in str(error)
-    )
-    return getattr(error, "errno", None) or next(numbers, None)
+    number = getattr(error, "errno", None)
+    if number:
+        return number
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if os.strerror(number) in str(error):
+            return number
+    return None
 
 
 def need_addresses(gigabytes: int) -> None:
-    """Raise InputError if `ulimit -v` is too low. Some libraries would then end the process
-    without a message.
+    """Raise InputError if `ulimit -v` is too low.
+
+    Some libraries would then end the process without a message.
     """
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < gigabytes * 2**30:
@@ -128,8 +146,9 @@ def need_addresses(gigabytes: int) -> None:
 
 
 def report_error(error: Exception) -> int:
-    """Print the error that ends a command, and return the exit status. Raises an error that
-    `explain` does not know.
+    """Print the error that ends a command, and return the exit status.
+
+    Raises an error that `explain` does not know.
     """
     line = explain(error)
     if line is None:
@@ -140,6 +159,7 @@ def report_error(error: Exception) -> int:
 
 def run_main(main: Callable[[], object]) -> None:
     """Call the function of a program, and end the process with `report_error` if it fails."""
+    print_messages()
     try:
         main()
     except Exception as error:
@@ -150,8 +170,9 @@ def run_main(main: Callable[[], object]) -> None:
 
 
 class _LogFile(MemoryHandler):
-    """The log of a run. It is written once the folder holds results, so a refused run leaves no
-    files.
+    """The log of a run.
+
+    It is written once the folder holds results, so a refused run leaves no files.
     """
 
     target: Any  # the FileHandler; of a MemoryHandler it may be None
@@ -165,29 +186,27 @@ class _LogFile(MemoryHandler):
         self.target.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
         # a full disk is reported when results are written
         self.target.handleError = lambda record: None
-        self.folder, self.has_results, self.warnings, self.started = (
-            folder,
-            has_results,
-            0,
-            time.monotonic(),
-        )
+        self.folder = folder
+        self.has_results = has_results
+        self.warnings = 0
+        self.started = time.monotonic()
 
     def shouldFlush(self, record: logging.LogRecord) -> bool:
         self.warnings += record.levelno == logging.WARNING
-        self.has_results = (
-            self.has_results
-            or (self.folder / RECORD).exists()
-            or any(self.folder.glob(f"*/{RECORD}"))
-        )
+        if not self.has_results:
+            self.has_results = any(map(holds_results, (self.folder, *self.folder.glob("*"))))
         return self.has_results
 
     def end(self, text: str, reused: int = 0) -> None:
-        """Print a summary of the run, its time, the number of results reused from an earlier
-        run, and its warnings.
+        """Print a summary of the run, its time and its warnings.
+
+        reused: the number of results from an earlier run.
         """
         seconds = timedelta(seconds=round(time.monotonic() - self.started))
-        reused_text = f"from an earlier run: {reused:,}; " if reused else ""
-        text += f"\n{seconds} h; {reused_text}warnings: {self.warnings}; log: {self.folder / LOG}"
+        text += f"\n{seconds} h; "
+        if reused:
+            text += f"from an earlier run: {reused:,}; "
+        text += f"warnings: {self.warnings}; log: {self.folder / LOG}"
         print(text, flush=True)
         for line in text.splitlines():
             log.info(line, extra={"printed": True})
@@ -203,6 +222,8 @@ def logged(folder: str | Path, title: str, has_results: bool = False) -> Iterato
     loggers = log, logging.getLogger("py.warnings")
     for logger in loggers:
         logger.addHandler(handler)
+    level = log.level
+    log.setLevel(logging.INFO)
     logging.captureWarnings(True)
     log.info(title, extra={"printed": True})
     try:
@@ -216,6 +237,7 @@ def logged(folder: str | Path, title: str, has_results: bool = False) -> Iterato
         raise
     finally:
         logging.captureWarnings(False)
+        log.setLevel(level)
         for logger in loggers:
             logger.removeHandler(handler)
         with suppress(OSError):
@@ -283,8 +305,9 @@ def check_stop() -> None:
 
 
 def end_with_parent() -> None:
-    """Let the system kill this worker process when its parent ends, even if the parent is
-    killed (Linux only).
+    """Let the system kill this worker process when its parent ends (Linux only).
+
+    It does so even if the parent is killed.
     """
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
@@ -293,8 +316,9 @@ def end_with_parent() -> None:
 
 
 def interrupt_without(*ancestors: int) -> None:
-    """Send SIGTERM to this process when it or one of the `ancestors` (process ids) loses its
-    parent, even if that was killed (Linux only). A thread looks once a second.
+    """Send SIGTERM to this process when it or one of its ancestors loses its parent (Linux only).
+
+    It is sent even if the parent was killed. ancestors: process ids. A thread looks once a second.
     """
 
     def parents() -> list[str]:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from tqdm.utils import ObjectWrapper
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import console
+from thesis_repro.running.folders import holds_results
 
 # matches the names that `temporary_path` returns
 TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")
@@ -39,23 +40,24 @@ def read_gray(path: str | Path) -> np.ndarray:
 
 
 def read_color(path: str | Path) -> np.ndarray:
-    """Read one image as 8-bit red, green, blue, shape (height, width, 3). Raises what
-    `read_gray` raises.
+    """Read one image as 8-bit red, green, blue, shape (height, width, 3).
+
+    Raises what `read_gray` raises.
     """
     return _read(path, "RGB", cv2.IMREAD_COLOR_RGB)
 
 
 def read_ids(path: str | Path) -> np.ndarray:
-    """Read one PNG of numbers such as class ids, shape (height, width) uint8, without changing a
-    number.
+    """Read one PNG of numbers such as class ids, shape (height, width) uint8.
 
-    Raises what `read_gray` raises, and InputError if reading as gray would change numbers: for a
-    palette, fewer than 8 bits, channels that differ, or another format.
+    No number is changed. Raises what `read_gray` raises, and InputError if reading as gray would
+    change numbers: for a palette, fewer than 8 bits, channels that differ, or another format.
     """
     with _opened(path) as (_, image):
         # contains Pillow's name of the stored mode: "L;4" is gray with 4 bits
         stored = str(image.tile)
-    channels = np.atleast_3d(read_gray(path) if image.mode == "L" else read_color(path))
+    read = read_gray if image.mode == "L" else read_color
+    channels = np.atleast_3d(read(path))
     if (
         image.format != "PNG"
         or image.mode in ("1", "P")
@@ -69,15 +71,16 @@ def read_ids(path: str | Path) -> np.ndarray:
 
 
 def glance(path: str | Path) -> tuple[int, int]:
-    """Return the size (height, width) of an image from its header, and check that the file has its
-    end.
+    """Return the size (height, width) of an image, and check that the file has its end.
 
-    Nothing is decoded, so this is fast. Raises InputError as `read_gray` does, except for damage in
-    the middle.
+    Only the header is read. Nothing is decoded, so this is fast. Raises InputError as `read_gray`
+    does, except for damage in the middle.
     """
     with _opened(path) as (file, image):
-        file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
-        if END_MARKS["PNG" if image.format == "PNG" else "JPEG"] not in file.read():
+        end_mark = END_MARKS["PNG" if image.format == "PNG" else "JPEG"]
+        size = os.fstat(file.fileno()).st_size
+        file.seek(-min(TAIL, size), os.SEEK_END)
+        if end_mark not in file.read():
             read_gray(path)  # some cameras and tools append bytes after the end mark
         return image.size[::-1]
 
@@ -101,8 +104,9 @@ def _read(path: str | Path, mode: str, flag: int) -> np.ndarray:
 
 @contextmanager
 def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, ImageFile.ImageFile]]:
-    """Open an image file and read its header: yields (file, image). Turns all errors of the
-    block into InputError.
+    """Open an image file and read its header: yields (file, image).
+
+    Turns all errors of the block into InputError.
     """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
@@ -133,43 +137,50 @@ def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, ImageFile.ImageFile]]:
 
 
 def listed(folder: str | Path, pattern: str = "*.png") -> list[Path]:
-    """Return the files of a folder that match a pattern, in sorted order, without hidden
-    (temporary) files.
+    """Return the files of a folder that match a pattern, in sorted order.
+
+    Hidden (temporary) files are left out.
     """
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
 
 
 def images(folder: str | Path) -> list[Path]:
-    """Return the PNG or JPEG images of a folder, sorted by name with 9 before 10, without hidden
-    files.
+    """Return the PNG or JPEG images of a folder, sorted by name with 9 before 10.
 
-    Raises InputError if the folder holds both kinds.
+    Hidden files are left out. Raises InputError if the folder holds both kinds.
     """
-    paths = [
-        path for path in listed(folder, "*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")
-    ]
-    if len({path.suffix.lower() == ".png" for path in paths}) > 1:
+    pngs, jpegs = [], []
+    for path in listed(folder, "*"):
+        if path.suffix.lower() == ".png":
+            pngs.append(path)
+        elif path.suffix.lower() in (".jpg", ".jpeg"):
+            jpegs.append(path)
+    if pngs and jpegs:
         raise InputError(f"{folder}: holds PNG and JPEG images; move those of one kind away")
-    return sorted(
-        paths,
-        key=lambda path: (
-            [
-                (letters, int(digits or -1))
-                for letters, digits in re.findall(r"(\D*)(\d*)", path.stem)
-            ],
-            path,
-        ),
-    )
+    return sorted(pngs or jpegs, key=_natural_order)
+
+
+def _natural_order(path: Path) -> tuple[list[tuple[str, int]], Path]:
+    """Return a key that sorts names with 9 before 10."""
+    pieces = re.findall(r"(\D*)(\d*)", path.stem)
+    return [(letters, int(digits or -1)) for letters, digits in pieces], path
 
 
 def numbers_of(paths: Iterable[Path]) -> list[int] | None:
-    """Return the integers at the ends of file names, or None if a name has none or the names
-    start differently.
+    """Return the integers at the ends of file names.
+
+    Returns None if a name has none or the names start differently.
     """
-    matches = [re.fullmatch(r"(.*?)(\d+)", path.stem) for path in paths]
-    if not all(matches) or len({match[1] for match in matches if match}) > 1:
+    numbers, starts = [], set()
+    for path in paths:
+        match = re.fullmatch(r"(.*?)(\d+)", path.stem)
+        if match is None:
+            return None
+        starts.add(match[1])
+        numbers.append(int(match[2]))
+    if len(starts) > 1:
         return None
-    return [int(match[2]) for match in matches if match]
+    return numbers
 
 
 def is_whole(path: str | Path) -> bool:
@@ -182,13 +193,15 @@ def is_whole(path: str | Path) -> bool:
 
 @contextmanager
 def atomic(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path; rename it to `path` when the block ends, or delete it if the block
-    raises an error.
+    """Yield a temporary path, and rename it to `path` when the block ends.
 
-    A symbolic link is kept and its target is replaced; in a folder of results, the link is.
+    It is deleted if the block raises an error. A symbolic link is kept and its target is replaced;
+    in a folder of results, the link is.
     """
     path = Path(path)
-    target = path.resolve() if path.is_symlink() and _results_of(path) is None else path
+    target = path
+    if path.is_symlink() and not any(map(holds_results, path.absolute().parents)):
+        target = path.resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_path(target)
     try:
@@ -212,16 +225,10 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
 
 
-def _results_of(path: Path) -> Path | None:
-    """Return the folder of results that a file lies in, or None."""
-    return next(
-        (folder for folder in path.absolute().parents if (folder / console.RECORD).exists()), None
-    )
-
-
 def check_output(path: Path) -> None:
-    """Raise InputError if a file cannot be written to `path`, or could be moved away later with
-    results around it.
+    """Raise InputError if a file cannot be written to `path`.
+
+    Also if it could be moved away later with results around it.
     """
     # renaming a file cannot replace a device, a pipe or an open stream
     is_stream = str(path).startswith(("/dev/std", "/dev/fd/", "/proc/")) or path.name == "-"
@@ -232,13 +239,14 @@ def check_output(path: Path) -> None:
         raise InputError(
             f"{path}: cannot be written; name a file in a folder that you may write to"
         )
-    if any((folder / console.RECORD).exists() for folder in folders):
+    if any(map(holds_results, folders)):
         raise InputError(
             f"{path}: is in a folder of results, with which it could be moved; name a file elsewhere"
         )
 
 
 def write_text(path: str | Path, text: str) -> None:
+    """Write a text as UTF-8."""
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -257,8 +265,9 @@ def write_array(path: str | Path, array: np.ndarray) -> None:
 
 
 def needed(path: str | Path, notebook: str) -> Path:
-    """Return `path`, which an earlier notebook writes. Raises InputError with the notebook's
-    name if it is missing.
+    """Return `path`, which an earlier notebook writes.
+
+    Raises InputError with the notebook's name if it is missing.
     """
     path = Path(path)
     if not path.exists():
@@ -273,30 +282,29 @@ def progress(
     unit: str = "frame",
     initial: int = 0,
 ) -> tqdm:
-    """Return a tqdm progress bar on standard error, or on the file that THESIS_REPRO_PROGRESS
-    names.
+    """Return a tqdm progress bar on standard error.
 
-    `make figures` sets the variable to its terminal for the bars inside notebooks. Without a
-    terminal, the bar is replaced by a line every 20 seconds.
+    It is on the file that THESIS_REPRO_PROGRESS names, if that is set: `make figures` sets
+    it to its terminal for the bars inside notebooks. Without a terminal, the bar is replaced by a
+    line every 20 seconds.
     """
     stream = sys.stderr
     with suppress(KeyError, OSError):
-        stream = open(os.environ["THESIS_REPRO_PROGRESS"], "a", buffering=1)
-    live = stream.isatty()
+        # the bar needs it open, and the process closes it at its end
+        stream = open(os.environ["THESIS_REPRO_PROGRESS"], "a", buffering=1)  # noqa: SIM115
+    options: dict[str, Any] = {"file": _Lines(stream), "mininterval": 20, "ascii": True}
+    if stream.isatty():
+        options = {"file": stream, "mininterval": 0.2, "dynamic_ncols": True, "leave": False}
     return tqdm(
         iterable,
         desc=description,
         total=total,
         unit=unit,
         initial=initial,
-        dynamic_ncols=live,
-        file=stream if live else _Lines(stream),
-        mininterval=0.2 if live else 20,
-        leave=not live,
         delay=BAR_DELAY,
-        ascii=None if live else True,
-        smoothing=0,
-    )  # the average over the whole time predicts better than the last steps
+        smoothing=0,  # the average over the whole time predicts better than the last steps
+        **options,
+    )
 
 
 class _Lines(ObjectWrapper):

@@ -1,5 +1,4 @@
-"""Folders of results: which inputs they were made from, who works in them, and how a stopped job
-resumes.
+"""Folders of results: their inputs, their locks, and how a stopped job resumes.
 
 A *stage* is a folder of results with a record of their inputs (`stage`). Its lock keeps other runs
 out (`claimed`). A *checkpoint* is one file from which a long job resumes (`store`, `resume`). A
@@ -21,15 +20,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import console
-from thesis_repro.running.console import LOG, RECORD
 from thesis_repro.running.files import TEMPORARY, atomic, progress, write_text
+from thesis_repro.running.folders import LOG, RECORD
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -71,8 +70,9 @@ def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
 
 
 def _move_aside(folder: Path, changed: str) -> None:
-    """Move all that is in a folder of results into a new folder beside it. Nothing is deleted,
-    because a user may have changed or added files.
+    """Move all that is in a folder of results into a new folder beside it.
+
+    Nothing is deleted, because a user may have changed or added files.
     """
     # the record goes last, so that a killed move can be repeated; the log is being written
     paths = sorted(folder.glob("*"), key=lambda path: path.name == RECORD)
@@ -90,8 +90,9 @@ def _move_aside(folder: Path, changed: str) -> None:
 
 
 def record(folder: str | Path) -> Any:
-    """Return the inputs of the results in a stage's folder as a dict, or None if the folder is
-    not a stage.
+    """Return the inputs of the results in a stage's folder as a dict.
+
+    Returns None if the folder is not a stage.
     """
     path = Path(folder) / RECORD
     if not path.is_file():
@@ -104,7 +105,7 @@ def record(folder: str | Path) -> Any:
 
 def made_from(folder: str | Path) -> str:
     """Return a digest of the inputs of the results in a stage's folder."""
-    return content(Path(folder) / RECORD)
+    return digest_of_file(Path(folder) / RECORD)
 
 
 def check_worker(folder: str | Path, made_from: dict[str, Any], **here: Any) -> None:
@@ -126,8 +127,9 @@ def check_worker(folder: str | Path, made_from: dict[str, Any], **here: Any) -> 
 
 
 def sweep(folder: str | Path) -> None:
-    """Delete the temporary files of killed runs in and below a folder. The caller must hold its
-    lock.
+    """Delete the temporary files of killed runs in and below a folder.
+
+    The caller must hold its lock.
     """
     for path in Path(folder).rglob(".*"):
         if TEMPORARY.fullmatch(path.name):
@@ -139,10 +141,10 @@ _held: set[tuple[int, int]] = set()  # device and inode of each path that this p
 
 @contextmanager
 def claimed(folder: str | Path) -> Iterator[None]:
-    """Create a folder if needed, and lock it until the block ends. Raises InputError if another
-    process has locked it.
+    """Create a folder if needed, and lock it until the block ends.
 
-    Folders that were created here and are still empty at the end are removed.
+    Folders that were created here and are still empty at the end are removed. Raises InputError if
+    another process has locked it.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
@@ -160,8 +162,9 @@ def claimed(folder: str | Path) -> Iterator[None]:
 
 @contextmanager
 def locked(path: str | Path) -> Iterator[None]:
-    """Lock an existing folder or file until the block ends. The same process may lock it again
-    within the block.
+    """Lock an existing folder or file until the block ends.
+
+    The same process may lock it again within the block.
     """
     status = os.stat(path)
     key = status.st_dev, status.st_ino
@@ -187,11 +190,10 @@ TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
 
 
 def kept_table(path: str | Path, rows: int | None = None, **options: Any) -> pd.DataFrame | None:
-    """Return the table that an earlier run wrote to a CSV file, or None if there is none or it is
-    damaged.
+    """Return the table that an earlier run wrote to a CSV file.
 
-    Damaged means empty, cut off, with another number of rows than `rows`, or with text outside
-    TEXT_COLUMNS.
+    Returns None if there is none or it is damaged. Damaged means empty, cut off, with another
+    number of rows than `rows`, or with text outside TEXT_COLUMNS.
     """
     path = Path(path)
     if not path.is_file():
@@ -249,12 +251,13 @@ EXCEPT = ("thesis_repro.running.compiled",)
 
 
 @lru_cache
-def code(*modules: str) -> str:
-    """Return a digest of the code that results come from: of modules ("thesis_repro.masks"), and of
-    all modules of this project that they import.
+def digest_of_code(*modules: str) -> str:
+    """Return a digest of the code that results come from.
 
-    Code counts, but not its place: not its module, its order there, imports, comments, docstrings,
-    and what errors and the log say. Modules that no number comes from are left out (NO_NUMBERS).
+    It is that of modules ("thesis_repro.masks") and of all modules of this project that they
+    import. Code counts, but not its place: not its module, its order there, imports, comments,
+    docstrings, and what errors and the log say. Modules that no number comes from are left out
+    (NO_NUMBERS).
     """
     pieces = []
     for tree in _sources(modules).values():
@@ -338,59 +341,85 @@ def made_with(*packages: str) -> dict[str, Any]:
     return {"versions": {name: importlib.metadata.version(name) for name in packages}}
 
 
-def listing(paths: Iterable[str | Path]) -> str:
+def digest_of_files(paths: Iterable[str | Path]) -> str:
     """Return one digest of the names and contents of files."""
     files = [Path(path) for path in paths]
-    lines = [f"{path.name}:{digest}\n" for path, digest in zip(files, contents(files), strict=True)]
+    lines = [f"{path.name}:{digest}\n" for path, digest in zip(files, digests(files), strict=True)]
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
 
 
-def content(path: str | Path) -> str:
+def digest_of_file(path: str | Path) -> str:
     """Return a digest of the bytes of one file."""
-    return contents([path])[0]
+    return digests([path])[0]
 
 
 # seconds; a younger file may change again without a new date, so its digest is not remembered
 SETTLED = 0.1
 
 
-def contents(paths: Iterable[str | Path]) -> list[str]:
-    """Return digests of the bytes of files, in order. Raises InputError for a path that is not a
-    regular file.
+def digests(paths: Iterable[str | Path]) -> list[str]:
+    """Return a digest of the bytes of each file, in order.
 
     The digests are remembered in the build folder. A file is read again only if its path, size,
-    dates or inode differ.
+    dates or inode differ. Raises InputError for a path that is not a regular file.
     """
-    files = [Path(path).absolute() for path in paths]
-    identities = {path: _identity(path) for path in files}
-    keys = {
-        path: (json.dumps(str(path)), json.dumps(identity)) for path, identity in identities.items()
-    }
-    digests = {}
-    with suppress(OSError, sqlite3.Error), _digest_database() as database:
-        query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
-        rows = ((path, database.execute(query, key).fetchone()) for path, key in keys.items())
-        digests = {path: row[0] for path, row in rows if row}
-    unknown = [path for path in keys if path not in digests]
+    versions = [_version(Path(path).absolute()) for path in paths]
+    known = _recall(versions)
+    new = [version for version in dict.fromkeys(versions) if version not in known]
     with ThreadPoolExecutor(4) as pool:
-        read = pool.map(_sha256, unknown)
-        digests |= zip(unknown, progress(read, "reading the data once", len(unknown), unit="file"))
-    settled = [
-        path for path in unknown if max(identities[path][1:3]) < time.time_ns() - SETTLED * 1e9
-    ]
-    with suppress(OSError, sqlite3.Error), _digest_database() as database:
-        database.executemany(
-            "INSERT OR REPLACE INTO digests VALUES (?, ?, ?)",
-            [(*keys[path], digests[path]) for path in settled],
-        )
-    return [digests[path][:12] for path in files]
+        read = pool.map(_sha256, [version.path for version in new])
+        bar = progress(read, "reading the data once", len(new), unit="file")
+        read_now = dict(zip(new, bar))
+    _remember(read_now)
+    known |= read_now
+    return [known[version][:12] for version in versions]
 
 
-def _identity(path: Path) -> tuple[int, ...]:
+class _Version(NamedTuple):
+    """A file as it is now: it was not changed if all of this stays the same."""
+
+    path: Path
+    size: int  # bytes
+    modified: int  # ns
+    status_changed: int  # ns
+    inode: int
+    device: int
+
+    def key(self) -> tuple[str, str]:
+        """Return the path and the rest as the database has them."""
+        return json.dumps(str(self.path)), json.dumps(self[1:])
+
+
+def _version(path: Path) -> _Version:
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: is not a file; data must be in files")
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev
+    times = status.st_mtime_ns, status.st_ctime_ns
+    return _Version(path, status.st_size, *times, status.st_ino, status.st_dev)
+
+
+def _recall(versions: Iterable[_Version]) -> dict[_Version, str]:
+    """Return the digests of those files that were read before and have not changed."""
+    recalled: dict[_Version, str] = {}
+    query = "SELECT digest FROM digests WHERE path = ? AND identity = ?"
+    with suppress(OSError, sqlite3.Error), _digest_database() as database:
+        for version in versions:
+            row = database.execute(query, version.key()).fetchone()
+            if row:
+                recalled[version] = row[0]
+    return recalled
+
+
+def _remember(new: dict[_Version, str]) -> None:
+    """Write digests into the database, except those of files that may just be changing."""
+    newest = time.time_ns() - SETTLED * 1e9
+    rows = [
+        (*version.key(), digest)
+        for version, digest in new.items()
+        if max(version.modified, version.status_changed) < newest
+    ]
+    with suppress(OSError, sqlite3.Error), _digest_database() as database:
+        database.executemany("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", rows)
 
 
 @contextmanager

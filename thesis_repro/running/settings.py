@@ -71,8 +71,9 @@ class Profile:
 def _world(
     sequences: int, frames: int | None, train_images: int, validation_images: int
 ) -> dict[str, Any]:
-    """Sizes of the embedded world. frames: of each sequence; None for its whole drive, 41 to
-    132 frames.
+    """Sizes of the embedded world.
+
+    frames: of each sequence; None for its whole drive, 41 to 132 frames.
     """
     return {
         "sequences": tuple(f"{number:02d}" for number in range(sequences)),
@@ -153,8 +154,9 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of one run. `run` names its data and sizes, so that runs with other settings use
-    other folders.
+    """Settings of one run.
+
+    `run` names its data and sizes, so that runs with other settings use other folders.
     """
 
     profile: str
@@ -174,80 +176,63 @@ class Settings:
 
     @property
     def uses_shipped_model(self) -> bool:
-        """Whether the shipped model makes the label maps: there are real frames, but no real
-        images to train on.
+        """Whether the shipped model makes the label maps.
+
+        It does if there are real frames, but no real images to train on.
         """
         return self.cityscapes_is_embedded and not self.kitti_is_embedded
 
     @property
     def figures_in_git(self) -> bool:
-        """Whether the figures folder is the one in git, which holds the figures of the default
-        run.
+        """Whether the figures folder is the one in git.
+
+        It holds the figures of the default run.
         """
         return self.figures == ROOT / "figures"
 
     @property
     def data_note(self) -> str:
         """One line for captions that names the data and the sizes of the run."""
-        odometry = (
-            "embedded world (rendered)" if self.kitti_is_embedded else "the user's KITTI folder"
-        )
-        labels = (
-            "label maps: by the model in the package, no training"
-            if self.uses_shipped_model
-            else "training: embedded world (rendered)"
-            if self.cityscapes_is_embedded
-            else "training: the user's Cityscapes folder"
-        )
-        sizes = "".join(
-            f", {name} {text}" for name, text in _changed_sizes(self.profile, self.sizes).items()
-        )
-        return f"odometry: {odometry}; {labels}; profile {self.profile}{sizes}"
+        odometry = "the user's KITTI folder"
+        if self.kitti_is_embedded:
+            odometry = "embedded world (rendered)"
+        labels = "training: the user's Cityscapes folder"
+        if self.uses_shipped_model:
+            labels = "label maps: by the model in the package, no training"
+        elif self.cityscapes_is_embedded:
+            labels = "training: embedded world (rendered)"
+        parts = [f"profile {self.profile}"]
+        for name, text in _changed_sizes(self.profile, self.sizes).items():
+            parts.append(f"{name} {text}")
+        return f"odometry: {odometry}; {labels}; {', '.join(parts)}"
 
     def __str__(self) -> str:
         return f"run {self.run}; results: {_from_root(self.build)}"
 
 
 def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
-    """Return the settings that the THESIS_REPRO_ variables of an environment (default: os.environ)
-    give.
+    """Return the settings that the THESIS_REPRO_ variables of an environment give.
 
-    Raises InputError for an unknown variable, a data folder that does not exist, and a bad number.
+    The default is os.environ. Raises InputError for an unknown variable, a data folder that does
+    not exist, and a bad number.
     """
-    environment = os.environ if environment is None else environment
-    values = {
-        name[len(PREFIX) :]: value
-        for name, value in environment.items()
-        if name.startswith(PREFIX) and value
-    }
-    for name in sorted(values.keys() - set(VARIABLES)):
-        raise InputError(f"{PREFIX}{name}: unknown setting; known are {', '.join(VARIABLES)}")
+    values = _values(os.environ if environment is None else environment)
     profile = values.get("PROFILE", "demo")
     if profile not in PROFILES:
         raise InputError(f"PROFILE={profile}: unknown profile; choose one of {', '.join(PROFILES)}")
-    build = Path(values.get("BUILD", ROOT / "build")).absolute()
-    figures = Path(values.get("FIGURES", ROOT / "figures")).absolute()
-    world = build / f"world-{profile}"
-    folders: dict[str, Path] = {
-        name: Path(values[name]).expanduser().absolute()
-        for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC")
-        if name in values
-    }
-    for name, folder in folders.items():
-        if not folder.is_dir():
-            raise InputError(f"{name}={values[name]}: no such folder")
+    folders = _data_folders(values)
     for name in {"BUILD", "FIGURES"} & values.keys():
         if re.search(r"[`$\"'\\;&|<>()*?\[\]{}!\n]", values[name]):  # make passes them to a shell
             raise InputError(f"{name}={values[name]}: has a character that shells treat specially")
         check_outside(f"{name}={values[name]}", Path(values[name]), folders.values())
-    readers = {"WIDTHS": read_widths, "FRAMES": read_frames}
-    changed: dict[str, Any] = {
-        name.lower(): readers[name](text) if name in readers else number(name, text)
-        for name, text in values.items()
-        if name in SIZES
-    }
-    sizes = replace(PROFILES[profile], **changed)
+    build = Path(values.get("BUILD", ROOT / "build")).absolute()
+    figures = Path(values.get("FIGURES", ROOT / "figures")).absolute()
+    world = build / f"world-{profile}"
+    sizes = _sizes(profile, values)
     run = _run_name(folders, profile, sizes)
+    if run != "embedded-demo":
+        # figures/ holds the figures of the default run; every other run gets a folder in it
+        figures /= run
     return Settings(
         profile=profile,
         sizes=sizes,
@@ -257,8 +242,7 @@ def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
         cityscapes_is_embedded="CITYSCAPES" not in folders,
         run=run,
         build=build / run,
-        # figures/ holds the figures of the default run; every other run gets a folder in it
-        figures=figures if run == "embedded-demo" else figures / run,
+        figures=figures,
         world=world,
         jobs=number("JOBS", values.get("JOBS", str(cores()))),
         scheduler=scheduler_address(values.get("DASK_SCHEDULER")),
@@ -266,9 +250,49 @@ def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
     )
 
 
+def _values(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the THESIS_REPRO_ variables that are not empty, by name without this prefix."""
+    values = {}
+    for variable, value in environment.items():
+        if variable.startswith(PREFIX) and value:
+            values[variable.removeprefix(PREFIX)] = value
+    for name in sorted(values.keys() - set(VARIABLES)):
+        raise InputError(f"{PREFIX}{name}: unknown setting; known are {', '.join(VARIABLES)}")
+    return values
+
+
+def _data_folders(values: Mapping[str, str]) -> dict[str, Path]:
+    """Return the user's folders of data, by the name of their variable."""
+    folders = {}
+    for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC"):
+        if name not in values:
+            continue
+        folders[name] = Path(values[name]).expanduser().absolute()
+        if not folders[name].is_dir():
+            raise InputError(f"{name}={values[name]}: no such folder")
+    return folders
+
+
+def _sizes(profile: str, values: Mapping[str, str]) -> Profile:
+    """Return the sizes of a profile, with those replaced that variables give."""
+    changed: dict[str, Any] = {}
+    for name in SIZES:
+        if name not in values:
+            continue
+        text = values[name]
+        if name == "WIDTHS":
+            changed["widths"] = read_widths(text)
+        elif name == "FRAMES":
+            changed["frames"] = read_frames(text)
+        else:
+            changed[name.lower()] = number(name, text)
+    return replace(PROFILES[profile], **changed)
+
+
 def check_outside(name: str, path: Path, data: Iterable[Path]) -> None:
-    """Raise InputError if an output lies in or below one of the paths given as data, which are only
-    read. name: how the user gave the output.
+    """Raise InputError if an output lies in or below one of the paths given as data.
+
+    Data is only read. name: how the user gave the output.
     """
     for folder in data:
         if path.resolve().is_relative_to(folder.resolve()):
@@ -283,75 +307,88 @@ def _run_name(folders: dict[str, Path], profile: str, sizes: Profile) -> str:
         letters = re.sub(r"[^\w.+-]+", "-", folder.name)
         # for folders of the same name
         path_digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:6]
-        data.append(f"{name.lower().removeprefix('kitti_')}-{letters}-{path_digest}")
+        kind = name.lower().removeprefix("kitti_")
+        data.append(f"{kind}-{letters}-{path_digest}")
     parts = ["_".join(data), profile]
     for name, text in _changed_sizes(profile, sizes).items():
-        text = text.replace(", ", "_")
-        text = text if len(text) <= 40 else hashlib.sha256(text.encode()).hexdigest()[:8]
-        parts.append(f"{name.replace(' ', '-')}-{text}")
+        short = text.replace(", ", "_")
+        if len(short) > 40:
+            short = hashlib.sha256(short.encode()).hexdigest()[:8]
+        parts.append(f"{name.replace(' ', '-')}-{short}")
     return "-".join(parts)
 
 
 def _changed_sizes(profile: str, sizes: Profile) -> dict[str, str]:
     """The sizes that differ from the profile's, as text by name ("image size")."""
     texts = {}
-    for name in map(str.lower, SIZES):
-        value = getattr(sizes, name)
-        if value != getattr(PROFILES[profile], name):
-            # (5, 10) or 5
-            texts[name.replace("_", " ")] = "all" if value is None else str(value).strip("(),")
+    for size in SIZES:
+        field = size.lower()
+        value = getattr(sizes, field)
+        if value == getattr(PROFILES[profile], field):
+            continue
+        text = "all"
+        if value is not None:
+            text = str(value).strip("(),")  # of (5, 10), or of 5
+        texts[field.replace("_", " ")] = text
     return texts
 
 
 def number(name: str, text: str | int, limits: tuple[int, int, int] | None = None) -> int:
-    """Return the whole number in the text of setting `name`. Raises InputError if its limits
-    (default: LIMITS[name]) do not allow it. Notebooks check the numbers of their knobs with it.
+    """Return the whole number in the text of setting `name`.
+
+    Raises InputError if its limits (default: LIMITS[name]) do not allow it. Notebooks check the
+    numbers of their knobs with it.
     """
     least, most, step = limits or LIMITS[name]
     text = str(text)
-    value = int(text) if re.fullmatch("[0-9]{1,19}", text) else -1
-    if not least <= value <= most or value % step:
-        multiple = f", a multiple of {step}" if step > 1 else ""
-        raise InputError(
-            f"{name}={text[:60]}: must be a whole number from {least} to {most}{multiple}"
-        )
-    return value
+    if re.fullmatch("[0-9]{1,19}", text):
+        value = int(text)
+        if least <= value <= most and value % step == 0:
+            return value
+    allowed = f"from {least} to {most}"
+    if step > 1:
+        allowed += f", a multiple of {step}"
+    raise InputError(f"{name}={text[:60]}: must be a whole number {allowed}")
 
 
 def read_frames(text: str) -> int | None:
-    """Return the number of frames in a text, or None for "all". Raises InputError for a bad
-    number.
+    """Return the number of frames in a text, or None for "all".
+
+    Raises InputError for a bad number.
     """
-    return None if text == "all" else number("FRAMES", text)
+    if text == "all":
+        return None
+    return number("FRAMES", text)
 
 
 def read_widths(text: str) -> tuple[int, ...]:
-    """Return the dilation widths, pixels, in a text such as "1-3,10", sorted. Raises InputError
-    for another text.
+    """Return the dilation widths, pixels, in a text such as "1-3,10", sorted.
+
+    Raises InputError for another text.
     """
-    matches = [
-        re.fullmatch("([0-9]{1,4})(?:-([0-9]{1,4}))?", word)
-        for word in text.replace(",", " ").split()
-    ]
-    ranges = [range(int(match[1]), int(match[2] or match[1]) + 1) for match in matches if match]
-    numbers = sorted(set().union(*ranges))
     least, most, _ = LIMITS["WIDTHS"]
-    if (
-        not all(matches)
-        or not all(ranges)
-        or not numbers
-        or numbers[0] < least
-        or numbers[-1] > most
-    ):
-        raise InputError(
-            f"WIDTHS={text[:60]}: must be whole numbers from {least} to {most}, such as 5,10 or 1-15"
-        )
-    return tuple(numbers)
+    error = InputError(
+        f"WIDTHS={text[:60]}: must be whole numbers from {least} to {most}, such as 5,10 or 1-15"
+    )
+    widths: set[int] = set()
+    for word in text.replace(",", " ").split():
+        match = re.fullmatch("([0-9]{1,4})(?:-([0-9]{1,4}))?", word)
+        if match is None:
+            raise error
+        first, last = int(match[1]), int(match[2] or match[1])
+        if not least <= first <= last <= most:
+            raise error
+        widths.update(range(first, last + 1))
+    if not widths:
+        raise error
+    return tuple(sorted(widths))
 
 
 def scheduler_address(text: str | None) -> str | None:
-    """Return the address of a Dask scheduler, or None if there is none. Raises InputError for any
-    other text, for which Dask would start a new cluster or read a file."""
+    """Return the address of a Dask scheduler, or None if there is none.
+
+    Raises InputError for any other text, for which Dask would start a new cluster or read a file.
+    """
     if text is not None and not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d{1,5}", text):
         raise InputError(
             f"Dask scheduler {text}: must be tcp://host:port, as 'dask scheduler' prints it"
@@ -361,12 +398,15 @@ def scheduler_address(text: str | None) -> str | None:
 
 def cores() -> int:
     """Return the number of cores that this process may use."""
-    # cpu_count may give None, but not on the systems that lack sched_getaffinity
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()  # type: ignore[return-value]
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _from_root(path: Path) -> Path:
-    return path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
+    if path.is_relative_to(ROOT):
+        return path.relative_to(ROOT)
+    return path
 
 
 if __name__ == "__main__":
@@ -376,9 +416,10 @@ if __name__ == "__main__":
         _settings = read_settings()
     except InputError as error:
         sys.exit(f"error: {error}")
-    built, page = _from_root(_settings.build), _from_root(_settings.figures / "index.html")
-    print(
-        built
-        if sys.argv[1:] != ["figures"]
-        else f"tables and figures: open {page} in a browser; executed notebooks: {built / 'notebooks'}"
-    )
+    built = _from_root(_settings.build)
+    if sys.argv[1:] == ["figures"]:
+        page = _from_root(_settings.figures / "index.html")
+        print(f"tables and figures: open {page} in a browser; ", end="")
+        print(f"executed notebooks: {built / 'notebooks'}")
+    else:
+        print(built)

@@ -88,7 +88,7 @@ def _open(
     results.stage(
         output_dir,
         model=weights,
-        frames=results.listing(paths),
+        frames=results.digest_of_files(paths),
         batch_size=batch_size,
         **_arithmetic(),
     )
@@ -100,7 +100,7 @@ def _open(
 def _arithmetic() -> dict[str, Any]:
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
     return results.made_with("tensorflow", "keras", "opencv-python-headless") | {
-        "code": results.code("thesis_repro.segmentation.prediction"),
+        "code": results.digest_of_code("thesis_repro.segmentation.prediction"),
         "arithmetic": segmentation.arithmetic(),
     }
 

@@ -170,7 +170,7 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
     true = augmentation.one_hot(random.integers(0, N_CLASSES, (2, 16, 16), np.uint8), N_CLASSES)
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
     return {
-        "code": results.code("thesis_repro.segmentation.training"),
+        "code": results.digest_of_code("thesis_repro.segmentation.training"),
         "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),

@@ -95,10 +95,10 @@ def _measure(
     results.stage(
         folder,
         options=options,
-        code=results.code("thesis_repro.study.ablations"),
+        code=results.digest_of_code("thesis_repro.study.ablations"),
         **results.made_with("opencv-python-headless", "numpy", "numba"),
-        sequence=results.listing(sequence.files),
-        labels=results.listing([labels / path.name for path in sequence.frame_paths]),
+        sequence=results.digest_of_files(sequence.files),
+        labels=results.digest_of_files([labels / path.name for path in sequence.frame_paths]),
         model=results.made_from(labels),
     )
     path = folder / "runs.csv"

@@ -194,8 +194,8 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
     results.stage(
         folder,
         **_versions(),
-        sequence=results.listing(sequence.files),
-        true_labels=results.listing(true_labels),
+        sequence=results.digest_of_files(sequence.files),
+        true_labels=results.digest_of_files(true_labels),
         **records.pop("", {}),
     )
     for source, record in records.items():
@@ -208,7 +208,7 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": results.code("thesis_repro.odometry", "thesis_repro.study.jobs"),
+        "code": results.digest_of_code("thesis_repro.odometry", "thesis_repro.study.jobs"),
         **results.made_with("opencv-python-headless", "numpy", "numba"),
     }
 

@@ -68,7 +68,11 @@ class Source:
             if self.kind == "labels"
             else {"invert": str(self.invert)}
         )
-        return {self.kind: results.listing(listed(folder)), "made_from": made_from, **settings}
+        return {
+            self.kind: results.digest_of_files(listed(folder)),
+            "made_from": made_from,
+            **settings,
+        }
 
 
 def named(

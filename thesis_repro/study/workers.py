@@ -66,12 +66,21 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
 
 def _here(size: int, function: Callable, calls: Calls) -> Results:
     work = joblib.Parallel(
-        n_jobs=size, return_as="generator_unordered", initializer=console.end_with_parent
+        n_jobs=size,
+        return_as="generator_unordered",
+        initializer=_start_process,
+        initargs=(console.prints_messages(),),
     )(joblib.delayed(_numbered)(index, function, call) for index, call in enumerate(calls))
     try:
         yield from work
     except TerminatedWorkerError:
         raise InputError(console.WORKER_KILLED) from None
+
+
+def _start_process(prints_messages: bool) -> None:
+    console.end_with_parent()
+    if prints_messages:
+        console.print_messages()
 
 
 def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:
