@@ -27,7 +27,7 @@ def sequence(small_world):
 def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
     return {
-        method: controls.masks(method, Source(small_labels), sequence, WIDTH)
+        method: controls.masks_of_method(method, Source(small_labels), sequence, WIDTH)
         for method in controls.MASK_CONTROLS
     } | {"masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
 
@@ -111,14 +111,14 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     opened = [Sequence(small_world / "kitti", "00").subset(5)]
     jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
     assert {job.dilation_width for job in jobs if job.method in controls.MASK_CONTROLS} == {5}
-    runs = runner.run(jobs, opened, small_labels, tmp_path)
+    runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table
     left = compare.keypoints_left(runs)
     masked = compare.of_method(runs, "masked")
     jobs += reduced_jobs(thesis_tables.best_widths(masked)) + keypoint_control_jobs(
         left, opened, width=5
     )
     assert len({job.name for job in jobs}) == len(jobs)
-    runs = runner.run(jobs, opened, small_labels, tmp_path).set_index("run")
+    runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table.set_index("run")
     assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
     number = runs["mean_keypoints"]
     assert left["00"] == number["masked-05-0"] < number["masked-10-0"]
