@@ -43,6 +43,14 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
         assert sum(text in problem for problem in problems) == 1, text
 
 
+def test_an_unreadable_first_frame_is_one_problem_among_others(tiny_kitti):
+    for name in ("000000.png", "000002.png"):
+        (tiny_kitti / IMAGES / name).write_bytes(b"no picture")
+    _, problems = check_kitti(tiny_kitti)
+    first, third = problems
+    assert "000000.png" in first and "000002.png" in third
+
+
 def test_damage_within_a_file_is_found_by_a_deep_check(tiny_kitti, tiny_cityscapes):
     frame, label = tiny_kitti / IMAGES / "000001.png", tiny_cityscapes / "trainannot/street_1.png"
     data = bytearray(frame.read_bytes())

@@ -136,7 +136,9 @@ def _missing_frames(paths: list[Path], counts: dict[Path, int], problems: _Probl
     return []
 
 
-def _check_frames(name: str, paths: list[Path], size: Any, deep: bool, problems: _Problems) -> None:
+def _check_frames(
+    name: str, paths: list[Path], size: tuple[int, int] | None, deep: bool, problems: _Problems
+) -> None:
     """Check the file of each frame.
 
     size: (height, width) of the first one, or None if it cannot be read.
@@ -146,7 +148,8 @@ def _check_frames(name: str, paths: list[Path], size: Any, deep: bool, problems:
     def check_frame(path: Path) -> None:
         decode = deep or path in ends
         frame_size = files.read_gray(path).shape if decode else files.glance(path)
-        kitti.check_size(path, frame_size, size)
+        if size is not None:
+            kitti.check_size(path, frame_size, size)
 
     if size is None:
         paths = paths[1:]  # its problem is known
