@@ -172,9 +172,8 @@ def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
     monkeypatch.setattr("thesis_repro.study.workers.TIMEOUT", 1)
     # without workers, none, no address
     for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
-        with pytest.raises(InputError, match=address) as error:
-            with open_pool(1, address):
-                pass
+        with pytest.raises(InputError, match=address) as error, open_pool(1, address):
+            pass
         assert "\n" not in str(error.value)
 
 
