@@ -60,8 +60,9 @@ def reference():
 
 @pytest.fixture
 def kill_when():
-    """kill_when(command, condition): start a command, and kill it and its child processes when
-    the condition holds.
+    """A function that starts a command, and kills it when a condition holds.
+
+    Its child processes are killed, too.
     """
 
     def start(command, condition):
@@ -76,11 +77,13 @@ def kill_when():
 
 @contextmanager
 def _shared_folder(tmp_path_factory, name):
-    """A folder shared by all processes of a test run (pytest -n), locked while one of them
-    fills it.
+    """A folder shared by all processes of a test run (pytest -n).
+
+    It is locked while one of them fills it.
     """
     root = tmp_path_factory.getbasetemp()
-    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
     with open(root / f"{name}.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield root / name
@@ -88,8 +91,9 @@ def _shared_folder(tmp_path_factory, name):
 
 @pytest.fixture(scope="session")
 def small_world(tmp_path_factory):
-    """A small embedded world: two sequences of 12 frames and a few street images. Tests must
-    not change it.
+    """A small embedded world: two sequences of 12 frames and a few street images.
+
+    Tests must not change it.
     """
     from street_world import dataset
     from thesis_repro.running.settings import PROFILES
@@ -101,22 +105,21 @@ def small_world(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def small_labels(small_world, tmp_path_factory):
-    """Exact label maps of the small world, 320x320, one folder a sequence, laid out as notebook
-    5 does.
+    """Exact label maps of the small world, 320x320, one folder a sequence.
+
+    They are laid out as notebook 5 does.
     """
     from thesis_repro.running import results
 
     with _shared_folder(tmp_path_factory, "small_labels") as root:
-        for path in (
-            small_world.glob("kitti/sequences/*/labels_0/*.png") if not root.exists() else ()
-        ):
+        if root.exists():
+            return root
+        for path in small_world.glob("kitti/sequences/*/labels_0/*.png"):
             folder = root / path.parent.parent.name
             results.stage(folder, model="none")
             label_map = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            cv2.imwrite(
-                str(folder / path.name),
-                cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST),
-            )
+            resized = cv2.resize(label_map, (320, 320), interpolation=cv2.INTER_NEAREST)
+            cv2.imwrite(str(folder / path.name), resized)
     return root
 
 
@@ -133,9 +136,7 @@ def small_model(tmp_path_factory):
 
 @pytest.fixture
 def tiny_kitti(tmp_path):
-    """Sequence 00 with four 64x48 frames of noise, written by hand, for tests of reading and of
-    faults.
-    """
+    """Sequence 00 with four 64x48 frames of noise, for tests of reading and of faults."""
     root = tmp_path / "kitti"
     images = root / "sequences" / "00" / "image_0"
     images.mkdir(parents=True)

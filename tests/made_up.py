@@ -1,4 +1,6 @@
-"""Made-up paths, and runs with made-up errors, as `runner.run` gives them."""
+"""Made-up paths, and runs with made-up errors, as `runner.run_jobs` gives them."""
+
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -16,51 +18,39 @@ def runs(
     widths: {method: widths}; a method with widths [None] has no source. noise: relative spread of
     the repetitions.
     """
-    random, rows = np.random.default_rng(0), []
-    arms = [
-        (method, width, source)
-        for method, method_widths in widths.items()
-        for width in method_widths
-        for source in (sources if width else [""])
-    ]
-    for name in names:
-        for method, width, source in arms:
-            for estimator in estimators:
-                for repetition in range(repetitions):
-                    error = errors(name, method, width) * np.exp(noise * random.normal())
-                    job = Job(
-                        name,
-                        method,
-                        width,
-                        estimator=estimator,
-                        repetition=repetition,
-                        source=source,
-                    )
-                    rows.append(
-                        {
-                            "run": job.name,
-                            **vars(job),
-                            "frames": 100,
-                            "flagged": 0,
-                            "mean_keypoints": 500 + width if width else 1900,
-                            **dict.fromkeys(compare.METRICS, error),
-                            "mae": error / 2,
-                        }
-                    )
+    arms = []
+    for method, method_widths in widths.items():
+        for width in method_widths:
+            sources_of_width = sources if width else [""]
+            arms += [(method, width, source) for source in sources_of_width]
+    random = np.random.default_rng(0)
+    rows = []
+    for name, arm, estimator, repetition in product(names, arms, estimators, range(repetitions)):
+        method, width, source = arm
+        error = errors(name, method, width) * np.exp(noise * random.normal())
+        job = Job(name, method, width, estimator=estimator, repetition=repetition, source=source)
+        row = {"run": job.name, **vars(job), "frames": 100, "flagged": 0, "mean_keypoints": 1900}
+        if width:
+            row["mean_keypoints"] = 500 + width
+        row |= dict.fromkeys(compare.METRICS, error)
+        row["mae"] = error / 2
+        rows.append(row)
     return pd.DataFrame(rows).astype({"dilation_width": float})
 
 
 def winding(count=160, seed=None, stretch=1.0):
-    """Poses of a path with rotations about all axes and steps of one metre; with a seed, steps
-    have noise.
+    """Poses of a path with rotations about all axes and steps of one metre.
+
+    With a seed, steps have noise.
     """
-    random, noise = np.random.RandomState(seed), seed is not None
+    random = np.random.RandomState(seed)
+    noise = seed is not None
     poses = np.tile(np.eye(4), (count, 1, 1))
     for index in range(1, count):
-        turn = np.array([0.01 * np.sin(index), 0.03, 0.02 * np.cos(index)]) + noise * random.normal(
-            0, 0.01, 3
-        )
+        turn = np.array([0.01 * np.sin(index), 0.03, 0.02 * np.cos(index)])
+        turn += noise * random.normal(0, 0.01, 3)
+        rotation = Rotation.from_rotvec(turn).as_matrix()
         poses[index] = poses[index - 1]
-        poses[index, :3, :3] = poses[index - 1, :3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+        poses[index, :3, :3] = poses[index - 1, :3, :3] @ rotation
         poses[index, :3, 3] += stretch * poses[index, :3, 2] + noise * random.normal(0, 0.05, 3)
     return poses

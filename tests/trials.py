@@ -1,6 +1,4 @@
-"""Run commands as a user does, each as a process, wait for them, and check how they end and what
-they leave.
-"""
+"""Run commands as a user does, each as a process, and check how they end and what they leave."""
 
 import fnmatch
 import os
@@ -50,8 +48,9 @@ def environment(**changes):
 
 
 def start(command, where, before=None, **changes):
-    """Start a command in a folder; `before` is called in the new process, `changes` are of the
-    environment.
+    """Start a command in a folder.
+
+    before: is called in the new process. changes: of the environment.
     """
     return subprocess.Popen(
         list(map(str, command)),
@@ -102,22 +101,26 @@ def kill(process):
 
 
 def snapshot(where):
-    """{path: (size, date)} of all files below a folder but logs; None for folders. Files may
-    vanish meanwhile.
+    """{path: (size, date)} of all files below a folder but logs; None for folders.
+
+    Files may vanish meanwhile.
     """
     versions = {}
-    for path in (
-        Path(folder, name)
-        for folder, folders, names in os.walk(where)
-        for name in (*folders, *names)
-    ):
-        with suppress(FileNotFoundError):
-            status = path.lstat()
-            if path.name != LOG:
-                versions[path.relative_to(where)] = (
-                    None if path.is_dir() else (status.st_size, status.st_mtime_ns)
-                )
+    for folder, folders, names in os.walk(where):
+        for name in (*folders, *names):
+            if name != LOG:
+                path = Path(folder, name)
+                with suppress(FileNotFoundError):
+                    versions[path.relative_to(where)] = version(path)
     return versions
+
+
+def version(path):
+    """(size, date) of a file, None for a folder."""
+    status = path.lstat()
+    if path.is_dir():
+        return None
+    return status.st_size, status.st_mtime_ns
 
 
 def changes(before, after):
@@ -126,26 +129,26 @@ def changes(before, after):
 
 
 def refused(result, named, code=1, left=()):
-    """Check the exit code, that one line of error has the text `named`, and that only `left`
-    ("out/*") changed.
+    """Check the exit code and that one line of error has the text `named`.
+
+    left: patterns ("out/*") of the only paths that may have changed.
     """
     output = f"exit {result.returncode}\n{result.stdout}\n{result.stderr}"
-    assert result.returncode == code and "Traceback" not in result.stdout + result.stderr, output
-    errors = [
-        line for line in result.stderr.splitlines() if line.startswith(("error: ", "wrong: "))
-    ]
-    assert len(errors) == 1 and str(named) in errors[0], (
-        f"not one line that names {named}: {output}"
-    )
-    unexpected = [
-        path for path in result.left if not any(fnmatch.fnmatch(path, pattern) for pattern in left)
-    ]
+    assert result.returncode == code, output
+    assert "Traceback" not in result.stdout + result.stderr, output
+    lines = result.stderr.splitlines()
+    errors = [line for line in lines if line.startswith(("error: ", "wrong: "))]
+    assert len(errors) == 1, f"not one line: {output}"
+    assert str(named) in errors[0], f"does not name {named}: {output}"
+    expected = {path for pattern in left for path in fnmatch.filter(result.left, pattern)}
+    unexpected = [path for path in result.left if path not in expected]
     assert not unexpected, f"left behind: {', '.join(unexpected)}\n{output}"
 
 
 def contents(folder):
-    """{path: digest} of all files below a folder but logs; without times, which differ between
-    runs.
+    """{path: digest} of all files below a folder but logs.
+
+    Times, which differ between runs, are left out.
     """
     return {
         str(path.relative_to(folder)): sha256(_content(path)).hexdigest()
@@ -157,12 +160,12 @@ def contents(folder):
 def _content(path):
     if path.suffix == ".csv" and "runs" in path.parts:
         table = pd.read_csv(path, dtype=str)
-        return table[[name for name in table if not name.endswith("_seconds")]].to_csv().encode()
+        times = [name for name in table if name.endswith("_seconds")]
+        return table.drop(columns=times).to_csv().encode()
     if path.suffix == ".keras":
         with zipfile.ZipFile(path) as file:
-            return b"".join(
-                file.read(name) for name in sorted(file.namelist()) if name.endswith(".h5")
-            )
+            weights = [name for name in sorted(file.namelist()) if name.endswith(".h5")]
+            return b"".join(map(file.read, weights))
     return path.read_bytes()
 
 

@@ -129,7 +129,7 @@ def mask_cost(sequence, labels):
     """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        controls.masks(method, source, sequence, controls.LINE_WIDTH)
+        controls.masks_of_method(method, source, sequence, controls.LINE_WIDTH)
         for method in controls.MASK_CONTROLS
         if method != "true-labels"
     ]

@@ -65,7 +65,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
         prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
     names = [sequence.name for sequence in sequences]
     covered = {
-        source.name: [name for name in names if source.folder_of(name).is_dir()]
+        source.name: [name for name in names if source.sequence_folder(name).is_dir()]
         for source in others
     }
     for source in others:
@@ -74,7 +74,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
                 f"{source.folder}: holds no folder of label maps of {', '.join(names)}"
             )
     run = partial(
-        runner.run,
+        runner.run_jobs,
         sequences=sequences,
         sources=[Source(labels), *others],
         folder=build / "odometry",
@@ -95,7 +95,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
                 for name in source_names
                 for repetition in range(repetitions)
             ]
-        )
+        ).table
         for source, source_names in covered.items()
     }
     ablated = ablations.measure(
@@ -159,7 +159,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
 
 def _runs(run, sequences, repetitions):
     """Return the runs of the comparison. The runs with masks decide the jobs with fewer
-    keypoints. run: returns the runs of jobs.
+    keypoints. run: runs jobs, as `runner.run_jobs`.
     """
     planned = jobs.first_jobs(
         sequences,
@@ -167,14 +167,14 @@ def _runs(run, sequences, repetitions):
         tested=jobs.CONTROL_WIDTH,
         repetitions=repetitions,
     )
-    runs = run(planned)
+    runs = run(planned).table
     planned += jobs.reduced_jobs(
         thesis_tables.best_widths(compare.of_method(runs, "masked")), repetitions
     )
     planned += jobs.keypoint_control_jobs(
         compare.keypoints_left(runs), sequences, repetitions, width=jobs.CONTROL_WIDTH
     )
-    return run(planned)
+    return run(planned).table
 
 
 def _streets(sequences):
@@ -218,7 +218,9 @@ def _tracks(sequences, labels):
             "exact boundaries": masks.LabelMasks(
                 label_maps, sequence, width, masks.MaskSettings("exact")
             ),
-            "random lines": controls.masks("random-lines", Source(labels), sequence, width),
+            "random lines": controls.masks_of_method(
+                "random-lines", Source(labels), sequence, width
+            ),
         }
         rows.append(ablations.tracks(sequence, masks_by_name, SAMPLED_FRAMES))
     return pd.concat(rows, ignore_index=True)

@@ -80,7 +80,8 @@ def table(root, labels, build, repetitions=REPETITIONS, frames=None):
         for repetition in range(repetitions)
     ]
     sequences = [kitti.Sequence(root, name).subset(frames) for name in names]
-    runs = runner.run(planned, sequences, [Source(labels)], build, processes=cores())
+    outcome = runner.run_jobs(planned, sequences, [Source(labels)], build, processes=cores())
+    runs = outcome.table
     by_method = [runs[runs["method"] == method] for method in ("static", "baseline")]
     ratios = {
         metric: compare.ratios(*by_method, metric)

@@ -120,11 +120,12 @@ def run(settings, sources):
         repetitions=repetitions,
     )
     needed = [job for job in first if is_needed(job)]
-    runs = runner.run(needed, sequences, sources, folder, processes=settings.jobs)
+    outcome = runner.run_jobs(needed, sequences, sources, folder, processes=settings.jobs)
     needed += runner.keypoint_controls(
-        runs, sequences, sources, repetitions, jobs.CONTROL_WIDTH, [DECIDING]
+        outcome.table, sequences, sources, repetitions, jobs.CONTROL_WIDTH, [DECIDING]
     )
-    return runner.run(needed, sequences, sources, folder, processes=settings.jobs)
+    outcome = runner.run_jobs(needed, sequences, sources, folder, processes=settings.jobs)
+    return outcome.table
 
 
 def is_needed(job):

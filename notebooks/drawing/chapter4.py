@@ -1,7 +1,8 @@
 """Figures 4.2 to 4.16: single frames, errors in metres, and keypoints. comparison.py shows ratios
 of errors.
 
-`runs` is the table of `runner.run`. Lines and bars show the mean over repetitions, or the only run.
+`runs` is the table of `runner.run_jobs`. Lines and bars show the mean over repetitions, or the
+only run.
 Bands and error bars go from the lowest to the highest repetition.
 """
 

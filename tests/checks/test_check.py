@@ -25,9 +25,8 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
     (tiny_kitti / "poses/00.txt").write_text("1 0 0 0 0 2 0 0 0 0 1 0\n" * 4)
     cv2.imwrite(str(tiny_cityscapes / "valannot/street_0.png"), np.full((16, 32), 200, np.uint8))
     cv2.imwrite(str(tiny_cityscapes / "valannot/street_1.png"), np.full((8, 8), 7, np.uint8))
-    assert (
-        main(["check-data", "--kitti", str(tiny_kitti), "--cityscapes", str(tiny_cityscapes)]) == 1
-    )
+    roots = ["--kitti", str(tiny_kitti), "--cityscapes", str(tiny_cityscapes)]
+    assert main(["check-data", *roots]) == 1
     problems = sorted(capsys.readouterr().err.splitlines())
     named = [
         "000001.png",
@@ -41,6 +40,14 @@ def test_every_problem_is_listed_and_the_exit_code_is_1(tiny_kitti, tiny_citysca
     assert len(problems) == len(named)
     for text in named:
         assert sum(text in problem for problem in problems) == 1, text
+
+
+def test_an_unreadable_first_frame_is_one_problem_among_others(tiny_kitti):
+    for name in ("000000.png", "000002.png"):
+        (tiny_kitti / IMAGES / name).write_bytes(b"no picture")
+    _, problems = check_kitti(tiny_kitti)
+    first, third = problems
+    assert "000000.png" in first and "000002.png" in third
 
 
 def test_damage_within_a_file_is_found_by_a_deep_check(tiny_kitti, tiny_cityscapes):
@@ -67,24 +74,19 @@ def test_missing_files_are_counted_and_named(tiny_kitti, tiny_cityscapes):
     missing = [images / f"{index:06d}.png" for index in (0, 3, 4, 5, 9, 38, 39)]
     for path in missing:
         path.unlink()
-    assert [problem.split(":")[0] for problem in check_kitti(tiny_kitti)[1]] == list(
-        map(str, missing)
-    )
+    _, problems = check_kitti(tiny_kitti)
+    assert [problem.split(":")[0] for problem in problems] == [str(path) for path in missing]
     for index in range(4):
         (tiny_cityscapes / "trainannot" / f"street_{index}.png").unlink()
     for index in range(12):
         (tiny_cityscapes / "val" / f"lonely_{index}.png").write_bytes(b"")
-    counts = [
-        len(check_cityscapes(tiny_cityscapes, deep, splits)[1])
-        for deep, splits in (
-            (False, ("train", "val")),
-            (True, ("train", "val")),
-            (False, ("train",)),
-        )
-    ]
     # four images without label maps, and twelve more: ten are named, the others counted, and there
     # is no pair
-    assert counts == [4 + 12, 4 + 12, 4]
+    for deep in (False, True):
+        _, problems = check_cityscapes(tiny_cityscapes, deep)
+        assert len(problems) == 4 + 12
+    _, problems = check_cityscapes(tiny_cityscapes, splits=("train",))
+    assert len(problems) == 4
     shutil.rmtree(tiny_cityscapes / "val")
     assert len(check_cityscapes(tiny_cityscapes)[1]) == 4 + 1
 
@@ -105,9 +107,8 @@ def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsy
     monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
     for frame, reports in ((None, True), (None, False), (0, True), (9, True)):
         if frame is not None:
-            shutil.copy(
-                tiny_kitti / IMAGES / "000001.png", tiny_kitti / IMAGES / f"{frame:06d}.png"
-            )
+            images = tiny_kitti / IMAGES
+            shutil.copy(images / "000001.png", images / f"{frame:06d}.png")
         assert check.main(tmp_path / "checked") == (frame == 9)  # a missing frame
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
@@ -143,27 +144,28 @@ def test_implausible_data_is_one_line_with_the_number(tiny_kitti, path, text, se
 def test_a_path_of_another_drive_is_reported():
     def drive(seed):
         path = np.tile(np.eye(4), (40, 1, 1))
-        for pose, angle in zip(path, np.cumsum(np.random.default_rng(seed).normal(0, 0.02, 40))):
+        turns = np.random.default_rng(seed).normal(0, 0.02, 40)
+        for pose, angle in zip(path, np.cumsum(turns)):
             pose[:3, :3] = cv2.Rodrigues(np.array([0, angle, 0]))[0]
         return path
 
-    assert (
-        oddities.of_path("00", drive(0), drive(0))
-        == []
-        != oddities.of_path("00", drive(1), drive(0))
-    )
-    assert len(oddities.of_path("00", np.linalg.inv(drive(0)), drive(0))) == 1
-    # upside down, as if a file has w first
-    assert len(oddities.of_path("00", np.diag([1, -1, -1, 1]) @ drive(0), drive(0))) == 1
+    true = drive(0)
+    assert oddities.of_path("00", true, true) == []
+    assert oddities.of_path("00", drive(1), true) != []
+    assert len(oddities.of_path("00", np.linalg.inv(true), true)) == 1
+    # as if a file has w first
+    upside_down = np.diag([1, -1, -1, 1]) @ true
+    assert len(oddities.of_path("00", upside_down, true)) == 1
 
 
 STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)
 TRAIN = np.choose(STREET // 8, [0, 2, 10]).astype(np.uint8)
 # both leave out columns with a higher contrast: every sixth one, or 24 beside each other
-STRIPS = np.where((np.arange(64) % 6 == 0) & (np.arange(64) < 33), 0, 255).astype(
-    np.uint8
-) * np.ones((48, 1), np.uint8)
-AREA = np.where(np.arange(64) < 24, 0, 255).astype(np.uint8) * np.ones((48, 1), np.uint8)
+COLUMNS = np.arange(64)
+STRIPS = np.full((48, 64), 255, np.uint8)
+STRIPS[:, (COLUMNS % 6 == 0) & (COLUMNS < 33)] = 0
+AREA = np.full((48, 64), 255, np.uint8)
+AREA[:, COLUMNS < 24] = 0
 HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
 
 
@@ -189,20 +191,22 @@ def test_implausible_masks_are_one_line_with_the_option(
     tiny_kitti, tmp_path, kind, picture, count, options, seen
 ):
     folder = tmp_path / "masks"
-    for index in range(count):
-        files.write_png(folder / ("bonnet.png" if count == 1 else f"{index:06d}.png"), picture)
-    # where the mask is 255
-    for path in (tiny_kitti / IMAGES).iterdir() if options.pop("flat", False) else ():
-        image = cv2.imread(str(path), 0)
-        image[:, 33:] = 100
-        cv2.imwrite(str(path), image)
+    names = [f"{index:06d}.png" for index in range(count)]
+    if count == 1:
+        names = ["bonnet.png"]
+    for name in names:
+        files.write_png(folder / name, picture)
+    if "flat" in options:  # where the mask is 255
+        for path in (tiny_kitti / IMAGES).iterdir():
+            image = cv2.imread(str(path), 0)
+            image[:, 33:] = 100
+            cv2.imwrite(str(path), image)
     sequence = Sequence(tiny_kitti, "00")
-    made = (
-        MaskFolder(folder, sequence)
-        if kind == "masks"
-        else LabelMasks(folder, sequence, 3, MaskSettings(**options))
-    )
-    line, odd = oddities.of_masks(made, sequence)
+    if kind == "labels":
+        settings = MaskSettings(**options)
+        line, odd = oddities.of_masks(LabelMasks(folder, sequence, 3, settings), sequence)
+    else:
+        line, odd = oddities.of_masks(MaskFolder(folder, sequence), sequence)
     assert "%" in line and [seen in text for text in odd] == ([True] if seen else [])
 
 

@@ -1,5 +1,6 @@
-"""Comparisons of made-up runs: known ratios, intervals and verdicts; Equation 4.1 and the choice of
-the dilation width.
+"""Comparisons of made-up runs: known ratios, intervals and verdicts.
+
+Also Equation 4.1 and the choice of the dilation width.
 """
 
 import made_up
@@ -18,7 +19,9 @@ def runs_of(factors, sequences=EIGHT, width=10, **options):
 
     def error(name, method, _):
         factor = factors.get(method, 1.0)
-        return (1 + int(name)) * (factor(name) if callable(factor) else factor)
+        if callable(factor):
+            factor = factor(name)
+        return (1 + int(name)) * factor
 
     widths = {"baseline": [None]} | {method: [width] for method in factors}
     return made_up.runs(sequences, error, widths, sources=["net"], **{"repetitions": 2} | options)
@@ -69,7 +72,10 @@ def test_the_verdict_follows_the_interval(factor, verdict):
 
 
 def test_intervals_that_exclude_the_true_mean_by_chance():
-    """Print the percentages in docs/reading-results.md: pytest -s -k by_chance tests/study"""
+    """Print the percentages of docs/reading-results.md.
+
+    Call it with pytest -s -k by_chance tests/study.
+    """
     random = np.random.default_rng(0)
     draws = {
         "normal": lambda shape: random.normal(size=shape),
@@ -86,7 +92,8 @@ def test_intervals_that_exclude_the_true_mean_by_chance():
     for name, draw in draws.items():
         for count in percent.index:
             intervals = np.array([compare.mean_interval(row) for row in draw((2000, count))])
-            percent.loc[count, name] = 100 * ((intervals[:, 0] > 0) | (intervals[:, 1] < 0)).mean()
+            low, high = intervals.T
+            percent.loc[count, name] = 100 * ((low > 0) | (high < 0)).mean()
     print(percent.T)
     assert percent["normal"].between(4, 6).all() and (percent["heavy tails"] < 5).all()
 
@@ -114,17 +121,14 @@ def test_masks_are_compared_with_all_keypoints_and_every_control():
     assert rows.loc[("masked", "fewer", "refined"), "ratio"] == pytest.approx(2)
     assert rows.loc[("masked", "mirrored", "thesis"), EIGHT].tolist() == pytest.approx([0.5] * 8)
     primary = compare.primary_comparison(table)
-    assert set(primary["estimator"]) == {"refined"} and list(primary["metric"]) == list(
-        compare.JUDGING_METRICS
-    )
+    assert set(primary["estimator"]) == {"refined"}
+    assert list(primary["metric"]) == list(compare.JUDGING_METRICS)
     assert compare.overall(primary["verdict"]) == "lower"
-    assert set(compare.primary_comparison(table[table["estimator"] == "thesis"])["estimator"]) == {
-        "thesis"
-    }
-    against = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS).set_index(
-        ["reference", "metric"]
-    )["verdict"]
-    assert set(against["mirrored"]) == {"lower"} and set(against["fewer"]) == {"higher"}
+    of_thesis = compare.primary_comparison(table[table["estimator"] == "thesis"])
+    assert set(of_thesis["estimator"]) == {"thesis"}
+    against = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS)
+    verdicts = against.set_index(["reference", "metric"])["verdict"]
+    assert set(verdicts["mirrored"]) == {"lower"} and set(verdicts["fewer"]) == {"higher"}
     assert compare.overall(["lower", "higher"]) == "no clear difference"
     assert compare.overall(["lower", compare.TOO_FEW]) == compare.overall([]) == compare.TOO_FEW
 
@@ -159,9 +163,10 @@ def test_the_tested_width_is_the_width_of_the_controls():
 
 
 def test_sequences_far_off_the_mean_are_named():
-    runs = runs_of({"masked": lambda name: 6.0 if name == "03" else 0.1 if name == "05" else 1.0})
+    runs = runs_of({"masked": lambda name: {"03": 6.0, "05": 0.1}.get(name, 1.0)})
     rows = compare.comparisons(runs)
-    assert set(rows.loc[rows["method"] == "masked", "far_off"].map(tuple)) == {("03", "05")}
+    far_off = rows.loc[rows["method"] == "masked", "far_off"]
+    assert set(far_off.map(tuple)) == {("03", "05")}
     # two sequences do not show which one is far off
     assert compare.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []
     assert compare.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
@@ -177,8 +182,9 @@ def test_shuffling_is_reported_as_a_factor():
 def parts_of(
     error, sequences=(*EIGHT, "08", "09", "10"), widths=range(1, 16), repetitions=5, noise=0.0
 ):
-    """(masked, baseline) runs with errors error(sequence, width); width is None for all
-    keypoints.
+    """(masked, baseline) runs with errors error(sequence, width).
+
+    The width is None for all keypoints.
     """
     runs = made_up.runs(
         sequences,
@@ -193,7 +199,11 @@ def parts_of(
 
 def separate_optimum(name, width):
     """Error of a run when every sequence has another best width."""
-    return 1.0 if width is None else 0.5 if width == 1 + int(name) else 1.2 + 0.01 * width
+    if width is None:
+        return 1.0
+    if width == 1 + int(name):
+        return 0.5
+    return 1.2 + 0.01 * width
 
 
 def test_leaving_one_out_shows_that_the_best_width_is_chance():
@@ -201,9 +211,8 @@ def test_leaving_one_out_shows_that_the_best_width_is_chance():
     chosen = thesis_tables.chosen_widths(masked, baseline)
     assert chosen["best"].tolist() == list(range(1, 12)) and chosen["fixed"].nunique() == 1
     for choice, better in (("best", 11), ("fixed", 1), ("left_out", 0)):
-        changes = thesis_tables.changes(
-            thesis_tables.of_chosen_width(masked, chosen[choice]), baseline, "rmse"
-        )
+        rows = thesis_tables.of_chosen_width(masked, chosen[choice])
+        changes = thesis_tables.changes(rows, baseline, "rmse")
         assert (changes < 0).sum() == better
 
 
@@ -228,11 +237,11 @@ def test_a_width_that_failed_in_one_sequence_is_not_chosen_for_all():
 
 def test_other_repetitions_confirm_a_real_optimum_and_no_chance():
     real = thesis_tables.stability(*parts_of(separate_optimum, noise=0.05))
-    assert (real["same_best"] == 100).all() and np.allclose(real["elsewhere"], 0.5, atol=0.06)
+    assert (real["same_best"] == 100).all()
+    assert np.allclose(real["elsewhere"], 0.5, atol=0.06)
     chance = thesis_tables.stability(*parts_of(lambda *_: 1.0, noise=0.2))
-    assert chance["same_best"].mean() < 20 and chance["elsewhere"].mean() == pytest.approx(
-        1, abs=0.1
-    )
+    assert chance["same_best"].mean() < 20
+    assert chance["elsewhere"].mean() == pytest.approx(1, abs=0.1)
     assert thesis_tables.stability(*parts_of(separate_optimum, repetitions=1)).isna().all(axis=None)
     masked, baseline = parts_of(separate_optimum)  # only one width has repetitions
     repeated = masked[(masked["repetition"] == 0) | (masked["dilation_width"] == 10)]

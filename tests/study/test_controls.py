@@ -26,25 +26,24 @@ def sequence(small_world):
 @pytest.fixture(scope="module")
 def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
-    return {
-        method: controls.masks(method, Source(small_labels), sequence, WIDTH)
-        for method in controls.MASK_CONTROLS
-    } | {"masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
+    source = Source(small_labels)
+    by_method = {"masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
+    for method in controls.MASK_CONTROLS:
+        by_method[method] = controls.masks_of_method(method, source, sequence, WIDTH)
+    return by_method
 
 
 def test_masks_of_controls_are_valid_and_repeatable(sequence, made):
     for method, source in made.items():
         assert len(source) == len(sequence)
         mask = source[3]
-        assert (
-            mask.shape == sequence.size
-            and mask.dtype == np.uint8
-            and set(np.unique(mask)) == {0, 255}
-        ), method
-        assert mask.flags.c_contiguous
+        assert mask.shape == sequence.size and mask.dtype == np.uint8, method
+        assert set(np.unique(mask)) == {0, 255}, method
+        assert mask.flags.c_contiguous, method
         source[7]
         assert np.array_equal(source[3], mask), method
-        assert np.array_equal(mask, made["masked"][3]) == (method in ("masked", "fallback")), method
+        is_thesis_mask = np.array_equal(mask, made["masked"][3])
+        assert is_thesis_mask == (method in ("masked", "fallback")), method
 
 
 def test_controls_use_the_frame_and_settings_of_their_name(
@@ -62,9 +61,8 @@ def test_controls_use_the_frame_and_settings_of_their_name(
         ("exact-boundaries", predicted, masks.MaskSettings("exact")),
         ("corrected", predicted, masks.MaskSettings("exact", symmetric=True, movable=2, margin=10)),
     ):
-        assert np.array_equal(
-            made[method][5], masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)
-        ), method
+        expected = masks.keypoint_mask(label_map, sequence.size, WIDTH, settings)
+        assert np.array_equal(made[method][5], expected), method
 
 
 def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
@@ -90,8 +88,12 @@ def test_controls_of_empty_and_full_masks(sequence, made, monkeypatch, value):
     monkeypatch.setattr(
         masks.LabelMasks, "__getitem__", lambda self, index: np.full(self.size, value, np.uint8)
     )
-    lines, edges = (masks.coverage(made[method][0]) for method in ("random-lines", "image-edges"))
-    assert lines > 0.99 and edges > 0.5 if value else lines == edges == 0
+    lines = masks.coverage(made["random-lines"][0])
+    edges = masks.coverage(made["image-edges"][0])
+    if value:
+        assert lines > 0.99 and edges > 0.5
+    else:
+        assert lines == edges == 0
 
 
 def test_spread_keypoints_have_the_asked_number(sequence):
@@ -111,21 +113,20 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
     opened = [Sequence(small_world / "kitti", "00").subset(5)]
     jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
     assert {job.dilation_width for job in jobs if job.method in controls.MASK_CONTROLS} == {5}
-    runs = runner.run(jobs, opened, small_labels, tmp_path)
+    runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table
     left = compare.keypoints_left(runs)
     masked = compare.of_method(runs, "masked")
-    jobs += reduced_jobs(thesis_tables.best_widths(masked)) + keypoint_control_jobs(
-        left, opened, width=5
-    )
+    jobs += reduced_jobs(thesis_tables.best_widths(masked))
+    jobs += keypoint_control_jobs(left, opened, width=5)
     assert len({job.name for job in jobs}) == len(jobs)
-    runs = runner.run(jobs, opened, small_labels, tmp_path).set_index("run")
+    runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table.set_index("run")
     assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
     number = runs["mean_keypoints"]
     assert left["00"] == number["masked-05-0"] < number["masked-10-0"]
-    assert number[number.index.str.startswith("fewer")].iloc[0] == pytest.approx(left["00"], abs=1)
-    assert number[number.index.str.startswith("spread")].iloc[0] == pytest.approx(
-        left["00"], rel=0.05
-    )
+    fewer = number[number.index.str.startswith("fewer")]
+    spread = number[number.index.str.startswith("spread")]
+    assert fewer.iloc[0] == pytest.approx(left["00"], abs=1)
+    assert spread.iloc[0] == pytest.approx(left["00"], rel=0.05)
 
 
 # Ablations
@@ -135,9 +136,9 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     sequence = Sequence(small_world / "kitti", "00").subset(4)
     runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2, baseline_repetitions=3)
     settings, thesis_masks = runs["masked", "thesis", 0]
-    assert settings == THESIS and np.array_equal(
-        thesis_masks[0], masks.LabelMasks(small_labels / "00", sequence, 10)[0]
-    )
+    assert settings == THESIS
+    expected = masks.LabelMasks(small_labels / "00", sequence, 10)
+    assert np.array_equal(thesis_masks[0], expected[0])
     dropped, same = runs["filter", "thesis", 0]
     assert dropped.mask_mode == "filter" and same is thesis_masks
     repetitions = {
@@ -146,16 +147,13 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     }
     assert repetitions == {"thesis": {0, 1, 2}, "refined": {0, 1}}
     for method in ("nearest", "symmetric"):
-        mask = runs[method, "thesis", 0][1][0]
-        assert (
-            not np.array_equal(mask, thesis_masks[0])
-            and 0.5 < mask.sum() / thesis_masks[0].sum() < 2
-        )
+        _, method_masks = runs[method, "thesis", 0]
+        assert not np.array_equal(method_masks[0], thesis_masks[0])
+        assert 0.5 < method_masks[0].sum() / thesis_masks[0].sum() < 2
     label_map = cv2.imread(str(small_labels / "00" / sequence.frame_paths[0].name), 0)
-    vegetation = np.isin(
-        cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST), (21, 22)
-    )
-    assert np.array_equal(runs["no-vegetation", "thesis", 0][1][0] == 0, vegetation)
+    enlarged = cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
+    _, method_masks = runs["no-vegetation", "thesis", 0]
+    assert np.array_equal(method_masks[0] == 0, np.isin(enlarged, (21, 22)))
 
 
 @pytest.mark.parametrize("amount, low, high", [(300, 280, 300), (0.5, 0.48, 0.5)])
@@ -163,9 +161,12 @@ def test_random_keypoints_are_a_subset_of_the_asked_size(small_world, amount, lo
     sequence = Sequence(small_world / "kitti", "00").subset(2)
     drawn = ablations.random_keypoints(sequence, amount, 0)
     points = keypoints.detect(sequence.frame(0), THESIS, drawn)
-    detected = {tuple(point) for point in keypoints.detect(sequence.frame(0), THESIS).astype(int)}
-    count = len(points) if isinstance(amount, int) else len(points) / len(detected)
-    assert low <= count <= high and {tuple(point) for point in points.astype(int)} <= detected
+    detected = keypoints.detect(sequence.frame(0), THESIS)
+    count = len(points)
+    if isinstance(amount, float):
+        count /= len(detected)
+    assert low <= count <= high
+    assert set(map(tuple, points.astype(int))) <= set(map(tuple, detected.astype(int)))
     assert np.array_equal(drawn, ablations.random_keypoints(sequence, amount, 0))
 
 
@@ -184,17 +185,16 @@ def errors(spread, repetitions=200):
 
 
 def test_the_null_distribution_agrees_with_order_statistics():
-    assert (
-        np.abs(ablations.null_distribution(errors(0), REPORTED).iloc[:, :3].to_numpy()).max() < 1e-9
-    )
+    no_spread = ablations.null_distribution(errors(0), REPORTED)
+    assert no_spread[["expected", "low", "high"]].abs().max(axis=None) < 1e-9
     spread = 0.2
     runs = errors(spread, 2000)
     table = ablations.null_distribution(runs, REPORTED)
     # a standard normal's least of 15 is -1.736 on average, its median 0
-    assert table.loc["median", "expected"] == pytest.approx(
-        100 * (np.exp(-1.736 * spread) - 1), abs=2.5
-    )
-    assert table.loc["mean", "low"] < table.loc["mean", "expected"] < table.loc["mean", "high"] < 0
+    expected = 100 * (np.exp(-1.736 * spread) - 1)
+    assert table.loc["median", "expected"] == pytest.approx(expected, abs=2.5)
+    mean = table.loc["mean"]
+    assert mean["low"] < mean["expected"] < mean["high"] < 0
     assert (table["share_as_low"] == 100).all()  # every study reports less than 0
     scaled = runs.assign(rmse=runs["rmse"] * runs["sequence"].astype(int).add(1) * 7)
     assert np.allclose(ablations.deviations(runs), ablations.deviations(scaled))
@@ -206,13 +206,11 @@ def test_tracks_of_a_known_motion_have_small_residuals_and_cover_fields():
     street = Street(3)
     corner = np.zeros(street.size, np.uint8)
     corner[60:100, 380:440] = 255
-    table = ablations.tracks(
-        street, {"all": None, "stripes": Stripes(40), "corner": [corner] * 3}, pairs=2
-    )
+    masks_by_name = {"all": None, "stripes": Stripes(40), "corner": [corner] * 3}
+    table = ablations.tracks(street, masks_by_name, pairs=2)
     means = table.groupby("method")[["residual", "fields"]].mean()
-    assert (means["residual"] < 1).all() and means.loc["corner", "fields"] < means.loc[
-        "all", "fields"
-    ]
+    assert (means["residual"] < 1).all()
+    assert means.loc["corner", "fields"] < means.loc["all", "fields"]
 
 
 def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
@@ -221,13 +219,7 @@ def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
     near = ablations.boundaries(label_map, (188, 620))
     label_map[:, 160:] = 23
     far = ablations.boundaries(label_map, (188, 620))
-    assert (
-        near["lost"] == 100 == near["road/sidewalk"]
-        and far["lost"] == 0
-        and np.isnan(far["road/sidewalk"])
-    )
-    assert (
-        far["invented"]
-        > 0
-        == ablations.boundaries(np.full_like(label_map, 20), (188, 620))["invented"]
-    )
+    plain = ablations.boundaries(np.full_like(label_map, 20), (188, 620))
+    assert near["lost"] == 100 == near["road/sidewalk"]
+    assert far["lost"] == 0 and np.isnan(far["road/sidewalk"])
+    assert far["invented"] > 0 == plain["invented"]

@@ -16,6 +16,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.study import runner
 from thesis_repro.study.jobs import first_jobs
+from thesis_repro.study.sources import by_name
 from thesis_repro.study.workers import open_pool
 
 pytestmark = pytest.mark.slow
@@ -123,7 +124,7 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
     opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
     jobs = first_jobs(opened, {"thesis": (5, 15)}, repetitions=2)
     processes, log = workers
-    here = runner.run(jobs, opened, small_labels, tmp_path / "here")
+    here = runner.run_jobs(jobs, opened, small_labels, tmp_path / "here")
     there, killed, finished = tmp_path / "there", [], {}
 
     def kill():
@@ -145,10 +146,10 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
 
     killer = threading.Thread(target=kill)
     killer.start()
-    result = runner.run(jobs, opened, small_labels, there, scheduler=scheduler)
+    result = runner.run_jobs(jobs, opened, small_labels, there, scheduler=scheduler)
     killer.join()
 
-    pd.testing.assert_frame_equal(result, here, check_exact=True)
+    pd.testing.assert_frame_equal(result.table, here.table, check_exact=True)
     for job in jobs:
         one, two = (
             pd.read_csv(tmp_path / where / job.sequence / f"{job.name}.csv")
@@ -171,9 +172,8 @@ def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
     monkeypatch.setattr("thesis_repro.study.workers.TIMEOUT", 1)
     # without workers, none, no address
     for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
-        with pytest.raises(InputError, match=address) as error:
-            with open_pool(1, address):
-                pass
+        with pytest.raises(InputError, match=address) as error, open_pool(1, address):
+            pass
         assert "\n" not in str(error.value)
 
 
@@ -182,9 +182,9 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(
 ):
     opened = Sequence(small_world / "kitti", "00")
     jobs = first_jobs([opened], {"thesis": ()})
-    runner.run(jobs, [opened], small_labels, tmp_path)
+    runner.run_jobs(jobs, [opened], small_labels, tmp_path)
     record = runner.results.record(tmp_path / "00")
-    inputs = opened, runner.by_name(small_labels)
+    inputs = opened, by_name(small_labels)
     elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record)
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})

@@ -28,9 +28,10 @@ def opened(world, frames=None):
 def finished(small_world, small_labels, tmp_path_factory):
     folder = tmp_path_factory.mktemp("odometry")
     jobs = first_jobs(opened(small_world), {"thesis": WIDTHS})
-    summary = runner.run(jobs, opened(small_world), small_labels, folder, processes=2)
+    inputs = {"sequences": opened(small_world), "sources": small_labels, "folder": folder}
+    summary = runner.run_jobs(jobs, **inputs, processes=2).table
     jobs += reduced_jobs(thesis_tables.best_widths(compare.of_method(summary, "masked")))
-    return folder, jobs, runner.run(jobs, opened(small_world), small_labels, folder, processes=2)
+    return folder, jobs, runner.run_jobs(jobs, **inputs, processes=2).table
 
 
 def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, finished):
@@ -67,9 +68,10 @@ def test_only_missing_runs_are_run_again(small_world, small_labels, finished, mo
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
     lost = folder / "00" / "masked-05-0.csv"
     lost.unlink()
-    again = runner.run(jobs, opened(small_world), small_labels, folder)
+    again = runner.run_jobs(jobs, opened(small_world), small_labels, folder)
     assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost}
-    pd.testing.assert_frame_equal(again, summary)
+    pd.testing.assert_frame_equal(again.table, summary)
+    assert (again.made, again.kept, again.failed) == (1, len(jobs) - 1, 0)
 
 
 @pytest.mark.parametrize("error", [OSError("pulled the plug"), KeyboardInterrupt()])
@@ -91,16 +93,15 @@ def test_a_stopped_run_resumes_and_ends_as_an_undisturbed_one(
     monkeypatch.setattr(Sequence, "frame", frame)
     if isinstance(error, KeyboardInterrupt):
         with pytest.raises(KeyboardInterrupt):
-            runner.run(jobs, opened(small_world), small_labels, tmp_path)
+            runner.run_jobs(jobs, opened(small_world), small_labels, tmp_path)
     else:
-        assert set(runner.run(jobs, opened(small_world), small_labels, tmp_path)["sequence"]) == {
-            "00"
-        }
+        outcome = runner.run_jobs(jobs, opened(small_world), small_labels, tmp_path)
+        assert set(outcome.table["sequence"]) == {"00"}
     assert {path.suffix for path in (tmp_path / "01").iterdir()} == {".json", ".npz"}
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.csv")}
     read.clear()
     # jobs with a checkpoint resume in their old passes
-    runner.run(jobs + [Job("01", "masked", 7)], opened(small_world), small_labels, tmp_path)
+    runner.run_jobs(jobs + [Job("01", "masked", 7)], opened(small_world), small_labels, tmp_path)
     assert [index for name, index in read if name == "01"] == [*range(5, 12), *range(12)]
     assert times == {path: path.stat().st_mtime_ns for path in times} and len(times) == 4
     assert not list(tmp_path.rglob("pass-*"))
@@ -125,8 +126,9 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
         Job("00", "mirrored", 10),
         Job("00", "masked", dilation_width=0),
     ]
-    summary = runner.run(jobs, opened(small_world, 5), tmp_path / "labels", tmp_path / "runs")
-    assert list(summary["run"]) == ["baseline-0", "true-labels-10-0"]
+    outcome = runner.run_jobs(jobs, opened(small_world, 5), tmp_path / "labels", tmp_path / "runs")
+    assert (outcome.made, outcome.kept, outcome.failed) == (2, 0, len(jobs) - 2)
+    assert list(outcome.table["run"]) == ["baseline-0", "true-labels-10-0"]
     printed = capsys.readouterr().err
     assert (
         f"sequence 00, masked-05-0, masked-10-0, masked-15-0 and 1 more: failed: {broken}: "
@@ -134,20 +136,16 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     )
     assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
     with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
-        runner.run(jobs[-1:], opened(small_world), small_labels, tmp_path / "none")
+        runner.run_jobs(jobs[-1:], opened(small_world), small_labels, tmp_path / "none")
 
 
 def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path):
     jobs = [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)]
 
     def keypoints(*settings):
-        summary = runner.run(
-            jobs,
-            opened(small_world, 4),
-            [Source(small_labels, "labels", "", *settings)],
-            tmp_path,
-        )
-        return summary.set_index("method")["mean_keypoints"]
+        source = Source(small_labels, "labels", "", *settings)
+        outcome = runner.run_jobs(jobs, opened(small_world, 4), [source], tmp_path)
+        return outcome.table.set_index("method")["mean_keypoints"]
 
     thesis = keypoints()
     assert thesis["masked"] != thesis["exact-boundaries"]

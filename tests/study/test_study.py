@@ -53,7 +53,9 @@ def study(small_world, small_labels, masks):
 def done(study, tmp_path_factory):
     """(folder, runs) of the study."""
     folder = tmp_path_factory.mktemp("study") / "out"
-    return folder, study.run(folder)
+    runs = study.run(folder).table
+    report.write_paths(study, runs, folder)
+    return folder, runs
 
 
 def files(folder):
@@ -131,7 +133,8 @@ def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
     with monkeypatch.context() as patch:
         patch.setattr(runner.odometry, "run_many", None)  # would fail
         again = study.run(folder)
-    assert again.equals(runs) and again.attrs == {"made": 0, "kept": len(runs), "failed": 0}
+    assert again.table.equals(runs)
+    assert (again.made, again.kept, again.failed) == (0, len(runs), 0)
     other = tmp_path / "other"
     shutil.copytree(small_labels, other)
     for path in other.rglob("*.png"):
@@ -181,7 +184,7 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     ]
     kill_when(command, lambda: files(folder))
     finished = files(folder)
-    assert study.run(folder).equals(done[1])
+    assert study.run(folder).table.equals(done[1])
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
 
 
@@ -193,7 +196,7 @@ def test_a_single_sequence_may_have_plain_folders(small_world, small_labels, mas
         (5,),
         frames=4,
     )
-    assert compare.sources(single.run(tmp_path / "out")) == ["a", "b"]
+    assert compare.sources(single.run(tmp_path / "out").table) == ["a", "b"]
 
 
 def test_results_of_another_length_are_kept(done, study):

@@ -1,9 +1,11 @@
-"""Odd input: what can be read, but is probably not what the user intended. It causes a warning, not
-an error. Each function returns warnings, one line each.
+"""Odd input: what can be read, but is probably not what the user intended.
+
+It causes a warning, not an error. Each function returns warnings, one line each.
 """
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -54,83 +56,101 @@ MIN_CORRELATION, MAX_TURN_DIFFERENCE = 0.4, 0.5  # degrees; correct paths have >
 
 
 def of_sequence(sequence: kitti.Sequence) -> list[str]:
-    """Warnings, one line each, if a sequence's times, poses, camera matrix or frames are
-    implausible.
-    """
-    prefix = f"sequence {sequence.name}: "
+    """Return warnings if a sequence's times, poses, camera matrix or frames are implausible."""
     truth = sequence.poses if sequence.has_truth else None
-    lines = of_truth(sequence.name, truth, sequence.times)
+    warnings = of_truth(sequence.name, truth, sequence.times)
+    warnings += _of_camera(sequence)
+    warnings += _of_copies(sequence)
+    return warnings
+
+
+def _of_camera(sequence: kitti.Sequence) -> list[str]:
+    """Return a warning if the camera matrix does not fit KITTI's camera or the frames' size."""
     height, width = sequence.size
     (fx, _, u), (_, fy, v), _ = sequence.intrinsics
     camera = kitti.CAMERAS.get(sequence.name)
     if camera and (height, width) == (camera.height, camera.width):
-        if not np.allclose(
-            (fx, fy, u, v), (camera.fx, camera.fy, camera.cx, camera.cy), rtol=0, atol=1e-3
-        ):
-            lines.append(
-                f"{prefix}calib.txt has the focal lengths {fx:.8g}, {fy:.8g} and centre {u:.8g}, {v:.8g}; "
-                f"KITTI's camera has {camera.fx:.8g}, {camera.fy:.8g} and {camera.cx:.8g}, {camera.cy:.8g}"
-            )
-    elif (
-        abs(u / width - 0.5) > MAX_CENTRE_OFFSET[0] or abs(v / height - 0.5) > MAX_CENTRE_OFFSET[1]
-    ):
-        lines.append(
-            f"{prefix}calib.txt has the centre {u:g}, {v:g}, but frames have {width}x{height} pixels; it must "
-            "belong to frames of this size"
-        )
+        expected = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if np.allclose((fx, fy, u, v), expected, rtol=0, atol=1e-3):
+            return []
+        return [
+            f"sequence {sequence.name}: calib.txt has the focal lengths {fx:.8g}, {fy:.8g} and centre "
+            f"{u:.8g}, {v:.8g}; KITTI's camera has {camera.fx:.8g}, {camera.fy:.8g} and "
+            f"{camera.cx:.8g}, {camera.cy:.8g}"
+        ]
+    offset = abs(u / width - 0.5), abs(v / height - 0.5)
+    if offset[0] > MAX_CENTRE_OFFSET[0] or offset[1] > MAX_CENTRE_OFFSET[1]:
+        return [
+            f"sequence {sequence.name}: calib.txt has the centre {u:g}, {v:g}, but frames have "
+            f"{width}x{height} pixels; it must belong to frames of this size"
+        ]
+    return []
+
+
+def _of_copies(sequence: kitti.Sequence) -> list[str]:
+    """Return a warning if some frames are copies of other frames."""
     sizes = pd.Series({path: path.stat().st_size for path in sequence.frame_paths})
-    # compressed frames seldom have equal sizes
+    # compressed frames seldom have equal sizes, so few files are read
     candidates = sizes.index[sizes.duplicated(keep=False)]
-    copies = candidates[pd.Series(results.digests(candidates), dtype=object).duplicated()]
-    if len(copies):
-        lines.append(
-            f"{prefix}{len(copies)} frames are copies of other frames, first {copies[0].name}; remove them"
-        )
-    return lines
+    digests = pd.Series(results.digests(candidates), dtype=object)
+    copies = candidates[digests.duplicated()]
+    if not len(copies):
+        return []
+    return [
+        f"sequence {sequence.name}: {len(copies)} frames are copies of other frames, first "
+        f"{copies[0].name}; remove them"
+    ]
 
 
 def of_truth(name: str, poses: np.ndarray | None, times: np.ndarray) -> list[str]:
-    """Warnings, one line each, if the times (n,), seconds, or true poses (n, 4, 4), or None, of a
-    sequence are implausible.
+    """Return warnings if the times or the true poses of a sequence are implausible.
+
+    poses: (n, 4, 4), or None. times: (n,), seconds.
     """
-    lines, prefix, seconds = [], f"sequence {name}: ", np.diff(times)
+    seconds = np.diff(times)
     if not len(seconds):
         return []
-    if not FRAME_SECONDS[0] <= np.median(seconds) <= FRAME_SECONDS[1]:
-        return [f"{prefix}frames are {np.median(seconds):g} s apart; times.txt must be in seconds"]
+    interval = np.median(seconds)
+    if not FRAME_SECONDS[0] <= interval <= FRAME_SECONDS[1]:
+        return [f"sequence {name}: frames are {interval:g} s apart; times.txt must be in seconds"]
     if poses is None:
         return []
+    warnings = []
     motion, metres = _steps(poses)
-    moved = metres > MIN_STEP
-    forward, speed = motion[moved, 2, 3] / metres[moved], metres / seconds
-    turns = np.linalg.norm(motion[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2)  # radians
+    speed = metres / seconds
     if speed.max() > MAX_CAR_SPEED:
-        lines.append(
-            f"{prefix}at frame {speed.argmax() + 1} the car drives {speed.max():.0f} m/s "
+        warnings.append(
+            f"sequence {name}: at frame {speed.argmax() + 1} the car drives {speed.max():.0f} m/s "
             f"(median: {np.median(speed):.3g}); positions must be in metres, one line a frame"
         )
-    ahead = np.quantile(forward, (0.2, 0.5)) if len(forward) else np.ones(2)
-    if (ahead < MIN_FORWARD_SHARES).any():
-        lines.append(
-            f"{prefix}{ahead[1]:.2f} of a step lies along the camera's axis (median; {ahead[0]:.2f} or "
-            "less in a fifth of them); poses must be camera to world (inverted?), x right, y down, z ahead"
+    moved = metres > MIN_STEP
+    if moved.any():
+        forward = motion[moved, 2, 3] / metres[moved]
+        lowest_fifth, half = np.quantile(forward, (0.2, 0.5))
+        if lowest_fifth < MIN_FORWARD_SHARES[0] or half < MIN_FORWARD_SHARES[1]:
+            warnings.append(
+                f"sequence {name}: {half:.2f} of a step lies along the camera's axis (median; "
+                f"{lowest_fifth:.2f} or less in a fifth of them); poses must be camera to world "
+                "(inverted?), x right, y down, z ahead"
+            )
+    turns = np.linalg.norm(motion[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2)  # radians
+    most_turn = MAX_TURN_OF_A_METRE * max(1, metres.sum())
+    if len(metres) >= MIN_STEPS and turns.sum() > most_turn:
+        warnings.append(
+            f"sequence {name}: the car turns by {np.degrees(turns.sum()):.0f} degrees within "
+            f"{metres.sum():.3g} m; positions must be in metres, and poses those of each frame, not steps"
         )
-    if len(metres) >= MIN_STEPS and turns.sum() > MAX_TURN_OF_A_METRE * max(1, metres.sum()):
-        lines.append(
-            f"{prefix}the car turns by {np.degrees(turns.sum()):.0f} degrees within {metres.sum():.3g} m; "
-            "positions must be in metres, and poses those of each frame, not steps"
-        )
-    return lines
+    return warnings
 
 
 def _steps(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Motion from each pose (n, 4, 4) to the next one, (n - 1, 4, 4), and its length, (n - 1,)."""
+    """Return the motion from each pose (n, 4, 4) to the next one, (n - 1, 4, 4), and its length."""
     motion = np.linalg.inv(poses[:-1]) @ poses[1:]
     return motion, np.linalg.norm(motion[:, :3, 3], axis=1)
 
 
 def of_steps(name: str, failed: int, steps: int) -> list[str]:
-    """Warnings, one line each, if most of a run's steps are flagged."""
+    """Return a warning if most of a run's steps are flagged."""
     if failed <= steps / 2:
         return []
     return [
@@ -142,24 +162,25 @@ def of_steps(name: str, failed: int, steps: int) -> list[str]:
 def of_path(
     name: str, estimated: np.ndarray, true: np.ndarray, in_metres: bool = True
 ) -> list[str]:
-    """Warnings, one line each, if estimated and true poses, (n, 4, 4), probably belong to
-    different drives.
+    """Return warnings if estimated and true poses, (n, 4, 4), probably belong to different drives.
 
     in_metres: the estimate's scale is meant to be the true one.
     """
-    (steps, metres), (true_steps, true_metres) = _steps(estimated), _steps(true)
-    lines, moved = [], (metres > 0) & (true_metres > MIN_STEP)
+    steps, metres = _steps(estimated)
+    true_steps, true_metres = _steps(true)
+    warnings = []
     if estimated[0, :3, 1] @ true[0, :3, 1] < 0:
-        lines.append(
+        warnings.append(
             f"sequence {name}: the first camera is upside down; poses are x right, y down, z ahead, and "
             "TUM's quaternions end with w"
         )
+    moved = (metres > 0) & (true_metres > MIN_STEP)
     if moved.sum() >= MIN_STEPS:
         cosines = (steps[moved, :3, 3] * true_steps[moved, :3, 3]).sum(axis=1)
         cosines /= metres[moved] * true_metres[moved]
         angle = np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))
         if angle > MAX_DIRECTION_DIFFERENCE:
-            lines.append(
+            warnings.append(
                 f"sequence {name}: steps differ from the ground truth's by {angle:.0f} degrees in "
                 "direction (median); are frames in the order of the poses, with the same axes?"
             )
@@ -167,93 +188,129 @@ def of_path(
     if in_metres and both.sum() >= MIN_STEPS:
         ratio = np.median(metres[both]) / np.median(true_metres[both])
         if not 1 / MAX_LENGTH_RATIO < ratio < MAX_LENGTH_RATIO:
-            lines.append(
+            warnings.append(
                 f"sequence {name}: steps are {ratio:.3g} times as long as the ground truth's (median); "
                 "both must be in metres (--align sim3 compares paths without a scale)"
             )
-    turns = pd.DataFrame(
-        {
-            key: np.degrees(np.arctan2(motion[:, 0, 2], motion[:, 2, 2]))
-            for key, motion in (("estimated", steps), ("true", true_steps))
-        }
-    )
+    return warnings + _of_turns(name, steps, true_steps)
+
+
+def _of_turns(name: str, steps: np.ndarray, true_steps: np.ndarray) -> list[str]:
+    """Return a warning if the turns of estimated and true steps, (n, 4, 4), differ."""
+    turns = pd.DataFrame({"estimated": _headings(steps), "true": _headings(true_steps)})
     spread = (turns.quantile(0.95) - turns.quantile(0.05)) / 2
     if len(turns) < MIN_STEPS or not spread["estimated"]:
-        return lines
-    correlation = (
-        turns.corr("spearman").iloc[0, 1]
-        if spread.max() > MIN_TURN_SPREAD and spread["true"]
-        else 1
-    )
+        return []
+    correlation = 1.0
+    if spread.max() > MIN_TURN_SPREAD and spread["true"]:
+        correlation = turns.corr("spearman").iloc[0, 1]
     difference = (turns["estimated"] - turns["true"]).abs().median()
     if correlation >= MIN_CORRELATION and difference <= MAX_TURN_DIFFERENCE:
-        return lines
-    return lines + [
+        return []
+    return [
         f"sequence {name}: turns from frame to frame differ from the ground truth by {difference:.2g} degrees "
         f"(median), correlation {correlation:.2f}; do frames and poses belong to one drive, in the same order?"
     ]
 
 
+def _headings(steps: np.ndarray) -> np.ndarray:
+    """Return the change of heading (n,), degrees, of each step (n, 4, 4)."""
+    return np.degrees(np.arctan2(steps[:, 0, 2], steps[:, 2, 2]))
+
+
 def of_masks(source: Any, sequence: kitti.Sequence) -> tuple[str, list[str]]:
-    """Check MASK_SAMPLES masks (LabelMasks or MaskFolder) of a sequence. Returns (description,
-    [warning] or []).
+    """Check MASK_SAMPLES masks of a sequence. Returns (description, [warning] or []).
+
+    source: LabelMasks or MaskFolder.
     """
-    spread = np.linspace(0, len(source) - 1, MASK_SAMPLES).astype(int)
-    # of both parities, because a tool may treat every second frame in another way
-    indices = np.unique(
-        np.minimum(spread + (spread + np.arange(MASK_SAMPLES)) % 2, len(source) - 1)
-    )
+    indices = _sampled(len(source))
     sampled_masks = [source[index] for index in indices]
     coverage = np.array([masks.coverage(mask) for mask in sampled_masks])
-    folder, has_labels = source.paths[0].parent, isinstance(source, masks.LabelMasks)
-    description, faults = f"{folder}: masks keep {coverage.mean():.1%} of {sequence.name}", []
-    if has_labels:
+    folder = source.paths[0].parent
+    description = f"{folder}: masks keep {coverage.mean():.1%} of {sequence.name}"
+    kind, option = "masks", "; --invert inverts masks"
+    faults = []
+    if isinstance(source, masks.LabelMasks):
+        kind, option = "label maps", ""
         label_maps = [masks.label_map_of(source, index) for index in indices]
-        shares = np.mean(
-            [
-                np.bincount(label_map.ravel(), minlength=cityscapes.N_CLASSES) / label_map.size
-                for label_map in label_maps
-            ],
-            axis=0,
-        )
-        largest = [index for index in np.argsort(-shares, kind="stable") if shares[index] >= 0.005]
-        description += f" (width {source.dilation_width}); label maps hold " + ", ".join(
-            f"{cityscapes.LABELS[index].name} {shares[index]:.0%}" for index in largest
-        )
-        faults = _label_faults(label_maps, np.flatnonzero(shares), sequence, source.settings)
+        shares = _class_shares(label_maps)
+        description += f" (width {source.dilation_width}); label maps hold {_class_text(shares)}"
+        faults += _label_faults(label_maps, np.flatnonzero(shares), sequence, source.settings)
         faults += _foreign_ids(label_maps) or _misplacement(source, sequence, indices, label_maps)
-    record = results.record(folder) or {}
-    present, frames = len(files.listed(folder)), files.images(sequence.frame_paths[0].parent)
-    # A study may use only the first frames.
-    digests = [
-        results.digest_of_files(paths) for paths in (sequence.frame_paths, frames, frames[:present])
-    ]
-    if record.get("frames", digests[0]) not in digests:
-        faults.append("were made from other frames")
-    elif "frames" not in record and present not in (1, len(sequence), len(frames)):
-        faults.append(f"are {present} files for {len(frames)} frames")
-    option = "" if has_labels else "; --invert inverts masks"
+    faults += _file_faults(folder, sequence)
     if coverage.min() < MIN_COVERAGE or coverage.mean() > MAX_COVERAGE:
         faults.append(f"leave {coverage.min():.1%} to {coverage.max():.1%} of the frames{option}")
-    # masks that this project wrote are what their record says
-    elif not has_labels and ("keep" not in record or source.invert):
-        contrasts = [
-            _contrast(sequence.frame(index), mask)
-            for index, mask in zip(indices, sampled_masks, strict=True)
-        ]
-        low = [
-            contrast
-            for contrast, mask, share in zip(contrasts, sampled_masks, coverage, strict=True)
-            if contrast < (MIN_CONTRAST_OF_LARGE_MASK if share > 0.5 else MIN_CONTRAST)
-            and (share <= 0.5 or _leaves_strips(mask))
-        ]
-        if len(low) >= min(2, len(indices)):  # one odd mask is no fault
-            faults.append(
-                f"keep regions with {np.mean(low):.2f} times the contrast of the rest{option}"
-            )
-    return description, [
-        f"{folder}: {'label maps' if has_labels else 'masks'} {faults[0]}"
-    ] if faults else []
+    elif isinstance(source, masks.MaskFolder) and not _is_own(source, folder):
+        frames = [sequence.frame(index) for index in indices]
+        faults += [fault + option for fault in _inversion(frames, sampled_masks)]
+    if not faults:
+        return description, []
+    return description, [f"{folder}: {kind} {faults[0]}"]
+
+
+def _sampled(count: int) -> np.ndarray:
+    """Return the numbers of about MASK_SAMPLES frames, spread evenly over a sequence.
+
+    They are even and odd in turn, because a tool may treat every second frame in another way.
+    """
+    spread = np.linspace(0, count - 1, MASK_SAMPLES).astype(int)
+    wrong_parity = (spread + np.arange(MASK_SAMPLES)) % 2
+    return np.unique(np.minimum(spread + wrong_parity, count - 1))
+
+
+def _class_shares(label_maps: list[np.ndarray]) -> np.ndarray:
+    """Return the share of each label id in label maps of one size, (N_CLASSES,)."""
+    shares = [
+        np.bincount(label_map.ravel(), minlength=cityscapes.N_CLASSES) / label_map.size
+        for label_map in label_maps
+    ]
+    return np.mean(shares, axis=0)
+
+
+def _class_text(shares: np.ndarray) -> str:
+    """Return the names and shares of the labels that cover 0.5 % or more, the largest first."""
+    texts = []
+    for index in np.argsort(-shares, kind="stable"):
+        if shares[index] >= 0.005:
+            name = cityscapes.LABELS[index].name
+            texts.append(f"{name} {shares[index]:.0%}")
+    return ", ".join(texts)
+
+
+def _file_faults(folder: Path, sequence: kitti.Sequence) -> list[str]:
+    """Return the fault of a folder of masks or label maps that belongs to other frames."""
+    record = results.record(folder) or {}
+    present = len(files.listed(folder))
+    frames = files.images(sequence.frame_paths[0].parent)
+    if "frames" in record:
+        # A study may use only the first frames.
+        used = (sequence.frame_paths, frames, frames[:present])
+        if record["frames"] not in [results.digest_of_files(paths) for paths in used]:
+            return ["were made from other frames"]
+    elif present not in (1, len(sequence), len(frames)):
+        return [f"are {present} files for {len(frames)} frames"]
+    return []
+
+
+def _is_own(source: masks.MaskFolder, folder: Path) -> bool:
+    """Return whether this project wrote the masks, which then are what their record says."""
+    return "keep" in (results.record(folder) or {}) and not source.invert
+
+
+def _inversion(frames: list[np.ndarray], sampled_masks: list[np.ndarray]) -> list[str]:
+    """Return the fault of masks that keep what has less contrast, as inverted masks do."""
+    low_contrasts = []
+    for frame, mask in zip(frames, sampled_masks, strict=True):
+        contrast = _contrast(frame, mask)
+        if masks.coverage(mask) > 0.5:
+            is_low = contrast < MIN_CONTRAST_OF_LARGE_MASK and _leaves_strips(mask)
+        else:
+            is_low = contrast < MIN_CONTRAST
+        if is_low:
+            low_contrasts.append(contrast)
+    if len(low_contrasts) < min(2, len(frames)):  # one odd mask is no fault
+        return []
+    return [f"keep regions with {np.mean(low_contrasts):.2f} times the contrast of the rest"]
 
 
 def _label_faults(
@@ -262,6 +319,10 @@ def _label_faults(
     sequence: kitti.Sequence,
     settings: masks.MaskSettings,
 ) -> list[str]:
+    """Return the faults of label maps in their ids and their shape.
+
+    ids: those that the label maps hold. settings: say how the ids are read.
+    """
     height, width = label_maps[0].shape
     faults = []
     if len(ids) == 1:
@@ -278,21 +339,28 @@ def _label_faults(
 
 
 def _foreign_ids(label_maps: list[np.ndarray]) -> list[str]:
-    """Faults of label maps that hold other numbers than label ids: by the share of common classes,
-    and by numbers between those of both neighbours, which blurring and JPEG make.
+    """Return the fault of label maps that hold other numbers than label ids.
+
+    It shows in the share of common classes, and in numbers between those of both neighbours, which
+    blurring and JPEG make.
     """
     shares, blurred = [], []
     for label_map in label_maps:
-        shares.append(np.isin(label_map, COMMON).sum() / max(np.count_nonzero(label_map), 1))
+        labelled = max(np.count_nonzero(label_map), 1)
+        shares.append(np.isin(label_map, COMMON).sum() / labelled)
         left, middle, right = label_map[:, :-2], label_map[:, 1:-1], label_map[:, 2:]
         between = (np.minimum(left, right) < middle) & (middle < np.maximum(left, right))
-        blurred.append(between.sum() / max(np.count_nonzero(left != right), 1))
-    few, many = sorted(shares)[:2][-1], sorted(blurred)[-2:][0]  # one odd map is no fault
-    if few < MIN_COMMON:
-        return [f"hold {few:.0%} of the common street classes; are these Cityscapes label ids?"]
-    if many > MAX_BLURRED:
+        boundary = max(np.count_nonzero(left != right), 1)
+        blurred.append(between.sum() / boundary)
+    # one odd map is no fault, so the second worst one decides; a single map decides alone
+    second = min(1, len(label_maps) - 1)
+    share = sorted(shares)[second]
+    blur = sorted(blurred, reverse=True)[second]
+    if share < MIN_COMMON:
+        return [f"hold {share:.0%} of the common street classes; are these Cityscapes label ids?"]
+    if blur > MAX_BLURRED:
         return [
-            f"have other ids along {many:.0%} of boundaries; were they smoothed, or saved as JPEG?"
+            f"have other ids along {blur:.0%} of boundaries; were they smoothed, or saved as JPEG?"
         ]
     return []
 
@@ -303,8 +371,10 @@ def _misplacement(
     indices: np.ndarray,
     label_maps: list[np.ndarray],
 ) -> list[str]:
-    """Faults of label maps whose boundaries agree better with the frames' gradients at another
-    place, or with other frames, than with their own; [] for short sequences.
+    """Return the fault of label maps whose boundaries do not lie where the frames' gradients are.
+
+    They agree better with the gradients at another place, or with other frames, than with their
+    own. Short sequences are not judged. indices: of the frames of the label maps.
     """
     if len(sequence) < MIN_STEPS:
         return []
@@ -313,59 +383,95 @@ def _misplacement(
     own = np.array(list(map(_agreement, gradients, outlines)))
     if not own.all():
         return []  # maps of a single class
-    fits = {
-        name: np.mean([_agreement(*pair) for pair in zip(gradients, map(move, outlines))])
-        / own.mean()
-        for name, move in PLACES.items()
-    }
-    for step in (-5, -1, 1, 5):
-        parts = slice(int(step > 0), None, 2)  # half of the samples, to read fewer files
-        near = [
-            _agreement(gradient, _outline(masks.label_map_of(source, index + step)))
-            for gradient, index in zip(gradients[parts], indices[parts])
-            if 0 <= index + step < len(sequence)
-        ]
-        if len(near) > 1:
-            of_own = own[parts][-len(near) :] if step < 0 else own[parts][: len(near)]
-            fits[f"taken from frame {step:+}"] = np.mean(near) / of_own.mean()
+    fits = _fits_elsewhere(gradients, outlines, own)
+    fits |= _fits_of_near_frames(source, indices, gradients, own)
     best = max(fits, key=lambda place: fits[place])
     if fits[best] > MIN_BETTER_FIT:
         return [
             f"fit the frames {fits[best]:.2f} times as well if {best}; do both belong together?"
         ]
-    unlike = np.corrcoef([gradient.ravel() for gradient in gradients]) < MAX_FRAME_CORRELATION
-    others = [
-        np.mean([_agreement(gradient, outlines[other]) for other in np.flatnonzero(row)]) / fit
-        for gradient, row, fit in zip(gradients, unlike, own)
-        if row.any()
-    ]
-    if others and (
-        np.mean(others) > MAX_OTHER_FIT[0] or sum(np.array(others) > MAX_OTHER_FIT[1]) > 1
-    ):
+    others = _fits_of_unlike_frames(gradients, outlines, own)
+    if not others:
+        return []
+    mean, good_fits = np.mean(others), sum(fit > MAX_OTHER_FIT[1] for fit in others)
+    if mean > MAX_OTHER_FIT[0] or good_fits > 1:
         return [
-            f"fit other frames {np.mean(others):.2f} times as well as their own (at most "
+            f"fit other frames {mean:.2f} times as well as their own (at most "
             f"{max(others):.2f}); do both belong together?"
         ]
     return []
 
 
+def _fits_elsewhere(
+    gradients: list[np.ndarray], outlines: list[np.ndarray], own: np.ndarray
+) -> dict[str, float]:
+    """Return how well outlines fit at each of PLACES, {place: multiple of their own fit}.
+
+    own: agreement (n,) of the outlines with their own frames.
+    """
+    fits = {}
+    for place, move in PLACES.items():
+        moved = [move(outline) for outline in outlines]
+        fits[place] = np.mean(list(map(_agreement, gradients, moved))) / own.mean()
+    return fits
+
+
+def _fits_of_near_frames(
+    source: masks.LabelMasks, indices: np.ndarray, gradients: list[np.ndarray], own: np.ndarray
+) -> dict[str, float]:
+    """Return how well label maps of near frames fit, {place: multiple of the own maps' fit}."""
+    fits = {}
+    for step in (-5, -1, 1, 5):
+        first = 1 if step > 0 else 0
+        near, own_of_near = [], []
+        for sample in range(first, len(indices), 2):  # half of the samples, to read fewer files
+            index = indices[sample] + step
+            if 0 <= index < len(source):
+                outline = _outline(masks.label_map_of(source, index))
+                near.append(_agreement(gradients[sample], outline))
+                own_of_near.append(own[sample])
+        if len(near) > 1:
+            fits[f"taken from frame {step:+}"] = np.mean(near) / np.mean(own_of_near)
+    return fits
+
+
+def _fits_of_unlike_frames(
+    gradients: list[np.ndarray], outlines: list[np.ndarray], own: np.ndarray
+) -> list[float]:
+    """Return how well outlines of unlike frames fit, as multiples of the own outline's fit.
+
+    There is one number for each frame that is unlike others.
+    """
+    correlations = np.corrcoef([gradient.ravel() for gradient in gradients])
+    fits = []
+    for gradient, row, own_fit in zip(gradients, correlations, own, strict=True):
+        unlike = np.flatnonzero(row < MAX_FRAME_CORRELATION)
+        if len(unlike):
+            agreements = [_agreement(gradient, outlines[other]) for other in unlike]
+            fits.append(np.mean(agreements) / own_fit)
+    return fits
+
+
 def _gradient(frame: np.ndarray) -> np.ndarray:
-    """Square root of the gradient at PLACE_SIZE, (height, width), with mean 1; without the root,
-    few strong edges would decide.
+    """Return the square root of the gradient at PLACE_SIZE, (height, width), with mean 1.
+
+    Without the root, few strong edges would decide.
     """
     small = cv2.resize(frame, PLACE_SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
-    across, down = cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)
+    across = cv2.Sobel(small, cv2.CV_32F, 1, 0)
+    down = cv2.Sobel(small, cv2.CV_32F, 0, 1)
     gradient = np.sqrt(np.hypot(across, down))
     return gradient / max(gradient.mean(), 1e-9)
 
 
 def _outline(label_map: np.ndarray) -> np.ndarray:
-    """Boundaries of a label map at PLACE_SIZE: 1, and 0 elsewhere."""
-    return masks.edges(label_map, PLACE_SIZE[::-1], masks.MaskSettings("exact")) / np.float32(255)
+    """Return the boundaries of a label map at PLACE_SIZE: 1, and 0 elsewhere."""
+    edges = masks.edges(label_map, PLACE_SIZE[::-1], masks.MaskSettings("exact"))
+    return edges / np.float32(255)
 
 
 def _agreement(gradient: np.ndarray, outline: np.ndarray) -> float:
-    """Mean gradient along an outline, 0 without one."""
+    """Return the mean gradient along an outline, 0 without one."""
     return (gradient * outline).sum() / max(outline.sum(), 1)
 
 
@@ -375,30 +481,37 @@ def _zoomed(outline: np.ndarray, factor: float) -> np.ndarray:
     return cv2.warpAffine(outline, matrix, PLACE_SIZE, flags=cv2.INTER_NEAREST)
 
 
-PLACES: dict[str, Callable] = {
-    "mirrored": lambda outline: outline[:, ::-1],
-    "turned upside down": lambda outline: outline[::-1],
-    "turned by 180 degrees": lambda outline: outline[::-1, ::-1],
-    "made smaller": partial(_zoomed, factor=0.8),
-    "made larger": partial(_zoomed, factor=1.25),
-    **{
-        f"moved by {pixels} of {PLACE_SIZE[1 - axis]} pixels {direction}": partial(
-            np.roll, shift=pixels, axis=axis
-        )
-        for axis, direction in enumerate(("downwards", "to the right"))
-        for pixels in (-16, -8, -3, 3, 8, 16)
-    },
-}
+def _places() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    """Return the names of wrong places, and functions that move an outline there."""
+    places: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "mirrored": lambda outline: outline[:, ::-1],
+        "turned upside down": lambda outline: outline[::-1],
+        "turned by 180 degrees": lambda outline: outline[::-1, ::-1],
+        "made smaller": partial(_zoomed, factor=0.8),
+        "made larger": partial(_zoomed, factor=1.25),
+    }
+    width, height = PLACE_SIZE
+    for axis, size, direction in ((0, height, "downwards"), (1, width, "to the right")):
+        for pixels in (-16, -8, -3, 3, 8, 16):
+            name = f"moved by {pixels} of {size} pixels {direction}"
+            places[name] = partial(np.roll, shift=pixels, axis=axis)
+    return places
+
+
+PLACES = _places()
 
 
 def _contrast(frame: np.ndarray, mask: np.ndarray) -> float:
+    """Return the mean gradient inside a mask divided by the mean gradient outside."""
     gradient = np.abs(np.diff(frame.astype(np.int16), axis=1))
-    kept = mask[:, 1:] > 0
-    return gradient[kept].sum() * (~kept).sum() / max(gradient[~kept].sum() * kept.sum(), 1e-9)
+    inside = mask[:, 1:] > 0
+    total_inside, total_outside = gradient[inside].sum(), gradient[~inside].sum()
+    return total_inside * (~inside).sum() / max(total_outside * inside.sum(), 1e-9)
 
 
 def _leaves_strips(mask: np.ndarray) -> bool:
-    """Whether a mask leaves out strips, as inverted boundaries do, not areas, such as cars."""
+    """Return whether a mask leaves out strips, as inverted boundaries do, not areas, as of cars."""
     left_out = (mask == 0).astype(np.uint8)
-    areas = cv2.morphologyEx(left_out, cv2.MORPH_OPEN, np.ones((STRIP, STRIP), np.uint8))
+    square = np.ones((STRIP, STRIP), np.uint8)
+    areas = cv2.morphologyEx(left_out, cv2.MORPH_OPEN, square)
     return areas.sum() < MAX_AREAS * left_out.sum()

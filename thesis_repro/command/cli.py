@@ -220,14 +220,16 @@ def study(options: Any) -> int:
 
     with console.logged(folder, options.command_line) as run, results.claimed(folder):
         warnings = [
-            line for sequence, masks in planned.masks() for line in _print_oddities(sequence, masks)
+            line
+            for sequence, masks in planned.shown_masks()
+            for line in _print_oddities(sequence, masks)
         ]
         warnings = _warn(warnings)
-        summary = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += _warn(planned.path_oddities(summary, folder))
-        counts, page = summary.attrs, study.write(planned, summary, folder, warnings)
-        failed = f", {counts['failed']:,} failed (see above)" * (counts["failed"] > 0)
-        run.end(f"{len(summary):,} runs{failed}; open {page} in a browser", counts["kept"])
+        outcome = planned.run(folder, options.jobs or cores(), options.dask)
+        warnings += _warn(planned.path_oddities(outcome.table, folder))
+        page = study.write(planned, outcome.table, folder, warnings)
+        failed = f", {outcome.failed:,} failed (see above)" * (outcome.failed > 0)
+        run.end(f"{len(outcome.table):,} runs{failed}; open {page} in a browser", outcome.kept)
     return 1 if failed else 0
 
 

@@ -104,8 +104,8 @@ def measured(table: pd.DataFrame, kind: str) -> list[dict[str, Any]]:
 
     Where audit.json gives a unit, they are means over sequences. Otherwise they are ratios to a
     reference method, or to another column ("over") of the same rows.
-    kind: "ablations" (`ablations.measure`), "study" (`runner.run`), "tracks" and "boundaries" (as
-    in `ablations`), "shares" (of pixels, one row a frame).
+    kind: "ablations" (`ablations.measure`), "study" (`runner.run_jobs`), "tracks" and "boundaries"
+    (as in `ablations`), "shares" (of pixels, one row a frame).
     """
     measurements = []
     requested = [

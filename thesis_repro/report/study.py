@@ -10,17 +10,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from thesis_repro.data.trajectories import read_poses
+from thesis_repro.data.trajectories import read_poses, write_kitti_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.masks import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
-from thesis_repro.study import compare, controls
+from thesis_repro.study import compare, controls, runner
 from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import KINDS, Source
-from thesis_repro.study.study import PATHS, Study
+from thesis_repro.study.study import RUNS, Study
+
+PATHS = "paths"  # folder of the estimated paths
 
 
 @style.applied()
@@ -40,6 +42,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     note = f"odometry: {data}; masks: {masks}"
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
+    write_paths(study, runs, folder)
     figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
     for name, figure in figures.items():
@@ -81,13 +84,29 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     return folder / page.PAGE
 
 
+def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
+    """Write the ground truth and repetition 0 of every run in KITTI's and TUM's formats.
+
+    The files are folder/PATHS/kitti/SEQUENCE/RUN.txt and folder/PATHS/tum/SEQUENCE/RUN.txt.
+    """
+    unshuffled = runs[runs["repetition"] == 0]
+    for sequence in study.opened:
+        name = sequence.name
+        runs_of_sequence = unshuffled[unshuffled["sequence"] == name]
+        paths = {(name, "truth"): sequence.poses}
+        paths |= runner.run_poses(runs_of_sequence, folder / RUNS)
+        for (_, run), poses in paths.items():
+            write_kitti_poses(folder / PATHS / "kitti" / name / f"{run}.txt", poses)
+            write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
+
+
 def figure_sources(study: Study) -> Figure:
     """Draw the middle frame of the first readable sequence: each source's label map, its mask and
     the kept keypoints.
 
     The plain frame replaces a label map that is missing.
     """
-    for sequence, sequence_masks in study.masks():
+    for sequence, sequence_masks in study.shown_masks():
         index = len(sequence) // 2
         with suppress(InputError):  # if a frame cannot be read, only the runs of its sequence fail
             frame, masks_by_source = sequence.frame(index), sequence_masks

@@ -28,8 +28,8 @@ from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import measures
 
-# by method, estimator, repetition
-Runs = dict[tuple[str, str, int], tuple[OdometrySettings, Masks | None]]
+Run = tuple[OdometrySettings, Masks | None]
+Runs = dict[tuple[str, str, int], Run]  # by method, estimator, repetition
 ESTIMATORS = ("thesis", "inliers", "refined")
 # the second is for all keypoints with the thesis's estimator
 REPETITIONS, BASELINE_REPETITIONS = 3, 8
@@ -48,12 +48,16 @@ class FunctionMasks:
 
 
 def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.ndarray:
-    """Return a mask that keeps randomly drawn keypoints of a frame, one pixel each: a number
-    (int) or share (float).
+    """Return a mask that keeps randomly drawn keypoints of a frame, one pixel each.
+
+    amount: their number (int), or their share of all keypoints (float).
     """
     points = keypoints.detect(sequence.frame(index), THESIS).astype(int)
-    number = amount if isinstance(amount, int) else round(amount * len(points))
-    columns, rows = np.random.default_rng((0, index)).permutation(points)[:number].T
+    number = amount
+    if isinstance(amount, float):
+        number = round(amount * len(points))
+    shuffled = np.random.default_rng((0, index)).permutation(points)
+    columns, rows = shuffled[:number].T
     mask = np.zeros(sequence.size, np.uint8)
     mask[rows, columns] = 255
     return mask
@@ -83,9 +87,8 @@ def measure(
         for sequence in sequences
     ]
     with workers.open_pool(processes) as pool:
-        tables = dict(
-            progress(pool.run(_measure, calls), "ablations", total=len(calls), unit="sequence")
-        )
+        measured = pool.run(_measure, calls)
+        tables = dict(progress(measured, "ablations", total=len(calls), unit="sequence"))
     return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
 
 
@@ -108,15 +111,15 @@ def _measure(
         run_results = odometry.run_many(
             sequence, {" ".join(map(str, key)): run for key, run in runs.items()}
         )
-        rows = [
-            {"method": method, "estimator": estimator, "repetition": repetition}
-            | measures(result.frames, sequence.poses)
-            | {"sim3": metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]}
-            for (method, estimator, repetition), result in zip(
-                runs, run_results.values(), strict=True
-            )
-        ]
-        write_text(path, pd.DataFrame(rows).assign(sequence=sequence.name).to_csv(index=False))
+        rows = []
+        for key, result in zip(runs, run_results.values(), strict=True):
+            method, estimator, repetition = key
+            row = {"method": method, "estimator": estimator, "repetition": repetition}
+            row |= measures(result.frames, sequence.poses)
+            row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]
+            rows.append(row)
+        table = pd.DataFrame(rows).assign(sequence=sequence.name)
+        write_text(path, table.to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
@@ -135,60 +138,64 @@ def runs_of(
     seed that shuffles the matched points. `null_distribution` needs the `baseline_repetitions` with
     all keypoints and the thesis's estimator.
     """
-    label_masks = partial(masks.LabelMasks, labels, sequence, dilation_width)
+    runs: Runs = {}
+    for method, (settings, method_masks) in _methods(sequence, labels, dilation_width).items():
+        estimators: tuple[str, ...] = ("thesis", "refined")
+        if method in ("baseline", "masked"):
+            estimators = ESTIMATORS
+        for estimator in estimators:
+            count = repetitions
+            if method == "baseline" and estimator == "thesis":
+                count = max(repetitions, baseline_repetitions)
+            for repetition in range(count):
+                seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
+                runs[method, estimator, repetition] = seeded, method_masks
+    return runs
+
+
+def _methods(sequence: Sequence, labels: Path, dilation_width: int) -> dict[str, Run]:
+    """Return the ablations over one sequence: {method: (settings, masks)}."""
 
     def enlarged(index: int) -> np.ndarray:
         label_map = read_label_map(labels / sequence.frame_paths[index].name)
         return cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
 
-    thesis_masks = label_masks()
-    sample = range(0, len(sequence), max(1, len(sequence) // 8))
-    number = round(
-        np.mean(
-            [
-                len(keypoints.detect(sequence.frame(index), THESIS, thesis_masks[index]))
-                for index in sample
-            ]
-        )
-    )
-    methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
+    def nearest(index: int) -> np.ndarray:
+        edges = cv2.Canny(enlarged(index), *MaskSettings().canny)
+        return masks.dilate(edges, dilation_width)
+
+    def without_vegetation(index: int) -> np.ndarray:
+        is_vegetation = np.isin(enlarged(index), VEGETATION)
+        return np.where(is_vegetation, np.uint8(0), np.uint8(255))
+
+    thesis_masks = masks.LabelMasks(labels, sequence, dilation_width)
+    symmetric = masks.LabelMasks(labels, sequence, dilation_width, MaskSettings(symmetric=True))
+    number = _mean_number(sequence, thesis_masks)
+    methods: dict[str, Run] = {
         "baseline": (THESIS, None),
         "masked": (THESIS, thesis_masks),
         "filter": (replace(THESIS, mask_mode="filter"), thesis_masks),
-        "nearest": (
-            THESIS,
-            FunctionMasks(
-                lambda index: masks.dilate(
-                    cv2.Canny(enlarged(index), *MaskSettings().canny), dilation_width
-                )
-            ),
-        ),
-        "symmetric": (THESIS, label_masks(MaskSettings(symmetric=True))),
+        "nearest": (THESIS, FunctionMasks(nearest)),
+        "symmetric": (THESIS, symmetric),
         # Section 5.2.2: trees and bushes
-        "no-vegetation": (
-            THESIS,
-            FunctionMasks(
-                lambda index: np.where(
-                    np.isin(enlarged(index), VEGETATION), np.uint8(0), np.uint8(255)
-                )
-            ),
-        ),
+        "no-vegetation": (THESIS, FunctionMasks(without_vegetation)),
         "strongest": (replace(THESIS, max_keypoints=max(1, number)), None),
         "random": (THESIS, FunctionMasks(partial(random_keypoints, sequence, number))),
         "dropout": (THESIS, FunctionMasks(partial(random_keypoints, sequence, 0.9))),
-        **{f"strongest-{few}": (replace(THESIS, max_keypoints=few), None) for few in FEW_KEYPOINTS},
-        "orb": (replace(THESIS, detector="orb"), None),
     }
-    runs: Runs = {}
-    for method, (settings, method_masks) in methods.items():
-        for estimator in ESTIMATORS if method in ("baseline", "masked") else ("thesis", "refined"):
-            is_null = method == "baseline" and estimator == "thesis"
-            for repetition in range(
-                max(repetitions, baseline_repetitions) if is_null else repetitions
-            ):
-                seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
-                runs[method, estimator, repetition] = seeded, method_masks
-    return runs
+    for few in FEW_KEYPOINTS:
+        methods[f"strongest-{few}"] = replace(THESIS, max_keypoints=few), None
+    methods["orb"] = replace(THESIS, detector="orb"), None
+    return methods
+
+
+def _mean_number(sequence: Sequence, frame_masks: Masks) -> int:
+    """Return the mean number of keypoints that masks leave, from about eight frames."""
+    numbers = []
+    for index in range(0, len(sequence), max(1, len(sequence) // 8)):
+        points = keypoints.detect(sequence.frame(index), THESIS, frame_masks[index])
+        numbers.append(len(points))
+    return round(np.mean(numbers))
 
 
 # Results of the thesis's procedure if masks did nothing (Section 4.2, Tables 4.2 and 4.3)
@@ -200,9 +207,9 @@ STUDIES = 4000  # simulated ones
 def null_distribution(
     runs: pd.DataFrame, reported: pd.Series, widths: int = WIDTHS
 ) -> pd.DataFrame:
-    """Simulate what the thesis's procedure reports if masks do nothing; rows mean, median and sum
-    of the changes (%).
+    """Simulate what the thesis's procedure reports if masks do nothing.
 
+    Returns one row each for mean, median and sum of the changes (%).
     The thesis runs all keypoints once and masks of 15 widths once each, takes the best width of
     each sequence and averages Equation 4.1. If masks did nothing, these 16 runs would differ only
     in the order of the matched points. So the procedure is applied STUDIES times to 16 errors for
@@ -215,17 +222,20 @@ def null_distribution(
     the reported number or a lower one). The best of 15 drawn errors is never better than the best
     measured error.
     """
-    errors = np.random.default_rng(0).choice(deviations(runs), (STUDIES, SEQUENCES, widths + 1))
-    changes = metrics.percent_change(np.exp(errors[..., 1:].min(axis=-1)), np.exp(errors[..., 0]))
+    random = np.random.default_rng(0)
+    logarithms = random.choice(deviations(runs), (STUDIES, SEQUENCES, widths + 1))
+    best = np.exp(logarithms[..., 1:].min(axis=-1))
+    changes = metrics.percent_change(best, np.exp(logarithms[..., 0]))
     tail = (100 - LEVEL) / 2
     rows = {}
     for name, summarize in (("mean", np.mean), ("median", np.median), ("sum", np.sum)):
         values = summarize(changes, axis=1)
+        as_low = values <= summarize(reported.to_numpy())
         rows[name] = {
             "expected": values.mean(),
             "low": np.percentile(values, tail),
             "high": np.percentile(values, 100 - tail),
-            "share_as_low": 100 * (values <= summarize(reported.to_numpy())).mean(),
+            "share_as_low": 100 * as_low.mean(),
         }
     return pd.DataFrame(rows).T
 
@@ -239,7 +249,8 @@ def deviations(runs: pd.DataFrame) -> np.ndarray:
     logarithms = np.log(runs["rmse"])
     by_sequence = logarithms.groupby(runs["sequence"])
     count = by_sequence.transform("size")
-    widened = (logarithms - by_sequence.transform("mean")) * np.sqrt(count / (count - 1))
+    deviation = logarithms - by_sequence.transform("mean")
+    widened = deviation * np.sqrt(count / (count - 1))
     return widened[count > 1].to_numpy()
 
 
@@ -251,93 +262,109 @@ PAIRS = (("road", "sidewalk"), ("vegetation", "sky"), ("building", "fence"))
 
 
 def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: int) -> pd.DataFrame:
-    """Measure how well keypoints can be tracked and how they are spread: one row for each mask and
-    pair of frames.
+    """Measure how well keypoints can be tracked and how they are spread.
 
     masks_by_name: None for all keypoints. pairs: number of evenly spread frames that are tracked to
-    the next frame. Columns: sequence, frame, method (the name), keypoints; residual, the median
-    distance (pixels) of tracked points from the epipolar lines of the true motion; outliers, the
-    percentage of points beyond PySLAM's threshold; fields, the percentage of the frame's 16 x 5
-    fields with a keypoint.
+    the next frame. Returns one row for each mask and pair of frames. Columns: sequence, frame,
+    method (the name), keypoints; residual, the median distance (pixels) of tracked points from the
+    epipolar lines of the true motion; outliers, the percentage of points beyond PySLAM's threshold;
+    fields, the percentage of the frame's 16 x 5 fields with a keypoint.
     """
     rows = []
-    for index in np.unique(np.linspace(0, len(sequence) - 2, pairs).round().astype(int)):
+    height, width = sequence.size
+    field_size = np.array([width / FIELDS[0], height / FIELDS[1]])
+    indices = np.linspace(0, len(sequence) - 2, pairs).round().astype(int)
+    for index in np.unique(indices).tolist():
         before, after = sequence.frame(index), sequence.frame(index + 1)
         motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
         if np.linalg.norm(motion[:3, 3]) < metrics.MIN_DIRECTED_STEP:
             continue
         for name, frame_masks in masks_by_name.items():
-            points = keypoints.detect(
-                before, THESIS, None if frame_masks is None else frame_masks[int(index)]
-            )
+            mask = None
+            if frame_masks is not None:
+                mask = frame_masks[index]
+            points = keypoints.detect(before, THESIS, mask)
             if len(points) < 10:
                 continue
             moved, tracked = keypoints.track(before, after, points)
             distances = sampson_distances(
                 points[tracked], moved[tracked], motion, sequence.intrinsics
             )
-            fields = (
-                points // [sequence.size[1] / FIELDS[0], sequence.size[0] / FIELDS[1]]
-            ).astype(int)
-            rows.append(
-                {
-                    "sequence": sequence.name,
-                    "frame": int(index),
-                    "method": name,
-                    "keypoints": len(points),
-                    "residual": sequence.intrinsics[0, 0] * float(np.median(distances)),
-                    "outliers": 100 * (distances > THESIS.threshold).mean(),
-                    "fields": 100 * len(np.unique(fields, axis=0)) / (FIELDS[0] * FIELDS[1]),
-                }
-            )
+            fields = np.unique((points // field_size).astype(int), axis=0)
+            row = {
+                "sequence": sequence.name,
+                "frame": index,
+                "method": name,
+                "keypoints": len(points),
+                "residual": sequence.intrinsics[0, 0] * float(np.median(distances)),
+                "outliers": 100 * (distances > THESIS.threshold).mean(),
+                "fields": 100 * len(fields) / (FIELDS[0] * FIELDS[1]),
+            }
+            rows.append(row)
     return pd.DataFrame(rows)
 
 
 def sampson_distances(
     previous: np.ndarray, current: np.ndarray, motion: np.ndarray, intrinsics: np.ndarray
 ) -> np.ndarray:
-    """Return the Sampson distances (n,) of matched pixels (n, 2) under a 4x4 motion, in units
-    of the focal length.
+    """Return the Sampson distances (n,) of matched pixels (n, 2) under a 4x4 motion.
+
+    They are in units of the focal length. intrinsics: the 3x3 camera matrix.
     """
     essential = np.cross(np.eye(3), motion[:3, 3]) @ motion[:3, :3]
-    matches = zip(
-        *(
-            np.column_stack([normalise(points, intrinsics), np.ones(len(points))])
-            for points in (current, previous)
-        ),
-        strict=True,
-    )
-    return np.sqrt([cv2.sampsonDistance(*match, essential) for match in matches])
+    ones = np.ones(len(previous))
+    previous_rays = np.column_stack([normalise(previous, intrinsics), ones])
+    current_rays = np.column_stack([normalise(current, intrinsics), ones])
+    squares = [
+        cv2.sampsonDistance(current_ray, previous_ray, essential)
+        for current_ray, previous_ray in zip(current_rays, previous_rays, strict=True)
+    ]
+    return np.sqrt(squares)
 
 
 def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]:
-    """Measure what Canny on enlarged ids does to the boundaries of a label map, in percent (audit
-    rows 10 and 11).
+    """Measure what Canny on enlarged ids does to the boundaries of a label map, in percent.
 
+    (Audit rows 10 and 11.) size: (height, width) of the enlargement.
     lost: boundary pixels of the map, enlarged by nearest neighbour, without an edge within NEAR
     pixels. The same for each of PAIRS of classes ("road/sidewalk"), NaN for fewer than 20 boundary
     pixels. invented: pixels of the bilinear enlargement whose id no pixel within NEAR pixels has.
     """
     nearest = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
-    bilinear = cv2.resize(label_map, size[::-1])
     exact = masks.edges(label_map, size, MaskSettings("exact")) > 0
     missed = masks.dilate(masks.edges(label_map, size), 2 * NEAR + 1) == 0
-    around = np.ones((2 * NEAR + 1, 2 * NEAR + 1), np.uint8)
-    real = np.zeros(nearest.shape, bool)
-    for number in np.unique(bilinear):
-        real |= (bilinear == number) & (
-            cv2.dilate((nearest == number).astype(np.uint8), around) > 0
-        )
     shares = {
-        "lost": 100 * missed[exact].mean() if exact.any() else np.nan,
-        "invented": 100 * float((~real).mean()),
+        "lost": _percent_missed(missed, exact, least=1),
+        "invented": _percent_invented(label_map, nearest),
     }
+    # across a boundary: the pixel to the right or, if that has the same id, the one below
     right, below = np.roll(nearest, -1, axis=1), np.roll(nearest, -1, axis=0)
     neighbour = np.where(nearest != right, right, below)
     for pair in PAIRS:
         ids = [ID[name] for name in pair]
         pair_boundary = exact & np.isin(nearest, ids) & np.isin(neighbour, ids)
-        shares["/".join(pair)] = (
-            100 * missed[pair_boundary].mean() if pair_boundary.sum() >= 20 else np.nan
-        )
+        shares["/".join(pair)] = _percent_missed(missed, pair_boundary, least=20)
     return shares
+
+
+def _percent_missed(missed: np.ndarray, boundary: np.ndarray, least: int) -> float:
+    """Return the percentage of a boundary's pixels that are missed; NaN for fewer than `least`."""
+    if boundary.sum() < least:
+        return np.nan
+    return 100 * missed[boundary].mean()
+
+
+def _percent_invented(label_map: np.ndarray, nearest: np.ndarray) -> float:
+    """Return the percentage of pixels with an invented id, see `boundaries`.
+
+    nearest: the label map, enlarged by nearest neighbour.
+    """
+    height, width = nearest.shape
+    bilinear = cv2.resize(label_map, (width, height))
+    around = np.ones((2 * NEAR + 1, 2 * NEAR + 1), np.uint8)
+    is_real = np.zeros(nearest.shape, bool)
+    for number in np.unique(bilinear):
+        has_number = (nearest == number).astype(np.uint8)
+        is_near = cv2.dilate(has_number, around) > 0
+        is_real |= (bilinear == number) & is_near
+    return 100 * float((~is_real).mean())

@@ -1,6 +1,6 @@
 """The one place that compares: a table of runs goes in, a table of comparisons comes out.
 
-**Runs** (`runner.run`) have one row a run: sequence, run, source, method, dilation_width,
+**Runs** (`runner.run_jobs`) have one row a run: sequence, run, source, method, dilation_width,
 estimator, repetition, frames, mean_keypoints, flagged, and one column for each of METRICS.
 
 **Comparisons** (`comparisons`) have one row for each method, reference, metric and estimator: the
@@ -23,7 +23,7 @@ selects the rows that answer the main question.
 
 from collections.abc import Iterable
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -84,6 +84,25 @@ SEGMENTATION_FREE_CONTROLS = (
     "spread",
 )
 
+# of `comparisons`, before those of the sequences
+COLUMNS = (
+    "source",
+    "method",
+    "dilation_width",
+    "keypoints",
+    "reference_source",
+    "reference",
+    "metric",
+    "estimator",
+    "tested",
+    "ratio",
+    "low",
+    "high",
+    "n",
+    "far_off",
+    "verdict",
+)
+
 MIN_FOR_INTERVAL = 3  # sequences
 # With fewer sequences, all ratios lie on the same side of 1 by chance in more than 5 % of cases (2
 # / 2**n).
@@ -100,10 +119,9 @@ LOWER, HIGHER, NO_CLEAR_DIFFERENCE, TOO_FEW = (
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
-    """Return Student's t interval (low, high) of the mean of one value a sequence. NaN values are
-    left out.
+    """Return Student's t interval (low, high) of the mean of one value a sequence.
 
-    Returns (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
+    NaN values are left out. Returns (NaN, NaN) for fewer than MIN_FOR_INTERVAL values.
     """
     numbers = np.asarray(values, float)
     numbers = numbers[~np.isnan(numbers)]
@@ -115,24 +133,32 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
 
 
 def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
-    """Return {ratio, low, high, n, verdict}: the geometric mean of one ratio a sequence, with its
-    interval (`mean_interval` of the logarithms).
+    """Return {ratio, low, high, n, verdict} for one ratio a sequence.
 
-    The verdict is LOWER or HIGHER if the interval excludes 1, and TOO_FEW for fewer than
-    MIN_SEQUENCES sequences.
+    ratio is the geometric mean; low and high are its interval (`mean_interval` of the logarithms);
+    n is the number of sequences. The verdict is LOWER or HIGHER if the interval excludes 1, and
+    TOO_FEW for fewer than MIN_SEQUENCES sequences.
     """
     logarithms = np.log(np.asarray(ratios, float))
     logarithms = logarithms[np.isfinite(logarithms)]
-    mean = logarithms.mean() if len(logarithms) else np.nan
+    n = len(logarithms)
+    mean = np.nan
+    if n:
+        mean = logarithms.mean()
     ratio, low, high = np.exp([mean, *mean_interval(logarithms)]).tolist()
-    verdict = LOWER if high < 1 else HIGHER if low > 1 else NO_CLEAR_DIFFERENCE
-    return {
-        "ratio": ratio,
-        "low": low,
-        "high": high,
-        "n": len(logarithms),
-        "verdict": verdict if len(logarithms) >= MIN_SEQUENCES else TOO_FEW,
-    }
+    verdict = _verdict(low, high, n)
+    return {"ratio": ratio, "low": low, "high": high, "n": n, "verdict": verdict}
+
+
+def _verdict(low: float, high: float, n: int) -> str:
+    """Return the verdict on a ratio with the interval (low, high) over n sequences."""
+    if n < MIN_SEQUENCES:
+        return TOO_FEW
+    if high < 1:
+        return LOWER
+    if low > 1:
+        return HIGHER
+    return NO_CLEAR_DIFFERENCE
 
 
 def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Series:
@@ -140,17 +166,19 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
 
     metric: the column of the error. Sequences without a positive error in both tables are left out.
     """
+    difference = _mean_logarithms(rows, metric) - _mean_logarithms(reference, metric)
+    return np.exp(difference.dropna())
 
-    def logarithms(runs: pd.DataFrame) -> pd.Series:
-        positive = runs.loc[runs[metric] > 0]
-        return np.log(positive.set_index("sequence")[metric].astype(float)).groupby(level=0).mean()
 
-    return np.exp((logarithms(rows) - logarithms(reference)).dropna())
+def _mean_logarithms(runs: pd.DataFrame, metric: str) -> pd.Series:
+    """Return the mean logarithm of the positive errors of each sequence."""
+    positive = runs.loc[runs[metric] > 0]
+    errors = positive.set_index("sequence")[metric].astype(float)
+    return np.log(errors).groupby(level=0).mean()
 
 
 def far_off(ratios: pd.Series) -> list[str]:
-    """Return the sequences whose ratio differs from the median ratio by more than the factor
-    FAR_OFF.
+    """Return the sequences whose ratio differs from the median by more than the factor FAR_OFF.
 
     On these sequences the odometry got lost with one of the two methods. The list is empty for
     fewer than MIN_FOR_INTERVAL sequences, where the median does not show which sequence is the
@@ -159,69 +187,55 @@ def far_off(ratios: pd.Series) -> list[str]:
     if len(ratios) < MIN_FOR_INTERVAL:
         return []
     logarithms = np.log(ratios)
-    return list(ratios.index[(logarithms - logarithms.median()).abs() > np.log(FAR_OFF)])
+    distances = (logarithms - logarithms.median()).abs()
+    return list(ratios.index[distances > np.log(FAR_OFF)])
 
 
 def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
-    """Compare every method with all keypoints, and masks with every control and with the masks of
-    other sources.
+    """Compare every method with all keypoints, and masks with controls and other sources' masks.
 
-    Returns a table with the columns source, method, dilation_width (pixels), keypoints (mean
-    number); reference_source, reference (the method compared with); metric, estimator; tested
-    (whether the width is the `tested_width`); ratio, low, high, n, far_off (see `far_off`),
-    verdict; and one column for each sequence with its ratio. An error that no sequence has with
-    both methods has no row.
+    Masks are compared with every control. Returns a table with the columns source, method,
+    dilation_width (pixels), keypoints (mean number); reference_source, reference (the method
+    compared with); metric, estimator; tested (whether the width is the `tested_width`); ratio, low,
+    high, n, far_off (see `far_off`), verdict; and one column for each sequence with its ratio. An
+    error that no sequence has with both methods has no row.
     """
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
     for estimator in ESTIMATORS:
         variants = _variants(runs[runs["estimator"] == estimator])
-        for (variant, variant_runs), (reference, reference_runs) in product(variants, variants):
+        for variant, reference in product(variants, variants):
             if not _is_compared(variant, reference):
                 continue
-            row = {
-                **variant,
-                "reference_source": reference["source"],
-                "reference": reference["method"],
-                "estimator": estimator,
-            }
             for metric in metrics:
-                by_sequence = ratios(variant_runs, reference_runs, metric)
+                by_sequence = ratios(variant.runs, reference.runs, metric)
                 if by_sequence.empty:
                     continue
-                rows.append(
-                    {
-                        **row,
-                        "metric": metric,
-                        "far_off": far_off(by_sequence),
-                        **geometric_mean(by_sequence),
-                        **by_sequence,
-                    }
-                )
-    columns = [
-        "source",
-        "method",
-        "dilation_width",
-        "keypoints",
-        "reference_source",
-        "reference",
-        "metric",
-        "estimator",
-        "tested",
-        "ratio",
-        "low",
-        "high",
-        "n",
-        "far_off",
-        "verdict",
-    ]
-    return pd.DataFrame(rows, columns=[*columns, *sorted(runs["sequence"].unique())])
+                row = {
+                    **variant.columns,
+                    "reference_source": reference.source,
+                    "reference": reference.method,
+                    "estimator": estimator,
+                    "metric": metric,
+                    "far_off": far_off(by_sequence),
+                    **geometric_mean(by_sequence),
+                    **by_sequence,
+                }
+                rows.append(row)
+    return pd.DataFrame(rows, columns=[*COLUMNS, *sorted(runs["sequence"].unique())])
 
 
-def _variants(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    """Split the runs by method, source and width. Returns pairs of (the first columns of
-    `comparisons`, runs).
-    """
+class _Variant(NamedTuple):
+    """The runs of one method with the masks of one source and width."""
+
+    source: str
+    method: str
+    columns: dict[str, Any]  # of `comparisons`, about this variant
+    runs: pd.DataFrame
+
+
+def _variants(runs: pd.DataFrame) -> list[_Variant]:
+    """Split the runs by method, source and width."""
     variants = []
     for method in METHODS:
         by_width = runs[runs["method"] == method].groupby(
@@ -229,40 +243,33 @@ def _variants(runs: pd.DataFrame) -> list[tuple[dict[str, Any], pd.DataFrame]]:
         )
         for (source, width), rows in by_width:
             tested = pd.isna(width) or width == tested_width(of_source(runs, source))
-            keypoints = rows.groupby("sequence")["mean_keypoints"].mean().mean()
-            variants.append(
-                (
-                    {
-                        "source": source,
-                        "method": method,
-                        "dilation_width": width,
-                        "keypoints": keypoints,
-                        "tested": bool(tested),
-                    },
-                    rows,
-                )
-            )
+            columns = {
+                "source": source,
+                "method": method,
+                "dilation_width": width,
+                "keypoints": rows.groupby("sequence")["mean_keypoints"].mean().mean(),
+                "tested": bool(tested),
+            }
+            variants.append(_Variant(source, method, columns, rows))
     return variants
 
 
-def _is_compared(variant: dict[str, Any], reference: dict[str, Any]) -> bool:
-    """Return whether `comparisons` compares a variant with a reference, which is another
-    variant or the same.
+def _is_compared(variant: _Variant, reference: _Variant) -> bool:
+    """Return whether `comparisons` compares a variant with a reference.
+
+    The reference is another variant or the same one.
     """
-    if reference["method"] == "baseline":
+    if reference.method == "baseline":
         return True
-    if (
-        variant is reference
-        or variant["method"] != "masked"
-        or not (variant["tested"] and reference["tested"])
-    ):
+    if variant is reference or variant.method != "masked":
         return False
-    return variant["source"] == reference["source"] or reference["method"] == "masked"
+    if not (variant.columns["tested"] and reference.columns["tested"]):
+        return False
+    return variant.source == reference.source or reference.method == "masked"
 
 
 def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:
-    """Return the rows of `comparisons` that answer the main question: do masks from a segmentation
-    help?
+    """Return the rows of `comparisons` that answer whether masks from a segmentation help.
 
     They compare masks of the tested width with all keypoints by JUDGING_METRICS, under the
     `judging_estimator`. Masks help if both verdicts are LOWER. The segmentation helps if masks are
@@ -275,45 +282,50 @@ def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.Dat
 def against(
     table: pd.DataFrame, references: Iterable[str], source: str | None = None
 ) -> pd.DataFrame:
-    """Return the rows of `comparisons` for masks against the given methods, chosen as in
-    `primary_comparison`.
+    """Return the rows of `comparisons` for masks against the given methods.
+
+    They are chosen as in `primary_comparison`.
     """
-    rows = table[
-        (table["method"] == "masked")
-        & table["reference"].isin(list(references))
-        & table["metric"].isin(JUDGING_METRICS)
-    ]
-    rows = rows if source is None else rows[rows["source"] == source]
+    masked = table[table["method"] == "masked"]
+    rows = masked[masked["reference"].isin(list(references))]
+    rows = rows[rows["metric"].isin(JUDGING_METRICS)]
+    if source is not None:
+        rows = rows[rows["source"] == source]
     return rows[rows["estimator"] == judging_estimator(rows)]
 
 
 def overall(verdicts: Iterable[str]) -> str:
-    """Return the verdict of several metrics together: LOWER or HIGHER if all of them agree, TOO_FEW
-    if one of them has too few sequences.
+    """Return the verdict of several metrics together.
+
+    It is TOO_FEW if one of them has too few sequences, or if there are no verdicts. It is LOWER or
+    HIGHER if all of them agree.
     """
-    distinct = set(verdicts) or {TOO_FEW}
-    if TOO_FEW in distinct:
+    distinct = set(verdicts)
+    if not distinct or TOO_FEW in distinct:
         return TOO_FEW
-    return distinct.pop() if len(distinct) == 1 else NO_CLEAR_DIFFERENCE
+    if len(distinct) > 1:
+        return NO_CLEAR_DIFFERENCE
+    return distinct.pop()
 
 
 def judging_estimator(table: pd.DataFrame) -> str:
-    """Return the estimator that decides: the refined one if it has errors, since shuffling changes
-    them least.
+    """Return the estimator that decides.
+
+    It is the refined one if it has errors, since shuffling changes them least.
     """
-    return "refined" if (table["estimator"] == "refined").any() else "thesis"
+    if (table["estimator"] == "refined").any():
+        return "refined"
+    return "thesis"
 
 
 def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:
-    """Measure how much shuffling the matched points before RANSAC changes the RMSE, with all
-    keypoints.
+    """Measure how much shuffling the matched points before RANSAC changes the RMSE.
 
-    Returns one row for each estimator and sequence: mean, lowest, highest, factor (highest over
-    lowest).
+    The runs are those with all keypoints. Returns one row for each estimator and sequence: mean,
+    lowest, highest, factor (highest over lowest).
     """
-    table = spread(
-        runs[runs["method"] == "baseline"], "rmse", by=["estimator", "sequence"]
-    ).reset_index()
+    baseline = runs[runs["method"] == "baseline"]
+    table = spread(baseline, "rmse", by=["estimator", "sequence"]).reset_index()
     return table.assign(factor=table["highest"] / table["lowest"])
 
 
@@ -326,15 +338,15 @@ def of_method(runs: pd.DataFrame, method: str, estimator: str | None = None) -> 
     estimator: by default the thesis's estimator if it was run, as for the tables of the thesis.
     """
     if estimator is None:
-        estimator = next(
-            (name for name in ESTIMATORS if (runs["estimator"] == name).any()), "thesis"
-        )
+        estimators_run = [name for name in ESTIMATORS if (runs["estimator"] == name).any()]
+        estimator = next(iter(estimators_run), "thesis")
     return runs[(runs["method"] == method) & (runs["estimator"] == estimator)]
 
 
 def of_source(runs: pd.DataFrame, source: str) -> pd.DataFrame:
-    """Return the runs of one source of masks and the runs with all keypoints, which belong to
-    every source.
+    """Return the runs of one source of masks.
+
+    The runs with all keypoints are among them, since they belong to every source.
     """
     return runs[runs["source"].isin([source, ""])]
 
@@ -345,31 +357,35 @@ def sources(runs: pd.DataFrame) -> list[str]:
 
 
 def tested_width(runs: pd.DataFrame) -> int | None:
-    """Return the dilation width (pixels) at which masks are tested: that of the controls, or the
-    only width.
+    """Return the dilation width (pixels) at which masks are tested.
 
-    Returns CONTROL_WIDTH if the width is not unique, and None for ready-made masks.
+    It is that of the controls, or else the only width of masks. Returns CONTROL_WIDTH if the width
+    is not unique, and None for ready-made masks.
     """
     masked = runs.loc[runs["method"] == "masked", "dilation_width"]
     if len(masked) and masked.isna().all():
         return None
-    control_widths = (
-        runs.loc[runs["method"].isin(MASK_CONTROLS), "dilation_width"].dropna().unique()
-    )
-    widths = control_widths if len(control_widths) else masked.unique()
-    return int(widths[0]) if len(widths) == 1 else CONTROL_WIDTH
+    controls = runs.loc[runs["method"].isin(MASK_CONTROLS), "dilation_width"].dropna()
+    widths = masked.unique()
+    if len(controls):
+        widths = controls.unique()
+    if len(widths) != 1:
+        return CONTROL_WIDTH
+    return int(widths[0])
 
 
 def keypoints_left(runs: pd.DataFrame) -> pd.Series:
     """Return the mean number of keypoints that masks of the `tested_width` leave, by sequence."""
-    rows = runs[runs["method"] == "masked"]
-    rows = rows[rows["dilation_width"].isna() | (rows["dilation_width"] == tested_width(runs))]
+    masked = runs[runs["method"] == "masked"]
+    widths = masked["dilation_width"]
+    rows = masked[widths.isna() | (widths == tested_width(runs))]
     return rows.groupby("sequence")["mean_keypoints"].mean()
 
 
 def spread(rows: pd.DataFrame, column: str, by: str | list[str] = "sequence") -> pd.DataFrame:
-    """Return mean, lowest and highest of a column over the repetitions: one row for each value
-    of `by`.
+    """Return mean, lowest and highest of a column over the repetitions.
+
+    There is one row for each value of `by`.
     """
     table = rows.groupby(by)[column].agg(mean="mean", lowest="min", highest="max")
     # rounding may put the mean of equal values outside their range, which gives an error bar of

@@ -1,8 +1,7 @@
-"""The controls: masks and settings that leave as many keypoints as the masks of the segmentation,
-chosen differently.
+"""The controls: masks and settings that leave as many keypoints, chosen differently.
 
-If the odometry gains as much from a control, the segmentation is not what helps. Masks are indexed
-by frame number, as in `masks`.
+They leave as many as the masks of the segmentation. If the odometry gains as much from a control,
+the segmentation is not what helps. Masks are indexed by frame number, as in `masks`.
 """
 
 from dataclasses import replace
@@ -31,8 +30,9 @@ LINE_WIDTH = 10  # pixels, of lines and edges as controls of ready-made masks, w
 
 
 def true_labels(kitti: Path, name: str) -> Path:
-    """Return the folder of a sequence's true label maps. Only sequences of the embedded world
-    have one.
+    """Return the folder of a sequence's true label maps.
+
+    Only sequences of the embedded world have one. kitti: the root of the sequences.
     """
     return Path(kitti) / "sequences" / name / "labels_0"
 
@@ -41,7 +41,8 @@ class OtherFrame:
     """The mask of the frame half a sequence away: similar boundaries in the wrong place."""
 
     def __init__(self, source: Source, sequence: Sequence, dilation_width: int | None) -> None:
-        self.sequence, self.masks = sequence, source.masks(sequence, dilation_width)
+        self.sequence = sequence
+        self.masks = source.masks(sequence, dilation_width)
         self.paths = self.masks.paths
         self.line_width = dilation_width or LINE_WIDTH
 
@@ -54,8 +55,9 @@ class OtherFrame:
 
 
 class Mirrored(OtherFrame):
-    """The mask of the frame, flipped left to right: it looks like a street, but not like the
-    street in the frame.
+    """The mask of the frame, flipped left to right.
+
+    It looks like a street, but not like the street in the frame.
     """
 
     def __getitem__(self, index: int) -> np.ndarray:
@@ -63,8 +65,9 @@ class Mirrored(OtherFrame):
 
 
 class RandomLines(OtherFrame):
-    """Random line segments, dilated like the boundaries, that cover as many pixels as the mask
-    of the frame.
+    """Random line segments that cover as many pixels as the mask of the frame.
+
+    They are dilated like the boundaries.
     """
 
     def __getitem__(self, index: int) -> np.ndarray:
@@ -72,45 +75,43 @@ class RandomLines(OtherFrame):
         target = np.count_nonzero(mask)
         for number in (2**8, 2**11, 2**14):
             first = self._first_segments(index, number, mask.shape)
-            covered = np.cumsum(cv2.calcHist([first], [0], None, [number], [0, number]), dtype=int)
+            pixels = cv2.calcHist([first], [0], None, [number], [0, number])
+            covered = np.cumsum(pixels, dtype=int)  # by the first 1, 2, ... segments
             if covered[-1] >= target:
                 break
         count = np.abs(np.concatenate([[0], covered]) - target).argmin()
         return cv2.compare(first, int(count), cv2.CMP_LT)
 
     def _first_segments(self, index: int, number: int, shape: tuple[int, ...]) -> np.ndarray:
-        """Return, for each pixel, the index of the first dilated segment that covers it;
-        `number` if none does.
+        """Return, for each pixel, the index of the first dilated segment that covers it.
+
+        The index is `number` if none does.
         """
         random = np.random.default_rng((SEED, index))
         height, width = shape
         start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
         length = length * height / 2
         start = np.column_stack([start_x * width, start_y * height])
-        end = (
-            start
-            + np.column_stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
-            * length[:, None]
-        )
+        direction = np.column_stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
+        end = start + direction * length[:, None]
         image = np.full(shape, number, np.uint16)
-        for segment in range(number - 1, -1, -1):
-            cv2.line(
-                image,
-                start[segment].astype(int).tolist(),
-                end[segment].astype(int).tolist(),
-                segment,
-            )
+        starts, ends = start.astype(int).tolist(), end.astype(int).tolist()
+        for segment in reversed(range(number)):  # so that the first one is on top
+            cv2.line(image, starts[segment], ends[segment], segment)
         # the lowest index near a pixel
-        return cv2.erode(image, np.ones((self.line_width,) * 2, np.uint8))
+        square = np.ones((self.line_width, self.line_width), np.uint8)
+        return cv2.erode(image, square)
 
 
 class ImageEdges(OtherFrame):
     """The strongest Canny edges of the frame, dilated, that cover as many pixels as its mask.
+
     They need no network.
     """
 
     def __getitem__(self, index: int) -> np.ndarray:
-        frame, target = self.sequence.frame(index), np.count_nonzero(self.masks[index])
+        frame = self.sequence.frame(index)
+        target = np.count_nonzero(self.masks[index])
         across, down = cv2.spatialGradient(frame)
         low, high = 1, LARGEST_GRADIENT  # thresholds that cover too many and too few pixels
         covered_low, covered_high = frame.size, 0
@@ -118,7 +119,8 @@ class ImageEdges(OtherFrame):
         while high - low > 1 and miss > COVERAGE_TOLERANCE * frame.size:
             # interpolation, kept away from both ends so that the interval always shrinks
             share = np.clip((covered_low - target) / (covered_low - covered_high), 0.1, 0.9)
-            threshold = int(np.clip(low * (high / low) ** share, low + 1, high - 1))
+            between = low * (high / low) ** share
+            threshold = int(np.clip(between, low + 1, high - 1))
             mask = dilate(cv2.Canny(across, down, threshold / 2, threshold), self.line_width)
             covered = cv2.countNonZero(mask)
             if abs(covered - target) < miss:
@@ -144,13 +146,13 @@ OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
 MASK_CONTROLS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)
 
 
-def masks(
+def masks_of_method(
     method: str, source: Source, sequence: Sequence, dilation_width: int | None
 ) -> ControlMasks:
-    """Return the masks of a sequence for a method: "masked" or one of MASK_CONTROLS, a control of
-    the masks of `source`.
+    """Return the masks of a sequence for a method: "masked" or one of MASK_CONTROLS.
 
-    dilation_width: pixels, for masks from label maps.
+    source: of the masks that a control is compared with. dilation_width: pixels, for masks from
+    label maps.
     """
     if method in OF_MASKS:
         return OF_MASKS[method](source, sequence, dilation_width)
@@ -158,10 +160,8 @@ def masks(
         return source.masks(sequence, dilation_width)
     folder, settings = source.folder, source.settings
     if method == "true-labels":
-        folder, settings = (
-            true_labels(sequence.root, sequence.name),
-            replace(settings, ids="labels"),
-        )
+        folder = true_labels(sequence.root, sequence.name)
+        settings = replace(settings, ids="labels")
     elif method == "corrected":
         settings = replace(CORRECTED, ids=settings.ids)
     elif method in LITERATURE:
@@ -172,11 +172,10 @@ def masks(
 
 
 def min_distance(sequence: Sequence, number: float) -> float:
-    """Return the distance between keypoints (pixels) at which the detector finds `number` of them
-    on average.
+    """Return the distance between keypoints that leaves `number` of them on average.
 
-    It is found by bisection on SAMPLE frames of the sequence. It is never below the distance of the
-    thesis.
+    The distance (pixels) is the setting of the detector. It is found by bisection on SAMPLE frames
+    of the sequence, and is never below the distance of the thesis.
     """
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
     frames = [(sequence.frame(index), SharedKeypoints()) for index in sample]
@@ -186,14 +185,17 @@ def min_distance(sequence: Sequence, number: float) -> float:
 
     def mean_number(steps: int) -> float:
         settings = replace(THESIS, min_distance=distance(steps))
-        return float(
-            np.mean([len(keypoints.detect(frame, settings)) for frame, keypoints in frames])
-        )
+        numbers = [len(keypoints.detect(frame, settings)) for frame, keypoints in frames]
+        return float(np.mean(numbers))
 
     low, high = 0, round(min(sequence.size) / STEP)
     counts = {low: mean_number(low)}
     while high - low > 1:
         middle = (low + high) // 2
         counts[middle] = mean_number(middle)
-        low, high = (middle, high) if counts[middle] > number else (low, middle)
-    return distance(min(counts, key=lambda steps: abs(counts[steps] - number)))
+        if counts[middle] > number:
+            low = middle
+        else:
+            high = middle
+    nearest = min(counts, key=lambda steps: abs(counts[steps] - number))
+    return distance(nearest)

@@ -7,6 +7,7 @@ import pandas as pd
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.segmentation import prediction, quality
+from thesis_repro.study import controls
 
 IMAGES = 100  # most images of a domain
 
@@ -32,9 +33,8 @@ def measure(models: dict[str, Any], domains: dict[str, list[cityscapes.Pair]]) -
         for domain, pairs in domains.items():
             images, true = cityscapes.load(pairs, *model.input_shape[2:])
             predicted = prediction.predict(model, images)
-            mean_iou, accuracy, table = quality.cityscapes_scores(
-                quality.confusion_matrix(true, predicted)
-            )
+            confusion = quality.confusion_matrix(true, predicted)
+            mean_iou, accuracy, table = quality.cityscapes_scores(confusion)
             names = {"model": model_name, "domain": domain}
             scores.append(
                 {
@@ -52,18 +52,16 @@ def measure(models: dict[str, Any], domains: dict[str, list[cityscapes.Pair]]) -
 
 
 def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
-    """Return evenly spread frames of `kitti.Sequence`s with their exact label maps (labels_0);
-    none for real data.
-    """
+    """Return evenly spread frames of sequences with their exact label maps; none for real data."""
     pairs = []
     for drive in drives:
-        if (drive.folder / "labels_0").is_dir():
-            count = min(len(drive), max(1, IMAGES // len(drives)))
-            for index in ((np.arange(count) + 0.5) * len(drive) / count).astype(int):
-                path = drive.frame_paths[index]
-                pairs.append(
-                    cityscapes.Pair(
-                        f"{drive.name}_{path.stem}", path, drive.folder / "labels_0" / path.name
-                    )
-                )
+        label_folder = controls.true_labels(drive.root, drive.name)
+        if not label_folder.is_dir():
+            continue
+        count = min(len(drive), max(1, IMAGES // len(drives)))
+        middles = (np.arange(count) + 0.5) * len(drive) / count  # of equal parts of the drive
+        for index in middles.astype(int):
+            path = drive.frame_paths[index]
+            name = f"{drive.name}_{path.stem}"
+            pairs.append(cityscapes.Pair(name, path, label_folder / path.name))
     return pairs

@@ -8,8 +8,9 @@ masked runs are done.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -26,6 +27,14 @@ ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined estimator"}
 KEYPOINT_CONTROLS = ("fewer", "spread")  # as many keypoints as masks leave, without a mask
 UNMASKED = ("baseline", "reduced", *KEYPOINT_CONTROLS)
 PIECES = 4  # passes for each of several workers
+
+
+class MaskKey(NamedTuple):
+    """What decides the masks of a job, beside its sequence; the fields are those of `Job`."""
+
+    method: str
+    dilation_width: int | None
+    source: str
 
 
 @dataclass(frozen=True)
@@ -53,38 +62,41 @@ class Job:
 
     @property
     def name(self) -> str:
-        """The name of the run's file, unique in its sequence: masked-05-0,
-        mine/mirrored-10-refined-1, spread-7.5-0.
+        """The name of the run's file, unique in its sequence.
+
+        Examples: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0.
         """
-        has_no_mask = self.dilation_width is None or self.method in UNMASKED
-        width = None if has_no_mask else f"{self.dilation_width:02d}"
-        distance = None if self.min_distance is None else f"{self.min_distance:g}"
-        estimator = None if self.estimator == "thesis" else self.estimator
-        parts = (self.method, width, self.max_keypoints, distance, estimator, self.repetition)
-        name = "-".join(str(part) for part in parts if part is not None)
-        return f"{self.source}/{name}" if self.source else name
+        parts = [self.method]
+        if self.dilation_width is not None and self.method not in UNMASKED:
+            parts.append(f"{self.dilation_width:02d}")
+        if self.max_keypoints is not None:
+            parts.append(str(self.max_keypoints))
+        if self.min_distance is not None:
+            parts.append(f"{self.min_distance:g}")
+        if self.estimator != "thesis":
+            parts.append(self.estimator)
+        parts.append(str(self.repetition))
+        name = "-".join(parts)
+        if self.source:
+            return f"{self.source}/{name}"
+        return name
 
     @property
     def settings(self) -> OdometrySettings:
         """The thesis's settings of the odometry, with the changes that the job asks for."""
-        changes: dict[str, Any] = {
-            "max_keypoints": self.max_keypoints,
-            "min_distance": self.min_distance,
-            "shuffle_seed": self.repetition or None,
-            "estimator": self.estimator,
-            "fallback": self.method == "fallback",
-        }
-        return replace(
-            THESIS, **{name: value for name, value in changes.items() if value is not None}
-        )
+        settings = replace(THESIS, estimator=self.estimator, fallback=self.method == "fallback")
+        if self.max_keypoints is not None:
+            settings = replace(settings, max_keypoints=self.max_keypoints)
+        if self.min_distance is not None:
+            settings = replace(settings, min_distance=self.min_distance)
+        if self.repetition:
+            settings = replace(settings, shuffle_seed=self.repetition)
+        return settings
 
-    def masks(
-        self, sequence: Sequence, sources: Mapping[str, Source]
-    ) -> controls.ControlMasks | None:
-        """Return the job's masks, or None for a job without masks. sources: by name."""
-        if self.method in UNMASKED:
-            return None
-        return controls.masks(self.method, sources[self.source], sequence, self.dilation_width)
+    @property
+    def mask_key(self) -> MaskKey:
+        """What decides the job's masks. Jobs of a sequence with the same key have the same ones."""
+        return MaskKey(self.method, self.dilation_width, self.source)
 
 
 def first_jobs(
@@ -95,11 +107,10 @@ def first_jobs(
     sources: Iterable[Source] = (Source(Path()),),
     repetitions: int = 1,
 ) -> list[Job]:
-    """Return the jobs that need no other results: all keypoints, masks of every width, and controls
-    that are masks.
+    """Return the jobs that need no other results.
 
-    widths: pixels, for masks from label maps, by estimator: {"thesis":
-    range(1, 16)}.
+    These are all keypoints, masks of every width, and the controls that are masks.
+    widths: pixels, for masks from label maps, by estimator: {"thesis": range(1, 16)}.
     tested: width (pixels) of the controls, None for no controls; it is added to the widths of every
     estimator.
     sources: of masks. All keypoints are run once for all sources.
@@ -109,35 +120,50 @@ def first_jobs(
         name = sequence.name
         jobs += _repeated([Job(name, "baseline")], widths, repetitions)
         for source in sources:
-            has_widths = source.kind == "labels"
-            all_widths = (
-                sorted(set().union(*widths.values(), [tested] if tested else []))
-                if has_widths
-                else [None]
-            )
-            for width in all_widths:
-                estimators = [
-                    estimator
-                    for estimator, requested_widths in widths.items()
-                    if width in (None, tested) or width in requested_widths
-                ]
-                jobs += _repeated(
-                    [Job(name, "masked", width, source=source.name)], estimators, repetitions
-                )
-            for method in controls.MASK_CONTROLS if tested else ():
-                if method in controls.OF_LABEL_MAPS and not has_widths:
-                    continue
-                if (
-                    method == "true-labels"
-                    and not controls.true_labels(sequence.root, name).is_dir()
-                ):
-                    continue
-                jobs += _repeated(
-                    [Job(name, method, tested if has_widths else None, source=source.name)],
-                    widths,
-                    repetitions,
-                )
+            jobs += _masked_jobs(name, source, widths, tested, repetitions)
+            if tested:
+                controls_of_source = _control_jobs(sequence, source, tested)
+                jobs += _repeated(controls_of_source, widths, repetitions)
     return jobs
+
+
+def _masked_jobs(
+    sequence: str,
+    source: Source,
+    widths: Mapping[str, Iterable[int]],
+    tested: int | None,
+    repetitions: int,
+) -> list[Job]:
+    """Return the jobs over a sequence with the masks of a source, of every width."""
+    if not source.has_label_maps:
+        return _repeated([Job(sequence, "masked", source=source.name)], widths, repetitions)
+    all_widths = set().union(*widths.values())
+    if tested:
+        all_widths.add(tested)
+    jobs = []
+    for width in sorted(all_widths):
+        estimators = [
+            estimator
+            for estimator, requested_widths in widths.items()
+            if width == tested or width in requested_widths
+        ]
+        job = Job(sequence, "masked", width, source=source.name)
+        jobs += _repeated([job], estimators, repetitions)
+    return jobs
+
+
+def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
+    """Return the controls that are masks, as far as a source and a sequence allow them."""
+    if not source.has_label_maps:
+        return [
+            Job(sequence.name, method, source=source.name)
+            for method in controls.MASK_CONTROLS
+            if method not in controls.OF_LABEL_MAPS
+        ]
+    methods = list(controls.MASK_CONTROLS)
+    if not controls.true_labels(sequence.root, sequence.name).is_dir():
+        methods.remove("true-labels")
+    return [Job(sequence.name, method, tested, source=source.name) for method in methods]
 
 
 def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
@@ -150,20 +176,16 @@ def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) 
 
 
 def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
-    """Return jobs that limit the detector to each sequence's mean number of keypoints at its best
-    width (Figure 4.12).
+    """Return jobs that limit the detector to as many keypoints as the best masks leave.
 
-    best: the table of `thesis_tables.best_widths`.
+    This is each sequence's mean number of keypoints at its best width (Figure 4.12). best: the
+    table of `thesis_tables.best_widths`.
     """
-    # OpenCV takes 0 as "no limit"
-    return _repeated(
-        [
-            Job(name, "reduced", max_keypoints=max(1, round(number)))
-            for name, number in best["mean_keypoints"].items()
-        ],
-        ["thesis"],
-        repetitions,
-    )
+    jobs = []
+    for name, number in best["mean_keypoints"].items():
+        limit = max(1, round(number))  # OpenCV takes 0 as "no limit"
+        jobs.append(Job(name, "reduced", max_keypoints=limit))
+    return _repeated(jobs, ["thesis"], repetitions)
 
 
 def keypoint_control_jobs(
@@ -184,16 +206,11 @@ def keypoint_control_jobs(
         name = sequence.name
         if name not in keypoints:  # its runs with masks failed
             continue
-        number = keypoints[name]
-        distance = controls.min_distance(sequence, number)
-        jobs += _repeated(
-            [
-                Job(name, "fewer", width, max_keypoints=max(1, round(number)), source=source),
-                Job(name, "spread", width, min_distance=distance, source=source),
-            ],
-            estimators,
-            repetitions,
-        )
+        limit = max(1, round(keypoints[name]))
+        fewer = Job(name, "fewer", width, max_keypoints=limit, source=source)
+        distance = controls.min_distance(sequence, keypoints[name])
+        spread = Job(name, "spread", width, min_distance=distance, source=source)
+        jobs += _repeated([fewer, spread], estimators, repetitions)
     return jobs
 
 
@@ -207,23 +224,24 @@ def in_passes(
     leave workers without one. A single worker gets one pass a sequence.
     """
     jobs = list(jobs)
+    # jobs that are equal without these fields have the same keypoints
     unshared: dict[str, Any] = {"estimator": "", "repetition": 0}
     if len({replace(job, **unshared) for job in jobs}) < workers:
         unshared = {"estimator": ""}
     groups: dict[str, dict[Job, list[Job]]] = {}
     for job in jobs:
-        keypoints = replace(job, **unshared)
-        groups.setdefault(job.sequence, {}).setdefault(keypoints, []).append(job)
-    total = sum(len(job_lists) * len(sequences[name]) for name, job_lists in groups.items())
+        by_keypoints = groups.setdefault(job.sequence, {})
+        by_keypoints.setdefault(replace(job, **unshared), []).append(job)
+    # work is measured in frames, of which a group of jobs reads each once
+    work = sum(len(by_keypoints) * len(sequences[name]) for name, by_keypoints in groups.items())
+    work_of_pass = work / (PIECES * workers)
     passes = []
     for name, by_keypoints in groups.items():
         job_lists = list(by_keypoints.values())
-        size = (
-            max(1, round(total / (PIECES * workers) / len(sequences[name])))
-            if workers > 1
-            else len(job_lists)
-        )
-        passes += [
-            sum(job_lists[start : start + size], []) for start in range(0, len(job_lists), size)
-        ]
+        size = len(job_lists)
+        if workers > 1:
+            size = max(1, round(work_of_pass / len(sequences[name])))
+        for start in range(0, len(job_lists), size):
+            pass_jobs = chain.from_iterable(job_lists[start : start + size])
+            passes.append(list(pass_jobs))
     return passes

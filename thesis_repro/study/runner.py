@@ -1,16 +1,14 @@
-"""Run the jobs of a study that have no result yet, here or on a cluster, and make the table of all
-runs.
+"""Run the jobs of a study that have no result yet, and make the table of all runs.
 
-Each finished run is one CSV file with one row a frame. A study that stopped or failed resumes from
-its checkpoints.
+They run here or on a cluster. Each finished run is one CSV file with one row a frame. A study that
+stopped or failed resumes from its checkpoints.
 """
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
-from functools import cache
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,11 +22,39 @@ from thesis_repro.odometry.passes import poses_of
 from thesis_repro.running import console, results
 from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare, controls, workers
-from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, keypoint_control_jobs
-from thesis_repro.study.sources import Source
+from thesis_repro.study.jobs import (
+    ESTIMATORS,
+    UNMASKED,
+    Job,
+    MaskKey,
+    in_passes,
+    keypoint_control_jobs,
+)
+from thesis_repro.study.sources import Source, by_name
 
 # pattern of the file names, one for each unfinished pass
 CHECKPOINTS = f"pass-{'[0-9a-f]' * 12}.npz"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What `run_jobs` did.
+
+    table: all runs that succeeded, one row a job. made, kept, failed: numbers of jobs that were run
+    now, that had a result from before, and that failed.
+    """
+
+    table: pd.DataFrame
+    made: int
+    kept: int
+    failed: int
+
+
+class Failure(NamedTuple):
+    """Why a job failed. by_machine: the machine caused it, such as a full disk."""
+
+    reason: str
+    by_machine: bool = False
 
 
 def result_file(folder: Path, job: Job) -> Path:
@@ -36,7 +62,7 @@ def result_file(folder: Path, job: Job) -> Path:
     return folder / job.sequence / f"{job.name}.csv"
 
 
-def run(
+def run_jobs(
     jobs: Iterable[Job],
     sequences: Iterable[Sequence],
     sources: Path | Iterable[Source],
@@ -44,9 +70,8 @@ def run(
     *,
     processes: int = 1,
     scheduler: str | None = None,
-) -> pd.DataFrame:
-    """Run the jobs that have no result yet; returns the table of all runs that succeeded, one row a
-    job.
+) -> Outcome:
+    """Run the jobs that have no result yet; returns the table of all runs and how many ran.
 
     sequences: those of the jobs. sources: folder with one folder of label maps a sequence, or the
     sources of the jobs.
@@ -58,39 +83,46 @@ def run(
 
     Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results
     of separate runs. An interrupted pass resumes from its checkpoint. A job that fails is printed
-    with its reason and does not stop other jobs. The table's `attrs` say how many jobs were "made"
-    now, "kept" from before, and "failed".
+    with its reason and does not stop other jobs.
     Raises InputError if another run is using the folder, if all jobs fail, or if the machine lacks
     disk space or memory. Finished results are kept.
     """
-    jobs, sources_by_name = list(dict.fromkeys(jobs)), by_name(sources)
+    jobs = list(dict.fromkeys(jobs))
+    sources_by_name = by_name(sources)
     names = {job.sequence for job in jobs}
     opened = {sequence.name: sequence for sequence in sequences if sequence.name in names}
-    files = {job: result_file(folder, job) for job in jobs}
     with results.claimed(folder):
         for sequence in opened.values():
             _stage(folder, sequence, sources_by_name)
-        for job, path in files.items():
-            table = results.kept_table(path, len(opened[job.sequence]))
-            if table is None or not np.isfinite(poses_of(table)).all():
-                path.unlink(missing_ok=True)  # missing results are made again
-        finished = sum(path.is_file() for path in files.values())
+        for job in jobs:
+            _delete_if_damaged(result_file(folder, job), len(opened[job.sequence]))
+        finished = sum(result_file(folder, job).is_file() for job in jobs)
         failures = _run_passes(jobs, opened, sources_by_name, folder, processes, scheduler)
     rows = []
-    for job, path in files.items():
+    for job in jobs:
+        path = result_file(folder, job)
         if path.is_file():
-            table = pd.read_csv(
-                path, keep_default_na=False, na_values={"detected": "", "tracked": ""}
-            )
-            errors = measures(table, opened[job.sequence].poses)
+            # an empty flag stays a text, an empty number becomes NaN
+            numbers = {"detected": "", "tracked": ""}
+            frames = pd.read_csv(path, keep_default_na=False, na_values=numbers)
+            errors = measures(frames, opened[job.sequence].poses)
             rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **errors})
     if not rows:
-        raise InputError(
-            f"all {len(jobs)} odometry runs failed; the first: {next(iter(failures.values()))}"
-        )
-    runs = pd.DataFrame(rows)
-    runs.attrs = {"made": len(rows) - finished, "kept": finished, "failed": len(jobs) - len(rows)}
-    return runs
+        first = next(iter(failures.values()))
+        raise InputError(f"all {len(jobs)} odometry runs failed; the first: {first.reason}")
+    return Outcome(
+        pd.DataFrame(rows),
+        made=len(rows) - finished,
+        kept=finished,
+        failed=len(jobs) - len(rows),
+    )
+
+
+def _delete_if_damaged(path: Path, frames: int) -> None:
+    """Delete a result file that cannot be used, so that it is made again."""
+    table = results.kept_table(path, frames)
+    if table is None or not np.isfinite(poses_of(table)).all():
+        path.unlink(missing_ok=True)
 
 
 def keypoint_controls(
@@ -105,18 +137,14 @@ def keypoint_controls(
 
     width: pixels, of the masks from label maps that leave as many keypoints.
     """
-    return [
-        job
-        for source in sources
-        for job in keypoint_control_jobs(
-            compare.keypoints_left(compare.of_source(runs, source.name)),
-            sequences,
-            repetitions,
-            estimators,
-            source.name,
-            width if source.kind == "labels" else None,
+    jobs = []
+    for source in sources:
+        keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
+        width_of_source = width if source.has_label_maps else None
+        jobs += keypoint_control_jobs(
+            keypoints, sequences, repetitions, estimators, source.name, width_of_source
         )
-    ]
+    return jobs
 
 
 def _run_passes(
@@ -126,55 +154,44 @@ def _run_passes(
     folder: Path,
     processes: int,
     scheduler: str | None,
-) -> dict[Job, str]:
-    """Run the jobs without a result and print which of them failed; returns {job: reason} for
-    the failed ones.
+) -> dict[Job, Failure]:
+    """Run the jobs without a result and print which of them failed; returns these.
+
+    Raises InputError if the machine caused a failure.
     """
-    failures: dict[Job, str] = {}
+    failures: dict[Job, Failure] = {}
     with workers.open_pool(processes, scheduler) as pool:
         passes = _passes(jobs, sequences, folder, pool.size)
         calls, frames = [], []
         for pass_jobs in passes:
             sequence = sequences[pass_jobs[0].sequence]
-            calls.append(
-                (
-                    pass_jobs,
-                    sequence,
-                    sources,
-                    folder,
-                    results.record(folder / sequence.name),
-                )
-            )
+            record = results.record(folder / sequence.name)
+            calls.append((pass_jobs, sequence, sources, folder, record))
             frames.append(len(pass_jobs) * len(sequence))
         with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
-            for index, failed in pool.run(_run_pass, calls):
+            for index, pass_failures in pool.run(_run_pass, calls):
                 console.check_stop()
-                failures |= (
-                    failed if isinstance(failed, dict) else dict.fromkeys(passes[index], failed)
-                )
+                if isinstance(pass_failures, str):  # the reason why the call was lost
+                    pass_failures = dict.fromkeys(passes[index], Failure(pass_failures))
+                failures |= pass_failures
                 bar.update(frames[index])
-    by_reason: dict[tuple[str, str], list[str]] = {}
-    for job, reason in failures.items():
-        by_reason.setdefault((job.sequence, reason), []).append(job.name)
-    for (name, reason), runs in by_reason.items():
-        more = f" and {len(runs) - 3} more" * (len(runs) > 3)
-        console.log.warning(f"sequence {name}, {', '.join(runs[:3])}{more}: failed: {reason}")
-    for reason in failures.values():
-        if isinstance(reason, _MachineFault):  # a study without these runs could mislead
-            raise InputError(reason)
+    _print_failures(failures)
+    for failure in failures.values():
+        if failure.by_machine:  # a study without these runs could mislead
+            raise InputError(failure.reason)
     return failures
 
 
-class _MachineFault(str):
-    """The reason of a failure that the machine caused, such as a full disk."""
-
-
-def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
-    """Return the sources by name. A folder becomes a single source with an empty name."""
-    return {
-        source.name: source
-        for source in ([Source(sources)] if isinstance(sources, Path) else sources)
-    }
+def _print_failures(failures: Mapping[Job, Failure]) -> None:
+    """Print one line for the failed runs of a sequence that have the same reason."""
+    by_reason: dict[tuple[str, str], list[str]] = {}
+    for job, failure in failures.items():
+        by_reason.setdefault((job.sequence, failure.reason), []).append(job.name)
+    for (name, reason), runs in by_reason.items():
+        shown = ", ".join(runs[:3])
+        if len(runs) > 3:
+            shown += f" and {len(runs) - 3} more"
+        console.log.warning(f"sequence {name}, {shown}: failed: {reason}")
 
 
 def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None:
@@ -216,8 +233,9 @@ def _versions() -> dict[str, Any]:
 def _passes(
     jobs: list[Job], sequences: Mapping[str, Sequence], folder: Path, workers: int
 ) -> list[list[Job]]:
-    """Divide the jobs without a result into passes, the longest first. A pass with a checkpoint
-    keeps its jobs.
+    """Divide the jobs without a result into passes, the longest first.
+
+    A pass with a checkpoint keeps its jobs.
     """
     passes: list[list[Job]] = []
     jobs_without_checkpoint: list[Job] = []
@@ -236,42 +254,60 @@ def _passes(
                 passes.append([sequence_jobs[key] for key in keys])
                 waiting = {key: job for key, job in waiting.items() if key not in keys}
         jobs_without_checkpoint += waiting.values()
-    return sorted(
-        passes + in_passes(jobs_without_checkpoint, sequences, workers),
-        key=lambda pass_jobs: -len(pass_jobs) * len(sequences[pass_jobs[0].sequence]),
-    )
+    passes += in_passes(jobs_without_checkpoint, sequences, workers)
+
+    def frames(pass_jobs: list[Job]) -> int:
+        return len(pass_jobs) * len(sequences[pass_jobs[0].sequence])
+
+    return sorted(passes, key=frames, reverse=True)
 
 
-def masks_of(
+def checked_masks(
     jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
-) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
-    """Return {job: masks} over a sequence, and {job: reason} for the jobs whose masks cannot be
-    made.
+) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, Failure]]:
+    """Return {job: masks} over a sequence, and {job: failure} for masks that cannot be made.
 
-    Every file is read here, because a bad file in the middle of a pass would stop the whole pass.
-    Jobs with the same masks get the same object, by which `run_many` recognises that they share
-    work.
+    The masks are None for jobs without masks. Every file is read here, because a bad file in the
+    middle of a pass would stop the whole pass. Jobs with the same masks get the same object, by
+    which `run_many` recognises that they share work.
     """
-    check_file = cache(lambda source, path: sources[source].check_file(path, sequence.size))
-
-    @cache
-    def checked_masks(job: Job) -> controls.ControlMasks | str | None:
-        try:
-            masks = job.masks(sequence, sources)
-            for path in masks.paths if masks is not None else ():
-                check_file(job.source, path)
-        except InputError as error:
-            return str(error)
-        return masks
-
+    masks_by_key: dict[MaskKey, controls.ControlMasks | None] = {}
+    failures_by_key: dict[MaskKey, Failure] = {}
+    checked_files: set[tuple[str, Path]] = set()
     masks_by_job, failures = {}, {}
     for job in jobs:
-        masks = checked_masks(Job("", job.method, job.dilation_width, source=job.source))
-        if isinstance(masks, str):
-            failures[job] = masks
+        key = job.mask_key
+        if key not in masks_by_key and key not in failures_by_key:
+            try:
+                masks_by_key[key] = _masks_of_key(key, sequence, sources, checked_files)
+            except InputError as error:
+                failures_by_key[key] = Failure(str(error))
+        if key in masks_by_key:
+            masks_by_job[job] = masks_by_key[key]
         else:
-            masks_by_job[job] = masks
+            failures[job] = failures_by_key[key]
     return masks_by_job, failures
+
+
+def _masks_of_key(
+    key: MaskKey,
+    sequence: Sequence,
+    sources: Mapping[str, Source],
+    checked_files: set[tuple[str, Path]],
+) -> controls.ControlMasks | None:
+    """Make masks and read all their files. Raises InputError for a bad file.
+
+    checked_files: files that were read before, with the name of their source; new ones are added.
+    """
+    if key.method in UNMASKED:
+        return None
+    source = sources[key.source]
+    masks = controls.masks_of_method(key.method, source, sequence, key.dilation_width)
+    for path in masks.paths:
+        if (source.name, path) not in checked_files:
+            source.check_file(path, sequence.size)
+            checked_files.add((source.name, path))
+    return masks
 
 
 def _run_pass(
@@ -280,23 +316,21 @@ def _run_pass(
     sources: dict[str, Source],
     folder: Path,
     record: dict,
-) -> dict[Job, str]:
-    """Run jobs of one sequence in one pass, here or on another machine; returns {job: reason}
-    for the failed ones.
+) -> dict[Job, Failure]:
+    """Run jobs of one sequence in one pass, here or on another machine; returns the failed ones.
+
+    record: of the sequence's results, as the main process sees it.
     """
     cv2.setNumThreads(1)  # the processes already use every core
     digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
     checkpoint = folder / sequence.name / f"pass-{digest}.npz"
-    failures: dict[Job, str] = {}
+    failures: dict[Job, Failure] = {}
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
-        # a checkpoint can be resumed only with all of its jobs
-        waiting = (
-            jobs
-            if checkpoint.is_file()
-            else [job for job in jobs if not result_file(folder, job).is_file()]
-        )
-        masks_by_job, failures = masks_of(waiting, sequence, sources)
+        waiting = jobs
+        if not checkpoint.is_file():  # a checkpoint can be resumed only with all of its jobs
+            waiting = _unfinished(jobs, folder)
+        masks_by_job, failures = checked_masks(waiting, sequence, sources)
         if not masks_by_job:  # also if Dask repeats a finished pass because it lost the answer
             return failures
         run_results = odometry.run_many(
@@ -304,29 +338,30 @@ def _run_pass(
             {job.name: (job.settings, masks) for job, masks in masks_by_job.items()},
             checkpoint=checkpoint,
         )
-        for job in masks_by_job:
-            if not result_file(folder, job).is_file():
-                write_text(
-                    result_file(folder, job), run_results.pop(job.name).frames.to_csv(index=False)
-                )
+        for job in _unfinished(masks_by_job, folder):
+            frames = run_results.pop(job.name).frames
+            write_text(result_file(folder, job), frames.to_csv(index=False))
         checkpoint.unlink(missing_ok=True)
     except Exception as error:  # report any error as the reason, and let other passes run
-        reason = console.explain(error)
-        if reason is None:
-            reason = f"{type(error).__name__}: {error}"
-        elif not isinstance(error, InputError):
-            reason = _MachineFault(reason)
-        failures = (
-            dict.fromkeys((job for job in jobs if not result_file(folder, job).is_file()), reason)
-            | failures
-        )
+        failures = dict.fromkeys(_unfinished(jobs, folder), _failure_of(error)) | failures
     return failures
 
 
-def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
-    """Return the columns of a table of runs that come from a run's table of frames: errors,
-    keypoints, flagged frames.
+def _unfinished(jobs: Iterable[Job], folder: Path) -> list[Job]:
+    return [job for job in jobs if not result_file(folder, job).is_file()]
 
+
+def _failure_of(error: Exception) -> Failure:
+    reason = console.explain(error)
+    if reason is None:
+        return Failure(f"{type(error).__name__}: {error}")
+    return Failure(reason, by_machine=not isinstance(error, InputError))
+
+
+def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
+    """Return what a table of runs has from a run's frames: errors, keypoints, flagged frames.
+
+    frames: the table of `odometry.Result`.
     true: poses (n, 4, 4). The errors are those of `metrics.errors` and `metrics.step_errors`; t_rel
     (percent) and r_rel (degrees per 100 m) are those of `metrics.kitti_errors`.
     """
@@ -345,7 +380,7 @@ def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
     """Return {(sequence, run): estimated poses (n, 4, 4)} for each row of a table of runs."""
-    return {
-        (name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
-        for name, run in zip(runs["sequence"], runs["run"], strict=True)
-    }
+    paths = {}
+    for name, run in zip(runs["sequence"], runs["run"], strict=True):
+        paths[name, run] = poses_of(pd.read_csv(folder / name / f"{run}.csv"))
+    return paths

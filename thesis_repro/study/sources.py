@@ -1,6 +1,4 @@
-"""The sources of the masks of a study: folders of label maps or of ready-made masks, one or
-several.
-"""
+"""The sources of a study's masks: one or several folders of label maps or of ready-made masks."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -39,7 +37,12 @@ class Source:
     settings: MaskSettings = MaskSettings()
     invert: bool = False
 
-    def folder_of(self, sequence: str) -> Path:
+    @property
+    def has_label_maps(self) -> bool:
+        """Whether masks are made from label maps, so that they have a dilation width."""
+        return self.kind == "labels"
+
+    def sequence_folder(self, sequence: str) -> Path:
         """Return the folder with the files of one sequence."""
         return masks.folder_of(self.folder, sequence)
 
@@ -48,31 +51,39 @@ class Source:
 
         Raises InputError if a frame has no file.
         """
-        if self.kind == "masks":
+        if not self.has_label_maps:
             return MaskFolder(self.folder, sequence, self.invert)
         assert dilation_width is not None  # masks from label maps need a width
         return LabelMasks(self.folder, sequence, dilation_width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError if a file is not a label map, or not a mask of size (height, width)."""
-        read_label_map(path, self.settings.ids == "train") if self.kind == "labels" else read_mask(
-            path, size
-        )
+        if self.has_label_maps:
+            read_label_map(path, self.settings.ids == "train")
+        else:
+            read_mask(path, size)
 
     def record(self, sequence: str) -> dict[str, str | None]:
         """Return the digests and settings that the results of a sequence depend on."""
-        folder = self.folder_of(sequence)
-        made_from = results.made_from(folder) if results.record(folder) is not None else None
-        settings = (
-            {"settings": str(self.settings)}
-            if self.kind == "labels"
-            else {"invert": str(self.invert)}
-        )
-        return {
+        folder = self.sequence_folder(sequence)
+        record: dict[str, str | None] = {
             self.kind: results.digest_of_files(listed(folder)),
-            "made_from": made_from,
-            **settings,
+            "made_from": None,
         }
+        if results.record(folder) is not None:
+            record["made_from"] = results.made_from(folder)
+        if self.has_label_maps:
+            record["settings"] = str(self.settings)
+        else:
+            record["invert"] = str(self.invert)
+        return record
+
+
+def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
+    """Return sources by name. A folder becomes a single source with an empty name."""
+    if isinstance(sources, Path):
+        sources = [Source(sources)]
+    return {source.name: source for source in sources}
 
 
 def named(
@@ -81,9 +92,9 @@ def named(
     settings: MaskSettings,
     invert: bool = False,
 ) -> tuple[Source, ...]:
-    """Return sources from (kind, folder) pairs and their names, in order. The default name is that
-    of the folder.
+    """Return sources from (kind, folder) pairs and their names, in order.
 
+    The default name is that of the folder.
     settings: for all masks from label maps. invert: for all ready-made masks.
     Raises InputError for a name that cannot be a folder's name, for equal names, and for more names
     than folders.
@@ -100,9 +111,10 @@ def named(
             raise InputError(
                 f"--name {given_name}: a name may have letters, digits, '_', '+' and '-'"
             )
-        name = given_name or re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-") or "masks"
+        folder_name = re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-")
+        name = given_name or folder_name or "masks"
         # some file systems ignore case
-        if name.lower() in (source.name.lower() for source in sources):
+        if name.lower() in [source.name.lower() for source in sources]:
             raise InputError(
                 f"--name: two folders of masks would be called {name!r}; give each a different --name, in "
                 "the order of --labels and --masks"
@@ -114,29 +126,40 @@ def named(
 def check(
     sources: Iterable[Source], sequences: Collection[Sequence], widths: Collection[int]
 ) -> None:
-    """Raise InputError, before anything runs, if a source lacks a file for a frame or has files of
-    the wrong kind.
+    """Raise InputError, before anything runs, if a source lacks files or has files of a wrong kind.
 
+    Each frame needs a file.
     widths: pixels, for masks from label maps. Only the size of every mask and the first file of
     each sequence are checked here. The runner reads all files, and a bad one stops only the runs
     that need it.
     """
     for source in sources:
-        kind = KINDS[source.kind]
         if not source.folder.is_dir():
             raise InputError(
-                f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence"
+                f"{source.folder}: no such folder; it must hold a folder of {KINDS[source.kind]} for "
+                "each sequence"
             )
         for sequence in sequences:
-            if source.folder_of(sequence.name) == source.folder and len(sequences) > 1:
-                raise InputError(
-                    f"{source.folder}: holds the {kind} of one sequence, but {len(sequences)} are asked "
-                    f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "
-                    "name one with --sequences"
-                )
-            # raises InputError for a width that is too large for the frames
-            for width in widths or (1,):
-                paths = source.masks(sequence, width).paths
-            for path in paths if source.kind == "masks" else ():
-                check_size(path, glance(path), sequence.size, "its frame")
-            source.check_file(paths[0], sequence.size)
+            _check_folder(source, sequence, len(sequences))
+            _check_masks(source, sequence, widths)
+
+
+def _check_folder(source: Source, sequence: Sequence, count: int) -> None:
+    """Raise InputError if a source holds the files of one sequence, but `count` are asked for."""
+    if count > 1 and source.sequence_folder(sequence.name) == source.folder:
+        raise InputError(
+            f"{source.folder}: holds the {KINDS[source.kind]} of one sequence, but {count} are asked "
+            f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "
+            "name one with --sequences"
+        )
+
+
+def _check_masks(source: Source, sequence: Sequence, widths: Collection[int]) -> None:
+    """Raise InputError if the masks of a sequence, of any of the widths, cannot be made."""
+    # raises InputError for a width that is too large for the frames
+    for width in widths or (1,):
+        paths = source.masks(sequence, width).paths
+    if not source.has_label_maps:
+        for path in paths:
+            check_size(path, glance(path), sequence.size, "its frame")
+    source.check_file(paths[0], sequence.size)

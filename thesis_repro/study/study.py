@@ -1,6 +1,6 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -8,14 +8,13 @@ import pandas as pd
 
 from thesis_repro.checks import oddities
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import InputError
 from thesis_repro.running import results
 from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
-PATHS = "paths"  # folder of the estimated paths
+RUNS = "runs"  # folder of the results of the runs
 
 
 @dataclass(frozen=True)
@@ -57,18 +56,24 @@ class Study:
                 raise InputError(
                     f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
                 )
-        sources.check(
-            self.sources, sequences, (*self.widths, self.tested) if self.tested else self.widths
-        )
+        widths = list(self.widths)
+        if self.tested:
+            widths.append(self.tested)
+        sources.check(self.sources, sequences, widths)
 
     @property
     def shown_width(self) -> int | None:
-        """The dilation width (pixels) of the masks in figures: the tested width, or else the
-        middle one.
-        """
-        return self.tested or (self.widths[len(self.widths) // 2] if self.widths else None)
+        """The dilation width (pixels) of the masks in figures.
 
-    def masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
+        It is the tested width, or else the middle one; None for only ready-made masks.
+        """
+        if self.tested:
+            return self.tested
+        if not self.widths:
+            return None
+        return self.widths[len(self.widths) // 2]
+
+    def shown_masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
         """Return each sequence with the masks of each source, at the `shown_width`."""
         return [
             (sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
@@ -76,56 +81,33 @@ class Study:
         ]
 
     def shown_jobs(self, name: str) -> list[jobs.Job]:
-        """Return the runs of a sequence whose paths are drawn: all keypoints and the masks of
-        each source.
-        """
-        estimator = "refined" if "refined" in self.estimators else "thesis"
-        return [
-            jobs.Job(name, "baseline", estimator=estimator),
-            *(
-                jobs.Job(
-                    name,
-                    "masked",
-                    self.shown_width if source.kind == "labels" else None,
-                    estimator=estimator,
-                    source=source.name,
-                )
-                for source in self.sources
-            ),
-        ]
+        """Return the runs of a sequence whose paths are drawn.
 
-    def write_paths(self, runs: pd.DataFrame, folder: Path) -> None:
-        """Write the ground truth and repetition 0 of every run into folder/PATHS, in KITTI's
-        and TUM's formats.
+        They are all keypoints and the masks of each source.
         """
-        first_runs = runs[runs["repetition"] == 0]
-        for sequence in self.opened:
-            name = sequence.name
-            estimated = runner.run_poses(
-                first_runs[first_runs["sequence"] == name], folder / "runs"
-            )
-            for (_, run), poses in {(name, "truth"): sequence.poses, **estimated}.items():
-                write_kitti_poses(folder / PATHS / "kitti" / name / f"{run}.txt", poses)
-                write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
+        estimator = "thesis"
+        if "refined" in self.estimators:
+            estimator = "refined"
+        shown = [jobs.Job(name, "baseline", estimator=estimator)]
+        for source in self.sources:
+            width = self.shown_width if source.has_label_maps else None
+            shown.append(jobs.Job(name, "masked", width, estimator=estimator, source=source.name))
+        return shown
 
     def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
-        """Return the warnings of `oddities.of_steps` and `oddities.of_path` for one run with
-        all keypoints of each sequence.
+        """Return the warnings of `oddities.of_steps` and `oddities.of_path`.
+
+        They are about one run with all keypoints of each sequence.
         """
-        baselines = runs[
-            (runs["method"] == "baseline") & (runs["repetition"] == 0)
-        ].drop_duplicates("sequence")
+        unshuffled = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)]
+        baselines = unshuffled.drop_duplicates("sequence")
+        warnings = []
+        for run in baselines.itertuples():
+            warnings += oddities.of_steps(run.sequence, run.flagged, run.frames)
         true = {sequence.name: sequence.poses for sequence in self.opened}
-        lines = [
-            line
-            for run in baselines.itertuples()
-            for line in oddities.of_steps(run.sequence, run.flagged, run.frames)
-        ]
-        return lines + [
-            line
-            for (name, _), poses in runner.run_poses(baselines, folder / "runs").items()
-            for line in oddities.of_path(name, poses, true[name])
-        ]
+        for (name, _), poses in runner.run_poses(baselines, folder / RUNS).items():
+            warnings += oddities.of_path(name, poses, true[name])
+        return warnings
 
     def first_jobs(self) -> list[jobs.Job]:
         """Return the jobs that need no other results."""
@@ -137,46 +119,46 @@ class Study:
             repetitions=self.repetitions,
         )
 
-    def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> pd.DataFrame:
-        """Run the jobs whose results are not in the folder yet; returns the table of all runs, see
-        `runner.run`.
+    def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
+        """Run the jobs whose results are not in the folder yet, see `runner.run_jobs`.
 
         Raises InputError for a folder with results of another number of frames.
         """
-        run = partial(
-            runner.run,
+        run_jobs = partial(
+            runner.run_jobs,
             sequences=self.opened,
             sources=self.sources,
-            folder=folder / "runs",
+            folder=folder / RUNS,
             processes=processes,
             scheduler=scheduler,
         )
         with results.claimed(folder):
             results.stage(folder, replace=False, frames=self.frames)
-            study_jobs = self.first_jobs()
-            runs = run(study_jobs)
-            if runs["mean_keypoints"].isna().all():
-                raise InputError(
-                    f"{self.kitti}: no frame has any structure (all are black, white or of one gray); "
-                    "check how they were written"
-                )
-            if not (runs["method"] == "masked").any():
-                raise InputError(
-                    "every run with masks failed (see above), so there is nothing to compare"
-                )
-            if self.tested:
-                made = runs.attrs["made"]
-                study_jobs += runner.keypoint_controls(
-                    runs,
-                    self.opened,
-                    self.sources,
-                    self.repetitions,
-                    self.tested,
-                    self.estimators,
-                )
-                runs = run(study_jobs)
-                # the second call counts the runs of the first one as kept
-                runs.attrs["made"] += made
-                runs.attrs["kept"] -= made
-            self.write_paths(runs, folder)
-        return runs
+            first_jobs = self.first_jobs()
+            first = run_jobs(first_jobs)
+            self._check_runs(first.table)
+            if not self.tested:
+                return first
+            more_jobs = runner.keypoint_controls(
+                first.table,
+                self.opened,
+                self.sources,
+                self.repetitions,
+                self.tested,
+                self.estimators,
+            )
+            both = run_jobs(first_jobs + more_jobs)
+        # the second call counts the runs of the first one as kept
+        return replace(both, made=both.made + first.made, kept=both.kept - first.made)
+
+    def _check_runs(self, runs: pd.DataFrame) -> None:
+        """Raise InputError if the runs leave nothing to compare."""
+        if runs["mean_keypoints"].isna().all():
+            raise InputError(
+                f"{self.kitti}: no frame has any structure (all are black, white or of one gray); "
+                "check how they were written"
+            )
+        if not (runs["method"] == "masked").any():
+            raise InputError(
+                "every run with masks failed (see above), so there is nothing to compare"
+            )

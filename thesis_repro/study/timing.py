@@ -1,8 +1,8 @@
-"""Time every dilation width as the thesis does (Figure 4.17), and each stage from a frame's file to
-its pose.
+"""Time every dilation width, and each stage from a frame's file to its pose.
 
-The stages include the network, as Section 5.2.2 asks for. They are timed as in a live system: one
-frame after the other, the network on one image at a time, all cores.
+The widths are timed as in the thesis (Figure 4.17). The stages include the network, as Section
+5.2.2 asks for. They are timed as in a live system: one frame after the other, the network on one
+image at a time, all cores.
 """
 
 import platform
@@ -24,8 +24,8 @@ from thesis_repro.running.files import progress, write_text
 from thesis_repro.running.settings import cores
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
-from thesis_repro.study.runner import by_name, masks_of
-from thesis_repro.study.sources import Source
+from thesis_repro.study.runner import checked_masks
+from thesis_repro.study.sources import Source, by_name
 
 STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
 FRAMES = 20  # on which the stages are timed
@@ -51,38 +51,33 @@ def time_runs(
     *,
     processes: int = 1,
 ) -> pd.DataFrame:
-    """Time each job as a separate run; returns a table of sequence, run, method, dilation_width and
-    seconds.
+    """Time each job as a separate run; returns a table with one row a run.
 
-    The first two steps are not timed, because they load compiled code. The jobs of a sequence take
-    turns at every frame, so that other programs slow all of them equally. Call it after
-    `runner.run`, with the same folder and label maps. Times in the folder are not measured again.
+    Its columns are sequence, run, method, dilation_width and seconds. The first two steps are not
+    timed, because they load compiled code. The jobs of a sequence take turns at every frame, so
+    that other programs slow all of them equally. Call it after `runner.run_jobs`, with the same
+    folder and label maps. Times in the folder are not measured again.
     """
     jobs, sources = list(jobs), by_name(labels)
-    calls = [
-        (
-            [job for job in jobs if job.sequence == sequence.name],
-            sequence,
-            sources,
-            folder / sequence.name / f"seconds-{len(sequence)}.csv",
-        )
-        for sequence in sequences
-    ]
+    calls = []
+    for sequence in sequences:
+        sequence_jobs = [job for job in jobs if job.sequence == sequence.name]
+        path = folder / sequence.name / f"seconds-{len(sequence)}.csv"
+        calls.append((sequence_jobs, sequence, sources, path))
     with workers.open_pool(processes) as pool:
-        tables = dict(
-            progress(pool.run(_time_jobs, calls), "timing", total=len(calls), unit="sequence")
-        )
+        timed = pool.run(_time_jobs, calls)
+        tables = dict(progress(timed, "timing", total=len(calls), unit="sequence"))
     return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
 
 
 def _time_jobs(
     jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
 ) -> pd.DataFrame:
-    kept = results.kept_table(path, dtype={"sequence": str})
-    if kept is not None and {job.name for job in jobs} <= set(kept["run"]):
-        return kept
+    earlier = results.kept_table(path, dtype={"sequence": str})
+    if earlier is not None and {job.name for job in jobs} <= set(earlier["run"]):
+        return earlier
     scales = odometry.scales(sequence)
-    masks_by_job, _ = masks_of(jobs, sequence, sources)
+    masks_by_job, _ = checked_masks(jobs, sequence, sources)
     odometries = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
     seconds = dict.fromkeys(masks_by_job, 0.0)
     with opencv_threads(1):  # one thread makes times comparable
@@ -90,33 +85,31 @@ def _time_jobs(
             frame = sequence.frame(index)
             for job, job_masks in masks_by_job.items():
                 masks.forget_edges()  # a separate run would have to find them
-                mask, mask_seconds = (
-                    (None, 0.0) if job_masks is None else _timed(job_masks.__getitem__, index)
-                )
+                mask, mask_seconds = None, 0.0
+                if job_masks is not None:
+                    mask, mask_seconds = _timed(job_masks.__getitem__, index)
                 step = odometries[job].step(frame, scales[index], mask)
                 if index > 1:
                     # Section 4.2 counts the odometry and the making of the mask, not the prediction
                     seconds[job] += mask_seconds + sum(step.seconds.values())
-    table = pd.DataFrame(
-        [
-            {
-                "sequence": job.sequence,
-                "run": job.name,
-                "method": job.method,
-                "dilation_width": job.dilation_width,
-                "seconds": value,
-            }
-            for job, value in seconds.items()
-        ]
-    )
-    write_text(path, table.to_csv(index=False))
+    rows = [
+        {
+            "sequence": job.sequence,
+            "run": job.name,
+            "method": job.method,
+            "dilation_width": job.dilation_width,
+            "seconds": job_seconds,
+        }
+        for job, job_seconds in seconds.items()
+    ]
+    write_text(path, pd.DataFrame(rows).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
 def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
-    """Time each stage of a frame, with all keypoints and with masks: a table of method, stage,
-    milliseconds (medians).
+    """Time each stage of a frame, with all keypoints and with masks.
 
+    Returns a table of method, stage, milliseconds (medians).
     Stages: read (the frame's file), segmentation (resize to the model's input, network, class of
     every pixel), mask (label map to 320x320, edges, dilation), detection, tracking, pose (essential
     matrix, then rotation and translation). model: a Keras model of `segmentation`. width: of the
@@ -128,44 +121,44 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
         raise InputError(
             f"sequence {sequence.name}: {len(sequence)} frames; timing needs {WARM_UP + 2} or more"
         )
-    plain, masked = "all keypoints", f"masked, width {width}"
-    metres, rows = odometry.scales(sequence), []
-    runs = {name: odometry.Odometry(sequence.intrinsics) for name in (plain, masked)}
+    scales = odometry.scales(sequence)
+    unmasked_odometry = odometry.Odometry(sequence.intrinsics)
+    masked_odometry = odometry.Odometry(sequence.intrinsics)
+    rows: list[dict[str, Any]] = []
     with opencv_threads(-1):
         for index in progress(range(len(sequence)), "timing"):
             frame, read = _timed(sequence.frame, index)
             label_map, segmentation = _timed(_segment, model, frame)
             mask, masking = _timed(_mask, label_map, frame.shape, width)
-            for name, run in runs.items():
-                seconds = run.step(frame, metres[index], mask if name == masked else None).seconds
-                if index >= WARM_UP:
-                    network_stages = (
-                        {"segmentation": segmentation, "mask": masking} if name == masked else {}
-                    )
-                    rows.append(
-                        {
-                            "method": name,
-                            "read": read,
-                            **network_stages,
-                            "detection": seconds["detect"],
-                            "tracking": seconds["track"],
-                            "pose": seconds["essential"] + seconds["pose"],
-                        }
-                    )
-    medians = 1000 * pd.DataFrame(rows).groupby("method", sort=False)[list(STAGES)].median()
-    return (
-        medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds")
-        .dropna()
-        .reset_index()
-    )
+            unmasked = unmasked_odometry.step(frame, scales[index], None)
+            masked = masked_odometry.step(frame, scales[index], mask)
+            if index < WARM_UP:
+                continue
+            network = {"segmentation": segmentation, "mask": masking}
+            rows += [
+                {"method": "all keypoints", "read": read, **_stages_of(unmasked)},
+                {"method": f"masked, width {width}", "read": read, **network, **_stages_of(masked)},
+            ]
+    by_method = pd.DataFrame(rows).groupby("method", sort=False)
+    medians = 1000 * by_method[list(STAGES)].median()
+    table = medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds")
+    return table.dropna().reset_index()
+
+
+def _stages_of(step: odometry.Step) -> dict[str, float]:
+    """Return the seconds of the stages that a step of the odometry has."""
+    return {
+        "detection": step.seconds["detect"],
+        "tracking": step.seconds["track"],
+        "pose": step.seconds["essential"] + step.seconds["pose"],
+    }
 
 
 def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
-    """Write measured timings to a file and return them, with a column for the processor; with
-    `keep`, return the timings of an existing file instead.
+    """Write measured timings to a file and return them, with a column for the processor.
 
-    Figures in git keep their timings, which would otherwise change with every machine and every
-    run.
+    keep: return the timings of an existing file instead. Figures in git keep their timings, which
+    would otherwise change with every machine and every run.
     """
     if not (keep and path.is_file()):
         write_text(path, measured.assign(processor=processor()).to_csv(index=False))

@@ -24,8 +24,9 @@ Results = Iterator[tuple[int, Any]]
 
 
 class Pool(NamedTuple):
-    """`run(function, calls)` yields (index of the call, result) in the order in which the calls
-    end.
+    """Something that makes calls at the same time.
+
+    `run(function, calls)` yields (index of the call, result) in the order in which the calls end.
     """
 
     size: int  # number of calls that run at the same time
@@ -34,9 +35,9 @@ class Pool(NamedTuple):
 
 @contextmanager
 def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
-    """Open a pool on a Dask scheduler ("tcp://host:8786") or, without one, on `processes` processes
-    of this machine.
+    """Open a pool on a Dask scheduler or, without one, on processes of this machine.
 
+    processes: their number. scheduler: its address, "tcp://host:8786".
     Raises InputError if the scheduler does not answer or has no workers.
     """
     if scheduler_address(scheduler) is None:
@@ -65,14 +66,16 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
 
 
 def _here(size: int, function: Callable, calls: Calls) -> Results:
-    work = joblib.Parallel(
+    parallel = joblib.Parallel(
         n_jobs=size,
         return_as="generator_unordered",
         initializer=_start_process,
         initargs=(console.prints_messages(),),
-    )(joblib.delayed(_numbered)(index, function, call) for index, call in enumerate(calls))
+    )
+    numbered = joblib.delayed(_numbered)
+    work = (numbered(index, function, call) for index, call in enumerate(calls))
     try:
-        yield from work
+        yield from parallel(work)
     except TerminatedWorkerError:
         raise InputError(console.WORKER_KILLED) from None
 
@@ -88,24 +91,29 @@ def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:
 
 
 def _on_workers(client: Any, function: Callable, calls: Calls) -> Results:
-    """If a worker dies, Dask restarts its call on another worker, up to three times."""
+    """Yield the results of a cluster.
+
+    If a worker dies, Dask restarts its call on another worker, up to three times.
+    """
     from dask.distributed import as_completed
 
-    index = {
-        client.submit(function, *call, pure=False): number for number, call in enumerate(calls)
-    }
-    for future in as_completed(list(index), loop=client.loop):
+    indices = {}
+    for index, call in enumerate(calls):
+        future = client.submit(function, *call, pure=False)
+        indices[future] = index
+    for future in as_completed(list(indices), loop=client.loop):
         if client.status != "running" and future.status != "finished":
             raise InputError(
                 f"Dask scheduler {client.scheduler.address}: no longer answers; finished runs are kept; "
                 "start it again, then repeat the command"
             )
-        error = (
-            future.exception()
-            if future.status == "error"
-            else f"the cluster reports: {future.status}"
-        )
-        yield (
-            index[future],
-            future.result() if future.status == "finished" else str(error).splitlines()[0],
-        )
+        yield indices[future], _result_or_reason(future)
+
+
+def _result_or_reason(future: Any) -> Any:
+    """Return the result of a future that ended, or the reason, one line, why it has none."""
+    if future.status == "finished":
+        return future.result()
+    if future.status == "error":
+        return str(future.exception()).splitlines()[0]
+    return f"the cluster reports: {future.status}"
