@@ -88,10 +88,10 @@ DRAWN = {
     "4.4": lambda: chapter4.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
     "4.5": lambda: chapter4.figure_4_05(FRAME, POINTS, LABEL_MAP, MASK, POINTS, 10, "sequence 00"),
     "4.8": lambda: chapter4.figure_4_08(
-        flicker.follow([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"
+        flicker.follow_window([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"
     ),
     "4.8 without keypoints": lambda: chapter4.figure_4_08(
-        flicker.follow([FRAME] * 2, [BLANK] * 2, 5), "00"
+        flicker.follow_window([FRAME] * 2, [BLANK] * 2, 5), "00"
     ),
     "paths": lambda: trajectories.figure(
         {"masked": turning(), "$all$": 2 * turning()}, turning(), "sequence 00"
@@ -160,7 +160,7 @@ def test_keypoints_jump_with_a_moving_boundary_alone():
     frame = textured(size=(120, 240))
     car = np.where(MASK[:, :240] > 0, ID["car"], ID["road"]).astype(np.uint8)
     still, jumping = (
-        flicker.follow([frame, frame], [car, later], 5, first=7)
+        flicker.follow_window([frame, frame], [car, later], 5, first=7)
         for later in (car, np.roll(car, 14, 1))
     )
     assert [view.frame for view in still] == [7, 8] and still[0].expected is None
