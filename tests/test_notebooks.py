@@ -1,4 +1,5 @@
 """Notebooks as they are in git and as they run; they are executed once, on the smallest profile.
+
 An edit of a cell reaches the last table of notebook 8; the cells concerned run in one process.
 """
 
@@ -37,9 +38,7 @@ def cells(name, kind):
 
 
 def execute(name, build, output):
-    """Execute a notebook by nbconvert with no setting of the Makefile but the profile and the
-    folders.
-    """
+    """Execute a notebook by nbconvert, with no setting of the Makefile but profile and folders."""
     environment = {key: os.environ[key] for key in ("PATH", "HOME", "LANG") if key in os.environ}
     environment |= {
         "PYTHONPATH": str(ROOT),

@@ -1,5 +1,6 @@
-"""Figures of chapter 2 and of frames show the numbers of the data and can be read; axes that
-figures share; the video of the odometry.
+"""Figures of chapter 2 and of frames show the numbers of the data and can be read.
+
+Also the axes that figures share, and the video of the odometry.
 """
 
 import cv2
@@ -60,7 +61,7 @@ LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = (
     ID["license plate"],
 )
 MOVED = np.roll(LABEL_MAP, 14, axis=1)
-MASK = 255 * (LABEL_MAP == ID["car"]).astype(np.uint8)
+MASK = np.where(LABEL_MAP == ID["car"], 255, 0).astype(np.uint8)
 POINTS = np.array([[110.0, 50.0], [120.0, 60.0]])
 DRAWN = {
     "2.2": lambda: chapter2.figure_2_02(*convolution()),
