@@ -61,7 +61,8 @@ LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = (
     ID["license plate"],
 )
 MOVED = np.roll(LABEL_MAP, 14, axis=1)
-MASK = np.where(LABEL_MAP == ID["car"], 255, 0).astype(np.uint8)
+MASK = BLANK.copy()
+MASK[40:75, 100:130] = 255  # on the car
 POINTS = np.array([[110.0, 50.0], [120.0, 60.0]])
 DRAWN = {
     "2.2": lambda: chapter2.figure_2_02(*convolution()),
