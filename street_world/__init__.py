@@ -1,5 +1,6 @@
-"""The embedded world: rendered street drives with exact poses and label maps, in the layouts of
-the real data.
+"""The embedded world: rendered street drives with exact poses and label maps.
+
+Its files have the layouts of the real data.
 """
 
 from street_world.dataset import write

@@ -6,6 +6,7 @@ from thesis_repro.running.settings import read_settings
 
 
 def main() -> None:
+    """Render the drives of the current settings."""
     settings = read_settings()
     street_world.write(
         settings.world,

@@ -1,17 +1,16 @@
-"""The embedded world: rendered street drives with exact poses and label maps, written in the two
-real file layouts.
+"""The embedded world: rendered street drives with exact poses and label maps, written as files.
 
-OUT/kitti has the layout of the KITTI odometry benchmark, plus sequences/NN/labels_0 with the exact
-label maps. OUT/cityscapes has the layout of Cityscapes and shows other streets than the sequences.
-Each picture depends only on the seed and its own name, so neither the number of processes nor an
-interruption changes a byte.
+The files have the two real layouts. OUT/kitti has the layout of the KITTI odometry benchmark, plus
+sequences/NN/labels_0 with the exact label maps. OUT/cityscapes has the layout of Cityscapes and
+shows other streets than the sequences. Each picture depends only on the seed and its own name, so
+neither the number of processes nor an interruption changes a byte.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
@@ -32,12 +31,14 @@ CITIES = {
 
 @lru_cache(maxsize=2)
 def _drive(name: str, frames: int, seed: int) -> tuple[street.Street, np.ndarray, np.ndarray]:
-    """Return a sequence's street, camera-to-world poses in it, (frames, 4, 4), and metres
-    driven, (frames,).
+    """Return a sequence's street, the camera-to-world poses in it and the metres driven.
+
+    Poses are (frames, 4, 4), metres driven (frames,).
     """
     track, poses, driven = drives.way(name, frames, seed)
     rng = np.random.default_rng((seed, drives.STREET, int(name)))
-    return street.build(rng, textures.build(seed), track, drives.DRIVES[name].style), poses, driven
+    scenery = street.build(rng, textures.build(seed), track, drives.DRIVES[name].style)
+    return scenery, poses, driven
 
 
 def render_frame(
@@ -58,20 +59,38 @@ def render_frame(
 def render_image(
     split: str, index: int, scale: float = 0.5, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render training or validation image `index` ("train", "val"): image and label map, both
-    uint8 (height, width).
+    """Render training or validation image `index`: image and label map, uint8 (height, width).
+
+    split: "train" or "val".
     """
     rng = np.random.default_rng((seed, drives.IMAGE, ("train", "val").index(split), index))
     plan = drives.DRIVES[SEQUENCES[int(rng.integers(0, len(SEQUENCES)))]]
+    track = _random_track(rng)
+    scenery = street.build(rng, textures.build(seed), track, _random_style(rng, plan.style))
+    camera = _random_camera(rng, track, plan.lane)
+    height, width = round(IMAGE_SIZE[0] * scale), round(IMAGE_SIZE[1] * scale)
+    focal = width * rng.uniform(0.6, 1.0)
+    intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+    image, labels = scenery.view(camera, intrinsics, (height, width), int(rng.integers(0, 30)))
+    return _expose(rng, image, rng.uniform(88, 122), rng.uniform(1.2, 3.0)), labels
+
+
+def _random_track(rng: np.random.Generator) -> drives.Track:
+    """Return a road that is straight or has one bend."""
     bend = rng.uniform(-70, 70)
-    pieces = (
-        (float(rng.uniform(8, 40)), 0.0),
-        (float(rng.uniform(15, 40)), bend if rng.random() < 0.6 else 0.0),
-        (300.0, 0.0),
-    )
+    straight = float(rng.uniform(8, 40))
+    bent = float(rng.uniform(15, 40))
+    if rng.random() >= 0.6:
+        bend = 0.0
+    pieces = ((straight, 0.0), (bent, bend), (300.0, 0.0))
+    return drives.Track(pieces, -drives.BEHIND, drives.AHEAD)
+
+
+def _random_style(rng: np.random.Generator, style: drives.Style) -> drives.Style:
+    """Return a sequence's style with other light, persons, traffic and trees."""
     sky = (rng.uniform(120, 190), rng.uniform(175, 235))
-    style = dataclasses.replace(
-        plan.style,
+    return dataclasses.replace(
+        style,
         leaders=(),
         crossing=None,
         sky=sky,
@@ -81,18 +100,16 @@ def render_image(
         traffic=rng.uniform(0.01, 0.05),
         trees=rng.uniform(0.1, 0.9),
     )
-    track = drives.Track(pieces, -drives.BEHIND, drives.AHEAD)
-    scenery = street.build(rng, textures.build(seed), track, style)
-    x, z, heading = track.at(rng.uniform(0, 12), plan.lane * rng.uniform(-0.3, 1.2))
-    camera = drives.poses_of(
-        [(x, -rng.uniform(1.2, 1.9), z)],
-        [(heading, 0, 0) + np.radians(rng.uniform((-14, -2.5, -1), (14, 2, 1)))],
-    )[0]
-    height, width = round(IMAGE_SIZE[0] * scale), round(IMAGE_SIZE[1] * scale)
-    focal = width * rng.uniform(0.6, 1.0)
-    intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
-    image, labels = scenery.view(camera, intrinsics, (height, width), int(rng.integers(0, 30)))
-    return _expose(rng, image, rng.uniform(88, 122), rng.uniform(1.2, 3.0)), labels
+
+
+def _random_camera(rng: np.random.Generator, track: drives.Track, lane: float) -> np.ndarray:
+    """Return a camera-to-world pose (4, 4) near the start of a road, on its lane or beside it."""
+    s = rng.uniform(0, 12)
+    x, z, heading = track.at(s, lane * rng.uniform(-0.3, 1.2))
+    height = rng.uniform(1.2, 1.9)
+    turned = np.radians(rng.uniform((-14, -2.5, -1), (14, 2, 1)))
+    (pose,) = drives.poses_of([(x, -height, z)], [(heading, 0, 0) + turned])
+    return pose
 
 
 def _expose(rng: np.random.Generator, image: np.ndarray, level: float, noise: float) -> np.ndarray:
@@ -102,13 +119,16 @@ def _expose(rng: np.random.Generator, image: np.ndarray, level: float, noise: fl
     """
     mean = float(np.mean(image, dtype=np.float64))
     # The gain is rounded, so that machines whose sums round differently use the same one.
-    gain = round((level / max(mean, 1.0)) ** 0.8 * (1 + 0.01 * rng.standard_normal()) * 512) / 512
+    wanted = (level / max(mean, 1.0)) ** 0.8 * (1 + 0.01 * rng.standard_normal())
+    gain = round(wanted * 512) / 512
     rows, columns = image.shape
     y = np.linspace(-1, 1, rows, dtype=np.float32)[:, None]
     x = np.linspace(-1, 1, columns, dtype=np.float32)[None]
-    picture = image * np.float32(gain) * (1 - np.float32(0.06) * (x * x + y * y))
+    vignette = 1 - np.float32(0.06) * (x * x + y * y)
+    picture = image * np.float32(gain) * vignette
     # Photon noise grows with the square root of the light.
-    sigma = np.float32(noise) * np.sqrt(np.float32(0.25) + np.maximum(picture, 0) / np.float32(160))
+    light = np.maximum(picture, 0) / np.float32(160)
+    sigma = np.float32(noise) * np.sqrt(np.float32(0.25) + light)
     picture = picture + sigma * rng.standard_normal(image.shape, dtype=np.float32)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
@@ -151,30 +171,31 @@ def write(
         results.stage(
             out, replace=replace, code=results.digest_of_code("street_world.dataset"), **parameters
         )
-        pictures = [
+        pictures = []
+        for picture in _pictures(out, **parameters):
+            benchmark = picture.image_path.relative_to(out).parts[0]
+            if only in (None, benchmark):
+                pictures.append(picture)
+        missing = [
             picture
-            for picture in _pictures(out, **parameters)
-            if only in (None, picture[1].relative_to(out).parts[0])
+            for picture in pictures
+            if not (is_whole(picture.image_path) and is_whole(picture.label_path))
         ]
-        missing = [picture for picture in pictures if not all(map(is_whole, picture[1:]))]
-        workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
-        with progress(
-            description="rendering the embedded world", total=len(missing), unit="picture"
-        ) as bar:
-            # compiles the rasteriser once, for all worker processes
-            bar.update(_write_pictures(missing[:1]))
-            # Ten at a time, because pictures of one sequence share its street.
-            work = (
-                delayed(_write_pictures)(missing[k : k + 10]) for k in range(1, len(missing), 10)
-            )
-            for count in Parallel(
-                n_jobs=workers, return_as="generator_unordered", initializer=console.end_with_parent
-            )(work):
-                bar.update(count)
-        for name in sequences if only != "cityscapes" else ():
-            if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # written last
-                _write_sequence_texts(out, name, frames or drives.DRIVES[name].frames, scale, seed)
+        _write_missing(missing, jobs)
+        if only != "cityscapes":
+            for name in sequences:
+                if not (out / "kitti" / "poses" / f"{name}.txt").is_file():  # written last
+                    count = frames or drives.DRIVES[name].frames
+                    _write_sequence_texts(out, name, count, scale, seed)
     return len(missing), len(pictures)
+
+
+class Picture(NamedTuple):
+    """A picture of a world: the function that renders it, and its two files."""
+
+    render: Callable[[], tuple[np.ndarray, np.ndarray]]
+    image_path: Path
+    label_path: Path
 
 
 def _pictures(
@@ -185,33 +206,52 @@ def _pictures(
     train_images: int,
     validation_images: int,
     seed: int,
-) -> Iterator[tuple[Callable, Path, Path]]:
-    """Yield (function that renders it, image path, label map path) for every picture of a world."""
+) -> Iterator[Picture]:
+    """Yield every picture of a world."""
     for name in sequences:
         folder = root / "kitti" / "sequences" / name
         for index in range(frames or drives.DRIVES[name].frames):
-            picture = f"{index:06d}.png"
-            yield (
-                partial(render_frame, name, index, frames, scale, seed),
-                folder / "image_0" / picture,
-                folder / "labels_0" / picture,
-            )
+            render = partial(render_frame, name, index, frames, scale, seed)
+            file = f"{index:06d}.png"
+            yield Picture(render, folder / "image_0" / file, folder / "labels_0" / file)
+    folder = root / "cityscapes"
     for split, count in (("train", train_images), ("val", validation_images)):
+        cities = CITIES[split]
         for index in range(count):
-            city, number = CITIES[split][index % len(CITIES[split])], index // len(CITIES[split])
+            render = partial(render_image, split, index, scale, seed)
+            city, number = cities[index % len(cities)], index // len(cities)
             stem = f"{city}_{number:06d}_000000"
-            yield (
-                partial(render_image, split, index, scale, seed),
-                root / "cityscapes" / "leftImg8bit" / split / city / f"{stem}_leftImg8bit.png",
-                root / "cityscapes" / "gtFine" / split / city / f"{stem}_gtFine_labelIds.png",
+            yield Picture(
+                render,
+                folder / "leftImg8bit" / split / city / f"{stem}_leftImg8bit.png",
+                folder / "gtFine" / split / city / f"{stem}_gtFine_labelIds.png",
             )
 
 
-def _write_pictures(pictures: list[tuple[Callable, Path, Path]]) -> int:
-    for render, image_path, label_path in pictures:
-        image, labels = render()
-        write_png(label_path, labels)
-        write_png(image_path, image)
+def _write_missing(missing: list[Picture], jobs: int) -> None:
+    """Render and write pictures in several processes."""
+    workers = min(effective_n_jobs(jobs), 1 + len(missing) // 40)
+    with progress(
+        description="rendering the embedded world", total=len(missing), unit="picture"
+    ) as bar:
+        # compiles the rasteriser once, for all worker processes
+        bar.update(_write_pictures(missing[:1]))
+        parallel = Parallel(
+            n_jobs=workers, return_as="generator_unordered", initializer=console.end_with_parent
+        )
+        # Ten at a time, because pictures of one sequence share its street.
+        starts = range(1, len(missing), 10)
+        work = (delayed(_write_pictures)(missing[start : start + 10]) for start in starts)
+        for count in parallel(work):
+            bar.update(count)
+
+
+def _write_pictures(pictures: list[Picture]) -> int:
+    """Render and write pictures, and return how many."""
+    for picture in pictures:
+        image, labels = picture.render()
+        write_png(picture.label_path, labels)
+        write_png(picture.image_path, image)
     return len(pictures)
 
 
@@ -221,13 +261,13 @@ def _write_sequence_texts(root: Path, name: str, frames: int, scale: float, seed
     _, intrinsics = drives.scaled_camera(name, scale)
     lines = []
     for camera in range(4):
-        projection = np.c_[intrinsics, [-BASELINE * intrinsics[0, 0] * (camera % 2), 0, 0]]
-        lines.append(f"P{camera}: " + " ".join(f"{value:.12e}" for value in projection.ravel()))
-    write_text(folder / "calib.txt", "\n".join(lines) + "\n")
-    write_text(
-        folder / "times.txt", "".join(f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames))
-    )
+        shift = -BASELINE * intrinsics[0, 0] * (camera % 2)
+        projection = np.c_[intrinsics, [shift, 0, 0]]
+        numbers = " ".join(f"{value:.12e}" for value in projection.ravel())
+        lines.append(f"P{camera}: {numbers}\n")
+    write_text(folder / "calib.txt", "".join(lines))
+    times = [f"{kitti.FRAME_TIME * k:.6e}\n" for k in range(frames)]
+    write_text(folder / "times.txt", "".join(times))
     _, poses, _ = drives.way(name, frames, seed)
-    trajectories.write_kitti_poses(
-        root / "kitti" / "poses" / f"{name}.txt", drives.relative_to_first(poses)
-    )
+    path = root / "kitti" / "poses" / f"{name}.txt"
+    trajectories.write_kitti_poses(path, drives.relative_to_first(poses))

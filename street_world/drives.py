@@ -1,5 +1,4 @@
-"""The drives of the embedded world: eleven sequences, their roads and cameras, and how the camera's
-car moves.
+"""The drives of the embedded world: eleven sequences, their roads, cameras and motions.
 
 A place on a street is (s, d): metres along the middle line of the road, and metres to the right of
 that line.
@@ -74,9 +73,8 @@ class Track:
         begin = 0.0
         while pieces and begin < stop:
             for length, degrees in pieces:
-                curvature[(self.s >= begin) & (self.s < begin + length)] = (
-                    np.radians(degrees) / length
-                )
+                piece = (self.s >= begin) & (self.s < begin + length)
+                curvature[piece] = np.radians(degrees) / length
                 begin += length
         window = int(SMOOTHING / STEP)
         padded = np.pad(curvature, (window // 2, window - 1 - window // 2), mode="edge")
@@ -85,9 +83,8 @@ class Track:
         # The trapezoidal rule integrates the curvature to the heading, and its direction to the
         # position.
         first = int(round(-start / STEP))
-        turn = np.concatenate(
-            [[0.0], np.cumsum(0.5 * (self.curvature[1:] + self.curvature[:-1])) * STEP]
-        )
+        mean_curvature = 0.5 * (self.curvature[1:] + self.curvature[:-1])
+        turn = np.concatenate([[0.0], np.cumsum(mean_curvature) * STEP])
         self.heading = heading + turn - turn[first]
         middle = 0.5 * (self.heading[1:] + self.heading[:-1])
         x = np.concatenate([[0.0], np.cumsum(np.sin(middle)) * STEP])
@@ -271,20 +268,17 @@ def scaled_camera(name: str, scale: float) -> tuple[tuple[int, int], np.ndarray]
     camera = kitti.CAMERAS[name]
     width, height = round(camera.width * scale), round(camera.height * scale)
     x, y = width / camera.width, height / camera.height
-    return (height, width), np.array(
-        [
-            [camera.fx * x, 0, (camera.cx + 0.5) * x - 0.5],
-            [0, camera.fy * y, (camera.cy + 0.5) * y - 0.5],
-            [0, 0, 1.0],
-        ]
-    )
+    centre_x = (camera.cx + 0.5) * x - 0.5
+    centre_y = (camera.cy + 0.5) * y - 0.5
+    intrinsics = [[camera.fx * x, 0, centre_x], [0, camera.fy * y, centre_y], [0, 0, 1.0]]
+    return (height, width), np.array(intrinsics)
 
 
 def _driven(drive: Drive, track: Track, frames: int, phase: float) -> np.ndarray:
-    """Return the metres driven until each frame, (frames,); the car slows down for bends and stops.
+    """Return the metres driven until each frame, (frames,).
 
-    With acceleration a, the squared pace changes by at most 2 a ds over a distance ds, forwards and
-    backwards.
+    The car slows down for bends and stops. With acceleration a, the squared pace changes by at most
+    2 a ds over a distance ds, forwards and backwards.
     """
     limit = drive.pace * (1 + 0.12 * np.sin(track.s / 11 + phase))
     limit = np.minimum(limit, TURN_RATE / np.maximum(np.abs(track.curvature), 1e-9))
@@ -296,20 +290,19 @@ def _driven(drive: Drive, track: Track, frames: int, phase: float) -> np.ndarray
     share = np.ones(frames)
     if drive.stop is not None:
         stop = max(4, min(drive.stop, frames // 3))
-        share = np.interp(
-            np.arange(frames) % ROUND,
-            np.cumsum([max(stop - BRAKING, 0), min(stop, BRAKING), WAITING, STARTING]),
-            [1, 0, 0, 1],
-        )
+        parts = [max(stop - BRAKING, 0), min(stop, BRAKING), WAITING, STARTING]
+        share = np.interp(np.arange(frames) % ROUND, np.cumsum(parts), [1, 0, 0, 1])
     driven = np.zeros(frames)
     for k in range(1, frames):
-        driven[k] = driven[k - 1] + share[k] * np.interp(track.along(driven[k - 1]), track.s, limit)
+        pace = np.interp(track.along(driven[k - 1]), track.s, limit)
+        driven[k] = driven[k - 1] + share[k] * pace
     return driven
 
 
 def poses_of(places: np.ndarray | list, angles: np.ndarray | list) -> np.ndarray:
-    """Return camera-to-world poses (n, 4, 4); places: (n, 3) metres; angles: (n, 3) radians
-    right, up, clockwise.
+    """Return camera-to-world poses (n, 4, 4).
+
+    places: (n, 3) metres; angles: (n, 3) radians right, up, clockwise.
     """
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("YXZ", angles).as_matrix()
@@ -318,8 +311,9 @@ def poses_of(places: np.ndarray | list, angles: np.ndarray | list) -> np.ndarray
 
 
 def way(name: str, frames: int, seed: int) -> tuple[Track, np.ndarray, np.ndarray]:
-    """Return a sequence's `Track`, camera-to-world poses in the street (frames, 4, 4), and
-    metres driven (frames,).
+    """Return a sequence's `Track`, its camera-to-world poses in the street and the metres driven.
+
+    Poses are (frames, 4, 4), metres driven (frames,).
     """
     drive = DRIVES[name]
     if drive.closed:
@@ -330,16 +324,13 @@ def way(name: str, frames: int, seed: int) -> tuple[Track, np.ndarray, np.ndarra
     driven = _driven(drive, track, frames, phase[0])
     # The sway depends on the metres driven, so the camera does not move while the car waits.
     x, z, heading = track.at(driven, drive.lane + 0.06 * np.sin(driven / 6 + phase[1]))
-    pitch = np.radians(0.12) * np.sin(driven / 1.9 + phase[2]) + np.radians(0.08) * np.sin(
-        driven / 0.83 + phase[3]
-    )
+    pitch = np.radians(0.12) * np.sin(driven / 1.9 + phase[2])
+    pitch += np.radians(0.08) * np.sin(driven / 0.83 + phase[3])
     roll = np.radians(0.12) * np.sin(driven / 2.7 + phase[4])
     y = -CAMERA_HEIGHT + 0.008 * np.sin(driven / 1.3 + phase[5])
-    return (
-        track,
-        poses_of(np.stack([x, y, z], axis=1), np.stack([heading, pitch, roll], axis=1)),
-        driven,
-    )
+    places = np.stack([x, y, z], axis=1)
+    angles = np.stack([heading, pitch, roll], axis=1)
+    return track, poses_of(places, angles), driven
 
 
 def relative_to_first(poses: np.ndarray) -> np.ndarray:

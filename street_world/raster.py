@@ -57,8 +57,9 @@ SKY = ID["sky"]
 
 
 class Textures(NamedTuple):
-    """All textures in one array of bytes. Level (j, i) is halved j times along v and i times
-    along u.
+    """All textures in one array of bytes.
+
+    Level (j, i) is halved j times along v and i times along u.
     """
 
     # uint8: gray values of each level, followed by its alphas if the texture is a cut-out
@@ -94,8 +95,9 @@ class Environment(NamedTuple):
 
 @inner
 def _between(place, log_size):
-    """Return the two texels along one axis that a place (in repeats) lies between, and the
-    second one's weight.
+    """Return the two texels along one axis that a place lies between, and the second one's weight.
+
+    place: in repeats of the texture.
     """
     size = 1 << log_size
     x = place * size - 0.5
@@ -108,8 +110,10 @@ def _between(place, log_size):
 @inner
 def _mix(data, offset, log_width, x, y):
     """Interpolate one level of a texture; offset: its first byte; x, y: results of `_between`."""
-    (x0, x1, fx), (y0, y1, fy) = x, y
-    row0, row1 = offset + (y0 << log_width), offset + (y1 << log_width)
+    x0, x1, fx = x
+    y0, y1, fy = y
+    row0 = offset + (y0 << log_width)
+    row1 = offset + (y1 << log_width)
     top = data[row0 + x0] * (1 - fx) + data[row0 + x1] * fx
     bottom = data[row1 + x0] * (1 - fx) + data[row1 + x1] * fx
     return top * (1 - fy) + bottom * fy
@@ -117,20 +121,25 @@ def _mix(data, offset, log_width, x, y):
 
 @inner
 def _level(step, levels):
-    """Return the level for a step of that many texels, and the weight of the next level (log2,
-    linear between).
+    """Return the level for a step of that many texels, and the weight of the next level.
+
+    The level is log2 of the step, linear in between.
     """
     level = 0
     while step >= 2.0 and level < levels:
         step *= 0.5
         level += 1
-    return level, (step - 1.0 if level < levels and step > 1.0 else 0.0)
+    weight = 0.0
+    if level < levels and step > 1.0:
+        weight = step - 1.0
+    return level, weight
 
 
 @inner
 def _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step):
-    """Return a texture's value for a sample that covers u_step by v_step repeats; blends
-    neighbouring levels.
+    """Return a texture's value for a sample that covers u_step by v_step repeats.
+
+    Neighbouring levels are blended.
     """
     i, u_part = _level(u_step * (1 << log_width), log_width)
     j, v_part = _level(v_step * (1 << log_height), log_height)
@@ -139,49 +148,55 @@ def _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step)
     value = _mix(data, start[texture, j, i], columns, x, y)
     if u_part > 0.0:
         half_x = _between(u, columns - 1)
-        value += u_part * (_mix(data, start[texture, j, i + 1], columns - 1, half_x, y) - value)
+        next_value = _mix(data, start[texture, j, i + 1], columns - 1, half_x, y)
+        value += u_part * (next_value - value)
     if v_part > 0.0:
         half_y = _between(v, rows - 1)
         other = _mix(data, start[texture, j + 1, i], columns, x, half_y)
         if u_part > 0.0:
-            other += u_part * (
-                _mix(data, start[texture, j + 1, i + 1], columns - 1, half_x, half_y) - other
-            )
+            next_other = _mix(data, start[texture, j + 1, i + 1], columns - 1, half_x, half_y)
+            other += u_part * (next_other - other)
         value += v_part * (other - value)
     return value
 
 
 @inner
 def _place(coefficients, faces, index, row, x, w):
-    """Return a sample's position u, v on a face's texture, and the steps of u and v to the next
-    sample.
+    """Return a sample's position u, v on a face's texture, and its steps to the next sample.
 
-    The steps are the larger ones of both image directions. The quotient rule gives ds/dx = (d(w
-    s)/dx - s dw/dx) / w.
+    The steps of u and v are the larger ones of both image directions. The quotient rule gives
+    ds/dx = (d(w s)/dx - s dw/dx) / w.
     """
-    c, f, n, z = coefficients, faces, index, 1.0 / w
+    c, f, n = coefficients, faces, index
+    z = 1.0 / w
     s = (c[n, S] + c[n, S_Y] * row + c[n, S_X] * x) * z
     t = (c[n, T] + c[n, T_Y] * row + c[n, T_X] * x) * z
-    s_x, s_y = (c[n, S_X] - s * c[n, W_X]) * z, (c[n, S_Y] - s * c[n, W_Y]) * z
-    t_x, t_y = (c[n, T_X] - t * c[n, W_X]) * z, (c[n, T_Y] - t * c[n, W_Y]) * z
-    u_step = max(abs(f[n, U_S] * s_x + f[n, U_T] * t_x), abs(f[n, U_S] * s_y + f[n, U_T] * t_y))
-    v_step = max(abs(f[n, V_S] * s_x + f[n, V_T] * t_x), abs(f[n, V_S] * s_y + f[n, V_T] * t_y))
-    return (
-        f[n, U] + f[n, U_S] * s + f[n, U_T] * t,
-        f[n, V] + f[n, V_S] * s + f[n, V_T] * t,
-        u_step,
-        v_step,
-    )
+    s_x = (c[n, S_X] - s * c[n, W_X]) * z
+    s_y = (c[n, S_Y] - s * c[n, W_Y]) * z
+    t_x = (c[n, T_X] - t * c[n, W_X]) * z
+    t_y = (c[n, T_Y] - t * c[n, W_Y]) * z
+    u_x = f[n, U_S] * s_x + f[n, U_T] * t_x
+    u_y = f[n, U_S] * s_y + f[n, U_T] * t_y
+    v_x = f[n, V_S] * s_x + f[n, V_T] * t_x
+    v_y = f[n, V_S] * s_y + f[n, V_T] * t_y
+    u = f[n, U] + f[n, U_S] * s + f[n, U_T] * t
+    v = f[n, V] + f[n, V_S] * s + f[n, V_T] * t
+    return u, v, max(abs(u_x), abs(u_y)), max(abs(v_x), abs(v_y))
+
+
+@inner
+def _inverse_depth(coefficients, index, row, x):
+    """Return w of a face at a sample."""
+    c, n = coefficients, index
+    return c[n, W] + c[n, W_Y] * row + c[n, W_X] * x
 
 
 @inner
 def _alpha_level(start, sides, coefficients, faces, index, row, x):
-    """Return the level of a face's alpha for one row of samples: its first byte, rows and
-    columns.
-    """
+    """Return the level of a face's alpha for one row of samples: first byte, rows and columns."""
     texture = int(faces[index, TEXTURE])
     log_height, log_width = sides[texture, 0], sides[texture, 1]
-    w = coefficients[index, W] + coefficients[index, W_Y] * row + coefficients[index, W_X] * x
+    w = _inverse_depth(coefficients, index, row, x)
     _, _, u_step, v_step = _place(coefficients, faces, index, row, x, w)
     i, u_part = _level(u_step * (1 << log_width), min(ALPHA_LEVELS - 1, log_width))
     j, v_part = _level(v_step * (1 << log_height), min(ALPHA_LEVELS - 1, log_height))
@@ -205,11 +220,31 @@ def _turn(rotation, x, y, z):
 
 
 @inner
-def _set_up(corner, edge_s, edge_t, view, c):
-    """Fill in the nine coefficients `c` of a face; return the first and last row that it may cover
-    (0, -1: none).
+def _cross(a, b):
+    """Return the cross product of two vectors."""
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
-    corner, edge_s and edge_t are in camera coordinates.
+
+@inner
+def _set_coefficients(c, first, vector, volume, focal, centre):
+    """Fill in c[first : first + 3] for p . vector / volume, which is linear in x and y."""
+    step_x = vector[0] / focal[0] / volume
+    step_y = vector[1] / focal[1] / volume
+    c[first] = vector[2] / volume - centre[0] * step_x - centre[1] * step_y
+    c[first + 1] = step_x
+    c[first + 2] = step_y
+
+
+@inner
+def _set_up(corner, edge_s, edge_t, view, c):
+    """Fill in the nine coefficients `c` of a face; return the first and last row that it may cover.
+
+    The rows are (0, -1) for a face that cannot be seen. corner, edge_s and edge_t are in camera
+    coordinates.
     """
     focal, centre = view.focal, view.centre
     height, width = view.size
@@ -224,7 +259,8 @@ def _set_up(corner, edge_s, edge_t, view, c):
         if z < NEAR:
             behind += 1
         else:
-            px, py = focal[0] * x / z + centre[0], focal[1] * y / z + centre[1]
+            px = focal[0] * x / z + centre[0]
+            py = focal[1] * y / z + centre[1]
             x_min, x_max = min(x_min, px), max(x_max, px)
             y_min, y_max = min(y_min, py), max(y_max, py)
     if behind == 4:
@@ -233,21 +269,13 @@ def _set_up(corner, edge_s, edge_t, view, c):
         y_min, y_max = 0.0, height - 1.0
     elif x_max < 0 or x_min > width - 1 or y_max < 0 or y_min > height - 1:
         return 0, -1
-    sx, sy, sz = edge_s[0], edge_s[1], edge_s[2]
-    tx, ty, tz = edge_t[0], edge_t[1], edge_t[2]
-    ox, oy, oz = corner[0], corner[1], corner[2]
-    nx, ny, nz = sy * tz - sz * ty, sz * tx - sx * tz, sx * ty - sy * tx  # edge_s x edge_t
-    volume = ox * nx + oy * ny + oz * nz
+    normal = _cross(edge_s, edge_t)
+    volume = corner[0] * normal[0] + corner[1] * normal[1] + corner[2] * normal[2]
     if abs(volume) < 1e-9:  # seen edge-on
         return 0, -1
-    ax, ay, az = ty * oz - tz * oy, tz * ox - tx * oz, tx * oy - ty * ox  # edge_t x corner
-    bx, by, bz = oy * sz - oz * sy, oz * sx - ox * sz, ox * sy - oy * sx  # corner x edge_s
-    for k in range(3):
-        vx, vy, vz = (ax, ay, az) if k == 0 else ((bx, by, bz) if k == 1 else (nx, ny, nz))
-        step_x, step_y = vx / focal[0] / volume, vy / focal[1] / volume
-        c[3 * k] = vz / volume - centre[0] * step_x - centre[1] * step_y
-        c[3 * k + 1] = step_x
-        c[3 * k + 2] = step_y
+    _set_coefficients(c, S, _cross(edge_t, corner), volume, focal, centre)
+    _set_coefficients(c, T, _cross(corner, edge_s), volume, focal, centre)
+    _set_coefficients(c, W, normal, volume, focal, centre)
     return max(0, math.ceil(y_min)), min(height - 1, math.floor(y_max))
 
 
@@ -265,10 +293,13 @@ def _narrow(value, slope, low, high):
 
 @inner
 def _span(c, triangle, row, width):
-    """Return the first and last sample of a row inside a face: z > NEAR, s >= 0, t >= 0, and s,
-    t or s + t <= 1.
+    """Return the first and last sample of a row inside a face.
+
+    Inside, z > NEAR, s >= 0, t >= 0, and s, t or s + t <= 1.
     """
-    ws, wt, w = c[S] + c[S_Y] * row, c[T] + c[T_Y] * row, c[W] + c[W_Y] * row
+    ws = c[S] + c[S_Y] * row
+    wt = c[T] + c[T_Y] * row
+    w = c[W] + c[W_Y] * row
     low, high = 0.0, width - 1.0
     # neighbouring faces overlap by this share of their edges, so no crack opens between them
     slack = 1e-7
@@ -276,13 +307,12 @@ def _span(c, triangle, row, width):
     low, high = _narrow(1.0 / NEAR - w, -c[W_X], low, high)
     low, high = _narrow(ws + slack * w, c[S_X] + slack * c[W_X], low, high)
     low, high = _narrow(wt + slack * w, c[T_X] + slack * c[W_X], low, high)
+    end, end_x = (1 + slack) * w, (1 + slack) * c[W_X]
     if triangle:
-        low, high = _narrow(
-            (1 + slack) * w - ws - wt, (1 + slack) * c[W_X] - c[S_X] - c[T_X], low, high
-        )
+        low, high = _narrow(end - ws - wt, end_x - c[S_X] - c[T_X], low, high)
     else:
-        low, high = _narrow((1 + slack) * w - ws, (1 + slack) * c[W_X] - c[S_X], low, high)
-        low, high = _narrow((1 + slack) * w - wt, (1 + slack) * c[W_X] - c[T_X], low, high)
+        low, high = _narrow(end - ws, end_x - c[S_X], low, high)
+        low, high = _narrow(end - wt, end_x - c[T_X], low, high)
     if high < low:
         return 0, -1
     return math.ceil(low), math.floor(high)
@@ -290,10 +320,10 @@ def _span(c, triangle, row, width):
 
 @fast
 def _draw(faces, textures, view, coefficients, depth, nearest):
-    """Find the nearest face at each sample: fills `depth` (w), `nearest` (row of `faces`) and
-    `coefficients`.
+    """Find the nearest face at each sample.
 
-    A face is drawn only where its w is larger than the value in `depth`.
+    Fills `depth` (w), `nearest` (row of `faces`) and `coefficients`. A face is drawn only where its
+    w is larger than the value in `depth`.
     """
     data, start, sides, cut_out = textures.data, textures.start, textures.sides, textures.cut_out
     rotation, position, width = view.rotation, view.position, view.size[1]
@@ -308,7 +338,8 @@ def _draw(faces, textures, view, coefficients, depth, nearest):
         edge_s = _turn(rotation, face[EDGE_S + X], face[EDGE_S + Y], face[EDGE_S + Z])
         edge_t = _turn(rotation, face[EDGE_T + X], face[EDGE_T + Y], face[EDGE_T + Z])
         first_row, last_row = _set_up(corner, edge_s, edge_t, view, c)
-        has_alpha, triangle = cut_out[int(face[TEXTURE])], face[TRIANGLE] > 0
+        has_alpha = cut_out[int(face[TEXTURE])]
+        triangle = face[TRIANGLE] > 0
         for row in range(first_row, last_row + 1):
             first, last = _span(c, triangle, row, width)
             if last < first:
@@ -322,15 +353,14 @@ def _draw(faces, textures, view, coefficients, depth, nearest):
                     w = w_row + w_x * x
                     if w > depth[row, x]:
                         u, v, _, _ = _place(coefficients, faces, index, row, x, w)
-                        texel_row, texel = (
-                            math.floor(v * rows) & (rows - 1),
-                            math.floor(u * columns) & (columns - 1),
-                        )
-                        if data[offset + texel_row * columns + texel] >= OPAQUE:
+                        texel_row = math.floor(v * rows) & (rows - 1)
+                        texel_column = math.floor(u * columns) & (columns - 1)
+                        if data[offset + texel_row * columns + texel_column] >= OPAQUE:
                             depth[row, x] = w
                             nearest[row, x] = index
             else:
-                depths, hits = depth[row, first : last + 1], nearest[row, first : last + 1]
+                depths = depth[row, first : last + 1]
+                hits = nearest[row, first : last + 1]
                 for k in range(len(depths)):  # a loop from 0 is vectorised
                     w = w_row + w_x * (first + k)
                     if w > depths[k]:
@@ -356,8 +386,9 @@ def _shadows(faces: np.ndarray, sun: np.ndarray, position: np.ndarray) -> np.nda
 
 @inner
 def _most(labels, depths):
-    """Return the most frequent label of a pixel's samples; of two equally frequent ones, the
-    nearer surface's.
+    """Return the most frequent label of a pixel's samples.
+
+    Of two equally frequent ones, it is the nearer surface's.
     """
     best, best_count, best_depth = labels[0], 0, -1.0
     for k in range(4):
@@ -366,7 +397,8 @@ def _most(labels, depths):
             if labels[m] == labels[k]:
                 count += 1
                 closest = max(closest, depths[m])
-        if count > best_count or (count == best_count and closest > best_depth):
+        nearer = count == best_count and closest > best_depth
+        if count > best_count or nearer:
             best, best_count, best_depth = labels[k], count, closest
     return best
 
@@ -379,57 +411,50 @@ def render(
     size: tuple[int, int],
     environment: Environment,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render one view: image float32 (height, width) before exposure and noise, and label map uint8
-    of that shape.
+    """Render one view: an image before exposure and noise, and a label map.
 
-    faces: (n, COLUMNS) float64; pose: 4x4 camera-to-world; intrinsics: 3x3 in pixels whose centres
-    have whole coordinates; size: (height, width).
+    The image is float32 (height, width), the label map uint8 of that shape. faces: (n, COLUMNS)
+    float64; pose: 4x4 camera-to-world; intrinsics: 3x3 in pixels whose centres have whole
+    coordinates; size: (height, width).
     """
-    middle = (
-        faces[:, CORNER : CORNER + 3]
-        + 0.5 * (faces[:, EDGE_S : EDGE_S + 3] + faces[:, EDGE_T : EDGE_T + 3])
-        - pose[:3, 3]
-    )
+    edge_s = faces[:, EDGE_S : EDGE_S + 3]
+    edge_t = faces[:, EDGE_T : EDGE_T + 3]
+    middle = faces[:, CORNER : CORNER + 3] + 0.5 * (edge_s + edge_t) - pose[:3, 3]
     # Near faces are drawn first, so most hidden samples cost one comparison.
-    faces = faces[np.argsort((middle * middle).sum(axis=1), kind="stable")]
+    order = np.argsort((middle * middle).sum(axis=1), kind="stable")
+    faces = faces[order]
+    focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
+    centre = np.array([intrinsics[0, 2], intrinsics[1, 2]])
     view = View(
         rotation=np.ascontiguousarray(pose[:3, :3].T),
         position=np.ascontiguousarray(pose[:3, 3]),
-        focal=np.array([intrinsics[0, 0], intrinsics[1, 1]]) * SUPERSAMPLING,
+        focal=focal * SUPERSAMPLING,
         # Sample 0 lies a quarter pixel before the centre of pixel 0.
-        centre=(np.array([intrinsics[0, 2], intrinsics[1, 2]]) + 0.5) * SUPERSAMPLING - 0.5,
+        centre=(centre + 0.5) * SUPERSAMPLING - 0.5,
         size=(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING),
     )
-    depth, nearest = np.zeros(view.size, np.float32), np.full(view.size, -1, np.int32)
+    depth = np.zeros(view.size, np.float32)
+    nearest = np.full(view.size, -1, np.int32)
     coefficients = np.empty((len(faces), 9))
     _draw(faces, textures, view, coefficients, depth, nearest)
     # the appended value is for samples without a face
     on_ground = np.append(faces[:, GROUND] > 0, False)[nearest]
-    shadows, shadow = (
-        _shadows(faces, environment.sun, view.position),
-        np.full(view.size, -1, np.int32),
-    )
-    _draw(
-        shadows,
-        textures,
-        view,
-        np.empty((len(shadows), 9)),
-        np.where(on_ground, 0, np.inf).astype(np.float32),
-        shadow,
-    )
-    return _pixels(
-        faces, _brightness(faces, environment), textures, environment, coefficients, nearest, shadow
-    )
+    shadows = _shadows(faces, environment.sun, view.position)
+    shadow = np.full(view.size, -1, np.int32)
+    ground_depth = np.where(on_ground, 0, np.inf).astype(np.float32)
+    _draw(shadows, textures, view, np.empty((len(shadows), 9)), ground_depth, shadow)
+    brightness = _brightness(faces, environment)
+    return _pixels(faces, brightness, textures, environment, coefficients, nearest, shadow)
 
 
 def _brightness(faces: np.ndarray, environment: Environment) -> np.ndarray:
-    """Return the factor of each face's texture, (n,): ambient light plus the sun by the cosine
-    of its angle.
+    """Return the factor of each face's texture, (n,).
+
+    It is the ambient light plus the sun by the cosine of its angle.
     """
     normal = np.cross(faces[:, EDGE_S : EDGE_S + 3], faces[:, EDGE_T : EDGE_T + 3])
-    cosine = -(normal * environment.sun).sum(axis=1) / np.maximum(
-        np.sqrt((normal * normal).sum(axis=1)), 1e-12
-    )
+    length = np.sqrt((normal * normal).sum(axis=1))
+    cosine = -(normal * environment.sun).sum(axis=1) / np.maximum(length, 1e-12)
     direct = np.where(faces[:, LIT] > 0, np.maximum(cosine, 0.0), UNLIT)
     return faces[:, GAIN] * (environment.ambient + environment.direct * direct)
 
@@ -452,8 +477,9 @@ def _pixels(faces, brightness, textures, environment, coefficients, nearest, sha
                 y, x = 2 * i + (k >> 1), 2 * j + (k & 1)
                 whole &= nearest[y, x] == index
                 shaded += shadow[y, x] >= 0
-            reads = 1 if whole else 4
-            spread = SHARPNESS * (2 if whole else 1)
+            reads, shift, spread = 4, 0.0, SHARPNESS
+            if whole:
+                reads, shift, spread = 1, 0.5, 2 * SHARPNESS
             total = 0.0
             for k in range(reads):
                 y, x = 2 * i + (k >> 1), 2 * j + (k & 1)
@@ -462,30 +488,22 @@ def _pixels(faces, brightness, textures, environment, coefficients, nearest, sha
                 if index < 0:
                     total += horizon
                     continue
-                row, column = (y + 0.5, x + 0.5) if whole else (float(y), float(x))
-                w = (
-                    coefficients[index, W]
-                    + coefficients[index, W_Y] * row
-                    + coefficients[index, W_X] * column
-                )
+                row, column = y + shift, x + shift
+                w = _inverse_depth(coefficients, index, row, column)
                 u, v, u_step, v_step = _place(coefficients, faces, index, row, column, w)
+                u_step *= spread
+                v_step *= spread
                 texture = int(faces[index, TEXTURE])
-                value = _filtered(
-                    data,
-                    start,
-                    texture,
-                    sides[texture, 0],
-                    sides[texture, 1],
-                    u,
-                    v,
-                    u_step * spread,
-                    v_step * spread,
-                )
+                log_height, log_width = sides[texture, 0], sides[texture, 1]
+                value = _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step)
                 if faces[index, GROUND] > 0:
                     value *= 1.0 - dark * shaded / 4
                 clear = math.exp(-haze / w)
                 total += value * brightness[index] * clear + horizon * (1 - clear)
                 labels[k], depths[k] = int(faces[index, LABEL]), w
             image[i, j] = total / reads
-            label_map[i, j] = labels[0] if whole else _most(labels, depths)
+            if whole:
+                label_map[i, j] = labels[0]
+            else:
+                label_map[i, j] = _most(labels, depths)
     return image, label_map

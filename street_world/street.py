@@ -4,7 +4,7 @@ The ground is flat, the road at y = 0 and the sidewalks a kerb higher. Cars driv
 `side` is 1 on the right and -1 on the left, looking along the track.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,12 +31,14 @@ class Mover:
     turn: float  # radians to the right of the track's direction
 
     def at(self, frame: int, driven: float) -> np.ndarray:
-        """Return the faces in the street at a frame; driven: metres that the camera has driven
-        by then.
+        """Return the faces in the street at a frame.
+
+        driven: metres that the camera has driven by then.
         """
-        x, z, heading = self.track.at(
-            self.s + (driven if self.pace is None else self.pace * frame), self.d
-        )
+        moved = driven
+        if self.pace is not None:
+            moved = self.pace * frame
+        x, z, heading = self.track.at(self.s + moved, self.d)
         return things.place(self.faces, x, z, heading + self.turn)
 
 
@@ -52,7 +54,8 @@ class Street:
     movers: list = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.names, self.environment = self.bank.names, environment(self.style)
+        self.names = self.bank.names
+        self.environment = environment(self.style)
         self.crossings: list[Track] = []  # tracks of the roads that cross this one
         if self.style.crossing is not None:
             x, z, heading = self.track.at(self.style.crossing)
@@ -71,33 +74,27 @@ class Street:
         frame: int,
         driven: float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Render the image (float32, before exposure and noise) and the label map (uint8), both
-        (height, width).
+        """Render the image before exposure and noise (float32) and the label map (uint8).
 
-        pose: 4x4 camera-to-world; intrinsics: 3x3, pixels; size: (height, width); frame, driven: as
-        in `Mover.at`.
+        Both are (height, width). pose: 4x4 camera-to-world; intrinsics: 3x3, pixels; size: (height,
+        width); frame, driven: as in `Mover.at`.
         """
         moved = [mover.at(frame, driven) for mover in self.movers]
-        return raster.render(
-            np.concatenate([*self.parts, *moved]),
-            self.bank.packed,
-            pose,
-            intrinsics,
-            size,
-            self.environment,
-        )
+        faces = np.concatenate([*self.parts, *moved])
+        light = self.environment
+        return raster.render(faces, self.bank.packed, pose, intrinsics, size, light)
 
     def off_road(self, x: float | np.ndarray, z: float | np.ndarray) -> np.ndarray:
-        """Return the distance of points, (n,) each, to the nearest edge of any road; negative
-        on a road.
+        """Return the distance of points to the nearest edge of any road; negative on a road.
+
+        x, z: (n,) each, metres.
         """
         return _distance(x, z, self.middle) - self.style.half
 
     def free(self, x: float, z: float, margin: float) -> bool:
-        """Return whether a point is more than `margin` metres from all roads, and outside all
-        houses.
-        """
-        return self.off_road(x, z)[0] > margin and _distance(x, z, self.houses)[0] >= 2.4
+        """Return whether a point is more than `margin` metres from all roads, and in no house."""
+        off_road = self.off_road(x, z)[0] > margin
+        return off_road and _distance(x, z, self.houses)[0] >= 2.4
 
     def put(self, faces: np.ndarray, x: float, z: float, yaw: float, y: float = -KERB) -> None:
         """Place a thing at (x, y, z), turned by yaw (radians to the right)."""
@@ -114,17 +111,22 @@ class Street:
         step: float = 1.0,
         **options: int,
     ) -> None:
-        """Place a strip along the main road; span: (start, stop); margin: metres that it keeps
-        from all roads.
+        """Place a strip along the main road.
+
+        span: (start, stop); margin: metres that it keeps from all roads.
         """
         start, stop = span or (self.track.s[0], self.track.s[-1])
         places = np.linspace(start, stop, max(2, round((stop - start) / step) + 1))
-        off_road = None if margin is None else lambda x, z: self.off_road(x, z) > margin
-        self.parts.append(
-            things.extrude(
-                self.names, self.track, places, side, profile, texture, label, off_road, **options
-            )
+        off_road = None
+        if margin is not None:
+
+            def off_road(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+                return self.off_road(x, z) > margin
+
+        faces = things.extrude(
+            self.names, self.track, places, side, profile, texture, label, off_road, **options
         )
+        self.parts.append(faces)
 
     def along(self, step: float) -> Iterator[float]:
         """Yield places along the main road, about `step` metres apart."""
@@ -147,11 +149,14 @@ def build(rng: np.random.Generator, bank: Bank, track: Track, style: Style) -> S
 
 
 def _distance(x: float | np.ndarray, z: float | np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the distance of each place, (n,), to the nearest of the points (m, 2); infinity
-    without points.
+    """Return the distance of each place, (n,), to the nearest of the points (m, 2).
+
+    It is infinity without points.
     """
-    x, z = np.atleast_1d(x)[:, None], np.atleast_1d(z)[:, None]
-    return np.sqrt(((x - points[:, 0]) ** 2 + (z - points[:, 1]) ** 2).min(axis=1, initial=np.inf))
+    x = np.atleast_1d(x)[:, None]
+    z = np.atleast_1d(z)[:, None]
+    squared = (x - points[:, 0]) ** 2 + (z - points[:, 1]) ** 2
+    return np.sqrt(squared.min(axis=1, initial=np.inf))
 
 
 def _lay_ground(street: Street) -> None:
@@ -159,38 +164,26 @@ def _lay_ground(street: Street) -> None:
     half, width = street.style.half, street.style.sidewalk
     street.extrude([(-half, 0), (half, 0)], 1, street.style.road, "road", step=2.0, ground=1)
     if width:
+        raised = [(half, 0.05), (half, -KERB), (half + width, -KERB)]
+        below = [(half - 0.02, 0.01), (half + width, 0.01)]
         for side in (-1, 1):
-            street.extrude(
-                [(half, 0.05), (half, -KERB), (half + width, -KERB)],
-                side,
-                "sidewalk",
-                "sidewalk",
-                margin=0.2,
-                ground=1,
-            )
-            street.extrude(
-                [(half - 0.02, 0.01), (half + width, 0.01)], side, "asphalt", "road", ground=1
-            )
+            street.extrude(raised, side, "sidewalk", "sidewalk", margin=0.2, ground=1)
+            street.extrude(below, side, "asphalt", "road", ground=1)
     for crossing in street.crossings:
         places = np.arange(crossing.s[0], crossing.s[-1], 2.0)
-        street.parts.append(
-            things.extrude(
-                street.names,
-                crossing,
-                places,
-                1,
-                [(-half, 0.005), (half, 0.005)],
-                "asphalt",
-                "road",
-                ground=1,
-            )
+        profile = [(-half, 0.005), (half, 0.005)]
+        faces = things.extrude(
+            street.names, crossing, places, 1, profile, "asphalt", "road", ground=1
         )
+        street.parts.append(faces)
 
 
 def _surround(street: Street) -> None:
     """Place grass around the roads, a forest around the grass, and the sky."""
-    faces, light = things.Faces(street.names), street.environment
-    low, high = street.middle.min(axis=0) - BEYOND, street.middle.max(axis=0) + BEYOND
+    faces = things.Faces(street.names)
+    light = street.environment
+    low = street.middle.min(axis=0) - BEYOND
+    high = street.middle.max(axis=0) + BEYOND
     (x, z), (width, depth) = low, high - low
     faces.add(
         (x, 0.06, z),
@@ -201,28 +194,30 @@ def _surround(street: Street) -> None:
         (width / TILE["grass"][0], depth / TILE["grass"][1]),
         ground=1,
     )
-    for corner, edge in (
-        ((x, z), (width, 0)),
-        ((x, z), (0, depth)),
+    for (corner_x, corner_z), edge in (
+        (low, (width, 0)),
+        (low, (0, depth)),
         (high, (-width, 0)),
         (high, (0, -depth)),
     ):
+        repeats = np.abs(edge).max() / TILE["forest"][0]
         faces.add(
-            (corner[0], 0.1, corner[1]),
+            (corner_x, 0.1, corner_z),
             (edge[0], 0, edge[1]),
             (0, -9, 0),
             "forest",
             "vegetation",
-            (np.abs(edge).max() / TILE["forest"][0], 1),
+            (repeats, 1),
             lit=0,
         )
+    repeats = 2 * SKY_HALF / TILE["sky"][0]
     faces.add(
         (-SKY_HALF, -SKY_HEIGHT, -SKY_HALF),
         (2 * SKY_HALF, 0, 0),
         (0, 0, 2 * SKY_HALF),
         "sky",
         "sky",
-        (2 * SKY_HALF / TILE["sky"][0],) * 2,
+        (repeats, repeats),
         lit=0,
         gain=street.style.sky[0] / 128 / (light.ambient + raster.UNLIT * light.direct),
     )
@@ -239,13 +234,8 @@ def _build_up(street: Street, side: int) -> None:
             _house_row(street, side, span, 0.02, 0.05, (2, 6), 0.5)
         elif zone == "gardens":
             _house_row(street, side, span, rng.uniform(2, 6), 4.0, (1, 4), 0.85)
-            _border(
-                street,
-                side,
-                span,
-                str(rng.choice(["fence", "hedge", "wall"])),
-                rng.uniform(0.9, 1.6),
-            )
+            kind = str(rng.choice(["fence", "hedge", "wall"]))
+            _border(street, side, span, kind, rng.uniform(0.9, 1.6))
             _scatter(street, side, span, 1.0, 12.0, 0.1)
         elif zone == "park":
             _scatter(street, side, span, 1.0, 26.0, 0.5)
@@ -272,29 +262,23 @@ def _house_row(
     one more than the highest; pitched: share of pitched roofs.
     """
     rng, s = street.rng, span[0]
-    across, along = (
-        grid.ravel()
-        for grid in np.meshgrid(np.linspace(-0.45, 0.45, 6), np.linspace(0.05, 0.95, 5))
-    )
+    grids = np.meshgrid(np.linspace(-0.45, 0.45, 6), np.linspace(0.05, 0.95, 5))
+    across, along = (grid.ravel() for grid in grids)
     while s < span[1] - 6:
-        width, depth = min(rng.uniform(9, 17), span[1] - s), rng.uniform(8, 12)
-        x, z, heading = street.track.at(
-            s + width / 2, side * (street.line + setback + rng.uniform(0, 2))
-        )
+        width = min(rng.uniform(9, 17), span[1] - s)
+        depth = rng.uniform(8, 12)
+        front = street.line + setback + rng.uniform(0, 2)
+        x, z, heading = street.track.at(s + width / 2, side * front)
         yaw = heading + side * np.pi / 2
-        points = np.stack(
-            [
-                x + width * across * np.cos(yaw) + depth * along * np.sin(yaw),
-                z - width * across * np.sin(yaw) + depth * along * np.cos(yaw),
-            ],
-            axis=1,
-        )
-        clear = _distance(points[:, 0], points[:, 1], street.houses).min() >= 0.8
-        if clear and street.off_road(*points.T).min() > street.style.sidewalk - 0.5:
-            house = things.building(
-                street.names, rng, width, depth, int(rng.integers(*floors)), rng.random() < pitched
-            )
+        points_x = x + width * across * np.cos(yaw) + depth * along * np.sin(yaw)
+        points_z = z - width * across * np.sin(yaw) + depth * along * np.cos(yaw)
+        clear = _distance(points_x, points_z, street.houses).min() >= 0.8
+        if clear and street.off_road(points_x, points_z).min() > street.style.sidewalk - 0.5:
+            count = int(rng.integers(*floors))
+            has_ridge = rng.random() < pitched
+            house = things.building(street.names, rng, width, depth, count, has_ridge)
             street.put(house, x, z, yaw)
+            points = np.stack([points_x, points_z], axis=1)
             street.houses = np.concatenate([street.houses, points])
         s += width + gap
 
@@ -306,94 +290,106 @@ def _border(street: Street, side: int, span: tuple[float, float], kind: str, hei
         "hedge": ("leaves", "vegetation", 0.7),
         "wall": ("stone", "wall", 0.3),
     }[kind]
-    near, far = street.line + 0.15, street.line + 0.15 + thickness
+    near = street.line + 0.15
+    far = near + thickness
     profile = [(near, -KERB), (near, -KERB - height)]
     if thickness:
         profile += [(far, -KERB - height), (far, -KERB)]
-    street.extrude(
-        profile,
-        side,
-        texture,
-        label,
-        (span[0], span[1] - 3),
-        margin=1.0,
-        step=2.0,
-        lit=int(kind != "hedge"),
-    )
+    shorter = (span[0], span[1] - 3)
+    lit = int(kind != "hedge")
+    street.extrude(profile, side, texture, label, shorter, margin=1.0, step=2.0, lit=lit)
 
 
 def _scatter(
     street: Street, side: int, span: tuple[float, float], near: float, far: float, density: float
 ) -> None:
-    """Place trees and bushes `near` to `far` metres behind the building line; density: plants
-    for each metre.
+    """Place trees and bushes `near` to `far` metres behind the building line.
+
+    density: plants for each metre.
     """
+    rng = street.rng
     for _ in range(int((span[1] - span[0]) * density) + 1):
-        x, z, _ = street.track.at(
-            street.rng.uniform(*span), side * (street.line + street.rng.uniform(near, far))
-        )
+        s = rng.uniform(*span)
+        x, z, _ = street.track.at(s, side * (street.line + rng.uniform(near, far)))
         if street.free(x, z, 2.0):
-            plant = things.tree if street.rng.random() < 0.65 else things.bush
-            street.put(plant(street.names, street.rng), x, z, street.rng.uniform(0, np.pi))
+            grow = things.bush
+            if rng.random() < 0.65:
+                grow = things.tree
+            plant = grow(street.names, rng)
+            street.put(plant, x, z, rng.uniform(0, np.pi))
 
 
 def _furnish(street: Street, side: int) -> None:
     """Place lamps, signs, trees, persons and parked cars on one side of the main road."""
-    rng, style, track = street.rng, street.style, street.track
-    ahead = 0.0 if side > 0 else np.pi  # direction of the traffic on that side
-    for make, step, distance in (
-        (things.lamp, 26.0, 0.45),
-        (things.sign, 21.0, 0.5),
-        (things.tree, 9.0 / style.trees, 0.8),
-    ):
-        if make is things.tree and not style.sidewalk:
-            continue
-        for s in street.along(step):
-            x, z, heading = track.at(
-                s, side * (style.half + distance + (0 if style.sidewalk else 1.2))
-            )
-            if street.free(x, z, 0.3):
-                street.put(
-                    make(street.names, rng), x, z, heading + ahead + rng.uniform(-0.15, 0.15)
-                )
+    style = street.style
+    extra = 0.0
+    if not style.sidewalk:
+        extra = 1.2  # behind the wall of a highway
+    _line_up(street, side, things.lamp, 26.0, 0.45 + extra)
+    _line_up(street, side, things.sign, 21.0, 0.5 + extra)
     if not style.sidewalk:
         near = style.half + 0.7
         profile = [(near, 0), (near, -0.8), (near + 0.3, -0.8), (near + 0.3, 0.06)]
         street.extrude(profile, side, "stone", "wall", step=4.0)
         return
+    _line_up(street, side, things.tree, 9.0 / style.trees, 0.8)
+    _people(street, side)
+    _park(street, side)
+
+
+def _ahead(side: int) -> float:
+    """Return the direction of the traffic on one side of the road, radians to the track's."""
+    if side > 0:
+        return 0.0
+    return np.pi
+
+
+def _line_up(
+    street: Street, side: int, make: Callable[..., np.ndarray], step: float, distance: float
+) -> None:
+    """Place things about `step` metres apart, `distance` metres from the road's edge."""
+    rng = street.rng
+    for s in street.along(step):
+        x, z, heading = street.track.at(s, side * (street.style.half + distance))
+        if street.free(x, z, 0.3):
+            faces = make(street.names, rng)
+            yaw = heading + _ahead(side) + rng.uniform(-0.15, 0.15)
+            street.put(faces, x, z, yaw)
+
+
+def _people(street: Street, side: int) -> None:
+    """Place persons who stand or walk on a sidewalk."""
+    rng, style, track = street.rng, street.style, street.track
     for _ in range(int((track.s[-1] - track.s[0]) * style.persons)):
-        s, d = (
-            rng.uniform(track.s[0], track.s[-1]),
-            side * (style.half + rng.uniform(0.6, style.sidewalk - 0.3)),
-        )
-        if street.free(*track.at(s, d)[:2], 0.4):
-            height = rng.uniform(1.6, 1.9)
-            faces = things.cut_out(
-                street.names, f"person{rng.integers(0, PERSONS)}", "person", height / 2, height
-            )
-            street.movers.append(
-                Mover(
-                    things.place(faces, 0, 0, 0, -KERB),
-                    track,
-                    s,
-                    float(rng.choice([0, 0.12, -0.12])),
-                    d,
-                    rng.uniform(-0.5, 0.5),
-                )
-            )
+        s = rng.uniform(track.s[0], track.s[-1])
+        d = side * (style.half + rng.uniform(0.6, style.sidewalk - 0.3))
+        x, z, _ = track.at(s, d)
+        if not street.free(x, z, 0.4):
+            continue
+        height = rng.uniform(1.6, 1.9)
+        texture = f"person{rng.integers(0, PERSONS)}"
+        faces = things.cut_out(street.names, texture, "person", height / 2, height)
+        faces = things.place(faces, 0, 0, 0, -KERB)
+        pace = float(rng.choice([0, 0.12, -0.12]))
+        street.movers.append(Mover(faces, track, s, pace, d, rng.uniform(-0.5, 0.5)))
+
+
+def _park(street: Street, side: int) -> None:
+    """Place parked cars along a sidewalk, away from crossings."""
+    rng, style = street.rng, street.style
+    of_crossings = street.middle[len(street.track.x[::2]) :]
     for s in street.along(5.8):
-        x, z, heading = track.at(s, side * (style.half - 1.0))
-        # of a crossing
-        clear = _distance(x, z, street.middle[len(track.x[::2]) :])[0] >= style.half + 3
+        x, z, heading = street.track.at(s, side * (style.half - 1.0))
+        clear = _distance(x, z, of_crossings)[0] >= style.half + 3
         if rng.random() < style.parked[side > 0] and clear:
-            street.put(
-                things.car(street.names, rng), x, z, heading + ahead + rng.normal(0, 0.02), 0.0
-            )
+            car = things.car(street.names, rng)
+            street.put(car, x, z, heading + _ahead(side) + rng.normal(0, 0.02), 0.0)
 
 
 def _traffic(street: Street) -> None:
-    """Place moving cars: beside the camera on a highway; else ahead at its pace, towards it and
-    on a crossing.
+    """Place moving cars.
+
+    On a highway they drive beside the camera; else ahead at its pace, towards it and on a crossing.
     """
     rng, style, track = street.rng, street.style, street.track
 
@@ -403,12 +399,10 @@ def _traffic(street: Street) -> None:
     if not style.sidewalk:
         for k in range(int((track.s[-1] - track.s[0]) / 28)):
             lane = (-4.6, 0.0, 4.6)[k % 3]
-            drive(
-                track,
-                25.0 + 26.0 * k + rng.uniform(-6, 6) + (0 if lane else 35),
-                rng.uniform(1.35, 1.75),
-                lane,
-            )
+            s = 25.0 + 26.0 * k + rng.uniform(-6, 6)
+            if not lane:
+                s += 35
+            drive(track, s, rng.uniform(1.35, 1.75), lane)
         return
     for distance in style.leaders:
         drive(track, distance, None, 1.9)
@@ -416,19 +410,21 @@ def _traffic(street: Street) -> None:
         drive(track, s + 40, -rng.uniform(0.7, 1.1), -1.8, np.pi)
     for crossing in street.crossings:
         for k in range(14):
-            side = 1 if k % 2 else -1
-            drive(
-                crossing,
-                -side * (12.0 + 13.0 * k + rng.uniform(-3, 3)),
-                side * rng.uniform(0.6, 0.75),
-                1.7 * side,
-                0.0 if side > 0 else np.pi,
-            )
+            side = -1
+            if k % 2:
+                side = 1
+            s = -side * (12.0 + 13.0 * k + rng.uniform(-3, 3))
+            drive(crossing, s, side * rng.uniform(0.6, 0.75), 1.7 * side, _ahead(side))
 
 
 def environment(style: Style) -> Environment:
     """Return the light of a style as a `raster.Environment`."""
-    azimuth, elevation = style.sun if style.sunny else (style.sun[0], 1.35)
+    azimuth, elevation = style.sun
+    ambient, direct, shadow = 0.36, 0.86, 0.36
+    if not style.sunny:
+        # Under clouds the light comes from above, so shadows are faint and lie under the things.
+        elevation = 1.35
+        ambient, direct, shadow = 0.70, 0.30, 0.62
     sun = np.array(
         [
             -np.cos(elevation) * np.sin(azimuth),
@@ -436,6 +432,4 @@ def environment(style: Style) -> Environment:
             -np.cos(elevation) * np.cos(azimuth),
         ]
     )
-    # Under clouds the light comes from above, so shadows are faint and lie under the things.
-    ambient, direct, shadow = (0.36, 0.86, 0.36) if style.sunny else (0.70, 0.30, 0.62)
     return Environment(sun, ambient, direct, shadow, float(style.sky[1]), style.haze)

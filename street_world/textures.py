@@ -63,28 +63,30 @@ class Bank(NamedTuple):
 def build(seed: int) -> Bank:
     """Return all textures of the world with this seed as a `Bank`."""
     painted = _painted(np.random.default_rng((seed, TEXTURES)))
-    chunks, start, length = [], np.zeros((len(painted), LEVELS, LEVELS), np.int64), 0
+    chunks: list[np.ndarray] = []
+    start = np.zeros((len(painted), LEVELS, LEVELS), np.int64)
+    length = 0
+    sides = []
     for index, layers in enumerate(painted.values()):
-        for j in range(layers[0].shape[0].bit_length()):
-            for i in range(layers[0].shape[1].bit_length()):
+        rows, columns = layers[0].shape
+        sides.append([rows.bit_length() - 1, columns.bit_length() - 1])
+        for j in range(rows.bit_length()):
+            for i in range(columns.bit_length()):
                 start[index, j, i] = length
-                # Coarser levels of the alpha are never read.
-                for number in range(len(layers) if max(i, j) < ALPHA_LEVELS else 1):
-                    chunks.append(_reduced(layers[number], j, i, is_alpha=number == 1))
-                    length += chunks[-1].size
-    sides = [[side.bit_length() - 1 for side in layers[0].shape] for layers in painted.values()]
-    return Bank(
-        {name: index for index, name in enumerate(painted)},
-        Textures(
-            np.concatenate(chunks),
-            start,
-            np.array(sides, np.int64),
-            np.array([len(layers) > 1 for layers in painted.values()]),
-        ),
-    )
+                levels = [_reduced(layers[0], j, i)]
+                if len(layers) > 1 and max(i, j) < ALPHA_LEVELS:  # coarser ones are never read
+                    levels.append(_reduced(layers[1], j, i, is_alpha=True))
+                chunks += levels
+                length += sum(level.size for level in levels)
+    names = {name: index for index, name in enumerate(painted)}
+    cut_out = np.array([len(layers) > 1 for layers in painted.values()])
+    packed = Textures(np.concatenate(chunks), start, np.array(sides, np.int64), cut_out)
+    return Bank(names, packed)
 
 
-def _reduced(layer: np.ndarray, row_level: int, column_level: int, is_alpha: bool) -> np.ndarray:
+def _reduced(
+    layer: np.ndarray, row_level: int, column_level: int, is_alpha: bool = False
+) -> np.ndarray:
     """Return one level of a gray or alpha image as a flat array of bytes.
 
     Rows and columns are reduced separately, so a road seen at a flat angle stays sharp in one
@@ -95,13 +97,15 @@ def _reduced(layer: np.ndarray, row_level: int, column_level: int, is_alpha: boo
     if is_alpha:
         # Averaging would push leaves below the opacity threshold, and distant trees would look
         # thin.
-        level = level * (OPAQUE / max(np.quantile(level, 1 - np.mean(layer >= OPAQUE)), 1.0))
+        threshold = np.quantile(level, 1 - np.mean(layer >= OPAQUE))
+        level = level * (OPAQUE / max(threshold, 1.0))
     return np.clip(np.rint(level), 0, 255).astype(np.uint8).ravel()
 
 
 def _painted(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, ...]]:
-    """Return all textures by name: (gray,), or (gray, alpha) for cut-outs. Their sides are
-    powers of two.
+    """Return all textures by name: (gray,), or (gray, alpha) for cut-outs.
+
+    Their sides are powers of two.
     """
     big, middle, small = (512, 512), (256, 256), (64, 64)
     sidewalk = 148 + _slabs(rng, (256, 512), 8, 16, 2) + 9 * noise(rng, (256, 512), 64, 1.2)
@@ -109,7 +113,7 @@ def _painted(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, ...]]:
     sidewalk[-28:, ::64], sidewalk[-30:-28] = 90, 100
     leaves = _leaves(rng)
     ridge = 90 + 90 * noise(rng, (1, 512), 64)
-    painted = {
+    painted: dict[str, Any] = {
         "road": _carriageway(rng, ((0.04, 0.008, 0), (0.5, 0.008, 3), (0.96, 0.008, 0))),
         "highway": _carriageway(
             rng, ((0.05, 0.008, 0), (0.35, 0.005, 2), (0.65, 0.005, 2), (0.95, 0.008, 0))
@@ -132,20 +136,19 @@ def _painted(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, ...]]:
         "car side": _car_side(rng),
         "sign0": _sign(0),
         "sign1": _sign(1),
-        **{f"facade{kind}": _facade(rng, kind) for kind in range(FACADES)},
-        **{
-            f"tree{kind}": _tree(rng, np.roll(leaves, 83 * kind, axis=1) * (1, 0.8, 1.1)[kind])
-            for kind in range(TREES)
-        },
-        **{f"person{kind}": _person(rng) for kind in range(PERSONS)},
     }
-    return {
-        name: tuple(
-            np.asarray(layer, np.float32)
-            for layer in (layers if isinstance(layers, tuple) else (layers,))
-        )
-        for name, layers in painted.items()
-    }
+    for kind in range(FACADES):
+        painted[f"facade{kind}"] = _facade(rng, kind)
+    for kind, tone in enumerate((1, 0.8, 1.1)):
+        painted[f"tree{kind}"] = _tree(rng, np.roll(leaves, 83 * kind, axis=1) * tone)
+    for kind in range(PERSONS):
+        painted[f"person{kind}"] = _person(rng)
+    textures = {}
+    for name, layers in painted.items():
+        if not isinstance(layers, tuple):
+            layers = (layers,)
+        textures[name] = tuple(np.asarray(layer, np.float32) for layer in layers)
+    return textures
 
 
 # Surfaces
@@ -154,10 +157,10 @@ def _painted(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, ...]]:
 def noise(
     rng: np.random.Generator, shape: tuple[int, ...], cell: float, slope: float = 1.7
 ) -> np.ndarray:
-    """Return periodic noise, float32, standard deviation 1, with structures of up to about `cell`
-    pixels.
+    """Return periodic noise, float32, standard deviation 1.
 
-    slope: how fast smaller structures fade; at 1 all sizes are equally strong.
+    cell: size of the largest structures, about, in pixels. slope: how fast smaller structures fade;
+    at 1 all sizes are equally strong.
     """
     frequency = np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1]))
     spectrum = np.fft.rfft2(rng.standard_normal(shape)) / np.maximum(frequency, 0.5 / cell) ** slope
@@ -175,10 +178,8 @@ def _asphalt(rng: np.random.Generator, shape: tuple[int, ...], patches: int) -> 
         width, height = int(rng.integers(40, 150)), int(rng.integers(30, 120))
         image[y : y + height, x : x + width] += rng.uniform(-16, 12)
         cv2.rectangle(image, (x, y), (x + width, y + height), base - 26, 2)
-        crack = np.cumsum(rng.normal(0, 1, (30, 2)) * (9, 5), axis=0) + rng.uniform(0.1, 0.9, 2) * (
-            columns,
-            rows,
-        )
+        crack = np.cumsum(rng.normal(0, 1, (30, 2)) * (9, 5), axis=0)
+        crack += rng.uniform(0.1, 0.9, 2) * (columns, rows)
         cv2.polylines(image, [np.rint(crack).astype(np.int32)], False, base - 32, 1)
     return image
 
@@ -194,13 +195,12 @@ def _carriageway(rng: np.random.Generator, lines: Iterable[tuple[float, float, i
     worn = noise(rng, image.shape, 16) > 1.5
     for place, half, dashes in lines:
         line = np.zeros(image.shape, bool)
-        for k in range(dashes or 1):
-            start, length = (
-                (k * columns // dashes, columns // dashes // 2) if dashes else (0, columns)
-            )
-            line[
-                round((place - half) * rows) : round((place + half) * rows), start : start + length
-            ] = True
+        across = slice(round((place - half) * rows), round((place + half) * rows))
+        if not dashes:
+            line[across] = True
+        for k in range(dashes):
+            start = k * columns // dashes
+            line[across, start : start + columns // dashes // 2] = True
         image[line & ~worn] = 208
     return image
 
@@ -213,10 +213,10 @@ def _slabs(
     joint: int,
     spread: float = 9.0,
 ) -> np.ndarray:
-    """Paint slabs or bricks with dark joints, to be added to a surface; each has a random tone
-    (deviation `spread`).
+    """Paint slabs or bricks with dark joints, to be added to a surface.
 
-    rows, columns: number of slabs; joint: pixels. Every second row is shifted by half a slab.
+    Each has a random tone (deviation `spread`). rows, columns: number of slabs; joint: pixels.
+    Every second row is shifted by half a slab.
     """
     height, width = shape
     y, x = np.mgrid[0:height, 0:width]
@@ -224,9 +224,9 @@ def _slabs(
     shifted = (x + (row % 2) * (width // columns // 2)) % width
     column = shifted * columns // width
     image = rng.normal(0, spread, (rows, columns))[row, column]
-    image[(y - row * height // rows < joint) | (shifted - column * width // columns < joint)] = (
-        -2.2 * spread
-    )
+    above = y - row * height // rows < joint
+    left = shifted - column * width // columns < joint
+    image[above | left] = -2.2 * spread
     return image
 
 
@@ -235,18 +235,20 @@ def _facade(rng: np.random.Generator, kind: int) -> np.ndarray:
     shape = (512, 1024)
     base = (172.0, 128.0, 200.0, 112.0)[kind]
     image = base + 17 * noise(rng, shape, 128, 1.2)
-    image += _slabs(rng, shape, 64, 64, 2) if kind % 2 else _slabs(rng, shape, 16, 32, 2, spread=6)
-    frame = 225.0 if base < 165 else 95.0
+    if kind % 2:
+        image += _slabs(rng, shape, 64, 64, 2)
+    else:
+        image += _slabs(rng, shape, 16, 32, 2, spread=6)
+    frame = 95.0
+    if base < 165:
+        frame = 225.0
     for floor in range(2):
         for bay in range(4):
             width, height = int(rng.integers(60, 150)), int(rng.integers(85, 155))
-            left, top = (
-                bay * 256 + 128 - width // 2 + int(rng.integers(-36, 37)),
-                floor * 256 + 200 - height,
-            )
-            cv2.rectangle(
-                image, (left - 5, top - 5), (left + width + 5, top + height + 5), frame, -1
-            )
+            left = bay * 256 + 128 - width // 2 + int(rng.integers(-36, 37))
+            top = floor * 256 + 200 - height
+            corner = (left + width + 5, top + height + 5)
+            cv2.rectangle(image, (left - 5, top - 5), corner, frame, -1)
             pane = image[top : top + height, left : left + width]
             pane[:] = 35 + 110 * rng.random() ** 2 + np.linspace(18, -12, height)[:, None]
             pane[: int(height * rng.uniform(0, 0.8))] = rng.uniform(90, 160)  # a blind
@@ -264,27 +266,20 @@ def _outline(
     polygons: list,
     ellipses: Iterable[tuple[float, float, float, float]] = (),
 ) -> np.ndarray:
-    """Return an antialiased alpha image of polygons and ellipses, whose coordinates are shares
-    of the size.
+    """Return an antialiased alpha image of polygons and ellipses.
+
+    Their coordinates are shares of the size. An ellipse: (x, y, radius along x, radius along y).
     """
     # reduced to `shape` at the end, which smooths the edges
     rows, columns = shape[0] * 2, shape[1] * 2
     mask = np.zeros((rows, columns), np.uint8)
     for polygon in polygons:
-        cv2.fillPoly(
-            mask, [np.rint(np.asarray(polygon, float) * (columns, rows)).astype(np.int32)], 255
-        )
+        corners = np.asarray(polygon, float) * (columns, rows)
+        cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 255)
     for x, y, radius_x, radius_y in ellipses:
-        cv2.ellipse(
-            mask,
-            (int(x * columns), int(y * rows)),
-            (int(radius_x * columns), int(radius_y * rows)),
-            0,
-            0,
-            360,
-            255,
-            -1,
-        )
+        centre = (int(x * columns), int(y * rows))
+        radii = (int(radius_x * columns), int(radius_y * rows))
+        cv2.ellipse(mask, centre, radii, 0, 0, 360, 255, -1)
     return cv2.resize(mask, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
 
 
@@ -295,7 +290,8 @@ def _leaves(rng: np.random.Generator) -> np.ndarray:
     x, y = rng.integers(0, 512, (2, count))
     angle, tone = rng.uniform(0, 180, count), np.sort(rng.random(count))
     for k in range(count):
-        value = 38 + 80 * float(np.clip(0.6 * tone[k] + 0.22 * clumps[y[k], x[k]], 0, 1))
+        lightness = np.clip(0.6 * tone[k] + 0.22 * clumps[y[k], x[k]], 0, 1)
+        value = 38 + 80 * float(lightness)
         cv2.ellipse(image, (int(x[k]), int(y[k])), (4, 2), angle[k], 0, 360, value, -1)
     return image + 10 * clumps
 
@@ -306,26 +302,24 @@ def _tree(rng: np.random.Generator, leaves: np.ndarray) -> tuple[np.ndarray, np.
     y, x = np.mgrid[0:512, 0:512]
     crown = 1.15 - ((x - 256) / 95) ** 2 - ((y - 205) / 120) ** 2  # around the trunk
     for centre_x, centre_y in rng.normal((256, 190), (85, 75), (14, 2)).clip(85, 427):
-        crown = np.maximum(
-            crown, 1 - ((x - centre_x) ** 2 + (y - centre_y) ** 2) / rng.uniform(40, 80) ** 2
-        )
+        squared = (x - centre_x) ** 2 + (y - centre_y) ** 2
+        crown = np.maximum(crown, 1 - squared / rng.uniform(40, 80) ** 2)
     ragged = noise(rng, shape, 32, 1.4)
     foliage = np.clip(crown, 0, 1.3) + 0.22 * ragged > rng.uniform(0.3, 0.46) + 9 * (crown <= 0)
     half = int(rng.integers(7, 12))
     wood = (np.abs(x - 256) < half * (0.5 + y / 1024)) & (y > 150)
     bark = 52 + 14 * noise(rng, shape, 16) + np.linspace(-28, 28, 512)
-    image = np.where(foliage, leaves * (1.15 - 0.5 * (y - 30) / 320) * (0.9 + 0.12 * ragged), bark)
-    return image, np.where(foliage | wood, 255.0, 0.0)
+    darker_below = 1.15 - 0.5 * (y - 30) / 320
+    shaded = leaves * darker_below * (0.9 + 0.12 * ragged)
+    return np.where(foliage, shaded, bark), np.where(foliage | wood, 255.0, 0.0)
 
 
 def _person(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Paint a standing or walking person, (256, 128)."""
     shape = (256, 128)
-    stride, shoulder, hip = (
-        rng.uniform(0.03, 0.14),
-        rng.uniform(0.17, 0.23),
-        rng.uniform(0.11, 0.14),
-    )
+    stride = rng.uniform(0.03, 0.14)
+    shoulder = rng.uniform(0.17, 0.23)
+    hip = rng.uniform(0.11, 0.14)
     torso = [
         (0.47, 0.15),
         (0.53, 0.15),
@@ -350,15 +344,15 @@ def _person(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     image[:38], image[:20], image[242:] = 118, rng.uniform(28, 80), 34  # face, hair, shoes
     folds = noise(rng, shape, 8)
     head = (0.5, 0.093, 0.08, 0.06)
-    return image * np.linspace(1.16, 0.8, 128) + 2.5 * folds, _outline(
-        shape, [torso, *legs], [head]
-    )
+    alpha = _outline(shape, [torso, *legs], [head])
+    return image * np.linspace(1.16, 0.8, 128) + 2.5 * folds, alpha
 
 
 def _picket(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Paint a picket fence, (128, 512), with pickets of unequal width, height and tone."""
-    image, alpha = 120 + 8 * noise(rng, (128, 512), 32, 1.2), np.zeros((128, 512))
-    alpha[34:46], alpha[96:108] = 255, 255
+    image = 120 + 8 * noise(rng, (128, 512), 32, 1.2)
+    alpha = np.zeros((128, 512))
+    alpha[34:46] = alpha[96:108] = 255
     left = 0
     while left < 500:
         right = left + int(rng.integers(6, 16))
@@ -369,8 +363,9 @@ def _picket(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sign(kind: int) -> tuple[np.ndarray, np.ndarray]:
-    """Paint a traffic sign, (128, 128): "no entry" (kind 0) or a board. Both look the same from
-    behind.
+    """Paint a traffic sign, (128, 128): "no entry" (kind 0) or a board.
+
+    Both look the same from behind.
     """
     image = np.full((128, 128), 95.0)
     if kind == 0:
@@ -399,17 +394,15 @@ def _car_side(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     # A curved door reflects the sky above its crease and the street below it.
     up = CAR_HEIGHT * (1 - np.arange(256)[:, None] / 256)
     image = 128 + 1.5 * noise(rng, shape, 128)
-    image *= np.interp(up, (0.2, 0.5, 0.62, 0.66, 1.5), (0.6, 0.8, 0.85, 1.1, 1.1)).astype(
-        np.float32
-    )
+    light = np.interp(up, (0.2, 0.5, 0.62, 0.66, 1.5), (0.6, 0.8, 0.85, 1.1, 1.1))
+    image *= light.astype(np.float32)
     for left, right in ((0.7, 1.5), (1.6, 2.6)):
-        window = _outline(
-            shape,
-            [parts([(left - 0.2, 1.0), (right + 0.1, 1.0), (right - 0.1, 1.36), (left, 1.36)])],
-        )
+        corners = [(left - 0.2, 1.0), (right + 0.1, 1.0), (right - 0.1, 1.36), (left, 1.36)]
+        window = _outline(shape, [parts(corners)])
         image[window > 127] = 50
     for door in (0.55, 1.55, 2.9):
-        cv2.line(image, (int(door / length * 512), 88), (int(door / length * 512), 205), 70.0, 2)
+        column = int(door / length * 512)
+        cv2.line(image, (column, 88), (column, 205), 70.0, 2)
     for share, gray in ((1.22, 22), (1.0, 34), (0.62, 150), (0.2, 60)):
         image[_outline(shape, [], wheels(share)) > 127] = gray
     return image, _outline(shape, [parts(CAR_PROFILE)], wheels(1.0))
@@ -417,11 +410,8 @@ def _car_side(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 def _car_end(rng: np.random.Generator) -> np.ndarray:
     """Paint the front or rear of a car in middle gray, (128, 256)."""
-    image = (
-        128
-        + 1.5 * noise(rng, (128, 256), 64)
-        + np.linspace(20, -40, 128, dtype=np.float32)[:, None]
-    )
+    shade = np.linspace(20, -40, 128, dtype=np.float32)[:, None]
+    image = 128 + 1.5 * noise(rng, (128, 256), 64) + shade
     for middle in (34, 222):
         cv2.ellipse(image, (middle, 44), (32, 15), 0, 0, 360, 60.0, -1)
         cv2.ellipse(image, (middle, 43), (27, 11), 0, 0, 360, 215.0, -1)

@@ -1,8 +1,8 @@
-"""The things of a street, as rows of the rasteriser's face matrix: ground, walls, houses, cars,
-trees and signs.
+"""The things of a street, as rows of the rasteriser's face matrix.
 
-A thing is built in local coordinates: metres, y = 0 on the ground, x and z around its foot. `place`
-moves it into the street. `names` maps the names of textures to their indices.
+They are ground, walls, houses, cars, trees and signs. A thing is built in local coordinates:
+metres, y = 0 on the ground, x and z around its foot. `place` moves it into the street. `names` maps
+the names of textures to their indices.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,9 @@ CAR_HALF = 0.86  # half of a car's width
 
 
 class Faces:
-    """A list of faces under construction: rectangles seen from outside, usually edge_s to the
-    right and edge_t up.
+    """A list of faces under construction.
+
+    They are rectangles seen from outside, usually edge_s to the right and edge_t up.
     """
 
     def __init__(self, names: dict[str, int]) -> None:
@@ -40,27 +41,15 @@ class Faces:
         ground: int = 0,
         lit: int = 1,
     ) -> None:
-        """Add one face; corner and edges in metres. The other arguments are columns that `raster`
-        describes.
+        """Add one face.
 
-        repeats: repeats of the upright texture along edge_s and edge_t; uv: the six numbers of u
-        and v instead.
+        corner and edges: metres. The other arguments are columns that `raster` describes. repeats:
+        repeats of the upright texture along edge_s and edge_t; uv: the six numbers of u and v
+        instead.
         """
         uv = uv or (0.0, repeats[0], 0.0, 1.0, 0.0, -repeats[1])
-        self._rows.append(
-            (
-                *corner,
-                *edge_s,
-                *edge_t,
-                *uv,
-                self.names[texture],
-                ID[label],
-                gain,
-                triangle,
-                ground,
-                lit,
-            )
-        )
+        columns = (self.names[texture], ID[label], gain, triangle, ground, lit)
+        self._rows.append((*corner, *edge_s, *edge_t, *uv, *columns))
 
     def box(
         self,
@@ -71,36 +60,27 @@ class Faces:
         label: str,
         gain: float = 1.0,
     ) -> None:
-        """Add an upright box without a bottom; x, y, z: (low, high) on each axis; low y is the
-        top.
+        """Add an upright box without a bottom.
+
+        x, y, z: (low, high) on each axis; low y is the top.
         """
-        (x0, x1), (top, bottom), (z0, z1) = x, y, z
+        x0, x1 = x
+        top, bottom = y
+        z0, z1 = z
         width, height, length = x1 - x0, bottom - top, z1 - z0
-        tile = TILE[texture]
-        for corner, edge in (
+        tile_u, tile_v = TILE[texture]
+        for (corner_x, corner_z), (edge_x, edge_z) in (
             ((x0, z0), (width, 0)),
             ((x1, z1), (-width, 0)),
             ((x1, z0), (0, length)),
             ((x0, z1), (0, -length)),
         ):
-            self.add(
-                (corner[0], bottom, corner[1]),
-                (edge[0], 0, edge[1]),
-                (0, -height, 0),
-                texture,
-                label,
-                (abs(edge[0] + edge[1]) / tile[0], height / tile[1]),
-                gain=gain,
-            )
-        self.add(
-            (x0, top, z0),
-            (width, 0, 0),
-            (0, 0, length),
-            texture,
-            label,
-            (width / tile[0], length / tile[1]),
-            gain=gain,
-        )
+            repeats = (abs(edge_x + edge_z) / tile_u, height / tile_v)
+            corner, along, up = (corner_x, bottom, corner_z), (edge_x, 0, edge_z), (0, -height, 0)
+            self.add(corner, along, up, texture, label, repeats, gain=gain)
+        repeats = (width / tile_u, length / tile_v)
+        lid = ((x0, top, z0), (width, 0, 0), (0, 0, length))
+        self.add(*lid, texture, label, repeats, gain=gain)
 
     def matrix(self) -> np.ndarray:
         """Return the faces added so far, (n, COLUMNS)."""
@@ -108,8 +88,9 @@ class Faces:
 
 
 def place(faces: np.ndarray, x: float, z: float, yaw: float, y: float = 0.0) -> np.ndarray:
-    """Return local faces (n, COLUMNS) turned by yaw (radians to the right) and moved to (x, y,
-    z).
+    """Return local faces (n, COLUMNS) turned by yaw and moved to (x, y, z).
+
+    yaw: radians to the right.
     """
     placed = faces.copy()
     cosine, sine = np.cos(yaw), np.sin(yaw)
@@ -135,63 +116,52 @@ def extrude(
     ground: int = 0,
     lit: int = 1,
 ) -> np.ndarray:
-    """Return the faces of a strip along a track, (n, COLUMNS): a road, a sidewalk, a fence or a
-    wall.
+    """Return the faces of a strip along a track, (n, COLUMNS).
 
-    s: (k,) evenly spaced places along the track; side: 1 right of it, -1 mirrored to its left;
-    profile: cross-section, (distance from the track, y) of points from the inner edge outwards;
-    off_road: function of (x, z) that returns whether a face may lie there.
+    The strip is a road, a sidewalk, a fence or a wall. s: (k,) evenly spaced places along the
+    track; side: 1 right of it, -1 mirrored to its left; profile: cross-section, (distance from the
+    track, y) of points from the inner edge outwards; off_road: function of (x, z) that returns
+    whether a face may lie there.
     """
-    points, (tile_u, tile_v) = np.array(profile, float), TILE[texture]
-    v = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    points = np.array(profile, float)
+    tile_u, tile_v = TILE[texture]
+    lengths = np.hypot(*np.diff(points, axis=0).T)
+    v = np.concatenate([[0], np.cumsum(lengths)])
     v = -v / (tile_v or v[-1])
     if side < 0:  # points must run to the right, or the normals would look inwards
         points, v = points[::-1] * (-1, 1), v[::-1]
-    u, u_step = s[:-1] / tile_u, (s[1] - s[0]) / tile_u
+    u = s[:-1] / tile_u
+    u_step = (s[1] - s[0]) / tile_u
     # Where a street meets itself, its later part lies a little lower. Otherwise the two would
     # flicker.
     lower = 1e-5 * (s - track.s[0])
-    bends = np.abs(np.interp(track.along(s), track.s, track.curvature)) > 1e-6
+    curvature = np.interp(track.along(s), track.s, track.curvature)
+    bends = np.abs(curvature) > 1e-6
     x_middle, z_middle, heading = track.at((s[:-1] + s[1:]) / 2, points[:, 0].mean())
-    free = np.ones(len(u), bool) if off_road is None else off_road(x_middle, z_middle)
+    free = np.ones(len(u), bool)
+    if off_road is not None:
+        free = off_road(x_middle, z_middle)
     parts = []
     for (d0, y0), (d1, y1), v0, v1 in zip(points, points[1:], v, v[1:]):
-        first, second = (
-            np.stack([x, y + lower, z], axis=1)
-            for y, (x, z, _) in ((y0, track.at(s, d0)), (y1, track.at(s, d1)))
-        )
+        x, z, _ = track.at(s, d0)
+        first = np.stack([x, y0 + lower, z], axis=1)
+        x, z, _ = track.at(s, d1)
+        second = np.stack([x, y1 + lower, z], axis=1)
         shown = free.copy()
         for edge in (first, second):  # inside a tight bend the faces would fold over
             step = edge[1:] - edge[:-1]
-            shown &= step[:, X] * np.sin(heading) + step[:, Z] * np.cos(heading) > 0.02
+            forwards = step[:, X] * np.sin(heading) + step[:, Z] * np.cos(heading)
+            shown &= forwards > 0.02
         bent = (bends[:-1] | bends[1:]) & (d0 != d1)  # two triangles instead of a parallelogram
+        near = (first[:-1], second[:-1] - first[:-1], first[1:] - first[:-1])
+        far = (second[1:], first[1:] - second[1:], second[:-1] - second[1:])
+        near_uv = (u, 0, u_step, v0, v1 - v0, 0)
+        far_uv = (u + u_step, 0, -u_step, v1, v0 - v1, 0)
         columns = (names[texture], ID[label], 1.0, bent, ground, lit)
-        near = (
-            *first[:-1].T,
-            *(second - first)[:-1].T,
-            *(first[1:] - first[:-1]).T,
-            u,
-            0,
-            u_step,
-            v0,
-            v1 - v0,
-            0,
-            *columns,
-        )
-        far = (
-            *second[1:].T,
-            *(first - second)[1:].T,
-            *(second[:-1] - second[1:]).T,
-            u + u_step,
-            0,
-            -u_step,
-            v1,
-            v0 - v1,
-            0,
-            *columns,
-        )
-        for face, kept in ((near, shown), (far, shown & bent)):
-            parts.append(np.stack(np.broadcast_arrays(*face), axis=1)[kept])
+        for vectors, uv, drawn in ((near, near_uv, shown), (far, far_uv, shown & bent)):
+            coordinates = np.concatenate(vectors, axis=1).T
+            faces = np.broadcast_arrays(*coordinates, *uv, *columns)
+            parts.append(np.stack(faces, axis=1)[drawn])
     return np.concatenate(parts)
 
 
@@ -200,16 +170,13 @@ def car(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
     faces = Faces(names)
     gain = float(rng.choice([1.55, 1.15, 0.7, 0.42, 0.32, 1.4]))
     size = rng.uniform(0.95, 1.12)
-    z, up = (
-        size * (CAR_PROFILE[:, 0] - CAR_PROFILE[:, 0].max() / 2),
-        CAR_PROFILE[:, 1] * rng.uniform(0.98, 1.12),
-    )
+    z = size * (CAR_PROFILE[:, 0] - CAR_PROFILE[:, 0].max() / 2)
+    up = CAR_PROFILE[:, 1] * rng.uniform(0.98, 1.12)
     half, length = CAR_HALF, z.max() - z.min()
     height = CAR_HEIGHT * up[0] / CAR_PROFILE[0, 1]
     for side in (1, -1):
-        faces.add(
-            (side * half, 0, z.min()), (0, 0, length), (0, -height, 0), "car side", "car", gain=gain
-        )
+        corner = (side * half, 0, z.min())
+        faces.add(corner, (0, 0, length), (0, -height, 0), "car side", "car", gain=gain)
     materials = (
         ("car end", 0.5, 1.0),
         ("car end", 0.0, 0.5),
@@ -222,8 +189,12 @@ def car(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
         ("car end", 0.5, 1.0),
     )
     for k, (texture, top, bottom) in enumerate(materials):
-        low, high = (k, k + 1) if up[k] < up[k + 1] else (k + 1, k)
-        right = half if low < high else -half  # as seen by somebody who looks at this part
+        low, high, right = k + 1, k, -half  # right: as seen by somebody who looks at this part
+        if up[k] < up[k + 1]:
+            low, high, right = k, k + 1, half
+        part_gain = gain
+        if texture == "glass":
+            part_gain = 1.0
         faces.add(
             (right, -up[low], z[low]),
             (-2 * right, 0, 0),
@@ -231,7 +202,7 @@ def car(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
             texture,
             "car",
             uv=(0, 1, 0, bottom, 0, top - bottom),
-            gain=1.0 if texture == "glass" else gain,
+            gain=part_gain,
         )
     return faces.matrix()
 
@@ -251,14 +222,9 @@ def tree(
 ) -> np.ndarray:
     """Build a tree; lowest, highest: metres."""
     height = rng.uniform(lowest, highest)
-    return cut_out(
-        names,
-        f"tree{rng.integers(0, TREES)}",
-        "vegetation",
-        height * rng.uniform(0.85, 1.05),
-        height,
-        rng.uniform(0.85, 1.2),
-    )
+    texture = f"tree{rng.integers(0, TREES)}"
+    width = height * rng.uniform(0.85, 1.05)
+    return cut_out(names, texture, "vegetation", width, height, rng.uniform(0.85, 1.2))
 
 
 def bush(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
@@ -268,7 +234,8 @@ def bush(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
 
 def lamp(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
     """Build a street lamp whose arm reaches to the left."""
-    faces, height = Faces(names), rng.uniform(5, 7)
+    faces = Faces(names)
+    height = rng.uniform(5, 7)
     faces.box((-0.07, 0.07), (-height, 0), (-0.07, 0.07), "metal", "pole")
     faces.box((-1.4, 0), (-height, -height + 0.09), (-0.05, 0.05), "metal", "pole")
     faces.box(
@@ -279,8 +246,12 @@ def lamp(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
 
 def sign(names: dict[str, int], rng: np.random.Generator) -> np.ndarray:
     """Build a traffic sign that is seen from z and from -z."""
-    faces, kind = Faces(names), int(rng.integers(0, SIGNS))
-    height, size = rng.uniform(1.9, 2.4), rng.uniform(0.65, 0.9) * (1.4 if kind == 1 else 1)
+    faces = Faces(names)
+    kind = int(rng.integers(0, SIGNS))
+    height = rng.uniform(1.9, 2.4)
+    size = rng.uniform(0.65, 0.9)
+    if kind == 1:  # a board
+        size *= 1.4
     faces.box((-0.04, 0.04), (-height - size / 2, 0), (0.01, 0.09), "metal", "pole")
     faces.add(
         (-size / 2, -height, 0),
@@ -302,39 +273,40 @@ def building(
     floors: int,
     pitched: bool,
 ) -> np.ndarray:
-    """Build a house whose front stands at z = 0 and looks to -z; pitched: a roof with a ridge
-    instead of a flat one.
+    """Build a house whose front stands at z = 0 and looks to -z.
+
+    pitched: a roof with a ridge instead of a flat one.
     """
-    faces, facade, height = Faces(names), f"facade{rng.integers(0, FACADES)}", 3.0 * floors
-    gain, start = rng.uniform(0.85, 1.12), rng.integers(0, 4) / 4.0
-    for corner, edge in (
+    faces = Faces(names)
+    facade = f"facade{rng.integers(0, FACADES)}"
+    height = 3.0 * floors
+    gain = rng.uniform(0.85, 1.12)
+    start = rng.integers(0, 4) / 4.0
+    tile_u, tile_v = TILE["facade"]
+    for (corner_x, corner_z), (edge_x, edge_z) in (
         ((-width / 2, 0), (width, 0)),
         ((width / 2, depth), (-width, 0)),
         ((width / 2, 0), (0, depth)),
         ((-width / 2, depth), (0, -depth)),
     ):
-        bays = max(1, round(4 * abs(edge[0] + edge[1]) / TILE["facade"][0])) / 4  # no window is cut
+        bays = max(1, round(4 * abs(edge_x + edge_z) / tile_u)) / 4  # no window is cut
         faces.add(
-            (corner[0], 0, corner[1]),
-            (edge[0], 0, edge[1]),
+            (corner_x, 0, corner_z),
+            (edge_x, 0, edge_z),
             (0, -height, 0),
             facade,
             "building",
-            uv=(start, bays, 0, 1, 0, -height / TILE["facade"][1]),
+            uv=(start, bays, 0, 1, 0, -height / tile_v),
             gain=gain,
         )
     if not pitched:
-        faces.box(
-            (-width / 2 - 0.15, width / 2 + 0.15),
-            (-height - 0.5, -height),
-            (-0.15, depth + 0.15),
-            "stone",
-            "building",
-            gain * 0.8,
-        )
+        roof_x = (-width / 2 - 0.15, width / 2 + 0.15)
+        roof_z = (-0.15, depth + 0.15)
+        faces.box(roof_x, (-height - 0.5, -height), roof_z, "stone", "building", gain * 0.8)
         return faces.matrix()
     rise, over = depth * rng.uniform(0.3, 0.5), 0.4
-    lift, across = over * rise / (depth / 2), width + 2 * over
+    lift = over * rise / (depth / 2)
+    across = width + 2 * over
     tiles = (across / TILE["roof"][0], np.hypot(rise, depth / 2) / TILE["roof"][1])
     for sign_x, z in ((1, -over), (-1, depth + over)):
         faces.add(

@@ -52,8 +52,9 @@ def _visible_texts(figure):
 
 
 def watch(shell, path):
-    """Append the faults of every figure that the notebook of an IPython shell saves to a file, and
-    the number of figures that a cell has made but not shown.
+    """Append the faults of every figure that the notebook of an IPython shell saves to a file.
+
+    Also the number of figures that a cell has made but not shown.
     """
 
     def wrap_save_figure(_):

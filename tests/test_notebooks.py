@@ -1,4 +1,5 @@
 """Notebooks as they are in git and as they run; they are executed once, on the smallest profile.
+
 An edit of a cell reaches the last table of notebook 8; the cells concerned run in one process.
 """
 
@@ -37,9 +38,7 @@ def cells(name, kind):
 
 
 def execute(name, build, output):
-    """Execute a notebook by nbconvert with no setting of the Makefile but the profile and the
-    folders.
-    """
+    """Execute a notebook by nbconvert, with no setting of the Makefile but profile and folders."""
     environment = {key: os.environ[key] for key in ("PATH", "HOME", "LANG") if key in os.environ}
     environment |= {
         "PYTHONPATH": str(ROOT),
@@ -183,6 +182,8 @@ def test_a_notebook_without_its_input_names_the_one_to_run_first(tmp_path):
         ("notebooks/06_keypoint_masks.ipynb", ["06", "07", "08", "09"]),
         ("notebooks/07_visual_odometry.ipynb", ["07", "08", "09"]),
         ("thesis_repro/masks.py", [name[:2] for name in NOTEBOOKS]),
+        ("street_world/street.py", [name[:2] for name in NOTEBOOKS]),
+        ("notebooks/drawing/chapter4.py", [name[:2] for name in NOTEBOOKS]),
         ("thesis_repro/report/page.py", []),
     ],
 )
@@ -199,13 +200,11 @@ def test_only_what_changed_is_made_again(executed, changed, again):
 def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     """On a copy of the project with two small notebooks."""
     root = tmp_path / "project"
-    shutil.copytree(
-        ROOT / "thesis_repro", root / "thesis_repro", ignore=shutil.ignore_patterns("__pycache__")
-    )
+    for folder in ("thesis_repro", "street_world", "notebooks/drawing"):
+        shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
     (root / ".venv").symlink_to(ROOT / ".venv")
     for name in ("Makefile", "environment.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, root)
-    (root / "notebooks").mkdir()
     for name, code in (
         ("01_one.ipynb", "print('by hand')"),
         ("02_two.ipynb", "raise ValueError('labels: missing')"),

@@ -1,5 +1,6 @@
-"""Measure what odometry and segmentation cost on this machine, as ratios: python tools/bench.py
---kitti ROOT.
+"""Measure what odometry and segmentation cost on this machine, as ratios.
+
+Usage: python tools/bench.py --kitti ROOT.
 
 Machines differ and are busy, so only the ratio of two measurements taken in turn in one process
 counts. Prints a table and writes it as JSON. A slow machine is no error.
@@ -47,9 +48,7 @@ def seconds(work, clock=time.perf_counter):
 
 
 def bare_calls(previous, frame, points, intrinsics):
-    """Return the OpenCV calls of one step of the thesis's odometry, as functions without
-    arguments.
-    """
+    """Return the OpenCV calls of one step of the thesis's odometry, functions without arguments."""
     tracked, followed = keypoints.track(previous, frame, points)
     old, new = (pose.normalise(corners[followed], intrinsics) for corners in (points, tracked))
     camera = {"focal": 1.0, "pp": (0.0, 0.0)}
@@ -71,8 +70,9 @@ def bare_calls(previous, frame, points, intrinsics):
 
 
 def step_cost(sequence):
-    """Return the milliseconds of a thesis step, a refined step and the bare OpenCV calls:
-    medians of the best of 3.
+    """Return the milliseconds of a thesis step, a refined step and the bare OpenCV calls.
+
+    They are medians of the best of 3.
     """
     followers = [
         Odometry(sequence.intrinsics, replace(THESIS, estimator=name))
@@ -99,8 +99,9 @@ def step_cost(sequence):
 
 
 def shared_cost(sequence):
-    """Return CPU milliseconds a frame of runs in one pass and one by one, and whether their
-    poses are equal.
+    """Return CPU milliseconds a frame of runs in one pass and one by one.
+
+    The last value is whether their poses are equal.
     """
     # edges of the frames stand in for label maps
     contours = [
@@ -124,8 +125,9 @@ def shared_cost(sequence):
 
 
 def mask_cost(sequence, labels):
-    """Return CPU milliseconds a mask, for the masks of all widths and controls made together
-    and one by one.
+    """Return CPU milliseconds a mask, for masks made together and one by one.
+
+    The masks are those of all widths and controls.
     """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
@@ -143,8 +145,9 @@ def mask_cost(sequence, labels):
 
 
 def compile_cost():
-    """Return the CPU seconds until the refined odometry is ready, with an empty and with a full
-    Numba cache.
+    """Return the CPU seconds until the refined odometry is ready.
+
+    The first value is with an empty Numba cache, the second with a full one.
     """
 
     def clock():
@@ -192,6 +195,7 @@ def measure(sequence):
 
 
 def main():
+    """Print the ratios, and write them as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--kitti", required=True, type=Path, help="KITTI odometry folder (sequences, poses)"

@@ -1,5 +1,6 @@
-"""Evidence on real frames for the repository: tables, plots and findings that contain no frame of
-the data.
+"""Evidence on real frames for the repository: tables, plots and findings.
+
+They contain no frame of the data.
 
 `make evidence KITTI=...` uses all sequences of a KITTI folder and the label maps of the model in
 the package. It runs the thesis's masks, the controls of one width with both estimators, and the
@@ -158,8 +159,9 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
 
 
 def _runs(run, sequences, repetitions):
-    """Return the runs of the comparison. The runs with masks decide the jobs with fewer
-    keypoints. run: runs jobs, as `runner.run_jobs`.
+    """Return the runs of the comparison. run: returns the runs of jobs.
+
+    The runs with masks decide the jobs with fewer keypoints.
     """
     planned = jobs.first_jobs(
         sequences,
@@ -195,17 +197,15 @@ def _streets(sequences):
 
 
 def _boundaries(sequences, labels):
-    return pd.DataFrame(
-        [
-            {"sequence": sequence.name, "frame": index}
-            | ablations.boundaries(
-                read_label_map(labels / sequence.name / sequence.frame_paths[index].name),
-                sequence.size,
-            )
-            for sequence in sequences
-            for index in range(0, len(sequence), max(1, len(sequence) // SAMPLED_FRAMES))
-        ]
-    )
+    """Return the measures of `ablations.boundaries` in SAMPLED_FRAMES frames of each sequence."""
+    rows = []
+    for sequence in sequences:
+        step = max(1, len(sequence) // SAMPLED_FRAMES)
+        for index in range(0, len(sequence), step):
+            label_map = read_label_map(labels / sequence.name / sequence.frame_paths[index].name)
+            measures = ablations.boundaries(label_map, sequence.size)
+            rows.append({"sequence": sequence.name, "frame": index} | measures)
+    return pd.DataFrame(rows)
 
 
 def _tracks(sequences, labels):

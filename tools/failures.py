@@ -1,5 +1,6 @@
-"""The steps on which masks fail: how many keypoints the masks keep, and how well these
-determine the motion.
+"""The steps on which masks fail.
+
+They are seen from how many keypoints the masks keep, and how well these determine the motion.
 """
 
 from dataclasses import replace
@@ -28,23 +29,23 @@ PANELS = {
 
 
 def measure(sequence, masks):
-    """Return one row for each step of a kitti.Sequence and kind of keypoints ("all" or "masks"),
-    refined estimator.
+    """Return one row for each step of a kitti.Sequence and kind of keypoints, refined estimator.
 
-    tracked: number of keypoints. agreeing: number of keypoints that agree with the motion from all
-    keypoints (the best known motion). cells: share of 4x4 cells that contain a tracked keypoint.
-    spread_u, spread_v: standard deviations of the tracked keypoints, pixels. depth_spread: upper
-    over lower quartile of the depths of the agreeing keypoints.
-    condition, direction_std: condition of their normal equations, and uncertainty of the direction
-    of motion, degrees.
-    rotation_error: of the estimate, degrees. flag: texts of its flags.
+    The kinds are "all" and "masks". tracked: number of keypoints. agreeing: number of keypoints
+    that agree with the motion from all keypoints (the best known motion). cells: share of 4x4 cells
+    that contain a tracked keypoint. spread_u, spread_v: standard deviations of the tracked
+    keypoints, pixels. depth_spread: upper over lower quartile of the depths of the agreeing
+    keypoints. condition, direction_std: condition of their normal equations, and uncertainty of the
+    direction of motion, degrees. rotation_error: of the estimate, degrees. flag: texts of its
+    flags.
     """
-    rows, scale = [], scales(sequence)
+    rows = []
+    scale = scales(sequence)
+    cell = [sequence.size[1] / CELLS, sequence.size[0] / CELLS]
     for index, steps in _steps(sequence, masks, range(len(sequence))):
         reference = steps["all"].motion
-        if scale[index] <= SETTINGS.scale_gate or any(
-            step.motion.rotation is None for step in steps.values()
-        ):
+        lost = any(step.motion.rotation is None for step in steps.values())
+        if lost or scale[index] <= SETTINGS.scale_gate:
             continue
         true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
         for kind, step in steps.items():
@@ -57,9 +58,7 @@ def measure(sequence, masks):
                 agreeing,
                 SETTINGS.threshold,
             )
-            cells = (step.previous // [sequence.size[1] / CELLS, sequence.size[0] / CELLS]).astype(
-                int
-            )
+            cells = (step.previous // cell).astype(int)
             rows.append(
                 {
                     "sequence": sequence.name,
@@ -82,79 +81,69 @@ def measure(sequence, masks):
 
 def _steps(sequence, masks, indices):
     """Yield (frame index, {kind: step}) for consecutive frames of a sequence."""
-    odometries, scale = (
-        {kind: Odometry(sequence.intrinsics, SETTINGS) for kind in KINDS},
-        scales(sequence),
-    )
+    odometries = {kind: Odometry(sequence.intrinsics, SETTINGS) for kind in KINDS}
+    scale = scales(sequence)
     for index in indices:
         frame = sequence.frame(index)
-        yield (
-            index,
-            {
-                kind: odometry.step(frame, scale[index], masks[index] if kind == "masks" else None)
-                for kind, odometry in odometries.items()
-            },
-        )
+        frame_masks = {"all": None, "masks": masks[index]}
+        steps = {}
+        for kind, odometry in odometries.items():
+            steps[kind] = odometry.step(frame, scale[index], frame_masks[kind])
+        yield index, steps
 
 
 def _agreeing(step, motion, sequence):
-    """Return a step's normalised matched points, current and previous, and which of them agree
-    with a motion.
+    """Return a step's normalised matched points, current and previous, and which of them agree.
+
+    They agree with `motion` if they are near its epipolar lines.
     """
-    current, previous = (
-        pose.normalise(points, sequence.intrinsics) for points in (step.current, step.previous)
-    )
+    current = pose.normalise(step.current, sequence.intrinsics)
+    previous = pose.normalise(step.previous, sequence.intrinsics)
     limit = SUPPORT_THRESHOLDS * SETTINGS.threshold
     return current, previous, near(motion.rotation, motion.translation, current, previous, limit)
 
 
 def _depth_spread(current, previous, motion):
-    """Return upper over lower quartile of the depths of the matched points in front of the
-    camera.
-    """
+    """Return upper over lower quartile of the depths of matched points in front of the camera."""
     projection = np.column_stack([motion.rotation, motion.translation])
     points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T, previous.T)
     ahead = points[2] * points[3] > 0
-    return (
-        np.divide(*np.percentile(points[2, ahead] / points[3, ahead], [75, 25]))
-        if ahead.any()
-        else np.nan
-    )
+    if not ahead.any():
+        return np.nan
+    upper, lower = np.percentile(points[2, ahead] / points[3, ahead], [75, 25])
+    return upper / lower
 
 
 def table(steps):
-    """Return the medians with all keypoints and with masks, by sequence and by number of
-    agreeing keypoints.
+    """Return the medians with all keypoints and with masks.
+
+    They are by sequence and by number of agreeing keypoints.
     """
     wide = steps.pivot(index=["sequence", "frame"], columns="kind").reset_index(level="sequence")
-    by_number = pd.cut(wide["agreeing", "masks"], BINS, right=False).map(
-        lambda bin: (
-            f"{bin.left} to {bin.right - 1} agreeing"
-            if bin.right < BINS[-1]
-            else f"{bin.left} or more"
-        )
-    )
+    by_number = pd.cut(wide["agreeing", "masks"], BINS, right=False).map(_name_bin)
     rows = []
     for name, group in [*wide.groupby("sequence"), *wide.groupby(by_number, observed=True)]:
-        medians = {
-            f"{column}, {KINDS[kind][0]}": float(f"{group[column, kind].median():.3g}")
-            for column in steps.columns[3:-1]
-            for kind in KINDS
-        }
+        row = {"steps": name, "number": len(group)}
+        for column in steps.columns[3:-1]:
+            for kind, (label, _) in KINDS.items():
+                row[f"{column}, {label}"] = float(f"{group[column, kind].median():.3g}")
         worse = group["rotation_error", "masks"] - group["rotation_error", "all"]
-        rows.append(
-            {
-                "steps": name,
-                "number": len(group),
-                **medians,
-                f"masks worse by {CLEAR_DIFFERENCE} degrees": int((worse > CLEAR_DIFFERENCE).sum()),
-                f"masks better by {CLEAR_DIFFERENCE} degrees": int(
-                    (worse < -CLEAR_DIFFERENCE).sum()
-                ),
-                "flagged, masks": int((group["flag", "masks"] != "").sum()),
-            }
+        much_worse, much_better = (
+            (worse > CLEAR_DIFFERENCE).sum(),
+            (worse < -CLEAR_DIFFERENCE).sum(),
         )
+        row[f"masks worse by {CLEAR_DIFFERENCE} degrees"] = int(much_worse)
+        row[f"masks better by {CLEAR_DIFFERENCE} degrees"] = int(much_better)
+        row["flagged, masks"] = int((group["flag", "masks"] != "").sum())
+        rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _name_bin(bin):
+    """Return the text for an interval of BINS."""
+    if bin.right == BINS[-1]:
+        return f"{bin.left} or more"
+    return f"{bin.left} to {bin.right - 1} agreeing"
 
 
 def figure(steps, sequences, masks):
@@ -195,11 +184,11 @@ def figure(steps, sequences, masks):
                     linewidth=0,
                     label="flag: ambiguous motion",
                 )
-            panel.set_ylabel(label if name == names[0] else "")
+            if name == names[0]:
+                panel.set_ylabel(label)
             panel.tick_params(labelsize=7)
-            style.ratio_axis(
-                panel.yaxis, np.concatenate([line.get_ydata() for line in panel.lines])
-            )
+            drawn = np.concatenate([line.get_ydata() for line in panel.lines])
+            style.ratio_axis(panel.yaxis, drawn)
         axes[f"agreeing {name}"].set_title(f"sequence {name}")
         panel.set_xlabel("frame")
     style.legend_below(axes["drawing"].figure, list(axes.values()), 4)
@@ -207,9 +196,7 @@ def figure(steps, sequences, masks):
 
 
 def _draw(panel, sequence, masks, index):
-    """Draw the keypoints before a step: dropped by the mask, or kept, and whether they agree
-    with the motion.
-    """
+    """Draw the keypoints before a step: dropped by the mask, or kept and agreeing or not."""
     _, (_, steps) = _steps(sequence, masks, (index - 1, index))
     motion, mask = steps["all"].motion, masks[index - 1]
     _, _, agreeing = _agreeing(steps["masks"], motion, sequence)

@@ -1,5 +1,6 @@
-"""Masks against the quality of their label maps: ratios of errors over the mean IoU, for the
-evidence on real frames.
+"""Masks against the quality of their label maps, for the evidence on real frames.
+
+They are compared by ratios of errors over the mean IoU.
 """
 
 import re
@@ -25,14 +26,15 @@ RATIO = r"([\d.]+)(?: \([^)]*?([\d.]+)-([\d.]+)\))?"  # "1.09 (95 % CI 0.98-1.32
 
 
 def table(runs, other_runs):
-    """Return the ratios of errors with masks from several label maps, refined estimator, one row a
-    source and comparison.
+    """Return the ratios of errors with masks from several label maps, refined estimator.
 
-    runs: with the model in the package. other_runs: {source: runs with masks from its label maps},
-    which may cover fewer sequences; masks of the package are then also compared on these alone. The
-    last rows come from figures/comparison.csv, the embedded world.
+    The table has one row a source and comparison. runs: with the model in the package. other_runs:
+    {source: runs with masks from its label maps}, which may cover fewer sequences; masks of the
+    package are then also compared on these alone. The last rows come from figures/comparison.csv,
+    the embedded world.
     """
-    baseline, masked = (compare.of_method(runs, name, "refined") for name in ("baseline", "masked"))
+    baseline = compare.of_method(runs, "baseline", "refined")
+    masked = compare.of_method(runs, "masked", "refined")
     quality = {PACKAGE: _on_card(), **MEASURED_ELSEWHERE}
     rows = [_row(PACKAGE, masked, baseline, quality)]
     for name, others in other_runs.items():
@@ -46,11 +48,11 @@ def table(runs, other_runs):
 
 
 def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
-    ratios = {
-        metric: compare.ratios(rows, reference, metric)
-        for metric in compare.JUDGING_METRICS
-        if metric in rows and metric in reference
-    }
+    ratios = {}
+    for metric, label in compare.JUDGING_METRICS.items():
+        if metric in rows and metric in reference:
+            mean = compare.geometric_mean(compare.ratios(rows, reference, metric))
+            ratios[label] = texts.ratio(mean)
     mean_iou, where = quality.get(name, (float("nan"), "not known"))
     return {
         "label maps": name,
@@ -59,29 +61,23 @@ def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
         "odometry": REAL,
         "sequences": ", ".join(sorted(rows["sequence"].unique())),
         "over": over,
-        **{
-            compare.METRICS[metric]: texts.ratio(compare.geometric_mean(by_sequence))
-            for metric, by_sequence in ratios.items()
-        },
+        **ratios,
     }
 
 
 def _on_card():
     """Return the mean IoU of the model in the package on KITTI's pairs held out, from its card."""
-    found = re.search(
-        r"\*\*Quality on (KITTI's .*?)\*\*.*?mean IoU \*\*([\d.]+)\*\*",
-        (ROOT / captions.CARD).read_text(encoding="utf-8"),
-        re.S,
-    )
-    return float(found[2]), f"{found[1]}, 11 classes, from gray (model card)"
+    card = (ROOT / captions.CARD).read_text(encoding="utf-8")
+    pattern = r"\*\*Quality on (KITTI's .*?)\*\*.*?mean IoU \*\*([\d.]+)\*\*"
+    pairs, mean_iou = re.search(pattern, card, re.DOTALL).groups()
+    return float(mean_iou), f"{pairs}, 11 classes, from gray (model card)"
 
 
 def _of_embedded_world():
     """Return the rows of the embedded world: its own network and its exact label maps."""
     ratios = pd.read_csv(ROOT / "figures" / "comparison.csv")
-    ratios = ratios[
-        (ratios["estimator"] == "refined estimator") & (ratios["over"] == ALL_KEYPOINTS)
-    ].set_index("keypoints")
+    refined = ratios["estimator"] == "refined estimator"
+    ratios = ratios[refined & (ratios["over"] == ALL_KEYPOINTS)].set_index("keypoints")
     quality = pd.read_csv(ROOT / "figures" / "domain_gap.csv", index_col="measure")
     trained = float(
         quality.loc["mean IoU over these", "the model of this run: the odometry's frames"]
@@ -106,8 +102,9 @@ def _of_embedded_world():
 
 
 def figure(table):
-    """Draw the ratios to all keypoints over the mean IoU, one panel a judging metric, from
-    `table`.
+    """Draw the ratios to all keypoints over the mean IoU, one panel a judging metric.
+
+    table: from `table`.
     """
     rows = table[(table["over"] == ALL_KEYPOINTS) & table["mean IoU"].notna()]
     labels = [label for label in compare.JUDGING_METRICS.values() if label in rows]
@@ -117,13 +114,16 @@ def figure(table):
         for number, (index, row) in enumerate(rows.iterrows()):
             ratio, low, high = numbers.loc[index]
             color = style.line_style(number)["color"]
+            marker, filling = "s", "white"
+            if row["odometry"] == REAL:
+                marker, filling = "o", color
             panel.plot([row["mean IoU"]] * 2, [low, high], color=color, linewidth=1.6)
             panel.plot(
                 row["mean IoU"],
                 ratio,
-                "o" if row["odometry"] == REAL else "s",
+                marker,
                 color=color,
-                markerfacecolor=color if row["odometry"] == REAL else "white",
+                markerfacecolor=filling,
                 label=f"{row['label maps']}; {row['odometry']}: {row['sequences']}",
             )
         panel.axhline(1, color="black", linewidth=0.8)

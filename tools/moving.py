@@ -42,10 +42,10 @@ NOTE = (
 
 
 def tracks(sequence, labels):
-    """Return one row for each keypoint of a sequence that is tracked into the next frame: the id of
-    its label and its distance, pixels, from the epipolar line of the true motion.
+    """Return one row for each keypoint of a sequence that is tracked into the next frame.
 
-    labels: folder of the label maps. Poses may be those of a camera beside: six centimetres
+    A row has the id of its label and its distance, pixels, from the epipolar line of the true
+    motion. labels: folder of the label maps. Poses may be those of a camera beside: six centimetres
     change the distances by 0.001 pixels.
     """
     rows = []
@@ -112,6 +112,7 @@ def table(root, labels, build, repetitions=REPETITIONS, frames=None):
 
 
 def main():
+    """Write and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kitti", type=Path, required=True, metavar="ROOT")
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR")

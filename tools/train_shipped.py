@@ -48,6 +48,8 @@ CAMVID_IDS = (7, 8, 11, 13, 17, 20, 21, 23, 24, 25, 26)
 
 
 class Phase(NamedTuple):
+    """A part of the training."""
+
     size: int  # height and width of the crops, pixels
     batch_size: int
     epochs: int
@@ -68,7 +70,8 @@ LIGHT = [
 
 
 class Muon(keras.optimizers.Muon):
-    """Keras' Muon, which also takes kernels of convolutions, as matrices (inputs x outputs);
+    """Keras' Muon, which also takes kernels of convolutions, as matrices (inputs x outputs).
+
     Adam does the rest.
     """
 
@@ -76,17 +79,20 @@ class Muon(keras.optimizers.Muon):
         return len(variable.shape) != 4 or 1 in variable.shape[:3]
 
     def zeropower_via_newtonschulz5(self, x, steps):
-        return ops.reshape(
-            super().zeropower_via_newtonschulz5(ops.reshape(x, (-1, x.shape[-1])), steps), x.shape
-        )
+        """Return Muon's orthogonal matrix for a kernel, in the kernel's shape."""
+        matrix = ops.reshape(x, (-1, x.shape[-1]))
+        return ops.reshape(super().zeropower_via_newtonschulz5(matrix, steps), x.shape)
 
     def lr_adjust(self, x):
-        return ops.reshape(super().lr_adjust(ops.reshape(x, (-1, x.shape[-1]))), x.shape)
+        """Return Muon's update of a kernel, scaled by the sides of its matrix."""
+        matrix = ops.reshape(x, (-1, x.shape[-1]))
+        return ops.reshape(super().lr_adjust(matrix), x.shape)
 
 
 def view(image, label, source, look, size, random):
-    """Return a random crop (size x size) of an image and its label map, as another camera would
-    show it.
+    """Return a random crop (size x size) of an image and its label map.
+
+    It is as another camera would show it.
     """
     height, width = label.shape
     across, down = np.array(LOOKS[look]) / FOCAL[source]
@@ -108,8 +114,9 @@ def view(image, label, source, look, size, random):
 
 
 class Views(training.Batches):
-    """Batches of views of the sources ({name: [(image, label map)]}), which depend only on SEED
-    and the epoch.
+    """Batches of views of the sources, which depend only on SEED and the epoch.
+
+    sources: {name: [(image, label map)]}.
     """
 
     def __init__(self, sources, phase):
@@ -139,8 +146,9 @@ class Views(training.Batches):
 
 
 def class_weights(sources, shares_of_batch):
-    """Return the weight of each of the 35 ids in the loss: larger for rare classes, 0 for ids
-    not evaluated.
+    """Return the weight of each of the 35 ids in the loss.
+
+    It is larger for rare classes, and 0 for ids that are not evaluated.
     """
     shares = sum(
         shares_of_batch[name]
@@ -156,8 +164,9 @@ def class_weights(sources, shares_of_batch):
 
 
 def weighted_loss(weights):
-    """Return weighted cross-entropy, which learns fast, plus the Dice loss of the batch's
-    classes, like IoU.
+    """Return weighted cross-entropy plus the Dice loss of the batch's classes.
+
+    The first learns fast, the second is like IoU.
     """
 
     def cross_entropy_and_dice(true, predicted):
@@ -178,8 +187,9 @@ def weighted_loss(weights):
 
 
 def train(camvid, kitti_semantic, pseudo, folder):
-    """Train in a folder; return (twin, model), which share all but the last phase, and KITTI's
-    held-out pairs.
+    """Train in a folder; return (twin, model) and KITTI's held-out pairs.
+
+    Twin and model share all but the last phase.
     """
     sets = {
         name: cityscapes.pairs(root, "train")
@@ -287,6 +297,7 @@ def measured(model, pairs):
 
 
 def main(arguments=None):
+    """Train the shipped model anew, and write it with its card."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("camvid", type=Path, help="folder with train, trainannot, val and valannot")
     parser.add_argument("kitti_semantic", type=Path, help="folder with train and trainannot")

@@ -14,34 +14,38 @@ from thesis_repro.report.style import BLUE, ORANGE, SKY
 def figure_3_03(
     image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, label: Label
 ) -> Figure:
-    """Figure 3.3: intersection and union of a prediction and its label map for one class (Equation
-    3.1).
+    """Figure 3.3: intersection and union of a prediction and its label map for one class.
 
-    image: (h, w) gray or (h, w, 3) RGB.
+    Equation 3.1. image: (h, w) gray or (h, w, 3) RGB.
     """
-    true, predicted = label_map == label.id, prediction == label.id
-    intersection, union = (true & predicted).sum(), (true | predicted).sum()
-    figure, axes = style.new_figure(1, 3, height=2.9)
+    true = label_map == label.id
+    predicted = prediction == label.id
+    both = true & predicted
+    intersection, union = both.sum(), (true | predicted).sum()
+    iou = intersection / max(union, 1)
+    panels = {
+        f"label map: {true.sum():,} pixels": {BLUE: true},
+        f"prediction: {predicted.sum():,} pixels": {BLUE: predicted},
+        f"IoU = {intersection:,} / {union:,} = {iou:.2f}": {
+            ORANGE: true & ~predicted,
+            SKY: predicted & ~true,
+            BLUE: both,
+        },
+    }
     dimmed = np.dstack([image] * 3)[..., :3] // 3 + 150
-    for panel, areas, title in (
-        (axes[0], {BLUE: true}, f"label map: {true.sum():,} pixels"),
-        (axes[1], {BLUE: predicted}, f"prediction: {predicted.sum():,} pixels"),
-        (
-            axes[2],
-            {ORANGE: true & ~predicted, SKY: predicted & ~true, BLUE: true & predicted},
-            f"IoU = {intersection:,} / {union:,} = {intersection / max(union, 1):.2f}",
-        ),
-    ):
+    figure, axes = style.new_figure(1, 3, height=2.9)
+    for panel, (title, areas) in zip(axes, panels.items(), strict=True):
         picture = dimmed.copy()
         for color, area in areas.items():
             picture[area] = 255 * np.array(to_rgb(color))
         style.show_image(panel, picture, title)
+    handles = [
+        Patch(color=BLUE, label="intersection"),
+        Patch(color=ORANGE, label="only in the label map"),
+        Patch(color=SKY, label="only in the prediction"),
+    ]
     figure.legend(
-        handles=[
-            Patch(color=BLUE, label="intersection"),
-            Patch(color=ORANGE, label="only in the label map"),
-            Patch(color=SKY, label="only in the prediction"),
-        ],
+        handles=handles,
         title=f"class {label.name}; the three colours together are the union",
         title_fontsize=8,
         loc="outside lower center",
@@ -57,21 +61,15 @@ def figure_3_06(
     mask: np.ndarray,
     dilation_width: int,
 ) -> Figure:
-    """Figure 3.6: a frame, its predicted label map, the Canny edges of the label map, and the
-    edges dilated.
-    """
-    return style.pictures(
-        frame,
-        {
-            "frame": frame,
-            "predicted label map": style.label_colors(label_map, frame),
-            # thin lines would drop out where the picture is reduced
-            "Canny edges (5, 15) of the label map, drawn wider": dilate(edge_image, 5),
-            f"edges dilated by {dilation_width}x{dilation_width}": mask,
-        },
-        columns=2,
-        label_maps=[label_map],
-    )
+    """Figure 3.6: a frame, its predicted label map, its Canny edges and the edges dilated."""
+    pictures = {
+        "frame": frame,
+        "predicted label map": style.label_colors(label_map, frame),
+        # thin lines would drop out where the picture is reduced
+        "Canny edges (5, 15) of the label map, drawn wider": dilate(edge_image, 5),
+        f"edges dilated by {dilation_width}x{dilation_width}": mask,
+    }
+    return style.pictures(frame, pictures, columns=2, label_maps=[label_map])
 
 
 def figure_masks(
@@ -80,15 +78,17 @@ def figure_masks(
     keypoints: dict[str, np.ndarray],
     true_edges: np.ndarray | None = None,
 ) -> Figure:
-    """Figure "masks": one frame with several masks. The kept area is light; true boundaries are
-    drawn on it.
+    """Figure "masks": one frame with several masks.
 
+    The kept area is light; true boundaries are drawn on it.
     masks: {title: (h, w)}. keypoints: {title: (n, 2)}. true_edges: (h, w), 255 on boundaries, or
     None if unknown.
     """
-    edges = np.zeros_like(frame) if true_edges is None else dilate(true_edges, 3)
-    pictures = {
-        title: style.with_edges(np.where(mask > 0, frame // 2 + 127, frame // 3), edges)
-        for title, mask in masks.items()
-    }
+    edges = np.zeros_like(frame)
+    if true_edges is not None:
+        edges = dilate(true_edges, 3)
+    pictures = {}
+    for title, mask in masks.items():
+        shaded = np.where(mask > 0, frame // 2 + 127, frame // 3)
+        pictures[title] = style.with_edges(shaded, edges)
     return style.pictures(frame, pictures, keypoints, columns=2)

@@ -1,5 +1,6 @@
-"""Figures 4.2 to 4.16: single frames, errors in metres, and keypoints. comparison.py shows ratios
-of errors.
+"""Figures 4.2 to 4.16: single frames, errors in metres, and keypoints.
+
+`thesis_repro.report.comparison` shows ratios of errors.
 
 `runs` is the table of `runner.run_jobs`. Lines and bars show the mean over repetitions, or the
 only run.
@@ -41,8 +42,9 @@ BAND = "lowest to highest of the repetitions"
 def figure_4_02(
     image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, model_name: str
 ) -> plt.Figure:
-    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction
-    (Section 4.1).
+    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction.
+
+    Section 4.1.
     """
     figure, axes = style.new_figure(1, 3, height=2.5)
     style.show_image(axes[0], image, "image")
@@ -55,28 +57,26 @@ def figure_4_02(
 def figure_4_03(
     frame: np.ndarray, prediction: np.ndarray, title: str, label_map: np.ndarray | None = None
 ) -> plt.Figure:
-    """Figure 4.3: a KITTI frame, its predicted label map at the network's size, and its true
-    label map if known.
+    """Figure 4.3: a KITTI frame and its predicted label map at the network's size.
+
+    If the true label map is known, it stands below.
     """
-    label_maps = {"prediction": prediction} | (
-        {} if label_map is None else {"true label map": label_map}
-    )
-    pictures = {
-        text: style.label_colors(label_map, frame) for text, label_map in label_maps.items()
-    }
-    return style.pictures(frame, {title: frame} | pictures, label_maps=label_maps.values())
+    label_maps = {"prediction": prediction}
+    if label_map is not None:
+        label_maps["true label map"] = label_map
+    pictures = {title: frame}
+    for name, classes in label_maps.items():
+        pictures[name] = style.label_colors(classes, frame)
+    return style.pictures(frame, pictures, label_maps=label_maps.values())
 
 
 def figure_4_04(
     frame: np.ndarray, edge_image: np.ndarray, keypoints: np.ndarray, title: str
 ) -> plt.Figure:
-    """Figure 4.4: the keypoints, (n, 2) pixels, that the mask keeps along the predicted
-    boundaries.
-    """
+    """Figure 4.4: the keypoints, (n, 2) pixels, that the mask keeps along predicted boundaries."""
     figure, (axes,) = style.frame_panels(frame)
-    brighter = np.clip(230 * (frame / max(np.percentile(frame, 98), 1)) ** 0.6, 0, 255).astype(
-        np.uint8
-    )
+    bright = max(np.percentile(frame, 98), 1)
+    brighter = np.clip(230 * (frame / bright) ** 0.6, 0, 255).astype(np.uint8)
     style.show_image(axes, style.with_edges(brighter, edge_image), title)
     axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
     return figure
@@ -91,28 +91,31 @@ def figure_4_05(
     dilation_width: int,
     title: str,
 ) -> plt.Figure:
-    """Figure 4.5: the procedure in five panels: frame, all keypoints, prediction, dilated
-    edges, kept keypoints.
+    """Figure 4.5: the procedure in five panels.
+
+    They are the frame, all keypoints, the prediction, its dilated edges and the kept keypoints.
     """
     all_title = f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints"
     kept_title = f"(e) the {len(kept_keypoints)} keypoints that the mask keeps"
-    return style.pictures(
-        frame,
-        {
-            f"(a) {title}": frame,
-            all_title: frame,
-            "(c) prediction": style.label_colors(prediction, frame),
-            f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask,
-            kept_title: frame,
-        },
-        {all_title: all_keypoints, kept_title: kept_keypoints},
-        label_maps=[prediction],
-    )
+    pictures = {
+        f"(a) {title}": frame,
+        all_title: frame,
+        "(c) prediction": style.label_colors(prediction, frame),
+        f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask,
+        kept_title: frame,
+    }
+    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
+    return style.pictures(frame, pictures, keypoints, label_maps=[prediction])
+
+
+# around a keypoint of the frame before
+RING: dict[str, Any] = {"s": 34, "facecolors": "none", "edgecolors": PINK, "linewidths": 1.1}
 
 
 def figure_4_08(views: list[View], title: str) -> plt.Figure:
-    """Figure 4.8: one place in consecutive frames, where keypoints jump. views: from
-    `flicker.follow`.
+    """Figure 4.8: one place in consecutive frames, where keypoints jump.
+
+    views: from `flicker.follow_window`.
     """
     figure, axes = style.new_figure(1, len(views), height=3.4)
     for panel, view in zip(axes, views, strict=True):
@@ -120,35 +123,27 @@ def figure_4_08(views: list[View], title: str) -> plt.Figure:
         text = f"frame {view.frame}: {len(view.keypoints)} keypoints"
         if view.expected is not None:
             text += f";\n{view.jumped} of {len(view.expected)} rings without a keypoint"
-            panel.scatter(
-                *view.expected.T, s=34, facecolors="none", edgecolors=PINK, linewidths=1.1
-            )
+            panel.scatter(*view.expected.T, **RING)
         style.show_image(panel, style.with_edges(view.crop, view.edges), text)
         panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
         # a circle at the border would widen the panel
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    marker: dict[str, Any] = {"linestyle": "none", "marker": "o"}
-    figure.legend(
-        handles=[
-            Patch(
-                color=tuple(np.array(EDGE_COLOR) / 255), label="edges of the predicted label map"
-            ),
-            Line2D([], [], **marker, markersize=4, color=KEYPOINT["color"], label="keypoints"),
-            Line2D(
-                [],
-                [],
-                **marker,
-                markersize=6,
-                markerfacecolor="none",
-                color=PINK,
-                label="where keypoints of the frame before are now",
-            ),
-        ],
-        loc="outside lower center",
-        ncols=3,
-    )
+    edge_color = tuple(np.array(EDGE_COLOR) / 255)
+    circle: dict[str, Any] = {"linestyle": "none", "marker": "o"}
+    dot = circle | {"markersize": 4, "color": KEYPOINT["color"]}
+    ring = circle | {"markersize": 6, "markerfacecolor": "none", "color": PINK}
+    handles = [
+        Patch(color=edge_color, label="edges of the predicted label map"),
+        Line2D([], [], **dot, label="keypoints"),
+        Line2D([], [], **ring, label="where keypoints of the frame before are now"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
     figure.suptitle(title, fontsize=9)
     return figure
+
+
+# by how much errors may be enlarged in a figure of paths
+ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100)
 
 
 def figure_paths(
@@ -157,8 +152,7 @@ def figure_paths(
     paths: dict[tuple[str, str], np.ndarray],
     method: str,
 ) -> plt.Figure:
-    """Figures 4.6, 4.11, 4.12: the paths from above, and below each path its distance to the ground
-    truth.
+    """Figures 4.6, 4.11, 4.12: the paths from above, and below each its distance to the truth.
 
     Small errors are enlarged in the paths, by a factor that is in the panel's title.
     truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method;
@@ -182,29 +176,16 @@ def figure_paths(
     errors = compare.spread(rows, "rmse")
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
         true = truths[name]
-        along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(true, axis=0), axis=1))])
         above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
-        # paths meet at frame 1, as for the RMSE
-        distances = [
-            paths[name, run] - paths[name, run][1] - (true - true[1]) for run in runs["run"]
-        ]
-        room = 0.15 * np.ptp(true[:, [0, 2]], axis=0).max() / max(np.abs(distances).max(), 1e-9)
-        factor = max(scale for scale in (1, 2, 5, 10, 20, 50, 100) if scale <= max(room, 1))
-        for repetition, distance in enumerate(distances):
-            line = {
-                "color": METHODS[method][1],
-                "linewidth": 0.6,
-                "alpha": 0.45,
-                "label": "matched points shuffled",
-            }
-            if repetition == 0:
-                line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
-            drawn = true + factor * distance
-            above.plot(drawn[:, 0], drawn[:, 2], **line)
-            below.plot(along, np.linalg.norm(distance, axis=1), **line)
+        estimates = [paths[name, run] for run in runs["run"]]
+        factor = _draw_estimates(above, below, true, estimates, METHODS[method][1])
         row = errors.loc[name]
-        span = f" ({row['lowest']:.2g}-{row['highest']:.2g})" if len(runs) > 1 else ""
-        enlarged = f"errors x{factor} in the path" if factor > 1 else "errors not enlarged"
+        span = ""
+        if len(runs) > 1:
+            span = f" ({row['lowest']:.2g}-{row['highest']:.2g})"
+        enlarged = "errors not enlarged"
+        if factor > 1:
+            enlarged = f"errors x{factor} in the path"
         above.set_title(f"{name}: {row['mean']:.2g}{span} m\n{enlarged}", fontsize=8)
         above.set_aspect("equal", adjustable="datalim")
         below.set_ylim(0, None)
@@ -216,22 +197,51 @@ def figure_paths(
         above.set_ylabel("z (m) over x (m)", fontsize=7.5)
         below.set_ylabel("distance (m)", fontsize=7.5)
     style.legend_below(figure, axes[0, :1], 3)
-    repeated = ", mean (lowest-highest of the repetitions)" if rows["repetition"].any() else ""
+    repeated = ""
+    if rows["repetition"].any():
+        repeated = ", mean (lowest-highest of the repetitions)"
     figure.suptitle(f"sequence: RMSE{repeated}", fontsize=9)
     return figure
 
 
-def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
-    """Figure 4.7: the keypoints that masks keep, as a part of the thesis's 2000, against
-    dilation width.
+def _draw_estimates(
+    above: plt.Axes, below: plt.Axes, true: np.ndarray, estimates: list[np.ndarray], color: str
+) -> int:
+    """Draw estimated paths from above, and below their distances to the true path.
+
+    true, estimates: positions (n, 3). Returns the factor by which errors are enlarged above.
     """
-    masked = compare.of_method(runs, "masked")
-    kept = (
-        masked.groupby(["sequence", "dilation_width"])["mean_keypoints"].mean().unstack()
-        / THESIS.max_keypoints
-    )
+    # paths meet at frame 1, as for the RMSE
+    differences = [estimate - estimate[1] - (true - true[1]) for estimate in estimates]
+    largest = max(np.abs(differences).max(), 1e-9)
+    extent = np.ptp(true[:, [0, 2]], axis=0).max()
+    room = max(0.15 * extent / largest, 1)
+    factor = max(scale for scale in ENLARGEMENTS if scale <= room)
+    steps = np.linalg.norm(np.diff(true, axis=0), axis=1)
+    along = np.concatenate([[0], np.cumsum(steps)])
+    for repetition, difference in enumerate(differences):
+        line: dict[str, Any] = {
+            "color": color,
+            "linewidth": 0.6,
+            "alpha": 0.45,
+            "label": "matched points shuffled",
+        }
+        if repetition == 0:
+            line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
+        drawn = true + factor * difference
+        above.plot(drawn[:, 0], drawn[:, 2], **line)
+        below.plot(along, np.linalg.norm(difference, axis=1), **line)
+    return factor
+
+
+def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
+    """Figure 4.7: the keypoints that masks keep against dilation width.
+
+    They are shown as a part of the thesis's 2000.
+    """
+    keypoints = _by_width(compare.of_method(runs, "masked"), "mean_keypoints")
     figure, axes = style.new_figure(height=4.0)
-    _lines(axes, kept)
+    _lines(axes, keypoints / THESIS.max_keypoints)
     axes.set(
         xlabel="dilation width (pixels)",
         ylabel=f"keypoints, part of {THESIS.max_keypoints}",
@@ -256,7 +266,7 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
-    _lines(axes, masked.groupby(["sequence", "dilation_width"])[metric].mean().unstack())
+    _lines(axes, _by_width(masked, metric))
     axes.set(
         xlabel="dilation width (pixels)",
         ylabel=label,
@@ -265,51 +275,41 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     )
     _, panels = style.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
-        errors = compare.spread(masked[masked["sequence"] == name], metric, by="dilation_width")
-        panel.vlines(
-            errors.index,
-            errors["lowest"],
-            errors["highest"],
-            color=MASKED,
-            alpha=0.35,
-            linewidth=4,
-            label=f"masked, {BAND}",
-        )
-        panel.plot(
-            errors.index,
-            errors["mean"],
-            color=MASKED,
-            marker="o",
-            markersize=2,
-            linewidth=1.1,
-            label="masked, mean",
-        )
+        of_sequence = masked[masked["sequence"] == name]
+        _draw_repetitions(panel, compare.spread(of_sequence, metric, by="dilation_width"))
         row = baseline.loc[name]
-        panel.axhspan(
-            row["lowest"],
-            row["highest"],
-            color=BASELINE,
-            alpha=0.2,
-            linewidth=0,
-            label=f"all keypoints, {BAND}",
-        )
-        panel.axhline(
-            row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean"
-        )
+        band: dict[str, Any] = {"color": BASELINE, "alpha": 0.2, "linewidth": 0}
+        panel.axhspan(row["lowest"], row["highest"], **band, label=f"all keypoints, {BAND}")
+        mean: dict[str, Any] = {"color": BASELINE, "linestyle": "--", "linewidth": 1.1}
+        panel.axhline(row["mean"], **mean, label="all keypoints, mean")
         panel.set_ylim(0, None)
     below.supylabel(label, fontsize=8)
     style.legend_below(below, panels, 2)
     return figure
 
 
+def _draw_repetitions(panel: plt.Axes, errors: pd.DataFrame) -> None:
+    """Draw the errors with masks against dilation width.
+
+    errors: mean, lowest and highest, one row a width.
+    """
+    bar: dict[str, Any] = {"color": MASKED, "alpha": 0.35, "linewidth": 4}
+    lowest, highest = errors["lowest"], errors["highest"]
+    panel.vlines(errors.index, lowest, highest, **bar, label=f"masked, {BAND}")
+    line: dict[str, Any] = {"color": MASKED, "marker": "o", "markersize": 2, "linewidth": 1.1}
+    panel.plot(errors.index, errors["mean"], **line, label="masked, mean")
+
+
 def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
-    """Figures 4.13, 4.15: the metric with all keypoints, the best mask and plainly reduced
-    keypoints, all sequences.
+    """Figures 4.13, 4.15: the metric of all sequences with the three METHODS.
+
+    These are all keypoints, the best mask and plainly reduced keypoints.
     """
     names, tables = _spread_by_method(runs, metric)
     figure, axes = style.new_figure(height=3.2)
     for offset, (method, table) in enumerate(tables.items()):
-        _bar(axes, np.arange(len(names)) + (offset - 1) * 0.27, table, 0.25, method)
+        positions = np.arange(len(names)) + (offset - 1) * 0.27
+        _bar(axes, positions, table, 0.25, method)
     axes.set_xticks(range(len(names)), names)
     axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
     axes.grid(axis="x", visible=False)
@@ -318,8 +318,9 @@ def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
 
 
 def figure_of_sequences(runs: pd.DataFrame, metric: str) -> plt.Figure:
-    """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel with a scale of its own
-    for each sequence.
+    """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel a sequence.
+
+    Each panel has a scale of its own.
     """
     names, tables = _spread_by_method(runs, metric)
     figure, panels = style.small_panels(names)
@@ -333,6 +334,11 @@ def figure_of_sequences(runs: pd.DataFrame, metric: str) -> plt.Figure:
     return figure
 
 
+def _by_width(runs: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return means over the repetitions, one row a sequence and one column a dilation width."""
+    return runs.groupby(["sequence", "dilation_width"])[column].mean().unstack()
+
+
 def _lines(axes: plt.Axes, table: pd.DataFrame) -> None:
     """Draw one line for each row of a table with one column for each dilation width."""
     for index, (name, row) in enumerate(table.iterrows()):
@@ -342,13 +348,15 @@ def _lines(axes: plt.Axes, table: pd.DataFrame) -> None:
 
 
 def _spread_by_method(runs: pd.DataFrame, metric: str) -> tuple[list[str], dict[str, pd.DataFrame]]:
-    """Return the sequences and, for each method of the thesis, a table (mean, lowest, highest)
-    with one row each.
+    """Return the sequences and a table for each method of the thesis.
+
+    A table has one row a sequence: mean, lowest, highest.
     """
     tables = {}
     for method in METHODS:
         rows = compare.of_method(runs, method)
-        rows = thesis_tables.of_chosen_width(rows) if method == "masked" else rows
+        if method == "masked":
+            rows = thesis_tables.of_chosen_width(rows)
         tables[method] = compare.spread(rows, metric)
     names = sorted(tables["baseline"].index)
     return names, {method: table.reindex(names) for method, table in tables.items()}
@@ -361,22 +369,12 @@ def _bar(
     width: float,
     method: str,
 ) -> None:
-    """Draw bars at the means of a table, with error bars from lowest to highest of the
-    repetitions.
-    """
+    """Draw bars at the means of a table, with error bars from lowest to highest repetition."""
     label, color, hatch = METHODS[method]
-    axes.bar(
-        positions,
-        table["mean"],
-        width,
-        label=label,
-        color=color,
-        hatch=hatch,
-        edgecolor="white",
-        linewidth=0,
-    )
+    look: dict[str, Any] = {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0}
+    axes.bar(positions, table["mean"], width, label=label, **look)
     table = table.where(table["highest"] > table["lowest"])  # a single run has no error bar
-    errors = [table["mean"] - table["lowest"], table["highest"] - table["mean"]]
-    axes.errorbar(
-        positions, table["mean"], yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2
-    )
+    mean = table["mean"]
+    errors = [mean - table["lowest"], table["highest"] - mean]
+    line: dict[str, Any] = {"fmt": "none", "ecolor": "black", "elinewidth": 0.9, "capsize": 2}
+    axes.errorbar(positions, mean, yerr=errors, **line)

@@ -1,5 +1,6 @@
-"""How masked keypoints jump from frame to frame, which the thesis names as a cause of errors
-(Sections 4.2, 5.1).
+"""How masked keypoints jump from frame to frame.
+
+The thesis names it as a cause of errors (Sections 4.2, 5.1).
 """
 
 from collections.abc import Sequence
@@ -25,15 +26,15 @@ class View(NamedTuple):
     jumped: int  # number of expected points without a keypoint of this frame within SAME pixels
 
 
-def follow(
+def follow_window(
     frames: Sequence[np.ndarray],
     label_maps: Sequence[np.ndarray],
     dilation_width: int,
     first: int = 0,
 ) -> list[View]:
-    """Show how masked keypoints jump between consecutive frames (Figure 4.8). Returns a View of
-    each frame.
+    """Show how masked keypoints jump between consecutive frames (Figure 4.8).
 
+    Returns a View of each frame.
     frames: (height, width) uint8 each. label_maps: one for each frame, (h, w) uint8 of any size.
     first: number of the first frame. The window has a quarter of the frame's height. It starts
     where most keypoints jump between the first two frames, or in the middle of the frame if none
@@ -46,10 +47,11 @@ def follow(
         keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
         for frame, edge_image in zip(frames, edge_images, strict=True)
     ]
+    center = size / 2
     tracked, followed = _track(frames[0], frames[1], points[0])
     jumping = points[0][followed & _far(tracked, points[1])]
-    near = np.abs(jumping[:, None] - jumping).max(axis=-1) < half
-    center = jumping[near.sum(axis=1).argmax()] if len(jumping) else size / 2
+    if len(jumping):
+        center = _densest(jumping, half)
     views: list[View] = []
     in_window = expected = np.zeros((0, 2), np.float32)
     for index, (frame, edge_image) in enumerate(zip(frames, edge_images, strict=True)):
@@ -59,38 +61,46 @@ def follow(
             if len(expected):
                 center = center + np.median(expected - in_window[followed], axis=0)
         low = np.clip(np.round(center - half).astype(int), 0, size - 2 * half)
-        crop = np.s_[low[1] : low[1] + 2 * half, low[0] : low[0] + 2 * half]
-        in_window = _inside(points[index], low, low + 2 * half)
-        expected = _inside(expected, low, low + 2 * half)
-        views.append(
-            View(
-                first + index,
-                frame[crop],
-                edge_image[crop],
-                in_window - low,
-                expected - low if index else None,
-                int(_far(expected, points[index]).sum()),
-            )
+        high = low + 2 * half
+        crop = np.s_[low[1] : high[1], low[0] : high[0]]
+        in_window = _inside(points[index], low, high)
+        expected = _inside(expected, low, high)
+        jumped = int(_far(expected, points[index]).sum())
+        shown_expected = None
+        if index:
+            shown_expected = expected - low
+        view = View(
+            first + index, frame[crop], edge_image[crop], in_window - low, shown_expected, jumped
         )
+        views.append(view)
     return views
+
+
+def _densest(points: np.ndarray, half: int) -> np.ndarray:
+    """Return the point with most points in the window around it, which reaches `half` pixels."""
+    near = np.abs(points[:, None] - points).max(axis=-1) < half
+    return points[near.sum(axis=1).argmax()]
 
 
 def _track(
     before: np.ndarray, after: np.ndarray, corners: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track keypoints (n, 2) to the next frame; returns their positions and whether tracking
-    back agrees with them.
+    """Track keypoints (n, 2) to the next frame.
+
+    Returns their positions (n, 2) there and whether tracking back agrees with them, (n,) bool.
     """
     if not len(corners):
         return corners, np.zeros(0, bool)
     tracked, followed = keypoints.track(before, after, corners)
     back, returned = keypoints.track(after, before, tracked)
-    return tracked, followed & returned & (np.linalg.norm(back - corners, axis=1) < SAME)
+    agrees = np.linalg.norm(back - corners, axis=1) < SAME
+    return tracked, followed & returned & agrees
 
 
 def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the points inside a window with the corners `low` and `high`."""
-    return points[((points >= low) & (points < high)).all(axis=1)]
+    inside = (points >= low) & (points < high)
+    return points[inside.all(axis=1)]
 
 
 def _far(points: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -112,10 +122,9 @@ def found_again(
     Lucas-Kanade tracks it to within SAME pixels of a keypoint of the second frame. The masks are
     for the detector, (height, width) uint8.
     """
-    before, after = (
-        keypoints.detect(first, THESIS, first_mask),
-        keypoints.detect(second, THESIS, second_mask),
-    )
+    before = keypoints.detect(first, THESIS, first_mask)
+    after = keypoints.detect(second, THESIS, second_mask)
     tracked, followed = _track(first, second, before)
     again = followed & ~_far(tracked, after)
-    return before[again], tracked[again], before[~again], after[_far(after, tracked[again])]
+    new = _far(after, tracked[again])
+    return before[again], tracked[again], before[~again], after[new]

@@ -1,5 +1,6 @@
-"""The audit's rows and the measurements that are joined to them; the gap between domains, and the
-recorded trainings.
+"""The audit's rows and the measurements that are joined to them.
+
+Also the gap between domains, and the recorded trainings.
 """
 
 from types import SimpleNamespace

@@ -35,8 +35,9 @@ COMMAND = [
 
 @pytest.fixture
 def start(tmp_path):
-    """start(*cells): start nbconvert, as the Makefile does, on a notebook of these cells; command:
-    another command that does so.
+    """Return a function that starts nbconvert, as the Makefile does, on a notebook of its cells.
+
+    command: another command that does so.
     """
 
     def started(*cells, command=COMMAND):

@@ -1,5 +1,6 @@
-"""Figures of chapter 2 and of frames show the numbers of the data and can be read; axes that
-figures share; the video of the odometry.
+"""Figures of chapter 2 and of frames show the numbers of the data and can be read.
+
+Also the axes that figures share, and the video of the odometry.
 """
 
 import cv2
@@ -60,7 +61,8 @@ LABEL_MAP[40:75, 100:130], LABEL_MAP[:30], LABEL_MAP[80:90, 300:330] = (
     ID["license plate"],
 )
 MOVED = np.roll(LABEL_MAP, 14, axis=1)
-MASK = 255 * (LABEL_MAP == ID["car"]).astype(np.uint8)
+MASK = BLANK.copy()
+MASK[40:75, 100:130] = 255  # on the car
 POINTS = np.array([[110.0, 50.0], [120.0, 60.0]])
 DRAWN = {
     "2.2": lambda: chapter2.figure_2_02(*convolution()),
@@ -88,10 +90,10 @@ DRAWN = {
     "4.4": lambda: chapter4.figure_4_04(FRAME, MASK, POINTS, "sequence 00"),
     "4.5": lambda: chapter4.figure_4_05(FRAME, POINTS, LABEL_MAP, MASK, POINTS, 10, "sequence 00"),
     "4.8": lambda: chapter4.figure_4_08(
-        flicker.follow([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"
+        flicker.follow_window([FRAME] * 3, [LABEL_MAP, MOVED, MOVED], 5), "00"
     ),
     "4.8 without keypoints": lambda: chapter4.figure_4_08(
-        flicker.follow([FRAME] * 2, [BLANK] * 2, 5), "00"
+        flicker.follow_window([FRAME] * 2, [BLANK] * 2, 5), "00"
     ),
     "paths": lambda: trajectories.figure(
         {"masked": turning(), "$all$": 2 * turning()}, turning(), "sequence 00"
@@ -160,7 +162,7 @@ def test_keypoints_jump_with_a_moving_boundary_alone():
     frame = textured(size=(120, 240))
     car = np.where(MASK[:, :240] > 0, ID["car"], ID["road"]).astype(np.uint8)
     still, jumping = (
-        flicker.follow([frame, frame], [car, later], 5, first=7)
+        flicker.follow_window([frame, frame], [car, later], 5, first=7)
         for later in (car, np.roll(car, 14, 1))
     )
     assert [view.frame for view in still] == [7, 8] and still[0].expected is None

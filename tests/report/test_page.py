@@ -30,8 +30,9 @@ ARTEFACTS = [
 
 
 class Reader(HTMLParser):
-    """The text of a page and its elements as (tag, attributes); fails if tags are not closed in
-    order.
+    """The text of a page and its elements as (tag, attributes).
+
+    Fails if tags are not closed in order.
     """
 
     def __init__(self, text):
@@ -143,8 +144,9 @@ document.querySelector("pre").textContent = JSON.stringify(faults); }</script>""
 
 
 def faults_in_a_browser(folder, scratch):
-    """Faults of a page at 400 and 1400 pixels, unfolded: too wide, missing images, dead links
-    and overlapping texts.
+    """Faults of a page at 400 and 1400 pixels, unfolded.
+
+    They are a page that is too wide, missing images, dead links and overlapping texts.
     """
     (folder / "probe.html").write_text(PROBE)  # a window cannot be as narrow
     dumped = subprocess.run(

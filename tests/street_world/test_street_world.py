@@ -1,5 +1,6 @@
-"""The embedded world: exact poses and label maps, equal bytes for equal seeds, both layouts,
-errors and resuming.
+"""The embedded world: exact poses and label maps, equal bytes for equal seeds, both layouts.
+
+Also its errors and resuming.
 """
 
 import shutil

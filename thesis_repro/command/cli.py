@@ -126,7 +126,7 @@ def odometry(options: Any) -> None:
     from thesis_repro.data import kitti
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
-    from thesis_repro.report import texts
+    from thesis_repro.report.record import run_record
 
     changes = {
         field.name: vars(options)[field.name]
@@ -154,7 +154,7 @@ def odometry(options: Any) -> None:
     if sequence.has_truth:
         _warn(oddities.of_path(sequence.name, result.poses, sequence.poses))
     _warn(oddities.of_steps(sequence.name, result.failed, len(sequence)))
-    record = texts.run_record(result, sequence)
+    record = run_record(result, sequence)
     if options.video:
         from thesis_repro.report import video
 

@@ -1,5 +1,4 @@
-"""The audit: where the thesis contradicts itself, its code or its libraries, and the measured
-effect of each.
+"""The audit: where the thesis contradicts itself, its code or its libraries, and what that does.
 
 audit.json holds the rows and lists which columns are measured for them. `table` joins the
 measurements to the rows. Ratios come from `study.compare`. Intervals are those of Student's t over
@@ -7,6 +6,7 @@ measurements to the rows. Ratios come from `study.compare`. Intervals are those 
 """
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -27,20 +27,22 @@ NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n
 def measurement(
     row: str, quantity: str, values: Any, unit: str = "", **more: Any
 ) -> dict[str, Any]:
-    """Return one measurement for a row of the audit: the mean of one or several values, its
-    interval and their number.
+    """Return one measurement for a row of the audit: a mean, its interval and number of values.
 
     quantity: a text, or the key of one in audit.json. more: further columns (metric, estimator,
     frames, data).
     """
     numbers = np.asarray(values, float).ravel()
     numbers = numbers[~np.isnan(numbers)]
+    mean = np.nan
+    if len(numbers):
+        mean = numbers.mean()
     low, high = compare.mean_interval(numbers)
     return {
         "row": row,
         "quantity": WORDS["quantities"].get(quantity, quantity),
         "unit": unit,
-        "value": numbers.mean() if len(numbers) else np.nan,
+        "value": mean,
         "low": low,
         "high": high,
         "n": len(numbers),
@@ -51,52 +53,41 @@ def measurement(
 def ratio(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the geometric mean of one ratio a sequence."""
     mean = compare.geometric_mean(ratios)
-    return measurement(
-        row,
-        quantity,
-        [],
-        "ratio",
-        value=mean["ratio"],
-        low=mean["low"],
-        high=mean["high"],
-        n=mean["n"],
-        **more,
-    )
+    interval = {"low": mean["low"], "high": mean["high"], "n": mean["n"]}
+    return measurement(row, quantity, [], "ratio", value=mean["ratio"], **interval, **more)
 
 
 def table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
-    """Return the audit as a table with one line a measurement. The first line of each row has the
-    row's texts.
+    """Return the audit as a table with one line a measurement.
 
-    data: the origin of measurements that name none. Numbers are rounded (see `rounded`). Raises
-    ValueError if a measurement's row is not in audit.json.
+    The first line of each row has the row's texts. data: the origin of measurements that name none.
+    Numbers are rounded (see `rounded`). Raises ValueError if a measurement's row is not in
+    audit.json.
     """
-    words = pd.DataFrame(WORDS["rows"]).rename(
-        columns={"does": "the thesis or its code", "right": "what would be right"}
-    )
-    numbers = (
-        pd.DataFrame(measurements)
-        .reindex(columns=["row", *NUMBERS])
-        .astype(dict.fromkeys(TEXTS, object))
-    )
-    unknown = set(numbers["row"]) - set(words["row"])
+    headings = {"does": "the thesis or its code", "right": "what would be right"}
+    words = pd.DataFrame(WORDS["rows"]).rename(columns=headings)
+    numbers = pd.DataFrame(measurements).reindex(columns=["row", *NUMBERS])
+    numbers = numbers.astype(dict.fromkeys(TEXTS, object)).fillna({"data": data})
+    unknown = sorted(set(numbers["row"]) - set(words["row"]))
     if unknown:
-        raise ValueError(
-            f"audit.json has no rows for these measurements: {', '.join(sorted(unknown))}"
-        )
-    lines = words.merge(numbers.fillna({"data": data}), on="row", how="left").fillna(
-        dict.fromkeys(TEXTS, "")
-    )
-    lines.loc[lines["row"].duplicated(), words.columns.drop("row")] = ""
-    lines[["value", "low", "high"]] = lines[["value", "low", "high"]].map(rounded)
+        raise ValueError(f"audit.json has no rows for these measurements: {', '.join(unknown)}")
+    lines = words.merge(numbers, on="row", how="left").fillna(dict.fromkeys(TEXTS, ""))
+    repeated = lines["row"].duplicated()
+    lines.loc[repeated, words.columns.drop("row")] = ""
+    bounds = ["value", "low", "high"]
+    lines[bounds] = lines[bounds].map(rounded)
     return lines.astype({"n": "Int64", "frames": "Int64"})
 
 
 def rounded(value: float) -> float:
-    """Round a number to four significant digits, or to eight close to 1, to show whether an
-    interval excludes 1.
+    """Round a number to four significant digits, or to eight close to 1.
+
+    Eight show whether an interval excludes 1.
     """
-    return float(f"{value:.{8 if abs(value - 1) < 5e-4 else 4}g}")
+    digits = 4
+    if abs(value - 1) < 5e-4:
+        digits = 8
+    return float(f"{value:.{digits}g}")
 
 
 def measured(table: pd.DataFrame, kind: str) -> list[dict[str, Any]]:
@@ -108,65 +99,82 @@ def measured(table: pd.DataFrame, kind: str) -> list[dict[str, Any]]:
     (as in `ablations`), "shares" (of pixels, one row a frame).
     """
     measurements = []
-    requested = [
-        (spec, metric)
-        for spec in WORDS["measured"]
-        if spec["runs"] == kind
-        for metric in spec["metrics"]
-    ]
-    for spec, metric in requested:
-        if metric not in table:
+    for spec in WORDS["measured"]:
+        if spec["runs"] != kind:
             continue
-        by_estimator = "estimator" in table and metric != "mean_keypoints"
-        pairs = [(name, name) for name in compare.ESTIMATORS] if by_estimator else [("", "")]
-        for estimator, reference_estimator in spec.get("estimators", pairs):
-            rows = _select(table, estimator, spec.get("method"), spec.get("widths"))
-            names = {
-                "metric": spec.get("label", WORDS["metrics"].get(metric, "")),
-                "estimator": estimator,
-            }
-            if "unit" in spec:
-                means = rows.groupby("sequence")[metric].mean()
-                measurements.append(
-                    measurement(spec["row"], spec["quantity"], means, spec["unit"], **names)
-                )
-            else:
-                reference = (
-                    rows.assign(**{metric: rows[spec["over"]]})
-                    if "over" in spec
-                    else _select(
-                        table,
-                        reference_estimator,
-                        spec.get("reference"),
-                        spec.get("reference_widths"),
-                    )
-                )
-                ratios = compare.ratios(rows, reference, metric)
-                measurements.append(ratio(spec["row"], spec["quantity"], ratios, **names))
+        for metric in spec["metrics"]:
+            if metric not in table:
+                continue
+            pairs = _estimator_pairs(spec, table, metric)
+            measurements += [_measure(spec, table, metric, *pair) for pair in pairs]
     return _with_frames(measurements, table)
+
+
+def _estimator_pairs(
+    spec: dict[str, Any], table: pd.DataFrame, metric: str
+) -> Iterable[tuple[str, str]]:
+    """Return the estimators to measure, each with that of the reference.
+
+    It is ("", "") where the estimator makes no difference.
+    """
+    if "estimators" in spec:
+        return spec["estimators"]
+    if "estimator" in table and metric != "mean_keypoints":
+        return [(name, name) for name in compare.ESTIMATORS]
+    return [("", "")]
+
+
+def _measure(
+    spec: dict[str, Any],
+    table: pd.DataFrame,
+    metric: str,
+    estimator: str,
+    reference_estimator: str,
+) -> dict[str, Any]:
+    """Return the measurement of one metric and estimator that an entry of audit.json describes."""
+    rows = _select(table, estimator, spec.get("method"), spec.get("widths"))
+    label = spec.get("label", WORDS["metrics"].get(metric, ""))
+    names = {"metric": label, "estimator": estimator}
+    if "unit" in spec:
+        means = rows.groupby("sequence")[metric].mean()
+        return measurement(spec["row"], spec["quantity"], means, spec["unit"], **names)
+    if "over" in spec:
+        reference = rows.assign(**{metric: rows[spec["over"]]})
+    else:
+        widths = spec.get("reference_widths")
+        reference = _select(table, reference_estimator, spec.get("reference"), widths)
+    ratios = compare.ratios(rows, reference, metric)
+    return ratio(spec["row"], spec["quantity"], ratios, **names)
 
 
 def _select(
     table: pd.DataFrame, estimator: str, method: str | None, widths: str | list | None
 ) -> pd.DataFrame:
-    """Select the rows of an estimator, a method and some widths; an empty estimator, or None,
-    selects all.
+    """Select the rows of an estimator, a method and some widths.
+
+    An empty estimator, or None, selects all. widths: a list, "tested" (`compare.tested_width`) or
+    "best" (each sequence's best width, of masks).
     """
     if estimator and "estimator" in table:
         table = table[table["estimator"] == estimator]
     if widths == "best":
         return thesis_tables.of_chosen_width(compare.of_method(table, "masked"))
+    if widths == "tested":
+        widths = [compare.tested_width(table)]
     if widths is not None:
-        widths = [compare.tested_width(table)] if widths == "tested" else widths
         table = table[table["dilation_width"].isin(widths)]
-    return table if method is None else table[table["method"] == method]
+    if method is not None:
+        table = table[table["method"] == method]
+    return table
 
 
 def _with_frames(measurements: list[dict[str, Any]], table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Add the table's mean number of frames a sequence, if known, and drop measurements without
-    values.
+    """Return the measurements that have values, with the number of frames.
+
+    It is the table's mean number of frames a sequence, if known.
     """
-    sequences, frames = table.groupby("sequence"), np.nan
+    frames = np.nan
+    sequences = table.groupby("sequence")
     if "frames" in table:
         frames = round(sequences["frames"].first().mean())
     elif "frame" in table:
@@ -175,57 +183,64 @@ def _with_frames(measurements: list[dict[str, Any]], table: pd.DataFrame) -> lis
 
 
 def of_tables() -> list[dict[str, Any]]:
-    """Return rows 1, 3, 4, 9, 18, 35, 41, 45, 60, 66, 69, 78 and 89: arithmetic on numbers that the
-    thesis reports.
+    """Return the rows that are arithmetic on numbers that the thesis reports.
+
+    They are rows 1, 3, 4, 9, 18, 35, 41, 45, 60, 66, 69, 78 and 89.
     """
-    measurements = []
-    for name, key in (
-        ("RMSE", "table_4_2_rmse_percent_change"),
-        ("MAE", "table_4_3_mae_percent_change"),
-    ):
-        change = pd.Series(REPORTED[key])
-        improved = int((change < 0).sum())
-        sign_test = binomtest(improved, len(change), alternative="greater").pvalue
-        measurements += [
-            measurement("1", "sum", change.sum(), "%", metric=name),
-            measurement("1", "mean", change, "%", metric=name),
-            measurement("1", "median", change.median(), "%", metric=name),
-            ratio("1", "ratio", 1 + change / 100, metric=name),
-            measurement("4", "larger", (change > 0).sum(), "sequences", metric=name),
-            measurement("41", "improved", improved, "sequences", metric=name),
-            measurement("41", "sign", 100 * sign_test, "%", metric=name),
-        ]
+    measurements = _of_changes("RMSE", "table_4_2_rmse_percent_change")
+    measurements += _of_changes("MAE", "table_4_3_mae_percent_change")
     best = pd.DataFrame(REPORTED["table_4_1"])
-    factors, classes = 2000 / best["mean_keypoints"], REPORTED["training"]["classes"]
+    keypoints = best["mean_keypoints"]
+    factors = 2000 / keypoints
+    classes = REPORTED["training"]["classes"]
+    parameters = REPORTED["figure_a1_model_summary"]["rows"][-1]["params"]
+    best_widths = best["dilation_width"].isin(WIDTHS).sum()
     measurements += [
-        measurement("3", "reduction", 2000 / best["mean_keypoints"].mean(), "ratio"),
+        measurement("3", "reduction", 2000 / keypoints.mean(), "ratio"),
         ratio("3", "reduction of each", factors),
         measurement("3", "three", (factors >= 3).sum(), "sequences"),
         measurement("9", "categories", len(LABELS)),
         measurement("9", "outputs", classes),
-        measurement(
-            "9", "parameters", REPORTED["figure_a1_model_summary"]["rows"][-1]["params"] // classes
-        ),
-        measurement("35", "widths", best["dilation_width"].isin(WIDTHS).sum(), "sequences"),
-        measurement("60", "keypoints", best["mean_keypoints"]),
-        *(measurement(**constant) for constant in WORDS["arithmetic"]),
+        measurement("9", "parameters", parameters // classes),
+        measurement("35", "widths", best_widths, "sequences"),
+        measurement("60", "keypoints", keypoints),
     ]
+    measurements += [measurement(**constant) for constant in WORDS["arithmetic"]]
     return [{**measurement, "data": "the thesis's numbers"} for measurement in measurements]
+
+
+def _of_changes(metric: str, key: str) -> list[dict[str, Any]]:
+    """Return rows 1, 4 and 41 for one metric. key: of its changes in percent in reported.json."""
+    change = pd.Series(REPORTED[key])
+    improved = int((change < 0).sum())
+    sign_test = binomtest(improved, len(change), alternative="greater").pvalue
+    larger = (change > 0).sum()
+    return [
+        measurement("1", "sum", change.sum(), "%", metric=metric),
+        measurement("1", "mean", change, "%", metric=metric),
+        measurement("1", "median", change.median(), "%", metric=metric),
+        ratio("1", "ratio", 1 + change / 100, metric=metric),
+        measurement("4", "larger", larger, "sequences", metric=metric),
+        measurement("41", "improved", improved, "sequences", metric=metric),
+        measurement("41", "sign", 100 * sign_test, "%", metric=metric),
+    ]
 
 
 def of_study(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Return rows 2, 31, 35 and those that audit.json lists, from the runs of notebook 08."""
-    masked, baseline = (compare.of_method(runs, method) for method in ("masked", "baseline"))
-    best, stability = (
-        thesis_tables.of_chosen_width(masked),
-        thesis_tables.stability(masked, baseline),
-    )
+    masked = compare.of_method(runs, "masked")
+    baseline = compare.of_method(runs, "baseline")
+    best = thesis_tables.of_chosen_width(masked)
+    stability = thesis_tables.stability(masked, baseline)
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
-    by_rmse, by_mae = (by_width[metric].groupby("sequence").idxmin() for metric in ("rmse", "mae"))
-    rmse_ratios = by_width["rmse"].loc[by_mae].to_numpy() / by_width["rmse"].loc[by_rmse].to_numpy()
+    by_rmse = by_width["rmse"].groupby("sequence").idxmin()
+    by_mae = by_width["mae"].groupby("sequence").idxmin()
+    rmse = by_width["rmse"]
+    rmse_ratios = rmse.loc[by_mae].to_numpy() / rmse.loc[by_rmse].to_numpy()
+    best_ratios = compare.ratios(best, baseline, "rmse")
     widths = thesis_tables.best_widths(masked)["dilation_width"]
     measurements = [
-        ratio("2", "best same", compare.ratios(best, baseline, "rmse"), metric="RMSE"),
+        ratio("2", "best same", best_ratios, metric="RMSE"),
         ratio("31", "mae chooses", rmse_ratios, metric="RMSE"),
         measurement("31", "other width", (by_rmse != by_mae).sum(), "sequences"),
         measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences"),
@@ -236,32 +251,20 @@ def of_study(runs: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return rows 14 and 39, and the rows that audit.json lists, from the runs of
-    `ablations.measure`.
-    """
-    null = ablations.null_distribution(
-        compare.of_method(runs, "baseline", "thesis"),
-        pd.Series(REPORTED["table_4_2_rmse_percent_change"]),
-    )
+    """Return rows 14, 39 and those that audit.json lists, from the runs of `ablations.measure`."""
+    measurements = []
     spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
-    measurements = [
-        *(
-            ratio("14", "spread", factors, metric="RMSE", estimator=estimator)
-            for estimator, factors in spread.groupby("estimator")["factor"]
-        ),
-        *(
-            measurement(
-                "39",
-                f"null {name}",
-                null.loc[name, "expected"],
-                "%",
-                metric="RMSE",
-                low=null.loc[name, "low"],
-                high=null.loc[name, "high"],
-                n=ablations.STUDIES,
-            )
-            for name in ("mean", "median")
-        ),
-        measurement("39", "as low", null.loc["mean", "share_as_low"], "%", metric="RMSE"),
-    ]
+    for estimator, factors in spread.groupby("estimator")["factor"]:
+        measurements.append(ratio("14", "spread", factors, metric="RMSE", estimator=estimator))
+    baseline = compare.of_method(runs, "baseline", "thesis")
+    reported = pd.Series(REPORTED["table_4_2_rmse_percent_change"])
+    null = ablations.null_distribution(baseline, reported)
+    for name in ("mean", "median"):
+        row = null.loc[name]
+        interval = {"low": row["low"], "high": row["high"], "n": ablations.STUDIES}
+        measurements.append(
+            measurement("39", f"null {name}", row["expected"], "%", metric="RMSE", **interval)
+        )
+    as_low = null.loc["mean", "share_as_low"]
+    measurements.append(measurement("39", "as low", as_low, "%", metric="RMSE"))
     return _with_frames(measurements, runs) + measured(runs, "ablations")

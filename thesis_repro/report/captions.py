@@ -1,11 +1,9 @@
-"""The captions of all tables, figures and texts (captions.json), and the numbers of the thesis
-(reported.json).
+"""The captions of all tables, figures and texts, and the numbers of the thesis.
 
-An artefact is a dict with kind ("figure", "table", "text"), name (of its files), title and caption.
-Optional keys: constant: true if it shows no data. needs: the variable that a run on real frames
-must set to make it.
-thesis: what the thesis reports, a dict of data and two Jinja templates, text and here (for this
-run's numbers).
+They stand in captions.json and reported.json. An artefact is a dict with kind ("figure", "table",
+"text"), name (of its files), title and caption. Optional keys: constant: true if it shows no data.
+needs: the variable that a run on real frames must set to make it. thesis: what the thesis reports,
+a dict of data and two Jinja templates, text and here (for this run's numbers).
 """
 
 import json

@@ -1,13 +1,14 @@
-"""Figures and tables of `compare.comparisons`: masks against all keypoints, controls and masks
-from other sources.
+"""Figures and tables of `compare.comparisons`.
+
+They compare masks with all keypoints, with controls and with masks from other sources.
 """
 
 import textwrap
-from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thesis_repro.report import style, texts
@@ -20,58 +21,61 @@ CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one wid
 
 
 def figure_comparison(table: pd.DataFrame) -> Figure:
-    """Draw each method's ratio to all keypoints: its sequences in grey, geometric mean and
-    interval.
+    """Draw each method's ratio to all keypoints.
 
-    The figure has one row of panels for each estimator. Its columns are the judging metrics and the
+    Grey dots are its sequences, the coloured mark is their geometric mean with its interval. The
+    figure has one row of panels for each estimator. Its columns are the judging metrics and the
     thesis's RMSE. With several sources of masks it shows only their masks, not the controls.
     """
     rows = _tested(_over_all_keypoints(table))
     if rows["source"].nunique() > 1:  # controls of every source would be dozens of rows
         rows = rows[rows["method"] == "masked"]
-    labels = _labels(rows)
-    order = list(labels.unique())
+    rows = rows.assign(label=_labels(rows))
+    order = list(rows["label"].unique())
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
     metrics = [name for name in SHOWN if (rows["metric"] == name).any()]
+    height = 0.7 + (0.9 + 0.21 * len(order)) * len(estimators)
     figure, axes = style.new_figure(
-        len(estimators),
-        len(metrics),
-        squeeze=False,
-        sharey=True,
-        height=0.7 + (0.9 + 0.21 * len(order)) * len(estimators),
+        len(estimators), len(metrics), squeeze=False, sharey=True, height=height
     )
-    for panel, (estimator, metric) in zip(axes.flat, product(estimators, metrics), strict=True):
-        for index, row in rows[
-            (rows["estimator"] == estimator) & (rows["metric"] == metric)
-        ].iterrows():
-            y, color = order.index(labels[index]), MASKED if row["method"] == "masked" else BASELINE
-            values = row[_sequences(table)].dropna().astype(float)
-            panel.plot(
-                values,
-                [y - 0.22] * len(values),
-                "o",
-                color="#555555",
-                alpha=0.45,
-                markersize=3,
-                markeredgewidth=0,
-            )
-            panel.plot([row["low"], row["high"]], [y + 0.1] * 2, color=color, linewidth=2.2)
-            panel.plot(
-                row["ratio"], y + 0.1, "D", color=color, markersize=5, markeredgecolor="white"
-            )
-        panel.axvline(1, color="black", linewidth=0.8)
-        panel.grid(axis="y", visible=False)
-        panel.set_yticks(range(len(order)), order)
-        panel.set_ylim(len(order) - 0.5, -0.6)
-        panel.tick_params(labelsize=7)
-        style.ratio_axis(panel.xaxis, np.concatenate([line.get_xdata() for line in panel.lines]))
+    for panels, estimator in zip(axes, estimators, strict=True):
+        panels[0].set_ylabel(ESTIMATORS[estimator])
+        for panel, metric in zip(panels, metrics, strict=True):
+            shown = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
+            _draw_ratios(panel, shown, order, _sequences(table))
     for panel, metric in zip(axes[0], metrics):
         panel.set_title(textwrap.fill(compare.METRICS[metric], 18))
-    for panel, estimator in zip(axes[:, 0], estimators):
-        panel.set_ylabel(ESTIMATORS[estimator])
     for panel in axes[-1]:
         panel.set_xlabel("ratio to all keypoints\n(left of 1: lower)", fontsize=8)
     return figure
+
+
+def _draw_ratios(panel: Axes, rows: pd.DataFrame, order: list[str], sequences: list[str]) -> None:
+    """Draw the ratios of one estimator and metric, each at the place of its label in `order`."""
+    for _, row in rows.iterrows():
+        y = order.index(row["label"])
+        color = BASELINE
+        if row["method"] == "masked":
+            color = MASKED
+        values = row[sequences].dropna().astype(float)
+        dots: dict[str, Any] = {
+            "color": "#555555",
+            "alpha": 0.45,
+            "markersize": 3,
+            "markeredgewidth": 0,
+        }
+        panel.plot(values, [y - 0.22] * len(values), "o", **dots)
+        interval = [row["low"], row["high"]]
+        panel.plot(interval, [y + 0.1] * 2, color=color, linewidth=2.2)
+        mean: dict[str, Any] = {"color": color, "markersize": 5, "markeredgecolor": "white"}
+        panel.plot(row["ratio"], y + 0.1, "D", **mean)
+    panel.axvline(1, color="black", linewidth=0.8)
+    panel.grid(axis="y", visible=False)
+    panel.set_yticks(range(len(order)), order)
+    panel.set_ylim(len(order) - 0.5, -0.6)
+    panel.tick_params(labelsize=7)
+    drawn = np.concatenate([line.get_xdata() for line in panel.lines])
+    style.ratio_axis(panel.xaxis, drawn)
 
 
 def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
@@ -79,21 +83,25 @@ def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _tested(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of the tested width. A source without masks of that width keeps all its
-    rows.
+    """Return the rows of the tested width.
+
+    A source without masks of that width keeps all its rows.
     """
     masked = rows[(rows["method"] == "masked") & rows["tested"]]
     return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
 
 
 def _labels(rows: pd.DataFrame) -> pd.Series:
-    """Label each row with its method, the width of its masks and, if there are several sources,
-    its source.
+    """Label each row with its method and the width of its masks.
+
+    If there are several sources, the label begins with the row's source.
     """
-    source = rows["source"] + ": " if rows["source"].nunique() > 1 else ""
     width = rows["dilation_width"].where(rows["method"] == "masked")
     width = width.map(", width {:g}".format, na_action="ignore").fillna("")
-    return source + rows["method"].map(compare.METHODS) + width
+    labels = rows["method"].map(compare.METHODS) + width
+    if rows["source"].nunique() > 1:
+        labels = rows["source"] + ": " + labels
+    return labels
 
 
 def _sequences(table: pd.DataFrame) -> list[str]:
@@ -112,112 +120,114 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     estimator = compare.judging_estimator(judged)
     total = compare.of_method(runs, "baseline", estimator)["mean_keypoints"].mean()
     controls = _tested(_over_all_keypoints(table))
-    controls = controls[
-        (controls["estimator"] == estimator)
-        & (controls["metric"] == next(iter(compare.JUDGING_METRICS)))
-        & controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)
-    ]
+    controls = controls[controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
+    controls = controls[controls["estimator"] == estimator]
+    first_metric = next(iter(compare.JUDGING_METRICS))
+    controls = controls[controls["metric"] == first_metric]
     rows = []
     for source, pair in judged.groupby("source", sort=False):
-        row = {
-            "masks": source,
-            "keypoints": f"{pair['keypoints'].iloc[0]:.0f} of {total:.0f}",
-            **{compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()},
-            "verdict": compare.overall(pair["verdict"]),
-        }
-        for _, best in controls[controls["source"] == source].nsmallest(1, "ratio").iterrows():
+        keypoints = pair["keypoints"].iloc[0]
+        row = {"masks": source, "keypoints": f"{keypoints:.0f} of {total:.0f}"}
+        row |= _ratios(pair)
+        row["verdict"] = compare.overall(pair["verdict"])
+        of_source = controls[controls["source"] == source]
+        for _, best in of_source.nsmallest(1, "ratio").iterrows():
             row["best control"] = f"{compare.METHODS[best['method']]} {texts.number(best['ratio'])}"
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the ratios of each method to all keypoints, and of masks to each control, one column a
-    metric.
+    """Return the ratios of each method to all keypoints, and of masks to each control.
 
-    A ratio is a text, "1.09 (0.98-1.32)". The last columns are the verdict on all judging metrics
-    (`compare.overall`) and each sequence's ratio of the first metric.
+    It has one column a metric. A ratio is a text, "1.09 (0.98-1.32)". The last columns are the
+    verdict on all judging metrics (`compare.overall`) and each sequence's ratio of the first
+    metric.
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
     rows = rows.assign(label=_labels(rows))
-    shown = []
+    sequences = _sequences(table)
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
+    lines = []
     for _, pair in rows.groupby(keys, dropna=False, sort=False):
-        first, judging = pair.iloc[0], pair[pair["metric"].isin(compare.JUDGING_METRICS)]
-        other_source = (
-            ""
-            if first["reference_source"] in ("", first["source"])
-            else f"{first['reference_source']}: "
-        )
-        shown.append(
+        first = pair.iloc[0]
+        over = compare.METHODS[first["reference"]]
+        if first["reference_source"] not in ("", first["source"]):
+            over = f"{first['reference_source']}: {over}"
+        verdict = pd.NA
+        judging = pair[pair["metric"].isin(compare.JUDGING_METRICS)]
+        if len(judging):
+            verdict = compare.overall(judging["verdict"])
+        by_sequence = first[sequences].dropna().map(texts.number)
+        lines.append(
             {
                 "estimator": ESTIMATORS[first["estimator"]],
                 "keypoints": first["label"],
                 "number": round(first["keypoints"]),
-                "over": other_source + compare.METHODS[first["reference"]],
+                "over": over,
                 "sequences": pair["n"].max(),
-                **{compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()},
-                "verdict": compare.overall(judging["verdict"]) if len(judging) else pd.NA,
-                **first[_sequences(table)].dropna().map(texts.number).add_prefix("sequence "),
+                **_ratios(pair),
+                "verdict": verdict,
+                **by_sequence.add_prefix("sequence "),
             }
         )
-    last = ["verdict", *(f"sequence {name}" for name in _sequences(table))]
-    shown = pd.DataFrame(shown)
-    return shown.reindex(columns=[*(name for name in shown if name not in last), *last])
+    shown = pd.DataFrame(lines)
+    last = ["verdict", *(f"sequence {name}" for name in sequences)]
+    others = [name for name in shown if name not in last]
+    return shown.reindex(columns=[*others, *last])
+
+
+def _ratios(pair: pd.DataFrame) -> dict[str, Any]:
+    """Return {name of the metric: ratio as a text} for two methods, which have one row a metric."""
+    return {compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()}
 
 
 def _short(row: dict[str, Any] | pd.Series) -> Any:
-    return (
-        pd.NA if pd.isna(row["ratio"]) else texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
-    )
+    if pd.isna(row["ratio"]):
+        return pd.NA
+    return texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
 
 
 def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the ratios of errors to all keypoints with the best, the left-out and the fixed width,
-    by sequence.
+    """Return the ratios of errors to all keypoints with three choices of the width, by sequence.
 
-    The last two rows of each source have the geometric mean with its interval, and the
-    number of sequences with a lower error.
+    The choices are the best, the left-out and the fixed width. The last two rows of each source
+    have the geometric mean with its interval, and the number of sequences with a lower error.
     """
     tables = {}
     for source in compare.sources(runs) or [""]:
-        masked, baseline = (
-            compare.of_method(compare.of_source(runs, source), name)
-            for name in ("masked", "baseline")
-        )
+        of_source = compare.of_source(runs, source)
+        masked = compare.of_method(of_source, "masked")
         if masked["dilation_width"].nunique() > 1:
-            tables[source] = _widths(masked, baseline)
-    if len(compare.sources(runs)) > 1 and tables:
+            tables[source] = _widths(masked, compare.of_method(of_source, "baseline"))
+    if not tables:
+        return pd.DataFrame()
+    if len(compare.sources(runs)) > 1:
         return pd.concat(tables, names=["masks"]).reset_index("masks")
-    return next(iter(tables.values()), pd.DataFrame())
+    return next(iter(tables.values()))
 
 
 def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
-    chosen, stability = (
-        thesis_tables.chosen_widths(masked, baseline),
-        thesis_tables.stability(masked, baseline),
-    )
-    ratios = {}
+    """Return `table_widths` of one source."""
+    chosen = thesis_tables.chosen_widths(masked, baseline)
+    stability = thesis_tables.stability(masked, baseline)
+    metrics = [name for name in ("rmse", "se3") if name in masked]
+    columns = {}
     for choice, label in CHOICES.items():
         rows = thesis_tables.of_chosen_width(masked, chosen[choice])
-        for metric in ("rmse", "se3"):
-            if metric in masked:
-                ratios[f"{label}: {compare.METRICS[metric]}"] = compare.ratios(
-                    rows, baseline, metric
-                )
-    ratios["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]
-    table = pd.DataFrame(ratios, index=chosen.index).dropna(axis=1, how="all")
+        for metric in metrics:
+            ratios = compare.ratios(rows, baseline, metric)
+            columns[f"{label}: {compare.METRICS[metric]}"] = ratios
+    columns["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]
+    table = pd.DataFrame(columns, index=chosen.index).dropna(axis=1, how="all")
     shown = table.map(texts.number, na_action="ignore").astype(object)
-    shown.loc["geometric mean"] = {
-        name: _short(compare.geometric_mean(table[name])) for name in table
-    }
-    shown.loc["lower in"] = {
-        name: f"{(table[name] < 1).sum()} of {table[name].count()}" for name in table
-    }
-    numbers = (
-        chosen[list(CHOICES)]
-        .rename(columns=CHOICES)
-        .assign(**{"same best width in two repetitions (%)": stability["same_best"].round()})
-        .dropna(axis=1, how="all")
-    )
-    return numbers.convert_dtypes().join(shown, how="right").rename_axis("sequence").reset_index()
+    means, lower = {}, {}
+    for name, ratios in table.items():
+        means[name] = _short(compare.geometric_mean(ratios))
+        lower[name] = f"{(ratios < 1).sum()} of {ratios.count()}"
+    shown.loc["geometric mean"] = means
+    shown.loc["lower in"] = lower
+    widths = chosen[list(CHOICES)].rename(columns=CHOICES)
+    widths["same best width in two repetitions (%)"] = stability["same_best"].round()
+    widths = widths.dropna(axis=1, how="all").convert_dtypes()
+    return widths.join(shown, how="right").rename_axis("sequence").reset_index()

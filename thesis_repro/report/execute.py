@@ -1,5 +1,4 @@
-"""Execution of notebooks by `make figures`: with progress bars, one line on failure, and a log
-file.
+"""Execution of notebooks by `make figures`: progress bars, one line on failure, a log file.
 
 The Makefile calls `jupyter nbconvert --to notebook --execute` with `Execution` as its preprocessor.
 """
@@ -23,8 +22,9 @@ from thesis_repro.running.settings import PREFIX
 
 
 class Execution(ExecutePreprocessor):
-    """Executes all cells of a notebook. Exits with status 1 if a cell fails and with 130 if it
-    is interrupted.
+    """Executes all cells of a notebook.
+
+    Exits with status 1 if a cell fails and with 130 if it is interrupted.
     """
 
     # the notebook may name a kernel that is not installed here
@@ -37,13 +37,16 @@ class Execution(ExecutePreprocessor):
     def preprocess(
         self, nb: Any, resources: Any = None, km: Any = None
     ) -> tuple[Any, dict[str, Any]]:
+        """Execute the notebook `nb`, as nbconvert asks for."""
         console.print_messages()
         # so that the kernel ends with this program, and this program with make: the parent of the
         # shell that runs it
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         console.interrupt_without(os.getppid())
         sys.excepthook = _print_error  # nbconvert may fail to write the executed notebook
-        name, path, started = resources["metadata"]["name"], Path(self.log_file), time.monotonic()
+        name = resources["metadata"]["name"]
+        path = Path(self.log_file)
+        started = time.monotonic()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch()
@@ -70,6 +73,7 @@ class Execution(ExecutePreprocessor):
         )
 
     def setup_kernel(self, **options: Any) -> Any:
+        """Start the kernel with an environment and outputs of its own, as nbclient asks for."""
         # compiled libraries log into the log file, not into the outputs of cells
         self.extra_arguments = ["--IPKernelApp.capture_fd_output=False"]
         # progress bars (`files.progress`) go to the standard error of this program

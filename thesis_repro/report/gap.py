@@ -1,6 +1,4 @@
-"""The domain gap (Section 4.1), a `segmentation.domain_gap.Gap`, as a table; the label maps'
-quality.
-"""
+"""The domain gap (Section 4.1), a `domain_gap.Gap`, as a table; the quality of the label maps."""
 
 from pathlib import Path
 from typing import Any
@@ -21,47 +19,36 @@ MEASURES = {  # column: name in the table, factor, digits
 
 
 def table(gap: Any) -> pd.DataFrame:
-    """Return one row for each measure and class, one column for each model and domain; empty if the
-    class is absent.
+    """Return one row for each measure and class, one column for each model and domain.
+
+    A cell is empty if the class is absent.
     """
-    scores, classes = (
-        rows.assign(column=rows["model"] + ": " + rows["domain"])
-        for rows in (gap.scores, gap.classes)
-    )
-    measures = (
-        pd.DataFrame(
-            {
-                name: (factor * scores[key]).round(digits)
-                for key, (name, factor, digits) in MEASURES.items()
-            }
-        )
-        .set_axis(scores["column"])
-        .T
-    )
-    ious = (
-        classes.pivot(index=["id", "class"], columns="column", values="iou")
-        .droplevel("id")
-        .round(3)
-    )
-    table = pd.concat([measures, ious.rename("IoU: {}".format)])
+    scores = gap.scores
+    measures = {}
+    for key, (name, factor, digits) in MEASURES.items():
+        measures[name] = (factor * scores[key]).round(digits)
+    columns = scores["model"] + ": " + scores["domain"]
+    measures = pd.DataFrame(measures).set_axis(columns).T
+    classes = gap.classes.assign(column=gap.classes["model"] + ": " + gap.classes["domain"])
+    ious = classes.pivot(index=["id", "class"], columns="column", values="iou")
+    ious = ious.droplevel("id").round(3).rename("IoU: {}".format)
+    table = pd.concat([measures, ious])
     return table.rename_axis(index="measure", columns=None).reset_index()
 
 
 def label_map_quality(build: Path) -> list[dict[str, Any]]:
-    """Return the scores of the model that the odometry uses, one dict a domain, or [] if notebook
-    05 measured none.
+    """Return the scores of the model that the odometry uses, one dict a domain.
 
-    They are read from RECORD in the build folder. The odometry's frames come first if they have
-    true label maps. `seen`: whether some of the domain's images are in the model's training data.
+    They are read from RECORD in the build folder; [] if notebook 05 measured none. The odometry's
+    frames come first if they have true label maps. `seen`: whether some of the domain's images are
+    in the model's training data.
     """
     path = build / f"{RECORD}.csv"
     if not path.is_file():
         return []
-    scores = (
-        pd.read_csv(path)
-        .query("used")
-        .sort_values("domain", key=lambda names: names != FRAMES, kind="stable")
-    )
-    return [
-        row | {"seen": (row["model"], row["domain"]) == SEEN} for row in scores.to_dict("records")
-    ]
+    used = pd.read_csv(path).query("used")
+    used = used.sort_values("domain", key=lambda names: names != FRAMES, kind="stable")
+    scores = used.to_dict("records")
+    for row in scores:
+        row["seen"] = (row["model"], row["domain"]) == SEEN
+    return scores

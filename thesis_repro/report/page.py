@@ -1,5 +1,7 @@
-"""The page with all tables and figures of a run or a study: index.html beside them. It needs no
-network or server. README.md beside it is a gallery of the same, for reading in a repository.
+"""The page with all tables and figures of a run or a study: index.html beside them.
+
+It needs no network or server. README.md beside it is a gallery of the same, for reading in a
+repository.
 
 `python -m thesis_repro.report.page` writes the page, and converts executed notebooks to HTML.
 """
@@ -13,7 +15,7 @@ import subprocess
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -39,11 +41,7 @@ def update(settings: Settings) -> None:
     """
     with results.claimed(settings.build / "notebooks"):
         results.sweep(settings.build)
-        # copied from the default run if their notebooks were not executed
-        for name in captions.CONSTANT:
-            for path in (ROOT / "figures").glob(f"{name}.*"):
-                if not (settings.figures / path.name).exists():
-                    write_text(settings.figures / path.name, path.read_text(encoding="utf-8"))
+        _copy_constant(settings)
         if settings.figures.is_dir():
             results.sweep(settings.figures)
         page = settings.figures / PAGE
@@ -58,6 +56,15 @@ def update(settings: Settings) -> None:
         write_text(settings.figures / GALLERY, gallery)
 
 
+def _copy_constant(settings: Settings) -> None:
+    """Copy the figures that show no data from the default run if a run has not made them."""
+    for name in captions.CONSTANT:
+        for path in (ROOT / "figures").glob(f"{name}.*"):
+            copy = settings.figures / path.name
+            if not copy.exists():
+                write_text(copy, path.read_text(encoding="utf-8"))
+
+
 def _executed(settings: Settings) -> list[Path]:
     return listed(settings.build / "notebooks", "*.ipynb")
 
@@ -68,23 +75,22 @@ def notebook_html(path: Path, page: Path) -> str:
     from latex2mathml.converter import convert
     from nbconvert import HTMLExporter
 
-    read = nbformat.read(path, as_version=4)
-    for cell in read.cells:
+    def mathml(equation: re.Match) -> str:
+        return convert(equation[1], display="block")
+
+    notebook = nbformat.read(path, as_version=4)
+    for cell in notebook.cells:
         if cell.cell_type == "markdown":  # browsers show MathML without scripts
-            cell.source = re.sub(
-                r"\$\$(.+?)\$\$",
-                lambda equation: convert(equation[1], display="block"),
-                cell.source,
-                flags=re.DOTALL,
-            )
+            cell.source = re.sub(r"\$\$(.+?)\$\$", mathml, cell.source, flags=re.DOTALL)
     # nbconvert's complete pages load scripts from the network, but the basic template does not
-    content, resources = HTMLExporter(
+    exporter = HTMLExporter(
         template_name="basic",
         embed_images=True,
         exclude_input_prompt=True,
         exclude_output_prompt=True,
         exclude_anchor_links=True,
-    ).from_notebook_node(read)
+    )
+    content, resources = exporter.from_notebook_node(notebook)
     return texts.render(
         "notebook.html.j2",
         title=path.stem,
@@ -97,40 +103,53 @@ def notebook_html(path: Path, page: Path) -> str:
 def _chapters(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     """Return the described artefacts of each chapter, {title: artefacts}."""
     numbers = tables.beside_the_thesis(settings)
-    return {
-        title: [_describe(settings.figures, artefact, settings, numbers) for artefact in artefacts]
-        for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items()
-    }
+    chapters = {}
+    for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items():
+        chapters[title] = [
+            _describe(settings.figures, artefact, settings, numbers) for artefact in artefacts
+        ]
+    return chapters
 
 
 def build(settings: Settings) -> str:
     """Return the page of a run as HTML, made from the files in its folders."""
     chapters = _chapters(settings)
-    executed, artefacts = _executed(settings), list(itertools.chain(*chapters.values()))
+    artefacts = list(itertools.chain(*chapters.values()))
+    of_thesis = [artefact for artefact in artefacts if artefact["number"] is not None]
+    shown = sum(artefact["there"] for artefact in of_thesis)
+    missing = [
+        artefact for artefact in artefacts if not (artefact["there"] or artefact["left_out"])
+    ]
+    executed = _executed(settings)
+    notebooks = {}
+    for path in executed:
+        notebooks[path.stem] = os.path.relpath(path.with_suffix(".html"), settings.figures)
     return texts.render(
         "page.html.j2",
         title=f"Keypoint masks, {settings.run}",
         settings=settings,
         network=trainings.network_note(settings),
         chapters=chapters,
-        shown=sum(artefact["there"] and artefact["number"] is not None for artefact in artefacts),
+        shown=shown,
         of=len(captions.THESIS),
         card=captions.CARD,
-        missing=[
-            artefact for artefact in artefacts if not artefact["there"] and not artefact["left_out"]
-        ],
-        documents={
-            name: _document(name, settings)
-            for name in (("answer",) if settings.figures_in_git else ()) + ("own-masks",)
-            if settings.figures.is_relative_to(ROOT)
-        },
-        notebooks={
-            path.stem: os.path.relpath(path.with_suffix(".html"), settings.figures)
-            for path in executed
-        },
+        missing=missing,
+        documents=_documents(settings),
+        notebooks=notebooks,
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
         made=_made(executed, settings.figures_in_git),
     )
+
+
+def _documents(settings: Settings) -> dict[str, tuple[Markup, Markup]]:
+    """Return the texts of the folder docs that a page has, if links from it reach the folder."""
+    documents: dict[str, tuple[Markup, Markup]] = {}
+    if not settings.figures.is_relative_to(ROOT):
+        return documents
+    if settings.figures_in_git:
+        documents["answer"] = _document("answer", settings)
+    documents["own-masks"] = _document("own-masks", settings)
+    return documents
 
 
 def _document(name: str, settings: Settings) -> tuple[Markup, Markup]:
@@ -138,13 +157,15 @@ def _document(name: str, settings: Settings) -> tuple[Markup, Markup]:
     text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
     # links are relative to docs
     folder = quote(os.path.relpath(ROOT / "docs", settings.figures))
-    _, first, rest = re.sub(r"\]\((?!\w+:|#)", f"]({folder}/", text).split("\n\n", 2)
+    text = re.sub(r"\]\((?!\w+:|#)", f"]({folder}/", text)
+    _, first, rest = text.split("\n\n", 2)
     return texts.html(first), texts.html(rest)
 
 
 def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str:
-    """Return the page of a study as HTML. names: (kind, name) of its files. facts: further
-    values of the template.
+    """Return the page of a study as HTML.
+
+    names: (kind, name) of its files. facts: further values of the template.
     """
     artefacts = []
     for artefact, (kind, name) in itertools.product([*captions.OF_STUDIES, *captions.ADDED], names):
@@ -169,90 +190,127 @@ def _describe(
     settings: Settings | None = None,
     numbers: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the values that the template needs to show a table, figure or text, or to report
-    it as missing.
+    """Return the values that the template needs to show an artefact, or to report it as missing.
+
+    settings, numbers: of a run, from `tables.beside_the_thesis`; None for a study.
     """
     kind, name = artefact["kind"], artefact["name"]
-    files = [path for ending in ENDINGS[kind] if (path := folder / f"{name}{ending}").is_file()]
-    content, details, rows, markdown = None, None, 0, None
-    if files and kind == "text":  # the page folds the part after the first heading
-        content, _, details = files[0].read_text(encoding="utf-8").partition("\n## ")
-        content, details = texts.html(content), texts.html(f"## {details}") if details else None
-    elif kind == "table" and files and files[0].suffix == ".csv":
-        table = tables.read(files[0])
-        content, rows = tables.html(table), len(table)
-        if len(table) <= ROWS_SHOWN and len(files) > 1:
-            markdown = files[1].read_text(encoding="utf-8")
-    there = bool(files) and (kind == "figure" or content is not None)
-    number = None
-    if name in captions.THESIS:  # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
-        _, chapter, count = name.split("_")
-        number = f"{kind.capitalize()} {chapter.upper()}.{int(count)}"
+    paths = [folder / f"{name}{ending}" for ending in ENDINGS[kind]]
+    files = [path for path in paths if path.is_file()]
+    content = Content()
+    if files and kind == "text":
+        content = _text(files[0])
+    elif files and kind == "table" and files[0].suffix == ".csv":
+        content = _table(files)
+    there = bool(files) and (kind == "figure" or content.html is not None)
+    number = _number(kind, name)
+    identity = name
+    if kind != "text" and number is None:
+        identity = f"{kind}-{name}"
+    makers = []
+    if settings:
+        makers = [notebook for notebook, names in captions.MADE_BY.items() if name in names]
     thesis = dict(artefact.get("thesis", ()))
     if thesis and settings and numbers is not None:
-        fill = texts.TEMPLATES.from_string
-        thesis["text"] = fill(thesis["text"]).render(captions.REPORTED)
-        thesis["here"] = name in numbers and fill(thesis["here"]).render(numbers[name])
-        thesis["embedded"] = (
-            settings.kitti_is_embedded
-            if thesis["data"] == "runs"
-            else thesis["data"] == "training" and settings.cityscapes_is_embedded
-        )
-    needs = artefact.get("needs")
-    given = (
-        not needs
-        or not settings
-        or not settings.uses_shipped_model
-        or (needs == "KITTI_SEMANTIC" and settings.kitti_semantic)
-    )
-    identity = name if number or kind == "text" else f"{kind}-{name}"
+        _compare_with_thesis(thesis, settings, numbers.get(name))
+    left_out = None
+    if not there and settings and _is_left_out(artefact, settings):
+        left_out = artefact["needs"]
     return artefact | {
         "id": identity,
         "number": number,
         "there": there,
-        "content": content,
-        "details": details,
-        "rows": rows,
-        "markdown": markdown,
+        "content": content.html,
+        "details": content.details,
+        "rows": content.rows,
+        "markdown": content.markdown,
         "files": [path.name for path in files],
-        "makers": [
-            notebook for notebook, names in captions.MADE_BY.items() if settings and name in names
-        ],
+        "makers": makers,
         "thesis": thesis,
         "opens": there and identity in OPENING,
-        "left_out": needs if not given and not there else None,
+        "left_out": left_out,
     }
+
+
+class Content(NamedTuple):
+    """What a page shows of a text or a table."""
+
+    html: Markup | None = None
+    details: Markup | None = None  # of a text: the part that the page folds
+    rows: int = 0  # of a table
+    markdown: str | None = None  # of a table that is short enough for the gallery
+
+
+def _text(file: Path) -> Content:
+    """Return a text in Markdown; the page folds the part after the first heading."""
+    first, _, rest = file.read_text(encoding="utf-8").partition("\n## ")
+    if not rest:
+        return Content(texts.html(first))
+    return Content(texts.html(first), texts.html(f"## {rest}"))
+
+
+def _table(files: list[Path]) -> Content:
+    """Return a table. files: its CSV file and, if it was written, its Markdown file."""
+    table = tables.read(files[0])
+    markdown = None
+    if len(table) <= ROWS_SHOWN and len(files) > 1:
+        markdown = files[1].read_text(encoding="utf-8")
+    return Content(tables.html(table), rows=len(table), markdown=markdown)
+
+
+def _number(kind: str, name: str) -> str | None:
+    """Return the number in the thesis: figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1."""
+    if name not in captions.THESIS:
+        return None
+    _, chapter, count = name.split("_")
+    return f"{kind.capitalize()} {chapter.upper()}.{int(count)}"
+
+
+def _compare_with_thesis(
+    thesis: dict[str, Any], settings: Settings, numbers: dict[str, Any] | None
+) -> None:
+    """Fill in what the thesis reports beside an artefact and what this run gives (see `captions`).
+
+    numbers: of this run, or None if it has none.
+    """
+    fill = texts.TEMPLATES.from_string
+    thesis["text"] = fill(thesis["text"]).render(captions.REPORTED)
+    if numbers is None:
+        thesis["here"] = False
+    else:
+        thesis["here"] = fill(thesis["here"]).render(numbers)
+    is_embedded = {
+        "runs": settings.kitti_is_embedded,
+        "training": settings.cityscapes_is_embedded,
+    }
+    thesis["embedded"] = is_embedded.get(thesis["data"], False)
+
+
+def _is_left_out(artefact: dict[str, Any], settings: Settings) -> bool:
+    """Return whether a run does not make an artefact, since a variable that it needs is not set."""
+    needs = artefact.get("needs")
+    if not needs or not settings.uses_shipped_model:
+        return False
+    return needs != "KITTI_SEMANTIC" or not settings.kitti_semantic
 
 
 def _made(executed: list[Path] | None = None, in_git: bool = False) -> dict[str, Any]:
-    """Return the packages and, for a page outside git, the machine, commit and day of the
-    results.
+    """Return the packages of the results.
+
+    For a page outside git, also their machine, commit and day.
     """
-    made: dict[str, Any] = {
-        "packages": {name: importlib.metadata.version(name) for name in PACKAGES}
-    }
+    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
+    made: dict[str, Any] = {"packages": packages}
     if in_git:
         return made
-    made |= {
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}",
-    }
+    made["python"] = platform.python_version()
+    made["machine"] = f"{platform.system()} {platform.machine()}"
+    # --git-dir excludes a repository in a parent folder
+    describe = ["git", f"--git-dir={ROOT / '.git'}", f"--work-tree={ROOT}", "describe"]
+    describe += ["--always", "--dirty", "--exclude=*", "--abbrev=12"]
     with suppress(OSError, subprocess.CalledProcessError):
-        made["commit"] = subprocess.run(  # --git-dir excludes a repository in a parent folder
-            [
-                "git",
-                f"--git-dir={ROOT / '.git'}",
-                f"--work-tree={ROOT}",
-                "describe",
-                "--always",
-                "--dirty",
-                "--exclude=*",
-                "--abbrev=12",
-            ],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
+        answer = subprocess.run(describe, capture_output=True, text=True, check=True)
+        made["commit"] = answer.stdout.strip()
     if executed:
         latest = max(path.stat().st_mtime for path in executed)
         made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"
@@ -260,6 +318,7 @@ def _made(executed: list[Path] | None = None, in_git: bool = False) -> dict[str,
 
 
 def main() -> None:
+    """Write the page of the run of the current settings."""
     settings = read_settings()
     update(settings)
     if note := trainings.network_note(settings):

@@ -1,10 +1,12 @@
-"""The results of a study with the user's masks: findings, figures, tables and a page. Tables are
-also written as LaTeX and figures as PDF, for use in a paper.
+"""The results of a study with the user's masks: findings, figures, tables and a page.
+
+Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
 
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,19 +29,21 @@ PATHS = "paths"  # folder of the estimated paths
 
 @style.applied()
 def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[str] = ()) -> Path:
-    """Write the findings, figures, tables and page of a `Study` into a folder, and return
-    the page's path.
+    """Write the findings, figures, tables and page of a `Study` into a folder.
 
-    warnings: lines for the top of the page.
+    Returns the page's path. warnings: lines for the top of the page.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
-    embedded = "train_images" in (results.record(study.kitti.absolute().parent) or {})
-    data = "embedded world (rendered)" if embedded else f"KITTI folder {study.kitti.name}"
+    world = results.record(study.kitti.absolute().parent) or {}
+    embedded = "train_images" in world
+    data = f"KITTI folder {study.kitti.name}"
+    if embedded:
+        data = "embedded world (rendered)"
     changed = {source.name: _changed(source) for source in study.sources}
-    masks = ", ".join(
+    masks = [
         f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources
-    )
-    note = f"odometry: {data}; masks: {masks}"
+    ]
+    note = f"odometry: {data}; masks: {', '.join(masks)}"
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", texts.findings(runs, table, note))
     write_paths(study, runs, folder)
@@ -55,32 +59,28 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         "runs": runs.round(6),
     }
     for name, rows in numbers.items():
+        layout: dict[str, Any] = {"longtable": True}
+        if name == "summary":  # narrow enough for a portrait page; long texts are broken
+            layout = {"column_format": f"lr{(rows.shape[1] - 2) * 'p{17mm}'}"}
         latex = rows.to_latex(
-            index=False,
-            escape=True,
-            na_rep="",
-            float_format="{:g}".format,
-            longtable=name != "summary",
-            # narrow enough for a portrait page; long texts are broken
-            column_format=f"lr{(rows.shape[1] - 2) * 'p{17mm}'}" if name == "summary" else None,
+            index=False, escape=True, na_rep="", float_format="{:g}".format, **layout
         )
         write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
     names = style.save_all(figures, numbers, folder, note)
-    write_text(
-        folder / page.PAGE,
-        page.build_study(
-            folder,
-            [("text", "findings"), *names],
-            study=study,
-            warnings=warnings,
-            embedded=embedded,
-            kinds=KINDS,
-            estimators=ESTIMATORS,
-            line_width=controls.LINE_WIDTH,
-            changed=changed,
-            widths=sorted(runs["dilation_width"].dropna().astype(int).unique()),
-        ),
+    widths = sorted(runs["dilation_width"].dropna().astype(int).unique())
+    text = page.build_study(
+        folder,
+        [("text", "findings"), *names],
+        study=study,
+        warnings=warnings,
+        embedded=embedded,
+        kinds=KINDS,
+        estimators=ESTIMATORS,
+        line_width=controls.LINE_WIDTH,
+        changed=changed,
+        widths=widths,
     )
+    write_text(folder / page.PAGE, text)
     return folder / page.PAGE
 
 
@@ -101,10 +101,10 @@ def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
 
 
 def figure_sources(study: Study) -> Figure:
-    """Draw the middle frame of the first readable sequence: each source's label map, its mask and
-    the kept keypoints.
+    """Draw the middle frame of the first readable sequence, one row a source.
 
-    The plain frame replaces a label map that is missing.
+    A row shows the source's label map, its mask and the kept keypoints. The plain frame replaces a
+    label map that is missing.
     """
     for sequence, sequence_masks in study.shown_masks():
         index = len(sequence) // 2
@@ -113,19 +113,18 @@ def figure_sources(study: Study) -> Figure:
             break
     label_maps = []
     figure, axes = style.frame_panels(frame, len(masks_by_source), 3, 1.5 * style.PAGE_WIDTH)
-    for (first, second, third), source, masks in zip(
-        np.reshape(axes, (-1, 3)), study.sources, masks_by_source
-    ):
+    rows = np.reshape(axes, (-1, 3))
+    for (first, second, third), source, masks in zip(rows, study.sources, masks_by_source):
         style.show_image(first, frame, f"{source.name}: frame {index}")
         style.show_image(second, np.zeros_like(frame), f"{source.name}: no mask")
         style.show_image(third, frame, "")
         with suppress(InputError):  # the runs report a file that cannot be read
             mask = masks[index]
             if isinstance(masks, LabelMasks):
-                label_maps.append(label_map_of(masks, index))
-                style.show_image(
-                    first, style.label_colors(label_maps[-1], frame), f"{source.name}: label map"
-                )
+                label_map = label_map_of(masks, index)
+                label_maps.append(label_map)
+                colors = style.label_colors(label_map, frame)
+                style.show_image(first, colors, f"{source.name}: label map")
             points = keypoints.detect(frame, THESIS, mask)
             style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
             third.set_title(f"{source.name}: {len(points)} keypoints")
@@ -136,32 +135,29 @@ def figure_sources(study: Study) -> Figure:
 
 
 def figure_paths(study: Study, name: str, folder: Path) -> Figure:
-    """Draw one path with all keypoints and one with each source's masks, shifted as for the
-    RMSE.
-    """
+    """Draw a path with all keypoints and one with each source's masks, shifted as for the RMSE."""
     (true,) = (sequence.poses for sequence in study.opened if sequence.name == name)
-    files = {
-        job.source or compare.METHODS[job.method]: folder
-        / PATHS
-        / "kitti"
-        / name
-        / f"{job.name}.txt"
-        for job in study.shown_jobs(name)
-    }
-    paths = {
-        label: metrics.shifted(read_poses(file), true)
-        for label, file in files.items()
-        if file.is_file()
-    }
+    poses_folder = folder / PATHS / "kitti" / name
+    paths = {}
+    for job in study.shown_jobs(name):
+        label = job.source or compare.METHODS[job.method]
+        file = poses_folder / f"{job.name}.txt"
+        if file.is_file():
+            paths[label] = metrics.shifted(read_poses(file), true)
     return trajectories.figure(paths, true, f"sequence {name}")
 
 
 def _changed(source: Source) -> str:
-    """Return the settings of masks from label maps that differ from the thesis's, such as ";
-    margin 10".
+    """Return the settings of masks from label maps that differ from the thesis's.
+
+    Such as "; margin 10".
     """
+    if source.kind != "labels":
+        return ""
     default = vars(type(source.settings)())
     changed = [
         f"{name} {value}" for name, value in vars(source.settings).items() if value != default[name]
     ]
-    return f"; {', '.join(changed)}" if changed and source.kind == "labels" else ""
+    if not changed:
+        return ""
+    return f"; {', '.join(changed)}"

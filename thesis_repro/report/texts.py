@@ -1,8 +1,7 @@
-"""Texts made from templates (templates/*.j2). Their conditions depend only on what was run and on
-the verdicts.
+"""Texts made from templates (templates/*.j2).
 
-A run, a study with the user's masks and the evidence on real frames share one template for their
-findings.
+Their conditions depend only on what was run and on the verdicts. A run, a study with the user's
+masks and the evidence on real frames share one template for their findings.
 """
 
 import re
@@ -15,19 +14,10 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import Result, metrics
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
 DIGITS = 2  # of a ratio that is not close to 1
-ERRORS = (
-    "rmse_m",
-    "mae_m",
-    "ate_se3_m",
-    "relative_translation_percent",
-    "relative_rotation_deg_per_100m",
-)
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
     autoescape=lambda name: ".html" in (name or ""),
@@ -38,28 +28,50 @@ TEMPLATES = Environment(
 
 
 def render(template: str, **values: Any) -> str:
-    """Return the text of a template in the folder templates. Repeated empty lines in Markdown
-    become one.
+    """Return the text of a template in the folder templates.
+
+    Repeated empty lines in Markdown become one.
     """
     text = TEMPLATES.get_template(template).render(values).strip() + "\n"
-    return re.sub(r"\n{3,}", "\n\n", text) if ".md" in template else text
+    if ".md" in template:
+        text = re.sub(r"\n{3,}", "\n\n", text)
+    return text
 
 
 def number(value: float) -> str:
     """Return a ratio as text with two digits, or with more if it would look like 1."""
-    near = 0 < abs(value - 1) < 0.5 * 10**-DIGITS
-    return f"{value:.{min(6, ceil(-log10(abs(value - 1))) + 1) if near else DIGITS}f}"
+    digits = DIGITS
+    distance = abs(value - 1)
+    if 0 < distance < 0.5 * 10**-DIGITS:
+        digits = min(6, ceil(-log10(distance)) + 1)
+    return f"{value:.{digits}f}"
 
 
 def ratio(row: dict[str, Any] | pd.Series) -> str:
-    """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high, or only the ratio
-    if low is missing.
+    """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high.
+
+    Without an interval (low is missing) it is only the ratio.
     """
+    mean = number(row["ratio"])
     if pd.isna(row["low"]):
-        return number(row["ratio"])
-    return (
-        f"{number(row['ratio'])} ({compare.LEVEL} % CI {number(row['low'])}-{number(row['high'])})"
-    )
+        return mean
+    low, high = number(row["low"]), number(row["high"])
+    return f"{mean} ({compare.LEVEL} % CI {low}-{high})"
+
+
+def ratio_and_far_off(row: dict[str, Any] | pd.Series) -> str:
+    """Return `ratio` and the sequences far from the others.
+
+    Such as "3.85 (95 % CI 0.71-80.41), sequence 01 alone 95.20".
+    """
+    text = ratio(row)
+    for name in row["far_off"]:
+        text += f", sequence {name} alone {number(row[name])}"
+    return text
+
+
+TEMPLATES.filters["ratio"] = ratio_and_far_off
+TEMPLATES.filters["number"] = number
 
 
 class _Renderer(mistune.HTMLRenderer):
@@ -70,20 +82,23 @@ class _Renderer(mistune.HTMLRenderer):
 
 def html(text: str) -> Markup:
     """Convert Markdown to HTML. HTML tags in the Markdown are shown as text."""
-    return Markup(mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])(text))
+    convert = mistune.create_markdown(renderer=_Renderer(escape=True), plugins=["table"])
+    return Markup(convert(text))
 
 
-def ratio_and_far_off(row: dict[str, Any] | pd.Series) -> str:
-    """Return `ratio` and the sequences far from the others: "3.85 (95 % CI 0.71-80.41),
-    sequence 01 alone 95.20".
-    """
-    return ratio(row) + "".join(
-        f", sequence {name} alone {number(row[name])}" for name in row["far_off"]
-    )
-
-
-TEMPLATES.filters["ratio"] = ratio_and_far_off
-TEMPLATES.filters["number"] = number
+# what the template of the findings says of every comparison, whatever was run
+OF_COMPARISONS = {
+    "estimators": ESTIMATORS,
+    "methods": compare.METHODS,
+    "metrics": compare.METRICS,
+    "deciding_metrics": list(compare.JUDGING_METRICS),
+    "too_few": compare.TOO_FEW,
+    "fewest": compare.MIN_SEQUENCES,
+    "least": compare.MIN_FOR_INTERVAL,
+    "level": compare.LEVEL,
+    "far": compare.FAR_OFF,
+    "thesis_width": CONTROL_WIDTH,
+}
 
 
 def findings(
@@ -99,101 +114,79 @@ def findings(
     label_maps: the quality of the label maps, rows of `gap.label_map_quality`.
     trainings: what other trainings of the network give, from `trainings.summary`.
     """
-    baseline, masked = runs[runs["method"] == "baseline"], runs[runs["method"] == "masked"]
-    pairs = table[
-        (table["method"] == "masked")
-        & (table["reference"] == "masked")
-        & table["metric"].isin(compare.JUDGING_METRICS)
-        & (table["source"] < table["reference_source"])
-        # each pair of sources once
-        & (table["estimator"] == compare.judging_estimator(table))
-    ]
+    baseline = runs[runs["method"] == "baseline"]
+    with_masks = set(runs.loc[runs["method"] == "masked", "source"])
     sources = [
         _source_values(runs, table, source)
         for source in compare.sources(runs) or [""]
-        if (masked["source"] == source).any()
+        if source in with_masks
     ]
-    spread = compare.shuffle_spread(runs).groupby("estimator")["factor"].agg(["median", "max"])
+    measured = set(table["metric"])
+    deciding = [label for name, label in compare.JUDGING_METRICS.items() if name in measured]
     return render(
         "findings.md.j2",
-        label_maps=label_maps,
-        trainings=trainings,
-        deciding_metrics=list(compare.JUDGING_METRICS),
+        **OF_COMPARISONS,
         data=data,
         embedded="embedded" in data.split(";")[0],
+        label_maps=label_maps,
+        trainings=trainings,
         frames=baseline.groupby("sequence")["frames"].first().to_dict(),
         repetitions=baseline["repetition"].nunique(),
-        spread=spread.reindex(list(ESTIMATORS)).dropna().T.to_dict(),
-        estimators=ESTIMATORS,
-        methods=compare.METHODS,
-        metrics=compare.METRICS,
-        deciding=[
-            compare.METRICS[name]
-            for name in compare.JUDGING_METRICS
-            if (table["metric"] == name).any()
-        ],
+        spread=_shuffle_spread(runs),
+        deciding=deciding,
         estimators_run=set(table["estimator"]),
-        too_few=compare.TOO_FEW,
-        fewest=compare.MIN_SEQUENCES,
-        least=compare.MIN_FOR_INTERVAL,
-        level=compare.LEVEL,
-        far=compare.FAR_OFF,
-        thesis_width=CONTROL_WIDTH,
         sources=sources,
-        against_each_other=pairs.to_dict("records"),
+        against_each_other=_sources_against_each_other(table),
     )
+
+
+def _shuffle_spread(runs: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Return {estimator: {"median", "max"}} of the factors of `compare.shuffle_spread`."""
+    factors = compare.shuffle_spread(runs).groupby("estimator")["factor"]
+    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATORS)).dropna()
+    return spread.T.to_dict()
+
+
+def _sources_against_each_other(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of `table` that compare masks of two sources, each pair of sources once."""
+    both_masked = (table["method"] == "masked") & (table["reference"] == "masked")
+    once = table["source"] < table["reference_source"]
+    pairs = table[both_masked & once & _judging(table)]
+    return pairs.to_dict("records")
+
+
+def _judging(table: pd.DataFrame) -> pd.Series:
+    """Return for each row of `compare.comparisons` whether it may decide, bool."""
+    metric = table["metric"].isin(compare.JUDGING_METRICS)
+    return metric & (table["estimator"] == compare.judging_estimator(table))
 
 
 def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict[str, Any]:
     """Return the values of one source of masks for the template."""
-    runs, judged = compare.of_source(runs, source), compare.primary_comparison(table, source)
-    rows = table[(table["source"] == source) & (table["reference"] == "baseline") & table["tested"]]
-    judging = rows["metric"].isin(compare.JUDGING_METRICS) & (
-        rows["estimator"] == compare.judging_estimator(table)
-    )
+    runs = compare.of_source(runs, source)
+    masked = compare.of_method(runs, "masked")
+    widths = masked["dilation_width"].nunique()
+    same_best = None
+    if widths > 1:
+        stability = thesis_tables.stability(masked, compare.of_method(runs, "baseline"))
+        mean = stability["same_best"].mean()
+        if not pd.isna(mean):
+            same_best = float(mean)
+    judged = compare.primary_comparison(table, source)
+    over_all = (table["source"] == source) & (table["reference"] == "baseline") & table["tested"]
+    of_masks = table[over_all & (table["method"] == "masked")]
+    of_corrected = table[over_all & (table["method"] == "corrected") & _judging(table)]
     controls = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS, source)
-    controls = controls[controls["reference_source"] == source].groupby("reference", sort=False)[
-        "verdict"
-    ]
-    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
-    tested, widths = compare.tested_width(runs), masked["dilation_width"].nunique()
-    same_best = (
-        thesis_tables.stability(masked, baseline)["same_best"].mean() if widths > 1 else pd.NA
-    )
+    controls = controls[controls["reference_source"] == source]
+    verdicts = controls.groupby("reference", sort=False)["verdict"].agg(compare.overall)
     return {
         "name": source,
         "judged": judged.to_dict("records"),
         "verdict": compare.overall(judged["verdict"]),
-        "width": tested,
-        "masked": rows[rows["method"] == "masked"].to_dict("records"),
-        "corrected": rows[judging & (rows["method"] == "corrected")].to_dict("records"),
-        "controls": controls.agg(compare.overall).to_dict(),
+        "width": compare.tested_width(runs),
+        "masked": of_masks.to_dict("records"),
+        "corrected": of_corrected.to_dict("records"),
+        "controls": verdicts.to_dict(),
         "widths": widths,
-        "same_best": None if pd.isna(same_best) else float(same_best),
-    }
-
-
-# Records of commands, for JSON and for templates
-
-
-def run_record(result: Result, sequence: Sequence) -> dict[str, Any]:
-    """Return the errors, keypoints, time and flags of an `odometry.Result`. An error that is
-    not determined is None.
-    """
-    errors = dict.fromkeys(ERRORS)
-    if sequence.has_truth:
-        values = metrics.errors(result.poses, sequence.poses).values()
-        errors = {
-            name: None if value != value else value
-            for name, value in zip(ERRORS, values, strict=True)
-        }
-    detected = result.frames["detected"].dropna()  # empty if no frame has structure
-    seconds = result.frames.filter(like="_seconds").sum(axis=1)
-    return {
-        "sequence": sequence.name,
-        "frames": len(sequence),
-        **errors,
-        "mean_keypoints": float(detected.mean()) if len(detected) else 0.0,
-        "ms_per_frame": 1000 * float(seconds.mean()),
-        "flagged": {flag: int(count) for flag, count in result.flagged.items()},
+        "same_best": same_best,
     }

@@ -1,15 +1,14 @@
-"""Trajectories compared with the ground truth: a table of their errors and a figure of their
-paths.
-"""
+"""Trajectories compared with the ground truth: a table of their errors, a figure of their paths."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from evo import EvoException
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thesis_repro.data.trajectories import read_poses, read_tum
@@ -32,79 +31,104 @@ COLUMNS = {
 }
 
 
+class Trajectory(NamedTuple):
+    """A trajectory that has a pose for some or all frames of its sequence."""
+
+    frames: np.ndarray  # (n,) indices of the frames
+    poses: np.ndarray  # (n, 4, 4) camera to world, metres
+
+
 def by_sequence(
     paths: Iterable[Path], root: str | Path | None, sequence: str | None = None
 ) -> dict[str, dict[str, Path]]:
-    """Return the files of trajectories, {sequence: {trajectory: file}}. A trajectory is named by
-    its path.
+    """Return the files of trajectories, {sequence: {trajectory: file}}.
 
+    A trajectory is named by its path.
     paths: files of one sequence, or folders with a file NN.txt or NN.tum for each sequence with
-    ground truth in a KITTI root. sequence: the only sequence to return, or None for all.
+    ground truth in a KITTI root. sequence: the only sequence to return, or None for all. Raises
+    InputError for a file without a sequence, a folder without files and two files of one sequence.
     """
     files: dict[str, dict[str, Path]] = {}
     for path in paths:
         path_files: dict[Any, Path] = {sequence: path}
         if path.is_dir():
-            names = (
-                [sequence]
-                if sequence
-                else [file.stem for file in listed(Path(root or "", "poses"), "*.txt")]
-            )
-            found = [file for file in listed(path, "*.t[xu][tm]") if file.stem in names]
-            path_files = {file.stem: file for file in found}
-            for file in found:
-                if file != path_files[file.stem]:
-                    raise InputError(f"{file}: {path_files[file.stem].name} is there too; move one")
+            path_files = _files_in(path, root, sequence)
         if not path_files or None in path_files:
             raise InputError(
                 f"{path}: name its sequence with --sequence; a folder must contain NN.txt or NN.tum for a "
                 "sequence with ground truth in --kitti"
             )
+        short = str(path)
+        if path.is_file():
+            short = str(path.with_suffix(""))
         for name, file in path_files.items():
             of_sequence = files.setdefault(name, {})
-            short = str(path.with_suffix("") if path.is_file() else path)
-            of_sequence[str(path) if short in of_sequence else short] = file
+            if short in of_sequence:
+                of_sequence[str(path)] = file
+            else:
+                of_sequence[short] = file
     return files
 
 
-def read(
-    file: Path, times: np.ndarray, frames: int | None = None, **matching: Any
-) -> tuple[np.ndarray, np.ndarray]:
-    """Read a trajectory in KITTI's or TUM's format: (indices of its frames (n,), poses (n, 4, 4)).
+def _files_in(folder: Path, root: str | Path | None, sequence: str | None) -> dict[str, Path]:
+    """Return {sequence: file} of one folder, see `by_sequence`."""
+    names = [sequence]
+    if not sequence:
+        names = [file.stem for file in listed(Path(root or "", "poses"), "*.txt")]
+    files: dict[str, Path] = {}
+    for file in listed(folder, "*.t[xu][tm]"):
+        if file.stem not in names:
+            continue
+        if file.stem in files:
+            raise InputError(f"{files[file.stem]}: {file.name} is there too; move one")
+        files[file.stem] = file
+    return files
+
+
+def read(file: Path, times: np.ndarray, frames: int | None = None, **matching: Any) -> Trajectory:
+    """Read a trajectory in KITTI's or TUM's format.
 
     times: of the ground truth, seconds. A file in KITTI's format needs one pose for each time; for
     TUM's format see `read_tum`, which gets `matching`. frames: use only the first ones. Raises
     InputError for any other file.
     """
-    first = ""
-    # read_poses reports these errors
-    with suppress(OSError, ValueError), open(file, encoding="utf-8-sig") as lines:
-        first = next((line for line in lines if not line.startswith("#")), "")
-    if len(first.split()) == 8:
+    used_times = times[:frames]
+    if _columns(file) == 8:
         matched, poses = read_tum(file, times, **matching)
-        return matched[matched < len(times[:frames])], poses[matched < len(times[:frames])]
-    poses, times = read_poses(file)[:frames], times[:frames]
-    if len(poses) != len(times):
+        used = matched < len(used_times)
+        return Trajectory(matched[used], poses[used])
+    poses = read_poses(file)[:frames]
+    if len(poses) != len(used_times):
         raise InputError(
-            f"{file}: {len(poses)} poses, but the ground truth has {len(times)}; KITTI's format needs one "
+            f"{file}: {len(poses)} poses, but the ground truth has {len(used_times)}; KITTI's format needs one "
             "for each frame (TUM's format has times and may leave frames out)"
         )
-    return np.arange(len(poses)), poses
+    return Trajectory(np.arange(len(poses)), poses)
+
+
+def _columns(file: Path) -> int:
+    """Return how many words the first line has that is no comment; 0 if it cannot be read."""
+    with suppress(OSError, ValueError), open(file, encoding="utf-8-sig") as lines:
+        for line in lines:
+            if not line.startswith("#"):
+                return len(line.split())
+    return 0  # `read_poses` reports the error
 
 
 def evaluate(
-    paths: dict[str, tuple[np.ndarray, np.ndarray]],
+    paths: dict[str, Trajectory],
     true: np.ndarray,
     alignment: str = "none",
     sequence: str = "",
 ) -> list[dict[str, Any]]:
     """Return the errors of each path. An error that is not determined is None.
 
-    paths: {name: (frames, poses)} from `read`; true: (n, 4, 4). RMSE and MAE follow the thesis and
+    paths: {name: trajectory} from `read`; true: (n, 4, 4). RMSE and MAE follow the thesis and
     ignore `alignment`. The other errors are of the path after `metrics.align`. The RPE is from one
     pose of the path to the next.
     """
-    rows, aligned_paths = [], aligned(paths, true, alignment)
+    rows = []
+    aligned_paths = aligned(paths, true, alignment)
     for name, (frames, poses) in paths.items():
         truth = true[frames]
         ate = metrics.ate(poses, truth, alignment)
@@ -118,47 +142,68 @@ def evaluate(
             "mae_m": metrics.mae(poses, truth),
             "note": ate.pop("note"),
             "scale": ate.pop("scale"),
-            **{f"ate_{key}_m": value for key, value in ate.items()},
         }
+        for statistic, value in ate.items():
+            row[f"ate_{statistic}_m"] = value
         if name in aligned_paths:  # else the note of the ATE says why the path cannot be aligned
-            rpe = metrics.rpe(aligned_paths[name], truth)
-            segments = metrics.kitti_errors(aligned_paths[name], truth)
-            row |= {
-                f"rpe_{key}_{'deg' if key.startswith('rotation') else 'm'}": value
-                for key, value in rpe.items()
-            }
-            row |= {
-                "t_rel_percent": segments["translation_percent"],
-                "segments": segments["segments"],
-                "r_rel_deg_per_100m": segments["rotation_deg_per_100m"],
-                "note": row["note"] or segments["note"],
-            }
-        rows.append({key: None if value != value else value for key, value in row.items()})
+            relative = _relative_errors(aligned_paths[name], truth)
+            note = relative.pop("note")
+            row |= relative
+            row["note"] = row["note"] or note
+        rows.append({key: _or_none(value) for key, value in row.items()})
     return rows
 
 
+def _relative_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    """Return the RPE and the errors of the KITTI benchmark under the keys of `evaluate`."""
+    errors: dict[str, Any] = {}
+    for statistic, value in metrics.rpe(poses, truth).items():
+        unit = "m"
+        if statistic.startswith("rotation"):
+            unit = "deg"
+        errors[f"rpe_{statistic}_{unit}"] = value
+    segments = metrics.kitti_errors(poses, truth)
+    errors["t_rel_percent"] = segments["translation_percent"]
+    errors["segments"] = segments["segments"]
+    errors["r_rel_deg_per_100m"] = segments["rotation_deg_per_100m"]
+    errors["note"] = segments["note"]
+    return errors
+
+
+def _or_none(value: Any) -> Any:
+    """Return a value, or None for NaN, which JSON has not."""
+    if value != value:
+        return None
+    return value
+
+
 def means(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield a row like those of `evaluate` with the means of each trajectory that has several
-    sequences.
+    """Yield a row with the means of each trajectory that has several sequences.
+
+    rows: of `evaluate`.
     """
-    sets = pd.DataFrame(rows).groupby("trajectory", sort=False)["sequence"].agg(", ".join)
-    for name, errors in pd.DataFrame(rows).groupby("trajectory", sort=False):
-        if len(errors) > 1:
-            of = sets[name] if sets.nunique() > 1 else len(errors)
-            mean = errors.drop(columns=["poses", "frames", "segments"], errors="ignore").mean(
-                numeric_only=True
-            )
-            yield {
-                "trajectory": name,
-                "sequence": f"mean of {of}",
-                "poses": int(errors["poses"].sum()),
-                **mean.to_dict(),
-                "note": "",
-            }
+    by_trajectory = pd.DataFrame(rows).groupby("trajectory", sort=False)
+    sequences = by_trajectory["sequence"].agg(", ".join)
+    differ = sequences.nunique() > 1
+    for name, errors in by_trajectory:
+        if len(errors) == 1:
+            continue
+        averaged = str(len(errors))
+        if differ:
+            averaged = sequences[name]
+        counts = ["poses", "frames", "segments"]
+        mean = errors.drop(columns=counts, errors="ignore").mean(numeric_only=True)
+        yield {
+            "trajectory": name,
+            "sequence": f"mean of {averaged}",
+            "poses": int(errors["poses"].sum()),
+            **mean.to_dict(),
+            "note": "",
+        }
 
 
 def aligned(
-    paths: dict[str, tuple[np.ndarray, np.ndarray]], true: np.ndarray, alignment: str
+    paths: dict[str, Trajectory], true: np.ndarray, alignment: str
 ) -> dict[str, np.ndarray]:
     """Return {name: poses} after `metrics.align`, without the paths that cannot be aligned."""
     aligned_paths = {}
@@ -170,11 +215,9 @@ def aligned(
 
 def table(rows: list[dict[str, Any]], alignment: str = "none") -> pd.DataFrame:
     """Return the rows of `evaluate` and `means` as a table for display."""
-    columns = {
-        key: name
-        for key, name in COLUMNS.items()
-        if key != "scale" or alignment in ("sim3", "scale")
-    }
+    columns = dict(COLUMNS)
+    if alignment not in ("sim3", "scale"):
+        del columns["scale"]
     table = pd.DataFrame(rows, columns=["trajectory", "sequence", "poses", *columns])
     return table.astype(dict.fromkeys(columns, float)).rename(columns=columns)
 
@@ -190,14 +233,13 @@ def figure(
     paths: {name: (n, 4, 4) aligned poses}. true: (n, 4, 4), or None. frames: {name: frame indices
     of its poses}, or None if every path has a pose for each frame.
     """
-    drawing, panels = new_figure(1, 1 if true is None else 2, height=3.4, squeeze=False)
-    above, error = panels[0, 0], panels[0, -1]
+    columns = 2
+    if true is None:
+        columns = 1
+    drawing, panels = new_figure(1, columns, height=3.4, squeeze=False)
+    above = panels[0, 0]
     for index, (name, poses) in enumerate(paths.items()):
         above.plot(poses[:, 0, 3], poses[:, 2, 3], label=name, **line_style(index))
-        if true is not None:
-            matched = slice(None) if frames is None else frames[name]
-            distance = np.linalg.norm(poses[:, :3, 3] - true[matched, :3, 3], axis=1)
-            error.plot(metrics.travelled(true)[matched], distance, **line_style(index))
     if true is not None:
         above.plot(
             true[:, 0, 3],
@@ -208,13 +250,30 @@ def figure(
             label="ground truth",
             zorder=1,
         )
-        error.set(
-            xlabel="travelled (m)",
-            ylabel="distance from the truth (m)",
-            title="error along the way",
-            ylim=(0, None),
-        )
+        _draw_distances(panels[0, 1], paths, true, frames)
     above.set(xlabel="x (m)", ylabel="z (m)", title=f"{title} from above")
     above.set_aspect("equal", adjustable="datalim")
     drawing.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawing
+
+
+def _draw_distances(
+    panel: Axes,
+    paths: dict[str, np.ndarray],
+    true: np.ndarray,
+    frames: dict[str, np.ndarray] | None,
+) -> None:
+    """Draw the distance of each path from the ground truth over the metres travelled."""
+    travelled = metrics.travelled(true)
+    for index, (name, poses) in enumerate(paths.items()):
+        matched: Any = slice(None)
+        if frames is not None:
+            matched = frames[name]
+        distance = np.linalg.norm(poses[:, :3, 3] - true[matched, :3, 3], axis=1)
+        panel.plot(travelled[matched], distance, **line_style(index))
+    panel.set(
+        xlabel="travelled (m)",
+        ylabel="distance from the truth (m)",
+        title="error along the way",
+        ylim=(0, None),
+    )

@@ -1,6 +1,4 @@
-"""Videos of the odometry: kept and discarded keypoints, tracks, the mask's outline and the path
-so far.
-"""
+"""Videos of the odometry: keypoints, tracks, the outline of the mask and the path so far."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,12 +37,11 @@ def draw_frame(
     settings: OdometrySettings = THESIS,
     mask: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draw a step of the odometry on its frame (height, width): returns (height, width, 3) blue,
-    green, red.
+    """Draw a step of the odometry on its frame.
 
-    The image shows detected keypoints, keypoints that the mask discards (from a second detection
-    without the mask), the mask's outline, and the tracks: inliers and outliers of the essential
-    matrix.
+    frame: (height, width). Returns (height, width, 3), blue, green, red. The image shows detected
+    keypoints, keypoints that the mask discards (from a second detection without the mask), the
+    mask's outline, and the tracks: inliers and outliers of the essential matrix.
     """
     image = cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR)
     if mask is not None:
@@ -69,11 +66,10 @@ def _dots(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int]) ->
 def pictures(
     sequence: Sequence, settings: OdometrySettings = THESIS, masks: Masks | None = None
 ) -> Iterator[np.ndarray]:
-    """Run the odometry over a kitti.Sequence and yield one picture for each frame, (h, w, 3) blue,
-    green, red.
+    """Run the odometry over a kitti.Sequence and yield one picture for each frame.
 
-    The upper part is the frame. The lower part shows the path so far, the ground truth and numbers
-    of the step.
+    A picture is (h, w, 3), blue, green, red. Its height and width are even. The upper part is the
+    frame. The lower part shows the path so far, the ground truth and numbers of the step.
     """
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence))
     height, width = sequence.size
@@ -81,7 +77,8 @@ def pictures(
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.2, 0.6, 0.75), xlabel="x (m)", ylabel="z (m)")
     axes.set_aspect("equal", adjustable="datalim")
-    true, metres, poses = None, scales(sequence), []
+    metres = scales(sequence)
+    true = None
     # both paths start at the same point here; for the RMSE they meet at frame 1
     if sequence.has_truth:
         true = sequence.poses[:, :3, 3] + odometry.pose[:3, 3] - sequence.poses[0, :3, 3]
@@ -89,28 +86,33 @@ def pictures(
     (path,) = axes.plot([], [], color=BASELINE, label="estimate")
     figure.legend(loc="lower right")
     description = figure.text(0.7, 0.95, "", va="top")
+    positions = []
     for index in progress(range(len(sequence)), "video"):
-        frame, mask = sequence.frame(index), None if masks is None else masks[index]
+        frame = sequence.frame(index)
+        mask = None
+        if masks is not None:
+            mask = masks[index]
         step = odometry.step(frame, metres[index], mask)
-        poses.append(step.pose)
-        path.set_data(*np.array(poses)[:, [0, 2], 3].T)
+        positions.append(step.pose[[0, 2], 3])
+        path.set_data(*np.transpose(positions))
         axes.relim()
         axes.autoscale_view()
         description.set_text(_describe(step, true, mask is not None))
         canvas.draw()
-        picture = np.vstack(
-            [draw_frame(frame, step, settings, mask), np.asarray(canvas.buffer_rgba())[..., 2::-1]]
-        )
-        yield picture[
-            : len(picture) // 2 * 2, : width // 2 * 2
-        ]  # colours at half the size need even sizes
+        drawn = draw_frame(frame, step, settings, mask)
+        below = np.asarray(canvas.buffer_rgba())[..., 2::-1]
+        picture = np.vstack([drawn, below])
+        # colours at half the size need even sizes
+        yield picture[: len(picture) // 2 * 2, : width // 2 * 2]
 
 
 def _describe(step: Step, true: np.ndarray | None, masked: bool) -> str:
     """Describe a step in lines of text that name the colours in the frame."""
-    row, lines = step.row(), [f"frame {step.frame}"]
+    row = step.row()
+    lines = [f"frame {step.frame}"]
     if true is not None:
-        lines.append(f"{np.linalg.norm(step.pose[:3, 3] - true[step.frame]):.2f} m from the truth")
+        distance = np.linalg.norm(step.pose[:3, 3] - true[step.frame])
+        lines.append(f"{distance:.2f} m from the truth")
     if step.detected is not None:
         lines.append(f"{step.detected} keypoints (blue)")
     if masked:
@@ -129,17 +131,22 @@ def write_video(
     Every browser plays VP8. OpenCV takes four times as long for VP9. Raises InputError if the video
     was not written whole.
     """
-    rate = 1 / np.median(np.diff(sequence.times)) if len(sequence) > 1 else 1 / FRAME_TIME
+    frame_time = FRAME_TIME
+    if len(sequence) > 1:
+        frame_time = np.median(np.diff(sequence.times))
     writer = cv2.VideoWriter()
     with atomic(path) as temporary:
         for picture in pictures(sequence, settings, masks):
             if not writer.isOpened():
                 with console.quiet():  # OpenCV looks for the codec's tag, which WebM does not use
                     vp8, size = cv2.VideoWriter_fourcc(*"VP80"), picture.shape[1::-1]
-                    writer.open(str(temporary), cv2.CAP_FFMPEG, vp8, rate, size)
+                    writer.open(str(temporary), cv2.CAP_FFMPEG, vp8, 1 / frame_time, size)
             writer.write(picture)
         writer.release()
         # the writer reports no errors, such as a full disk
-        written = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
-        if sum(1 for _ in iter(written.grab, False)) != len(sequence):
+        video = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
+        written = 0
+        while video.grab():
+            written += 1
+        if written != len(sequence):
             raise InputError(f"{path}: the video was not written whole; make room on its disk")
