@@ -1,7 +1,7 @@
 """Tables 4.1 to 4.3, the errors of all sequences and the time of a frame.
 
-They have units and few digits. `runs` is the table of `runner.run_jobs`. Equation 4.1 and the choice of
-a width are in `thesis_tables`.
+They have units and few digits. `runs` is the table of `runner.run_jobs`. Equation 4.1 and the
+choice of a width are in `thesis_tables`.
 """
 
 from pathlib import Path
