@@ -91,12 +91,10 @@ def label_maps(settings, seed):
 
 def all_label_maps(settings):
     """Return `label_maps` of each of SEEDS, in order; a training uses one core, so several run."""
-    calls, trained = [(settings, seed) for seed in SEEDS], {}
+    calls = [(settings, seed) for seed in SEEDS]
     with workers.open_pool(settings.jobs) as pool:
-        for index, result in files.progress(
-            pool.run(label_maps, calls), "trainings", len(calls), "network"
-        ):
-            trained[index] = result
+        results_by_index = pool.run(label_maps, calls)
+        trained = dict(files.progress(results_by_index, "trainings", len(calls), "network"))
     return [trained[index] for index in range(len(calls))]
 
 

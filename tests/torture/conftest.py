@@ -1,5 +1,6 @@
-"""Kills, faults and bad input, tried on real commands; trials marked `torture` are run by `make
-torture` alone.
+"""Kills, faults and bad input, tried on real commands.
+
+Trials marked `torture` are run by `make torture` alone.
 """
 
 import sys
@@ -27,8 +28,9 @@ except Exception as error:
 
 @pytest.fixture
 def words(small_world, small_labels, small_model):
-    """words(name, output): a command that writes `output`. The ending of "odometry.png" says
-    which output it is.
+    """Give words(name, output), which returns a command that writes `output`.
+
+    The ending of "odometry.png" says which output it is.
     """
     kitti = small_world / "kitti"
     options = {".txt": "--output", ".png": "--plot", ".webm": "--video"}
@@ -78,9 +80,7 @@ def words(small_world, small_labels, small_model):
 
 @pytest.fixture
 def folder(tmp_path, tiny_kitti, tiny_cityscapes):
-    """A folder with kitti, cityscapes, labels and masks of sequence 00, path.txt, and a user's
-    own mine/letter.txt.
-    """
+    """A folder with data and results of sequence 00, and with a letter of the user's own."""
     for name, picture in (
         ("labels", np.repeat([[7], [23]], 16, axis=0).repeat(40, axis=1)),
         ("masks", np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1)),

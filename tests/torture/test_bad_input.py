@@ -43,7 +43,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, (48, 64), np.uint8)
 
 @pytest.fixture
 def inside(folder, monkeypatch, capfd):
-    """inside(words): run a command in `folder` and in this process; returns a `trials.Result`."""
+    """Give inside(words), which runs a command in `folder` and returns a `trials.Result`."""
 
     def run(words):
         monkeypatch.chdir(folder)

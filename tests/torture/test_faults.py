@@ -1,5 +1,6 @@
-"""Faults of the machine: commands killed at random moments, full and read-only disks, killed
-workers, too little memory. Odd names, no network and a read-only cache must work.
+"""Faults of the machine: killed commands and workers, full and read-only disks, little memory.
+
+Odd names, no network and a read-only cache must work.
 """
 
 import ctypes
@@ -39,7 +40,7 @@ def long(*case):
 
 @pytest.fixture
 def disk(tmp_path):
-    """disk(kilobytes, "ro" or "rw"): make or resize a small disk below `tmp_path`."""
+    """Give disk(kilobytes, "ro" or "rw"), which makes or resizes a small disk."""
     folder = tmp_path / "disk"
     folder.mkdir()
 

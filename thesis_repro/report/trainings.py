@@ -39,10 +39,10 @@ def summary() -> list[dict[str, Any]]:
 
 
 def network_note(settings: Settings) -> str:
-    """Return one line that says whether a run's network is the recorded one, to the bit; empty for
-    a run of other data or sizes.
+    """Return one line that says whether a run's network is the recorded one, to the bit.
 
-    The digest of the network's weights is in the record of its label maps.
+    It is empty for a run of other data or sizes. The digest of the network's weights is in the
+    record of its label maps.
     """
     folders = listed(settings.build / "labels", "*")
     if not settings.figures_in_git or not folders:
