@@ -118,7 +118,8 @@ def test_few_samples_are_solved_by_opencv(monkeypatch):
 
 
 def test_opencv_does_the_whole_search_if_the_bounds_were_wrong(monkeypatch):
-    monkeypatch.setattr(ransac, "_opencv_solution", lambda *arguments: (1, None, None))
+    wrong = ransac._Solution(1, None, None)
+    monkeypatch.setattr(ransac, "_opencv_solution", lambda *arguments: wrong)
     assert assert_same_bits(*scene(np.random.default_rng(2), 500))
 
 
