@@ -13,7 +13,7 @@ from thesis_repro.data.trajectories import are_poses
 from thesis_repro.errors import InputError, need
 from thesis_repro.odometry import keypoints, pose
 from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refined.fit import RefinedMotion, fit, measured, smaller_rotation
+from thesis_repro.odometry.refined.fit import RefinedMotion, fit, smaller_rotation, with_uncertainty
 from thesis_repro.odometry.refined.guided import ransac_with_prior
 from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency, is_consistent
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
@@ -242,7 +242,7 @@ class Odometry:
             return True
         if not isinstance(motion, RefinedMotion):
             current, previous = self._normalised(step)
-            measured_motion = measured(
+            measured_motion = with_uncertainty(
                 motion.rotation,
                 motion.translation,
                 current,
