@@ -149,7 +149,7 @@ def test_of_two_motions_the_consistent_one_is_used_and_flagged():
         (turn(8), AHEAD, MotionPrior(turn(1), AHEAD, 0.5)),
         (turn(0.5), -AHEAD, MotionPrior(turn(1), AHEAD, 0.5)),
         (turn(-4), np.array([0.8, 0, 0.6]), MotionPrior(turn(1), AHEAD, 0.5)),
-        (turn(0.5), SIDEWAYS, MotionPrior()),
+        (turn(0.5), SIDEWAYS, MotionPrior.straight_ahead()),
     ],
     ids=["a sharp turn", "reversing", "both", "a first step sideways"],
 )
