@@ -128,9 +128,9 @@ def evaluate(
                 for key, value in rpe.items()
             }
             row |= {
-                "t_rel_percent": segments["translation_percent"],
+                "t_rel_percent": segments["t_rel"],
                 "segments": segments["segments"],
-                "r_rel_deg_per_100m": segments["rotation_deg_per_100m"],
+                "r_rel_deg_per_100m": segments["r_rel"],
                 "note": row["note"] or segments["note"],
             }
         rows.append({key: None if value != value else value for key, value in row.items()})
