@@ -220,8 +220,10 @@ def eliminate(a, b):
     B(z) is one eliminated row minus z times the next one, so that only x, y and 1 are left. It
     holds their factors: polynomials in z of degree 3, 3 and 4, each with its highest power first.
     """
-    if not _gauss_jordan(a):
+    # Gauss-Jordan elimination
+    if not _make_triangular(a):
         return False
+    _substitute_back(a)
     for i in range(3):
         # the columns of x z^2 to x, y z^2 to y, z^3 to 1
         for start, stop, place in ((10, 13, 0), (13, 16, 4), (16, 20, 8)):
@@ -232,8 +234,8 @@ def eliminate(a, b):
 
 
 @inner
-def _gauss_jordan(a):
-    """Gauss-Jordan elimination of a (10, 20) with partial pivoting, in place.
+def _make_triangular(a):
+    """Clear a (10, 20) below its diagonal, with partial pivoting.
 
     Returns False if a is singular.
     """
@@ -251,13 +253,18 @@ def _gauss_jordan(a):
             factor = a[i, k] / a[k, k]
             for j in range(k + 1, 20):
                 a[i, j] -= factor * a[k, j]
-    for k in range(9, 3, -1):  # B(z) needs the last six unknowns only
+    return True
+
+
+@inner
+def _substitute_back(a):
+    """Solve the triangular equations a (10, 20) for the last six unknowns: B(z) needs no others."""
+    for k in range(9, 3, -1):
         for i in range(k + 1, 10):
             for j in range(10, 20):
                 a[k, j] -= a[k, i] * a[i, j]
         for j in range(10, 20):
             a[k, j] /= a[k, k]
-    return True
 
 
 @inner

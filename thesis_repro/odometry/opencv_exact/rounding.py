@@ -69,9 +69,9 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
 def _elimination_errors(a):
     """Rounding errors (6) of the six rows that B(z) is made from, OpenCV's way included.
 
-    They are in units of ROUNDING. a (10, 20): result of the elimination, with the triangle U of the last six unknowns. An error of
-    one unit in the equations becomes |U^-1| times the size of the result. OpenCV inverts and
-    multiplies, which adds |U^-1| |U| |U^-1|.
+    They are in units of ROUNDING. a (10, 20): result of the elimination, with the triangle U of the
+    last six unknowns. An error of one unit in the equations becomes |U^-1| times the size of the
+    result. OpenCV inverts and multiplies, which adds |U^-1| |U| |U^-1|.
     """
     largest = 1.0
     for k in range(4, 10):
@@ -151,10 +151,10 @@ def _best_row(cofactors):
 def _solution_error(b, best, z, error, polynomial, work):
     """First-order rounding error of the essential matrix of a root z, in units of ROUNDING.
 
-    The matrix has unit norm. In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal to B(z). An error of z
-    changes it; that error is the error of det B(z) over the slope of det B(z). An error of B(z)
-    changes it by the error over B(z)'s second singular value, which is the norm of the cofactors
-    over the norm of B(z).
+    The matrix has unit norm. In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal
+    to B(z). An error of z changes it; that error is the error of det B(z) over the slope of det
+    B(z). An error of B(z) changes it by the error over B(z)'s second singular value, which is the
+    norm of the cofactors over the norm of B(z).
     """
     values, wrong, cofactors = work[0], work[2], work[3]
     cofactor_norm = 0.0

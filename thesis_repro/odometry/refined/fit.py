@@ -56,8 +56,8 @@ class RefinedMotion(Motion):
 def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smaller rotation (3x3) of an essential matrix, and its translation.
 
-    The translation (3) has unit length and either sign. The other rotation differs by 180 degrees about the translation (twisted pair). No car turns so
-    far between frames.
+    The translation (3) has unit length and either sign. The other rotation differs by 180 degrees
+    about the translation (twisted pair). No car turns so far between frames.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     smaller = first if np.trace(first) >= np.trace(second) else second
@@ -122,10 +122,11 @@ def refine(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motion (rotation 3x3, unit translation) fitted to all its inliers.
 
-    current, previous: normalised correspondences (N, 2). Levenberg-Marquardt over the rotation and the two angles of the translation's direction. It
-    minimises Sampson distances with Cauchy weights at half the threshold. The first fit uses
-    `inliers` (N booleans). Two more fits use the points within SUPPORT_THRESHOLDS, so the result
-    hardly depends on which inliers RANSAC happened to choose.
+    current, previous: normalised correspondences (N, 2). Levenberg-Marquardt over the rotation and
+    the two angles of the translation's direction. It minimises Sampson distances with Cauchy
+    weights at half the threshold. The first fit uses `inliers` (N booleans). Two more fits use the
+    points within SUPPORT_THRESHOLDS, so the result hardly depends on which inliers RANSAC happened
+    to choose.
 
     The cost at this narrow scale has many minima. So a second start fits the first result to all
     correspondences at wider scales first, and the motion with the lower cost is returned. A second
@@ -254,9 +255,9 @@ def _solve(matrix, right, integers):
 def cheirality_votes(rotation, t, current, previous, parallax):
     """Numbers of points in front of both cameras under (rotation, t) and (rotation, -t).
 
-    current, previous: correspondences (N, 2). Points whose rays meet at less than `parallax` (the sine of the angle) do not determine the
-    sign, so they do not vote. (pose.recover_pose leaves out points beyond 50 translations, which in
-    a slow step are a few metres.)
+    current, previous: correspondences (N, 2). Points whose rays meet at less than `parallax` (the
+    sine of the angle) do not determine the sign, so they do not vote. (pose.recover_pose leaves out
+    points beyond 50 translations, which in a slow step are a few metres.)
     """
     forward = 0
     backward = 0
@@ -386,7 +387,9 @@ def _normal_equations(r, t, current, previous, scale):
     """
     matrices = _essential_and_derivatives(r, t)
     essential = epipolar.entries(matrices[0])
-    cost, hessian, gradient = 0.0, np.zeros((5, 5)), np.zeros(5)
+    cost = 0.0
+    hessian = np.zeros((5, 5))
+    gradient = np.zeros(5)
     # Points are handled in blocks, one quantity after the other, so that these loops are
     # vectorised. The sums go point by point, so the bits are those of one loop over all points.
     size = POINTS_PER_BLOCK
@@ -429,7 +432,13 @@ def _normal_equations(r, t, current, previous, scale):
                 gradient[k] += weight[i] * residual[i] * jacobian[k, i]
                 for j in range(k + 1):
                     hessian[k, j] += weight[i] * jacobian[k, i] * jacobian[j, i]
+    _mirror(hessian)
+    return cost, hessian, gradient
+
+
+@inner
+def _mirror(matrix):
+    """Copy the lower triangle of a matrix (5, 5) to the upper one."""
     for k in range(5):
         for j in range(k):
-            hessian[j, k] = hessian[k, j]
-    return cost, hessian, gradient
+            matrix[j, k] = matrix[k, j]
