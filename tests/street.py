@@ -1,5 +1,6 @@
-"""A street of noise for tests of the odometry; it is rendered with exact arithmetic, the same
-on every machine.
+"""A street of noise for tests of the odometry.
+
+It is rendered with exact arithmetic, the same on every machine.
 """
 
 import cv2
@@ -7,8 +8,9 @@ import numpy as np
 
 
 class Street:
-    """A sequence, as far as `odometry.run` needs one: a drive between two walls along z with a
-    slight turn, 0.4 metres a step.
+    """A sequence, as far as `odometry.run` needs one.
+
+    It is a drive between two walls along z with a slight turn, 0.4 metres a step.
     """
 
     name = "street"

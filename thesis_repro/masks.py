@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehi
 # Where keypoints are allowed: on boundaries, as in the thesis, or as in published SLAM systems with
 # segmentation.
 KEEP = ("boundaries", "static", "inverse", "static-boundaries")
+CHOICES = {"boundaries": BOUNDARIES, "keep": KEEP, "ids": IDS, "symmetric": (False, True)}
 # pixels around movable objects that DynaSLAM excludes as well (in its Frame.cc)
 DYNASLAM_MARGIN = 15
 
@@ -65,19 +66,14 @@ class MaskSettings:
             if not isinstance(values, (tuple, list)):  # a list, if read from JSON
                 raise InputError(f"{name}={values!r}: must be a tuple, such as {example}")
             object.__setattr__(self, name, tuple(values))
-        if len(self.canny) != 2 or not all(
-            isinstance(threshold, Real) and threshold >= 0 for threshold in self.canny
-        ):
+        thresholds = [value for value in self.canny if isinstance(value, Real) and value >= 0]
+        if len(self.canny) != 2 or len(thresholds) != 2:
             raise InputError(f"canny={self.canny}: must be two numbers from 0 on, such as (5, 15)")
-        for name, known in (
-            ("boundaries", BOUNDARIES),
-            ("keep", KEEP),
-            ("ids", IDS),
-            ("symmetric", (False, True)),
-        ):
-            if getattr(self, name) not in known:
+        for name, choices in CHOICES.items():
+            value = getattr(self, name)
+            if value not in choices:
                 raise InputError(
-                    f"{name}={getattr(self, name)!r}: unknown; choose one of {', '.join(map(str, known))}"
+                    f"{name}={value!r}: unknown; choose one of {', '.join(map(str, choices))}"
                 )
         for name in self.classes:
             if name not in ID:
@@ -110,14 +106,12 @@ def edges(
         class_edges = edges(label_map, size, replace(settings, boundaries="exact", symmetric=True))
         return canny & dilate(class_edges, CLASS_EDGE_WINDOW)
     enlarged = _enlarge(label_map, size, settings.symmetric)
-    selected = (
-        np.isin(enlarged, [ID[name] for name in settings.classes])
-        if settings.classes
-        else np.ones(size, bool)
-    )
-    allowed = (
-        ~np.isin(enlarged, MOVABLE) if settings.keep == "static-boundaries" else np.ones(size, bool)
-    )
+    selected = np.ones(size, bool)  # one side of a boundary must be
+    if settings.classes:
+        selected = np.isin(enlarged, [ID[name] for name in settings.classes])
+    allowed = np.ones(size, bool)  # both sides of a boundary must be
+    if settings.keep == "static-boundaries":
+        allowed = ~np.isin(enlarged, MOVABLE)
     different = np.zeros(size, bool)
     for pixel, neighbour in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         change = (enlarged[pixel] != enlarged[neighbour]) & (selected[pixel] | selected[neighbour])
@@ -143,7 +137,9 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
     because symmetric exact edges are two pixels wide.
     """
     check_width(dilation_width, edge_image.shape)
-    side = dilation_width - (dilation_width % 2 == 0) if symmetric else dilation_width
+    side = dilation_width
+    if symmetric and side % 2 == 0:
+        side -= 1
     return cv2.dilate(edge_image, np.ones((side, side), np.uint8))
 
 
@@ -158,14 +154,14 @@ def check_width(dilation_width: int, size: tuple[int, int]) -> None:
 
 
 def forbidden(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> np.ndarray:
-    """Pixels where keypoints are forbidden, (height, width) booleans: movable objects and the
-    border's margin.
+    """Pixels where keypoints are forbidden, (height, width) booleans.
+
+    They are movable objects and the border's margin.
     """
     height, width = size
+    margin = settings.margin
     is_forbidden = np.ones(size, bool)
-    is_forbidden[
-        settings.margin : height - settings.margin, settings.margin : width - settings.margin
-    ] = False
+    is_forbidden[margin : height - margin, margin : width - margin] = False
     if settings.movable is not None:
         moving = _enlarge(np.isin(label_map, MOVABLE).astype(np.uint8), size, True)
         is_forbidden |= dilate(moving, 2 * settings.movable + 1) > 0
@@ -178,8 +174,9 @@ def keypoint_mask(
     dilation_width: int,
     settings: MaskSettings = MaskSettings(),
 ) -> np.ndarray:
-    """Keypoint mask of one frame from its label map: `dilate(edges(...))` without the
-    `forbidden` pixels.
+    """Keypoint mask of one frame from its label map.
+
+    It is `dilate(edges(...))` without the `forbidden` pixels.
 
     Raises InputError unless the label map is (h, w) uint8 label ids, and for another kind of size
     or settings.
@@ -196,37 +193,34 @@ def keypoint_mask(
         raise InputError(
             f"label map: holds {label_map.max()}; must hold Cityscapes label ids, 0 to {N_CLASSES - 1}"
         )
-    return _finish_mask(_edges_and_forbidden(label_map, size, settings), dilation_width, settings)
+    return _finish_mask(_parts(label_map, size, settings), dilation_width, settings)
 
 
-def _edges_and_forbidden(
-    label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Edges and forbidden pixels (None if there are none) of a mask; both do not depend on the
-    dilation width.
-    """
+class _Parts(NamedTuple):
+    """The parts of a mask that do not depend on the dilation width."""
+
+    edges: np.ndarray  # (height, width) uint8
+    forbidden: np.ndarray | None  # (height, width) booleans; None if no pixel is
+
+
+def _parts(label_map: np.ndarray, size: tuple[int, int], settings: MaskSettings) -> _Parts:
     if settings.keep == "static":
-        movable = DYNASLAM_MARGIN if settings.movable is None else settings.movable
-        return np.full(size, 255, np.uint8), forbidden(
-            label_map, size, replace(settings, movable=movable)
-        )
-    has_forbidden = settings.movable is not None or settings.margin
-    return edges(label_map, size, settings), forbidden(
-        label_map, size, settings
-    ) if has_forbidden else None
+        if settings.movable is None:
+            settings = replace(settings, movable=DYNASLAM_MARGIN)
+        everywhere = np.full(size, 255, np.uint8)
+        return _Parts(everywhere, forbidden(label_map, size, settings))
+    edge_image = edges(label_map, size, settings)
+    if settings.movable is None and not settings.margin:
+        return _Parts(edge_image, None)
+    return _Parts(edge_image, forbidden(label_map, size, settings))
 
 
-def _finish_mask(
-    edges_and_forbidden: tuple[np.ndarray, np.ndarray | None],
-    dilation_width: int,
-    settings: MaskSettings,
-) -> np.ndarray:
-    edge_image, forbidden_pixels = edges_and_forbidden
-    mask = dilate(edge_image, dilation_width, settings.symmetric)
+def _finish_mask(parts: _Parts, dilation_width: int, settings: MaskSettings) -> np.ndarray:
+    mask = dilate(parts.edges, dilation_width, settings.symmetric)
     if settings.keep == "inverse":
         mask = cv2.bitwise_not(mask)
-    if forbidden_pixels is not None:
-        mask[forbidden_pixels] = 0
+    if parts.forbidden is not None:
+        mask[parts.forbidden] = 0
     return mask
 
 
@@ -237,7 +231,9 @@ def boundaries_found(mask: np.ndarray, true_labels: np.ndarray) -> float:
     symmetric).
     """
     true = edges(true_labels, mask.shape, MaskSettings("exact", symmetric=True)) > 0
-    return float((mask[true] > 0).mean()) if true.any() else np.nan
+    if not true.any():
+        return np.nan
+    return float((mask[true] > 0).mean())
 
 
 def coverage(mask: np.ndarray) -> float:
@@ -261,17 +257,15 @@ class LabelMasks:
         settings: MaskSettings = MaskSettings(),
     ) -> None:
         need("settings", settings, MaskSettings)
-        self.paths, self.frame_paths = (
-            _paths_by_frame(folder, sequence, "label map"),
-            sequence.frame_paths,
-        )
+        self.paths = _paths_by_frame(folder, sequence, "label map")
+        self.frame_paths = sequence.frame_paths
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
         check_width(dilation_width, self.size)
         for name, pixels, limit in (
-            ("margin", self.settings.margin, (min(self.size) - 1) // 2),
-            ("movable", self.settings.movable or 0, max(self.size) - 1),
+            ("margin", settings.margin, (min(self.size) - 1) // 2),
+            ("movable", settings.movable or 0, max(self.size) - 1),
         ):
             if pixels > limit:
                 raise InputError(
@@ -283,7 +277,7 @@ class LabelMasks:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        parts = _edges_and_forbidden_of_file(self.paths[index], self.size, self.settings)
+        parts = _parts_of_file(self.paths[index], self.size, self.settings)
         return _finish_mask(parts, self.dilation_width, self.settings)
 
 
@@ -293,10 +287,9 @@ def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)  # masks of several dilation widths share edges
-def _edges_and_forbidden_of_file(
-    path: Path, size: tuple[int, int], settings: MaskSettings
-) -> tuple[np.ndarray, np.ndarray | None]:
-    return _edges_and_forbidden(_read_once(path, settings.ids == "train"), size, settings)
+def _parts_of_file(path: Path, size: tuple[int, int], settings: MaskSettings) -> _Parts:
+    label_map = _read_once(path, settings.ids == "train")
+    return _parts(label_map, size, settings)
 
 
 # Masks of several settings share the label map of a frame, and one control takes that of another
@@ -306,7 +299,7 @@ _read_once = lru_cache(maxsize=2)(read_label_map)
 
 def forget_edges() -> None:
     """Clear the caches of LabelMasks, so that the time to make a mask can be measured."""
-    _edges_and_forbidden_of_file.cache_clear()
+    _parts_of_file.cache_clear()
     _read_once.cache_clear()
 
 
@@ -351,14 +344,16 @@ class MaskFolder:
 
     def __getitem__(self, index: int) -> np.ndarray:
         mask = read_mask(self.paths[index], self.size)
-        return np.where(mask, np.uint8(0), np.uint8(255)) if self.invert else mask
+        if self.invert:
+            return np.where(mask, np.uint8(0), np.uint8(255))
+        return mask
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """Read a mask for frames of (height, width): uint8, 0 where keypoints are forbidden and one
-    other value elsewhere.
+    """Read a mask for frames of (height, width).
 
-    Raises InputError if the size differs or there are more than two values, as in a label map.
+    It is uint8, 0 where keypoints are forbidden and one other value elsewhere. Raises InputError if
+    the size differs or there are more than two values, as in a label map.
     """
     mask = read_gray(path)
     check_size(Path(path), mask.shape, size, "its frame")
@@ -370,39 +365,53 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
     return mask
 
 
-def folder_of(folder: str | Path, sequence: str) -> Path:
-    """Folder with the label maps or masks of a sequence: the folder of its name in `folder`, or
-    `folder` itself if that holds files, as `thesis-repro predict` and `masks` write them.
+def folder_of_sequence(folder: str | Path, sequence: str) -> Path:
+    """Folder with the label maps or masks of a sequence.
+
+    That is the folder of its name in `folder`, or `folder` itself if that holds files, as
+    `thesis-repro predict` and `masks` write them.
     """
-    folder, subfolder = Path(folder), Path(folder, sequence)
-    return folder if any(folder.glob("[!.]*.png")) and not subfolder.is_dir() else subfolder
+    folder = Path(folder)
+    subfolder = folder / sequence
+    if not subfolder.is_dir() and any(folder.glob("[!.]*.png")):
+        return folder
+    return subfolder
 
 
 def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[Path]:
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
     if kind == "mask" and Path(folder).is_file():
         return [Path(folder)] * len(sequence)
-    folder = folder_of(folder, sequence.name)
+    folder = folder_of_sequence(folder, sequence.name)
     if not folder.is_dir():
         raise InputError(
             f"{folder}: no such folder; it must hold one {kind} for each frame of sequence "
             f"{sequence.name}"
         )
     present = {path.name: path for path in listed(folder)}
-    # A single mask named as frames are is the mask of one frame only.
     if kind == "mask" and len(present) == 1:
-        stem = Path(*present).name.removesuffix(".png").removesuffix(".png")
-        if numbers_of([*sequence.frame_paths, Path(stem)]) is None:
-            return list(present.values()) * len(sequence)
-    # some tools append .png to the whole name
-    paths: list[Any] = [
-        present.get(name) or present.get(f"{frame.name}.png")
-        for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True)
-    ]
-    missing = [name for name, path in zip(sequence.label_names, paths, strict=True) if path is None]
+        single = next(iter(present.values()))
+        # a single mask named as frames are is the mask of one frame only
+        if not _is_named_as_a_frame(single, sequence):
+            return [single] * len(sequence)
+    paths: list[Path] = []
+    missing: list[str] = []
+    for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True):
+        # some tools append .png to the whole name
+        path = present.get(name) or present.get(f"{frame.name}.png")
+        if path is None:
+            missing.append(name)
+        else:
+            paths.append(path)
     if missing:
         raise InputError(
             f"{folder / missing[0]}: no such {kind} ({len(missing)} of {len(sequence)} frames of sequence "
             f"{sequence.name} have none); each frame needs one"
         )
     return paths
+
+
+def _is_named_as_a_frame(mask: Path, sequence: Sequence) -> bool:
+    """Whether a mask is that of one frame, by its name, with or without an appended .png."""
+    stem = mask.name.removesuffix(".png").removesuffix(".png")
+    return numbers_of([*sequence.frame_paths, Path(stem)]) is not None

@@ -16,7 +16,9 @@ import thesis_repro as tr
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.data.trajectories import read_poses
+from thesis_repro.odometry import estimators
 from thesis_repro.running.settings import ROOT
+from thesis_repro.study import jobs
 
 
 def run(command, *options):
@@ -42,6 +44,11 @@ def test_a_command_shows_two_valid_examples_and_takes_no_abbreviations(name):
     examples = [shlex.split(line) for line in COMMANDS[name].epilog.splitlines()[1:]]
     assert len(examples) == 2 and not COMMANDS[name].allow_abbrev and not PARSER.allow_abbrev
     assert [PARSER.parse_args(words).command for _, *words in examples] == [name, name]
+
+
+def test_the_help_names_every_estimator():
+    for command, names in (("odometry", estimators.ESTIMATORS), ("study", jobs.ESTIMATORS)):
+        assert f"--estimator {'|'.join(names)}" in COMMANDS[command].format_help()
 
 
 def test_forms_of_widths_and_frames():

@@ -1,6 +1,6 @@
 """The odometry against PySLAM's runs, its rules for bad frames, and its settings."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskFolder
-from thesis_repro.odometry import THESIS, Odometry, keypoints, metrics, pose
+from thesis_repro.odometry import THESIS, Odometry, OdometrySettings, keypoints, metrics, pose
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {
@@ -212,8 +212,9 @@ def test_the_pose_vote_has_opencvs_bits(drive, kind):
 
 
 class Changed(Street):
-    """A copy of a street with some frames replaced; it notes the frames read, and stops at one
-    of them if asked to.
+    """A copy of a street with some frames replaced.
+
+    It notes the frames read, and stops at one of them if asked to.
     """
 
     def __init__(self, sequence, replaced=None, poses=None, frames=None, killed_at=None):
@@ -395,14 +396,20 @@ def test_many_runs_in_one_pass_give_the_bits_of_separate_runs(drive):
     assert together["all"].frames["track_seconds"].isna().all()
 
 
+class Counted(Stripes):
+    """Stripes that note the frames whose mask was asked for."""
+
+    def __init__(self, width):
+        super().__init__(width)
+        self.asked = []
+
+    def __getitem__(self, index):
+        self.asked.append(index)
+        return super().__getitem__(index)
+
+
 def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypatch):
-    asked, estimated = [], []
-
-    class Counted(Stripes):
-        def __getitem__(self, index):
-            asked.append(index)
-            return super().__getitem__(index)
-
+    estimated = []
     stripes, few = Counted(20), Changed(drive, frames=6)
     runs = {
         (order, estimator): (replace(THESIS, shuffle_seed=order, estimator=estimator), stripes)
@@ -411,17 +418,46 @@ def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypa
     }
     for _, estimator in runs:
         odometry.odometry.warm_up(estimator == "refined")  # it estimates essential matrices too
-    monkeypatch.setattr(
-        pose,
-        "essential_matrix",
-        lambda *given, original=pose.essential_matrix: (estimated.append(1), original(*given))[1],
-    )
+    original = pose.essential_matrix
+
+    def counting(*arguments):
+        estimated.append(1)
+        return original(*arguments)
+
+    monkeypatch.setattr(pose, "essential_matrix", counting)
     together = odometry.run_many(few, runs)
-    assert asked == list(range(len(few))) and len(estimated) == 2 * (len(few) - 1)
+    assert stripes.asked == list(range(len(few))) and len(estimated) == 2 * (len(few) - 1)
     for name, (settings, masks) in runs.items():
         assert_same(together[name], odometry.run(few, settings, masks))
     # the refined runs are equal for both orders here, the others differ
     assert len({together[name].poses.tobytes() for name in runs}) == 3
+
+
+@dataclass(frozen=True)
+class NewSettings(OdometrySettings):
+    """Settings with one that nobody has said anything about."""
+
+    invented: int = 0
+
+
+@pytest.mark.parametrize(
+    "setting, value, times",
+    [
+        ("scale_gate", 0.2, 1),  # acts last
+        ("threshold", 0.001, 1),
+        ("quality", 0.02, 2),
+        ("invented", 1, 2),
+    ],
+)
+def test_runs_share_nothing_if_a_setting_differs_that_may_matter(drive, setting, value, times):
+    few, stripes = Changed(drive, frames=3), Counted(20)
+    settings = NewSettings(max_keypoints=300)
+    runs = {
+        "first": (settings, stripes),
+        "second": (replace(settings, **{setting: value}), stripes),
+    }
+    odometry.run_many(few, runs)
+    assert len(stripes.asked) == times * len(few)
 
 
 def test_a_killed_pass_resumes_with_the_same_bits(drive, tmp_path, monkeypatch):

@@ -23,8 +23,9 @@ def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBA
 
 
 def scene(random, count, outliers=0.3, noise=2e-4, motion=1.0, depth=(4, 40), turn=0.02):
-    """Correspondences (current, previous) of a camera that moves forward by `motion`; the first
-    ones are outliers.
+    """Correspondences (current, previous) of a camera that moves forward by `motion`.
+
+    The first ones are outliers.
     """
     points = random.uniform([-10, -3, depth[0]], [10, 3, depth[1]], (count, 3))
     rotation = cv2.Rodrigues(random.normal(0, turn, 3))[0]
@@ -100,25 +101,22 @@ def test_other_thresholds_and_probabilities():
 
 
 def test_few_samples_are_solved_by_opencv(monkeypatch):
-    """This makes the search fast: OpenCV solves a few samples of five and never does the whole
-    search.
-    """
+    """This makes the search fast: OpenCV never does the whole search."""
     real, sizes = cv2.findEssentialMat, []
+
+    def noting(points, *arguments, **options):
+        sizes.append(len(points))
+        return real(points, *arguments, **options)
+
     current, previous = scene(np.random.default_rng(1), 1000, outliers=0.5)
-    monkeypatch.setattr(
-        cv2,
-        "findEssentialMat",
-        lambda points, *arguments, **options: (
-            sizes.append(len(points)),
-            real(points, *arguments, **options),
-        )[1],
-    )
+    monkeypatch.setattr(cv2, "findEssentialMat", noting)
     ransac.find_essential_matrix(current, previous, THESIS.threshold, pose.PROBABILITY)
     assert 0 < len(sizes) < 60 and set(sizes) == {5}  # of about 200 samples
 
 
 def test_opencv_does_the_whole_search_if_the_bounds_were_wrong(monkeypatch):
-    monkeypatch.setattr(ransac, "_opencv_solution", lambda *arguments: (1, None, None))
+    wrong = ransac._Solution(1, None, None)
+    monkeypatch.setattr(ransac, "_opencv_solution", lambda *arguments: wrong)
     assert assert_same_bits(*scene(np.random.default_rng(2), 500))
 
 
@@ -158,11 +156,12 @@ def test_same_bits_on_real_frames(kitti_real, name, monkeypatch):
     # now, so that it adds no pair; lru_cache knows only the positional call
     odometry.odometry.warm_up(False)
     pairs, real = [], ransac.find_essential_matrix
-    monkeypatch.setattr(
-        ransac,
-        "find_essential_matrix",
-        lambda *arguments: (pairs.append(arguments[:2]), real(*arguments))[1],
-    )
+
+    def noting(current, previous, *arguments):
+        pairs.append((current, previous))
+        return real(current, previous, *arguments)
+
+    monkeypatch.setattr(ransac, "find_essential_matrix", noting)
     odometry.run(Sequence(kitti_real, name).subset(12))
     monkeypatch.undo()
     assert len(pairs) == 11

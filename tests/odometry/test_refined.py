@@ -1,6 +1,4 @@
-"""The refined estimator: the fit, the sign of slow steps and the consistency with the motion
-prior.
-"""
+"""The refined estimator: the fit, the sign of slow steps, consistency with the motion prior."""
 
 from dataclasses import replace
 
@@ -29,8 +27,9 @@ def turn(degrees):
 
 
 def seen(world, rotation, translation, noise=0.0, seed=0):
-    """Correspondences (current, previous) of points (N, 3) in the current camera and its motion
-    to the previous one.
+    """Correspondences (current, previous) of points (N, 3) in the current camera.
+
+    rotation, translation: its motion to the previous camera.
     """
     moved = world @ rotation.T + translation
     current, previous = (points[:, :2] / points[:, 2:] for points in (world, moved))
@@ -149,7 +148,7 @@ def test_of_two_motions_the_consistent_one_is_used_and_flagged():
         (turn(8), AHEAD, MotionPrior(turn(1), AHEAD, 0.5)),
         (turn(0.5), -AHEAD, MotionPrior(turn(1), AHEAD, 0.5)),
         (turn(-4), np.array([0.8, 0, 0.6]), MotionPrior(turn(1), AHEAD, 0.5)),
-        (turn(0.5), SIDEWAYS, MotionPrior()),
+        (turn(0.5), SIDEWAYS, MotionPrior.straight_ahead()),
     ],
     ids=["a sharp turn", "reversing", "both", "a first step sideways"],
 )
@@ -232,8 +231,9 @@ def test_a_camera_that_only_turns_or_zooms_is_flagged(estimator, axis, degrees, 
 @pytest.mark.real
 @pytest.mark.parametrize("seed", [None, 2, 4])
 def test_a_turn_is_estimated_from_few_keypoints(kitti_real, seed):
-    """05, frames 128 to 149: the points are far away, so a shift to the side explains them as
-    well as the turn.
+    """05, frames 128 to 149.
+
+    The points are far away, so a shift to the side explains them as well as the turn.
     """
     sequence = Sequence(kitti_real, "05")
     settings = replace(REFINED, max_keypoints=500, shuffle_seed=seed)
@@ -252,8 +252,9 @@ def test_a_turn_is_estimated_from_few_keypoints(kitti_real, seed):
 
 @pytest.mark.real
 def test_a_second_start_leaves_a_poor_minimum(kitti_real):
-    """05, frames 0 and 1: without a second start, six shuffles of 300 points give headings up
-    to 11 degrees apart.
+    """05, frames 0 and 1.
+
+    Without a second start, six shuffles of 300 points give headings up to 11 degrees apart.
     """
     sequence = Sequence(kitti_real, "05")
     directions = []

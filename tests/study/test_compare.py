@@ -35,6 +35,10 @@ def ratio_of(rows, reference):
     return compare.geometric_mean(compare.ratios(rows, reference, "rmse"))
 
 
+def test_a_change_in_percent_is_negative_if_the_value_is_smaller():
+    assert thesis_tables.percent_change(3.0, 4.0) == -25.0
+
+
 def test_known_ratios_are_found_and_inverted_by_swapping():
     masked, baseline = arms(runs_of({"masked": 0.5}, noise=0.3), "masked", "baseline")
     forth, back = ratio_of(masked, baseline), ratio_of(baseline, masked)

@@ -51,6 +51,14 @@ def _setting(read: Callable[[str], Any]) -> Callable[[str], Any]:
     return read_text
 
 
+def _compared_estimator(text: str) -> str:
+    from thesis_repro.study.jobs import ESTIMATORS  # here, because this import takes a second
+
+    if text not in ESTIMATORS:
+        raise InputError(f"{text!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    return text
+
+
 # options of several commands
 SHARED: dict[str, dict[str, Any]] = {
     "--kitti": dict(
@@ -272,7 +280,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         ),
         "--estimator": dict(
             nargs="+",
-            choices=("thesis", "refined"),
+            type=_setting(_compared_estimator),
+            metavar="thesis|refined",
             default=["thesis"],
             help="one or both (thesis)",
         ),

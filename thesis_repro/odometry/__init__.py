@@ -1,5 +1,7 @@
-"""Monocular visual odometry as PySLAM does it (Section 3.7): Shi-Tomasi, Lucas-Kanade, essential
-matrix, pose.
+"""Monocular visual odometry as PySLAM does it (Section 3.7).
+
+A step finds Shi-Tomasi keypoints, tracks them by Lucas-Kanade, and estimates the essential matrix
+and from it the pose.
 
 `run(sequence)` runs it once. `run_many` runs it with many settings or masks and shares work between
 the runs. With the settings THESIS, the result equals that of PySLAM of August 2021 on every frame.

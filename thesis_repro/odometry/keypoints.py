@@ -1,9 +1,11 @@
-"""Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2), for one
-run or for many runs.
+"""Keypoints: Shi-Tomasi detection and Lucas-Kanade tracking (Sections 3.7.1, 3.7.2).
+
+`detect` and `track` serve one run. `SharedKeypoints` does the same for many runs at once.
 """
 
 from collections.abc import Iterable
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,8 +22,15 @@ TRACKER = {
 
 NO_POINTS = np.empty((0, 2), np.float32)
 
-Corners = tuple[np.ndarray, np.ndarray]  # see find_corners
 Start = tuple[np.ndarray | None, np.ndarray]  # a frame to track from and its points (N, 2)
+
+
+class Corners(NamedTuple):
+    """Corners of a frame (height, width)."""
+
+    strength: np.ndarray  # of every pixel, (height, width)
+    # local maxima of the strength, as indices into the flattened image, strongest first
+    ranked: np.ndarray
 
 
 def detect(
@@ -41,20 +50,12 @@ def detect(
     """
     inside = mask if settings.mask_mode == "detect" else None
     if settings.detector == "orb":
-        points = cv2.KeyPoint_convert(_orb(settings.max_keypoints).detect(frame, inside))
+        keypoints = _orb(settings.max_keypoints).detect(frame, inside)
+        points = cv2.KeyPoint_convert(keypoints)
         points = np.reshape(points, (-1, 2)).astype(np.float32, copy=False)
     else:
-        strength, ranked = corners or find_corners(frame, settings.block_size)
-        # OpenCV computes the limit in double precision and rounds it to single.
-        limit = np.float32(cv2.minMaxLoc(strength, inside)[1] * settings.quality)
-        points = _spread(
-            strength,
-            ranked,
-            limit,
-            np.empty((0, 0), np.uint8) if inside is None else inside,
-            settings.max_keypoints,
-            float(settings.min_distance),
-        )
+        corners = corners or find_corners(frame, settings.block_size)
+        points = _strongest(corners, settings, inside)
     if mask is None or settings.mask_mode == "detect":
         return points
     columns, rows = np.rint(points).astype(int).T
@@ -64,6 +65,25 @@ def detect(
 @lru_cache
 def _orb(max_keypoints: int) -> cv2.ORB:
     return cv2.ORB_create(max_keypoints)
+
+
+def _strongest(
+    corners: Corners, settings: OdometrySettings, inside: np.ndarray | None
+) -> np.ndarray:
+    """Shi-Tomasi keypoints (N, 2) of a frame's corners, inside a mask if there is one."""
+    _, strongest, _, _ = cv2.minMaxLoc(corners.strength, inside)
+    # OpenCV computes the limit in double precision and rounds it to single.
+    limit = np.float32(strongest * settings.quality)
+    if inside is None:
+        inside = np.empty((0, 0), np.uint8)  # compiled functions take arrays of one type
+    return _spread(
+        corners.strength,
+        corners.ranked,
+        limit,
+        inside,
+        settings.max_keypoints,
+        float(settings.min_distance),
+    )
 
 
 def track(
@@ -84,14 +104,35 @@ def track(
     window leaves the frame; this function does that itself.
     """
     order = np.argsort(points[:, 1])
-    tracked, success = np.empty_like(points), np.empty(len(points), bool)
     tracker = TRACKER | {"winSize": (window, window), "maxLevel": levels}
-    tracked[order], status, _ = cv2.calcOpticalFlowPyrLK(
+    tracked_in_order, status, _ = cv2.calcOpticalFlowPyrLK(
         previous, current, points[order], None, flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, **tracker
     )
-    corner = tracked - (window - 1) / 2
-    success[order] = status.ravel() == 1
-    return tracked, success & ((corner >= -window) & (corner < current.shape[::-1])).all(axis=1)
+    tracked = np.empty_like(points)
+    tracked[order] = tracked_in_order
+    was_found = np.empty(len(points), bool)
+    was_found[order] = status.ravel() == 1
+    window_corner = tracked - (window - 1) / 2  # upper left
+    touches_frame = (window_corner >= -window) & (window_corner < current.shape[::-1])
+    return tracked, was_found & touches_frame.all(axis=1)
+
+
+class _Tracks(NamedTuple):
+    """Points of many runs, tracked together from one frame into the next."""
+
+    previous: np.ndarray
+    current: np.ndarray
+    keys: np.ndarray  # sorted, see `_key`
+    tracked: np.ndarray  # (N, 2), in the order of the keys
+    success: np.ndarray  # (N,) booleans
+
+
+class _FrameCorners(NamedTuple):
+    """The corners of a frame for one block size."""
+
+    frame: np.ndarray
+    block_size: int
+    corners: Corners
 
 
 class SharedKeypoints:
@@ -102,33 +143,26 @@ class SharedKeypoints:
     """
 
     def __init__(self) -> None:
-        # both frames, sorted keys of all points, result of `track`
-        self._tracks: tuple[np.ndarray, ...] = ()
-        # frame, block size, result of `find_corners`
-        self._corners: tuple[np.ndarray, int, Corners] | None = None
+        self._tracks: _Tracks | None = None
+        self._corners: _FrameCorners | None = None
 
     def expect(self, frame: np.ndarray, starts: Iterable[Start]) -> None:
-        """Track the points of all runs that have the same previous frame into `frame`. Few runs
-        have another one.
+        """Track the points of all runs that have the same previous frame into `frame`.
+
+        starts: of the runs. Few runs have another previous frame than the first one.
         """
-        with_points = [
+        starts_with_points = [
             (previous, points)
             for previous, points in starts
             if previous is not None and len(points)
         ]
-        if with_points:
-            first, _ = with_points[0]
-            keys = np.unique(
-                np.concatenate(
-                    [_key(points) for previous, points in with_points if previous is first]
-                )
-            )
-            self._tracks = (
-                first,
-                frame,
-                keys,
-                *track(first, frame, keys.view(np.float32).reshape(-1, 2)),
-            )
+        if not starts_with_points:
+            return
+        first, _ = starts_with_points[0]
+        all_keys = [_key(points) for previous, points in starts_with_points if previous is first]
+        keys = np.unique(np.concatenate(all_keys))
+        points = keys.view(np.float32).reshape(-1, 2)
+        self._tracks = _Tracks(first, frame, keys, *track(first, frame, points))
 
     def track(
         self,
@@ -138,78 +172,92 @@ class SharedKeypoints:
         window: int = WINDOW,
         levels: int = LEVELS,
     ) -> tuple[np.ndarray, np.ndarray]:
-        is_shared = self._tracks and previous is self._tracks[0] and current is self._tracks[1]
-        if not is_shared or (window, levels) != (WINDOW, LEVELS):
+        """Like `keypoints.track`. Points that `expect` has tracked are looked up."""
+        tracks = self._tracks
+        is_shared = (
+            tracks is not None
+            and previous is tracks.previous
+            and current is tracks.current
+            and (window, levels) == (WINDOW, LEVELS)
+        )
+        if tracks is None or not is_shared:
             return track(previous, current, points, window, levels)
-        _, _, keys, tracked, success = self._tracks
-        indices = np.searchsorted(keys, _key(points))
-        return tracked.take(indices, axis=0), success[indices]
+        indices = np.searchsorted(tracks.keys, _key(points))
+        return tracks.tracked.take(indices, axis=0), tracks.success[indices]
 
     def detect(
         self, frame: np.ndarray, settings: OdometrySettings, mask: np.ndarray | None = None
     ) -> np.ndarray:
+        """Like `keypoints.detect`. The corners of the last frame are kept."""
         size = settings.block_size
-        if self._corners is None or frame is not self._corners[0] or size != self._corners[1]:
-            self._corners = frame, size, find_corners(frame, size)
-        return detect(frame, settings, mask, self._corners[2])
+        last = self._corners
+        if last is None or frame is not last.frame or size != last.block_size:
+            last = _FrameCorners(frame, size, find_corners(frame, size))
+            self._corners = last
+        return detect(frame, settings, mask, last.corners)
 
 
 def _key(points: np.ndarray) -> np.ndarray:
+    """The bits of each of N points (N, 2) float32 as one integer, (N,)."""
     return np.ascontiguousarray(points).view(np.int64).ravel()
 
 
 def find_corners(frame: np.ndarray, block_size: int) -> Corners:
     """Corner strength of each pixel and its ranked local maxima.
 
-    The maxima are indices into the flattened image, strongest first. Of equal maxima, the last
-    pixel comes first. Pixels on the border are left out.
+    Of equal maxima, the last pixel comes first. Pixels on the border are left out.
     """
     strength = cv2.cornerMinEigenVal(frame, block_size)
     is_peak = (strength == cv2.dilate(strength, None)) & (strength > 0)
-    is_peak[[0, -1]] = is_peak[:, [0, -1]] = False
+    is_peak[[0, -1]] = False
+    is_peak[:, [0, -1]] = False
     peaks = np.flatnonzero(is_peak)
-    # Positive floats sort like their bit patterns, so one sort of integers ranks by strength and
-    # then by index.
-    return strength, np.sort(strength.ravel()[peaks].view(np.int32).astype(np.int64) << 32 | peaks)[
-        ::-1
-    ] & 0xFFFFFFFF
+    # a stable sort leaves equal maxima in the order of their pixels
+    weakest_first = np.argsort(strength.ravel()[peaks], kind="stable")
+    return Corners(strength, peaks[weakest_first[::-1]])
 
 
 @fast
 def _spread(strength, ranked, limit, mask, max_keypoints, min_distance):
-    """Strongest corners above `limit`, inside the mask if it is not empty, at least `min_distance`
-    apart.
+    """Strongest corners above `limit` that are at least `min_distance` apart.
 
-    As in OpenCV, neighbours are searched in adjacent grid cells only, so a fractional distance is
-    not kept exactly.
+    They lie inside the mask (height, width), unless it is empty, (0, 0). max_keypoints: 0 for no
+    limit. As in OpenCV, neighbours are searched in adjacent grid cells only, so a fractional
+    distance is not kept exactly.
     """
     height, width = strength.shape
     cell = max(int(np.rint(min_distance)), 1)
-    grid_rows, grid_columns = height // cell + 1, width // cell + 1
+    grid_rows = height // cell + 1
+    grid_columns = width // cell + 1
     head = np.empty((grid_rows, grid_columns), np.int32)  # last corner taken in a cell
     head[:] = -1
     below = np.empty(len(ranked), np.int32)  # the corner taken before it in the same cell
-    taken = np.empty(
-        (len(ranked) if max_keypoints <= 0 else min(len(ranked), max_keypoints), 2), np.float32
-    )
+    most = len(ranked)
+    if max_keypoints > 0:
+        most = min(most, max_keypoints)
+    taken = np.empty((most, 2), np.float32)
     count = 0
     for index in ranked:
-        y, x = index // width, index % width
-        if strength[y, x] <= limit or count == len(taken):
+        y = index // width
+        x = index % width
+        if strength[y, x] <= limit or count == most:
             break
         if mask.size and mask[y, x] == 0:
             continue
-        cell_y, cell_x = y // cell, x // cell
+        cell_y = y // cell
+        cell_x = x // cell
         free = True
         for near_y in range(max(cell_y - 1, 0), min(cell_y + 2, grid_rows)):
             for near_x in range(max(cell_x - 1, 0), min(cell_x + 2, grid_columns)):
                 other = head[near_y, near_x]
                 while free and other >= 0:
-                    dx, dy = x - taken[other, 0], y - taken[other, 1]
+                    dx = x - taken[other, 0]
+                    dy = y - taken[other, 1]
                     free = dx * dx + dy * dy >= min_distance * min_distance
                     other = below[other]
         if free:
-            taken[count, 0], taken[count, 1] = x, y
+            taken[count, 0] = x
+            taken[count, 1] = y
             below[count] = head[cell_y, cell_x]
             head[cell_y, cell_x] = count
             count += 1

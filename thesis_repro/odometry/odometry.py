@@ -12,22 +12,25 @@ from thesis_repro.data.kitti import check_camera, is_camera_matrix
 from thesis_repro.data.trajectories import are_poses
 from thesis_repro.errors import InputError, need
 from thesis_repro.odometry import keypoints, pose
+from thesis_repro.odometry.estimators import ESTIMATORS, Essential
 from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refined.fit import RefinedMotion, fit, measured, smaller_rotation
+from thesis_repro.odometry.refined.fit import RefinedMotion, fit, with_uncertainty
 from thesis_repro.odometry.refined.guided import ransac_with_prior
 from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency, is_consistent
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 
 TIMED_PARTS = ("detect", "track", "essential", "pose")
 ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
-ALL_KEYPOINTS = "all keypoints used"  # flag of a step that used the fallback
+# flags of a step that used the fallback, and of one that is shorter than the gate
+ALL_KEYPOINTS, STATIONARY = "all keypoints used", "stationary"
 MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
 
 
 @dataclass
 class Step:
-    """Results for one frame. Its N correspondences are `previous` and `current`, (N, 2) pixels;
-    `inliers` is (N,).
+    """Results for one frame.
+
+    Its N correspondences are `previous` and `current`, (N, 2) pixels; `inliers` is (N,).
     """
 
     frame: int
@@ -48,11 +51,10 @@ class Step:
 
     @property
     def inliers(self) -> np.ndarray:
-        return (
-            np.zeros(len(self.current), bool)
-            if self.motion.inliers is None
-            else self.motion.inliers
-        )
+        """Correspondences that agree with the essential matrix, (N,) booleans."""
+        if self.motion.inliers is None:
+            return np.zeros(len(self.current), bool)
+        return self.motion.inliers
 
     def copy(self) -> "Step":
         """Copy with the same correspondences, for another estimator."""
@@ -60,14 +62,18 @@ class Step:
 
     def row(self) -> dict[str, Any]:
         """One row of Result.frames."""
-        tracked = None if self.points is None else len(self.current)
+        tracked = inliers = pose_inliers = None
+        if self.points is not None:
+            tracked = len(self.current)
+            inliers = int(self.inliers.sum())
+            pose_inliers = self.motion.pose_inliers
         return {
             "frame": self.frame,
             "points": self.points,
             "detected": self.detected,
             "tracked": tracked,
-            "inliers": None if tracked is None else int(self.inliers.sum()),
-            "pose_inliers": None if tracked is None else self.motion.pose_inliers,
+            "inliers": inliers,
+            "pose_inliers": pose_inliers,
             "scale": self.scale,
             "updated": self.updated,
             "flag": "; ".join(self.flags),
@@ -96,7 +102,9 @@ class Odometry:
         start: np.ndarray | None = None,
         shared: keypoints.SharedKeypoints | None = None,
     ):
-        """intrinsics: 3x3, pixels, as (fx, 0, u), (0, fy, v), (0, 0, 1). start: pose of the first
+        """Start before the first frame.
+
+        intrinsics: 3x3, pixels, as (fx, 0, u), (0, fy, v), (0, 0, 1). start: pose of the first
         frame, 4x4. shared: keypoints shared with other runs. Raises InputError for another matrix,
         and for a start that is no pose.
         """
@@ -109,13 +117,12 @@ class Odometry:
                 "intrinsics: must be (fx, 0, u), (0, fy, v), (0, 0, 1) in pixels, not "
                 f"{self.intrinsics.tolist()}"
             )
-        if (
-            self.pose.shape != (4, 4)
-            or not are_poses(self.pose[None]).all()
-            or not np.array_equal(self.pose[3], [0, 0, 0, 1])
-        ):
+        is_pose = self.pose.shape == (4, 4) and are_poses(self.pose[None]).all()
+        if not is_pose or not np.array_equal(self.pose[3], [0, 0, 0, 1]):
             raise InputError("start: must be a pose, 4x4: a right-handed rotation and a position")
-        self.prior = MotionPrior()  # used by the refined estimator and the fallback only
+        self.prior = (
+            MotionPrior.straight_ahead()
+        )  # used by the refined estimator and the fallback only
         self.keypoints: Any = shared or keypoints  # both have `detect` and `track`
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
@@ -124,6 +131,7 @@ class Odometry:
         warm_up(settings.estimator == "refined" or settings.fallback)
 
     def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
+        """Take the next frame: `observe`, `estimate` and `compose`."""
         step = self.observe(frame, scale, mask)
         self.estimate(step)
         return self.compose(step)
@@ -131,11 +139,13 @@ class Odometry:
     def observe(
         self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None
     ) -> Step:
-        """Track the points into this frame and detect new keypoints. Returns a Step without a
-        motion.
+        """Track the points into this frame and detect new keypoints.
+
+        Returns a Step without a motion.
         """
         frame = np.asarray(frame)  # cv2.imread returns None for a missing file
-        mask = mask if mask is None else np.asarray(mask)
+        if mask is not None:
+            mask = np.asarray(mask)
         need(f"frame {self.count}: scale", np.asarray(scale)[()], Real)
         self._check(frame, scale, mask)
         step = Step(frame=self.count, scale=float(scale))
@@ -146,103 +156,110 @@ class Odometry:
             step.flags.append("flat frame")
             self.gap = step.scale
             return step
+        self.gap = 0.0
         if self.settings.fallback and mask is not None and self.previous is not None:
             step.images = self.previous, frame
-        started, self.gap = time.perf_counter(), 0.0
-        tracked = keypoints.NO_POINTS
-        if self.previous is not None and len(self.points):
-            step.points = len(self.points)
-            tracked, was_tracked = self.keypoints.track(
-                self.previous, frame, self.points, self.settings.window, self.settings.levels
-            )
-            step.previous, step.current = (
-                side.compress(was_tracked, axis=0) for side in (self.points, tracked)
-            )
-            tracked = step.current
-        elif self.previous is not None or step.frame > 0:
-            step.points = 0
-            step.flags.append("no points")
-        step.seconds["track"] = time.perf_counter() - started
-        if len(tracked) < self.settings.redetect_below or not len(tracked):
+        self._track(step, frame)
+        points = step.current
+        if len(points) < self.settings.redetect_below or not len(points):
             started = time.perf_counter()
             detected = self.keypoints.detect(frame, self.settings, mask)
             step.seconds["detect"] = time.perf_counter() - started
             step.detected = len(detected)
             if len(detected):
-                tracked = detected
+                points = detected
             else:
                 step.flags.append("no keypoints")
-        self.previous, self.points = frame, tracked
-        step.keypoints = tracked
+        self.previous = frame
+        self.points = step.keypoints = points
         return step
 
-    def estimate(self, step: Step, essential: "Essential | None" = None) -> "Essential | None":
+    def _track(self, step: Step, frame: np.ndarray) -> None:
+        """Track the points of the previous frame into this one: the step's correspondences."""
+        started = time.perf_counter()
+        if self.previous is not None and len(self.points):
+            step.points = len(self.points)
+            tracked, was_tracked = self.keypoints.track(
+                self.previous, frame, self.points, self.settings.window, self.settings.levels
+            )
+            step.previous = self.points.compress(was_tracked, axis=0)
+            step.current = tracked.compress(was_tracked, axis=0)
+        elif self.previous is not None or step.frame > 0:
+            step.points = 0
+            step.flags.append("no points")
+        step.seconds["track"] = time.perf_counter() - started
+
+    def estimate(self, step: Step, essential: Essential | None = None) -> Essential | None:
         """Estimate the motion from the step's correspondences. Returns the essential matrix.
 
         essential: the result of another Odometry for the same correspondences. Its settings may
-        differ in `estimator` only.
+        differ in passes.AFTER_ESSENTIAL only.
         """
         if not step.points:
             return None
-        settings = self.settings
-        essential = essential or _essential(step, settings, self.intrinsics)
+        if essential is None:
+            essential = _essential(step, self.settings, self.intrinsics)
         step.seconds["essential"] = essential.seconds
         if essential.matrix is None:
             step.motion = Motion(problem=essential.problem)
             return essential
         started = time.perf_counter()
-        current, previous, inliers = essential.current, essential.previous, essential.inliers
-        if settings.estimator == "refined":
-            motion = fit(
-                *smaller_rotation(essential.matrix), current, previous, inliers, settings.threshold
-            )
-            step.motion = replace(motion, inliers=essential.inliers_of_step())
-        else:
-            voters = inliers if settings.estimator == "inliers" else slice(None)
-            votes, rotation, translation = pose.recover_pose(
-                essential.matrix, current[voters], previous[voters]
-            )
-            step.motion = Motion(rotation, translation, essential.inliers_of_step(), votes)
+        estimator = ESTIMATORS[self.settings.estimator]
+        step.motion = estimator.motion(essential, self.settings.threshold)
         step.seconds["pose"] = time.perf_counter() - started
         return essential
 
     def compose(self, step: Step) -> Step:
-        """Move the pose by the step's motion, or keep it if a rule says so (see the table in
-        odometry/__init__.py).
+        """Move the pose by the step's motion, or keep it if a rule says so.
+
+        The rules are in the table in odometry/__init__.py.
         """
-        settings = self.settings
-        if step.images is not None and step.scale > settings.scale_gate and self._in_doubt(step):
+        is_long = step.scale > self.settings.scale_gate
+        if step.images is not None and is_long and self._in_doubt(step):
             self._use_all_keypoints(step, *step.images)
-        step.images, motion = None, step.motion
+        step.images = None
         if step.points:
-            if motion.rotation is None:
-                step.flags.append(motion.problem)
-            elif _by_chance(motion.inliers):
-                step.flags.append("no agreement")
-            elif step.scale <= settings.scale_gate:
-                step.flags.append("stationary")
+            flag = self._flag_if_kept(step)
+            if flag is None:
+                self._move(step)
             else:
-                if settings.estimator == "refined":
-                    self._check_consistency(step)
-                else:
-                    cosine = (np.trace(motion.rotation) - 1) / 2
-                    if cosine < np.cos(np.radians(MAX_TURN)):
-                        step.flags.append("too large a turn")
-                    if settings.fallback and motion.translation is not None:
-                        self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
-                self._check_parallax(step)
-                self.pose = self._moved(step.motion, step.scale)
-                step.updated = True
+                step.flags.append(flag)
         step.pose = self.pose
         return step
 
+    def _flag_if_kept(self, step: Step) -> str | None:
+        """Flag of a step that keeps the pose; None if the step moves it."""
+        motion = step.motion
+        if motion.rotation is None:
+            return motion.problem
+        if _by_chance(motion.inliers):
+            return "no agreement"
+        if step.scale <= self.settings.scale_gate:
+            return STATIONARY
+        return None
+
+    def _move(self, step: Step) -> None:
+        """Move the pose, and flag a motion that is doubtful."""
+        if self.settings.estimator == "refined":
+            self._check_consistency(step)
+        else:
+            self._check_turn(step)
+        self._check_parallax(step)
+        rotation = self.pose[:3, :3]
+        moved = np.eye(4)
+        moved[:3, :3] = rotation @ step.motion.rotation
+        moved[:3, 3] = self.pose[:3, 3] + step.scale * (rotation @ step.motion.translation)
+        self.pose = moved
+        step.updated = True
+
     def _in_doubt(self, step: Step) -> bool:
+        """Whether the masked keypoints do not determine the motion, or it is not consistent."""
         motion = step.motion
         if motion.rotation is None or _by_chance(motion.inliers):
             return True
         if not isinstance(motion, RefinedMotion):
             current, previous = self._normalised(step)
-            measured_motion = measured(
+            refined = with_uncertainty(
                 motion.rotation,
                 motion.translation,
                 current,
@@ -250,29 +267,30 @@ class Odometry:
                 motion.inliers,
                 self.settings.threshold,
             )
-            motion = replace(measured_motion, translation=motion.translation)
+            motion = replace(refined, translation=motion.translation)
         return not is_consistent(motion, step.scale, self.prior)
 
     def _use_all_keypoints(self, step: Step, previous_frame: np.ndarray, frame: np.ndarray) -> None:
+        """Estimate the step anew, without a mask."""
         points = keypoints.detect(previous_frame, self.settings)
-        if len(points):
-            current, was_tracked = keypoints.track(
-                previous_frame, frame, points, self.settings.window, self.settings.levels
-            )
-            step.points, step.previous, step.current = (
-                len(points),
-                points[was_tracked],
-                current[was_tracked],
-            )
-            step.flags.append(ALL_KEYPOINTS)
-            self.estimate(step)
-
-    def _normalised(self, step: Step) -> tuple[np.ndarray, ...]:
-        return tuple(
-            pose.normalise(points, self.intrinsics) for points in (step.current, step.previous)
+        if not len(points):
+            return
+        current, was_tracked = keypoints.track(
+            previous_frame, frame, points, self.settings.window, self.settings.levels
         )
+        step.points = len(points)
+        step.previous = points[was_tracked]
+        step.current = current[was_tracked]
+        step.flags.append(ALL_KEYPOINTS)
+        self.estimate(step)
+
+    def _normalised(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
+        """The step's correspondences (current, previous) in normalised coordinates."""
+        current = pose.normalise(step.current, self.intrinsics)
+        return current, pose.normalise(step.previous, self.intrinsics)
 
     def _check_consistency(self, step: Step) -> None:
+        """Compare the motion with the previous step's, and replace or flag it."""
         started = time.perf_counter()
         current, previous = self._normalised(step)
         step.motion, self.prior, flag = check_consistency(
@@ -282,22 +300,30 @@ class Odometry:
             step.flags.append(flag)
         step.seconds["pose"] += time.perf_counter() - started
 
+    def _check_turn(self, step: Step) -> None:
+        """Flag a step that turns more than a car can, and remember its motion for the fallback."""
+        motion = step.motion
+        cosine = (np.trace(motion.rotation) - 1) / 2
+        if cosine < np.cos(np.radians(MAX_TURN)):
+            step.flags.append("too large a turn")
+        if self.settings.fallback and motion.translation is not None:
+            self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
+
     def _check_parallax(self, step: Step) -> None:
-        """Flag a step without parallax: its points do not tell in which direction it went, or
-        whether it was a zoom.
+        """Flag a step without parallax.
+
+        Its points do not tell in which direction it went, or whether it was a zoom.
         """
-        current, previous = (side.compress(step.inliers, axis=0) for side in self._normalised(step))
-        distances, zoom = pose.rotation_and_zoom(current, previous)
-        if (distances < MAX_TRACKING_ERROR / self.intrinsics[0, 0]).mean() >= 0.95:
+        current, previous = self._normalised(step)
+        distances, zoom = pose.rotation_and_zoom(
+            current.compress(step.inliers, axis=0), previous.compress(step.inliers, axis=0)
+        )
+        largest = MAX_TRACKING_ERROR / self.intrinsics[0, 0]
+        if (distances < largest).mean() >= 0.95:
             step.flags.append("zoom" if abs(zoom - 1) > MIN_ZOOM else "no parallax")
 
-    def _moved(self, motion: Any, scale: float) -> np.ndarray:
-        moved, rotation = np.eye(4), self.pose[:3, :3]
-        moved[:3, :3] = rotation @ motion.rotation
-        moved[:3, 3] = self.pose[:3, 3] + scale * (rotation @ motion.translation)
-        return moved
-
     def _check(self, frame: np.ndarray, scale: float, mask: np.ndarray | None) -> None:
+        """Raise InputError unless frame, scale and mask fit the camera and the frames before."""
         if frame.dtype != np.uint8 or frame.ndim != 2:
             raise InputError(
                 f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
@@ -323,40 +349,22 @@ class Odometry:
             )
 
 
-@dataclass(frozen=True)
-class Essential:
-    """An essential matrix and the normalised correspondences (N, 2) from which it was estimated."""
-
-    current: np.ndarray
-    previous: np.ndarray
-    order: np.ndarray | slice  # indices of the step's points in the order given to RANSAC
-    matrix: np.ndarray | None
-    inliers: np.ndarray  # (N,) booleans, in the order given to RANSAC
-    problem: str
-    seconds: float
-
-    def inliers_of_step(self) -> np.ndarray:
-        """Inliers in the order of the step's points."""
-        inliers = np.empty_like(self.inliers)
-        inliers[self.order] = self.inliers
-        return inliers
-
-
 def _essential(step: Step, settings: OdometrySettings, intrinsics: np.ndarray) -> Essential:
+    """Essential matrix of a step's correspondences, which are shuffled if the settings say so."""
     started = time.perf_counter()
     order: np.ndarray | slice = slice(None)
     if settings.shuffle_seed is not None:
-        order = np.random.default_rng((settings.shuffle_seed, step.frame)).permutation(
-            len(step.current)
-        )
-    current, previous = (
-        pose.normalise(points, intrinsics)[order] for points in (step.current, step.previous)
-    )
-    result = pose.essential_matrix(current, previous, settings.threshold)
-    return Essential(current, previous, order, *result, time.perf_counter() - started)
+        random = np.random.default_rng((settings.shuffle_seed, step.frame))
+        order = random.permutation(len(step.current))
+    current = pose.normalise(step.current, intrinsics)[order]
+    previous = pose.normalise(step.previous, intrinsics)[order]
+    matrix, inliers, problem = pose.essential_matrix(current, previous, settings.threshold)
+    seconds = time.perf_counter() - started
+    return Essential(current, previous, order, matrix, inliers, problem, seconds)
 
 
 def _by_chance(inliers: np.ndarray) -> bool:
+    """Whether there are no more inliers (N booleans) than two unrelated frames have."""
     # With PySLAM's threshold, two unrelated frames have 7 inliers among 20 points, 9 among 100, 12
     # among 300, and 24 to 43 among 1600. In consecutive real frames, 45 to 85 % of the points are
     # inliers.
@@ -373,8 +381,9 @@ MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
 
 @lru_cache
 def warm_up(refined: bool) -> None:
-    """Load or compile the compiled functions, so that the measured time of the first frame does
-    not include it.
+    """Load or compile the compiled functions.
+
+    So the measured time of the first frame does not include it.
     """
     keypoints.detect(np.zeros((8, 8), np.uint8), THESIS)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))

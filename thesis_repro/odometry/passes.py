@@ -1,5 +1,6 @@
-"""Run the odometry over a sequence: one run, or many runs in one pass that shares detection and
-tracking.
+"""Run the odometry over a sequence: one run, or many runs in one pass.
+
+The runs of a pass share detection and tracking.
 """
 
 import time
@@ -14,28 +15,24 @@ import pandas as pd
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import keypoints
-from thesis_repro.odometry.odometry import FRAME_COLUMNS, ROTATION_COLUMNS, Odometry, Step
+from thesis_repro.odometry.odometry import (
+    FRAME_COLUMNS,
+    ROTATION_COLUMNS,
+    STATIONARY,
+    Odometry,
+    Step,
+)
 from thesis_repro.odometry.refined.motion_prior import MotionPrior
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.running import console, results
 from thesis_repro.running.files import progress
 
 CHECKPOINT = 300  # frames
-# Runs with the same KEYPOINT_SETTINGS share keypoints. If ESSENTIAL_SETTINGS agree too, they share
-# essential matrices.
-KEYPOINT_SETTINGS = (
-    "detector",
-    "max_keypoints",
-    "min_distance",
-    "quality",
-    "block_size",
-    "window",
-    "levels",
-    "mask_mode",
-    "redetect_below",
-    "fallback",
-)
-ESSENTIAL_SETTINGS = ("threshold", "shuffle_seed")
+# Settings that act only after the essential matrix: runs that differ in nothing else share it.
+AFTER_ESSENTIAL = {"estimator", "scale_gate"}
+# Settings that act only after the keypoints: runs that differ in nothing else share keypoints. Runs
+# that differ in any other setting, so also in a new one, share nothing of both.
+AFTER_KEYPOINTS = AFTER_ESSENTIAL | {"threshold", "shuffle_seed"}
 SHARED_TIMES = ("detect_seconds", "track_seconds")  # measured for all runs of a pass together
 DTYPES = {
     "frame": int,
@@ -46,8 +43,9 @@ NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "ma
 
 
 class Masks(Protocol):
-    """An object whose item i is the mask of frame i, (height, width) uint8. Keypoints are
-    forbidden where it is 0.
+    """An object whose item i is the mask of frame i, (height, width) uint8.
+
+    Keypoints are forbidden where it is 0.
     """
 
     def __getitem__(self, index: int, /) -> np.ndarray: ...
@@ -55,8 +53,10 @@ class Masks(Protocol):
 
 @dataclass(frozen=True)
 class Result:
-    """poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing
-    values are blank.
+    """Result of one run.
+
+    poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing values
+    are blank.
     """
 
     poses: np.ndarray
@@ -66,26 +66,33 @@ class Result:
     @property
     def flagged(self) -> pd.Series:
         """Number of frames by flag."""
-        return (
-            self.frames.loc[self.frames.flag != "", "flag"].str.split("; ").explode().value_counts()
-        )
+        texts = self.frames["flag"]
+        flags = texts[texts != ""].str.split("; ").explode()
+        return flags.value_counts()
 
     @property
     def failed(self) -> int:
         """Number of frames with a flag other than "stationary"."""
-        return int((~self.frames["flag"].isin(["", "stationary"])).sum())
+        return int(is_flagged(self.frames).sum())
+
+
+def is_flagged(frames: pd.DataFrame) -> pd.Series:
+    """Whether a frame has a flag other than "stationary", booleans (n,), see Result.frames."""
+    return ~frames["flag"].isin(["", STATIONARY])
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:
-    """First pose of the estimate: the identity, as in PySLAM, unless the ground truth starts at
-    another pose.
+    """First pose of the estimate.
 
-    Complete KITTI sequences start at the identity (up to 1e-10); excerpts do not.
+    It is the identity, as in PySLAM, unless the ground truth starts at another pose. Complete KITTI
+    sequences start at the identity (up to 1e-10); excerpts do not.
     """
     if not sequence.has_truth:
         return np.eye(4)
     first = sequence.poses[0]
-    return np.eye(4) if np.abs(first - np.eye(4)).max() < 1e-6 else first
+    if np.abs(first - np.eye(4)).max() < 1e-6:
+        return np.eye(4)
+    return first
 
 
 def scales(sequence: Sequence) -> np.ndarray:
@@ -95,9 +102,10 @@ def scales(sequence: Sequence) -> np.ndarray:
     """
     if not sequence.has_truth:
         return sequence.assumed_steps
-    return np.concatenate(
-        [[0.0], [np.linalg.norm(step) for step in np.diff(sequence.poses[:, :3, 3], axis=0)]]
-    )
+    lengths = np.zeros(len(sequence.poses))
+    for index, step in enumerate(np.diff(sequence.poses[:, :3, 3], axis=0)):
+        lengths[index + 1] = np.linalg.norm(step)
+    return lengths
 
 
 def run(
@@ -114,7 +122,8 @@ def run(
     """
     if isinstance(masks, Sized) and len(masks) < len(sequence):
         raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
-    return _run(sequence, {"": (settings, masks)}, None, description, None)[""]
+    results_by_name = _run_pass(sequence, {"": (settings, masks)}, None, description, None)
+    return results_by_name[""]
 
 
 def run_many(
@@ -123,18 +132,17 @@ def run_many(
     description: str | None = None,
     checkpoint: Path | None = None,
 ) -> dict[str, Result]:
-    """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}, equal
-    to separate runs.
+    """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}.
 
-    Frames are decoded, corner strengths computed and points tracked once for all runs. The times of
-    detection and tracking are blank, because they cannot be measured for a single run. Runs with
-    the same masks object and the same KEYPOINT_SETTINGS share masks and keypoints. Runs that differ
-    only in `estimator` share essential matrices.
-    checkpoint: file in which the state is stored every CHECKPOINT frames, and from which a stopped
-    pass resumes. The caller deletes the file after storing the results, and uses another file for
-    another sequence, other settings or other masks.
+    The results equal those of separate runs. Frames are decoded, corner strengths computed and
+    points tracked once for all runs. The times of detection and tracking are blank, because they
+    cannot be measured for a single run. Runs with the same masks object that differ only in
+    AFTER_KEYPOINTS share masks and keypoints. If they differ only in AFTER_ESSENTIAL, they share
+    essential matrices, too. checkpoint: file in which the state is stored every CHECKPOINT frames,
+    and from which a stopped pass resumes. The caller deletes the file after storing the results,
+    and uses another file for another sequence, other settings or other masks.
     """
-    return _run(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint)
+    return _run_pass(sequence, runs, keypoints.SharedKeypoints(), description, checkpoint)
 
 
 @dataclass
@@ -148,30 +156,28 @@ class _Run:
 
     def finish(self, step: Step, mask_seconds: float) -> None:
         """Move the pose by an estimated step, and store its row."""
-        row = self.odometry.compose(step).row()
+        row = self.odometry.compose(step).row() | {"mask_seconds": mask_seconds}
         flag = row.pop("flag")
-        self.numbers[step.frame] = [
-            np.nan if value is None else value for value in (*row.values(), mask_seconds)
-        ]
+        for column, value in enumerate(row.values()):
+            if value is not None:
+                self.numbers[step.frame, column] = value
         if flag:
             self.flags[step.frame] = flag
 
 
-def _run(
+def _run_pass(
     sequence: Sequence,
     runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
     shared: keypoints.SharedKeypoints | None,
     description: str | None,
     checkpoint: Path | None,
 ) -> dict[str, Result]:
-    members = {
-        name: _Run(
-            Odometry(sequence.intrinsics, settings, start_pose(sequence), shared),
-            masks,
-            np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan),
-        )
-        for name, (settings, masks) in runs.items()
-    }
+    """Make runs in one pass. shared: None if the times of a single run are wanted."""
+    members = {}
+    for name, (settings, masks) in runs.items():
+        odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), shared)
+        numbers = np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan)
+        members[name] = _Run(odometry, masks, numbers)
     groups = _groups(members.values())
     # the first run of each group detects and tracks for its group
     leaders = [group[0][0] for group in groups]
@@ -184,57 +190,66 @@ def _run(
         console.check_stop()
         frame = sequence.frame(index)
         if shared is not None:
-            shared.expect(
-                frame,
-                [(leader.odometry.previous, leader.odometry.points) for leader in leaders],
-            )
-        for leader, group in zip(leaders, groups, strict=True):
-            started = time.perf_counter()
-            mask = None if leader.masks is None else leader.masks[index]
-            mask_seconds = time.perf_counter() - started
-            observed = leader.odometry.observe(frame, step_lengths[index], mask)
-            for runs_of_matrix in group:
-                essential = None
-                for run in runs_of_matrix:
-                    step = observed.copy()
-                    essential = run.odometry.estimate(step, essential)
-                    run.finish(step, mask_seconds)
+            starts = [(leader.odometry.previous, leader.odometry.points) for leader in leaders]
+            shared.expect(frame, starts)
+        for group in groups:
+            _step_group(group, index, frame, step_lengths[index])
         if checkpoint and (index + 1) % CHECKPOINT == 0:
             _store(checkpoint, index + 1, members, leaders)
-    return {
-        name: _result(member, SHARED_TIMES if shared else ()) for name, member in members.items()
-    }
+    blank = () if shared is None else SHARED_TIMES
+    return {name: _result(member, blank) for name, member in members.items()}
 
 
-def _groups(members: Iterable[_Run]) -> list[list[list[_Run]]]:
-    """Groups of runs with the same keypoints. Each group is a list of lists of runs that share
-    an essential matrix.
-    """
+# Lists of runs that share an essential matrix. The runs of all lists have the same keypoints.
+_Group = list[list[_Run]]
+
+
+def _step_group(group: _Group, index: int, frame: np.ndarray, scale: float) -> None:
+    """Make one step of all runs with the same keypoints."""
+    leader = group[0][0]
+    started = time.perf_counter()
+    mask = None if leader.masks is None else leader.masks[index]
+    mask_seconds = time.perf_counter() - started
+    observed = leader.odometry.observe(frame, scale, mask)
+    for runs_of_matrix in group:
+        essential = None
+        for run in runs_of_matrix:
+            step = observed.copy()
+            essential = run.odometry.estimate(step, essential)
+            run.finish(step, mask_seconds)
+
+
+def _groups(members: Iterable[_Run]) -> list[_Group]:
+    """Groups of runs with the same keypoints."""
     groups: dict[tuple, dict[tuple, list[_Run]]] = {}
     for member in members:
         settings = member.odometry.settings
-        keypoint_key = (id(member.masks), *(getattr(settings, key) for key in KEYPOINT_SETTINGS))
-        essential_key = tuple(getattr(settings, key) for key in ESSENTIAL_SETTINGS)
+        keypoint_key = id(member.masks), *_all_but(AFTER_KEYPOINTS, settings)
+        essential_key = _all_but(AFTER_ESSENTIAL, settings)
         groups.setdefault(keypoint_key, {}).setdefault(essential_key, []).append(member)
     return [list(group.values()) for group in groups.values()]
+
+
+def _all_but(names: set[str], settings: OdometrySettings) -> tuple:
+    """The values of all settings but those with the given names."""
+    return tuple(value for name, value in vars(settings).items() if name not in names)
 
 
 # Checkpoints
 
 
 def _store(checkpoint: Path, done: int, members: Mapping[str, _Run], leaders: list[_Run]) -> None:
+    """Write the state after `done` frames to a checkpoint."""
     last = leaders[0].odometry  # the previous frame is the same in all runs
     arrays = {
         "numbers": np.array([member.numbers[:done] for member in members.values()]),
         "poses": np.array([member.odometry.pose for member in members.values()]),
-        **{
-            f"prior {part}": np.array(
-                [getattr(member.odometry.prior, part) for member in members.values()]
-            )
-            for part in MotionPrior._fields
-        },
-        **{f"points {index}": leader.odometry.points for index, leader in enumerate(leaders)},
     }
+    priors = [member.odometry.prior for member in members.values()]
+    for part in MotionPrior._fields:
+        arrays[f"prior {part}"] = np.array([getattr(prior, part) for prior in priors])
+    for index, leader in enumerate(leaders):
+        arrays[f"points {index}"] = leader.odometry.points
     if last.previous is not None:
         arrays["previous"] = last.previous
     flags = {name: member.flags for name, member in members.items()}
@@ -244,7 +259,9 @@ def _store(checkpoint: Path, done: int, members: Mapping[str, _Run], leaders: li
 
 def _resume(checkpoint: Path | None, members: Mapping[str, _Run], leaders: list[_Run]) -> int:
     """Restore the state from a checkpoint. Returns the number of finished frames, 0 without one."""
-    stored = results.resume(checkpoint) if checkpoint else None
+    if checkpoint is None:
+        return 0
+    stored = results.resume(checkpoint)
     if stored is None:
         return 0
     state, arrays = stored
@@ -255,15 +272,19 @@ def _resume(checkpoint: Path | None, members: Mapping[str, _Run], leaders: list[
     ):
         member.numbers[:done] = numbers
         member.flags.update({int(index): flag for index, flag in state["flags"][name].items()})
-        member.odometry.pose, member.odometry.prior = pose, MotionPrior(*prior)
+        member.odometry.pose = pose
+        member.odometry.prior = MotionPrior(*prior)
     for index, leader in enumerate(leaders):
         odometry = leader.odometry
-        odometry.count, odometry.gap = done, state["gap"]
-        odometry.previous, odometry.points = arrays.get("previous"), arrays[f"points {index}"]
+        odometry.count = done
+        odometry.gap = state["gap"]
+        odometry.previous = arrays.get("previous")
+        odometry.points = arrays[f"points {index}"]
     return done
 
 
 def _result(member: _Run, blank: Iterable[str]) -> Result:
+    """Result of a run; the columns in `blank` are left out of its table."""
     columns = dict(zip(NUMBER_COLUMNS, member.numbers.T, strict=True))
     columns |= dict.fromkeys(blank, np.full(len(member.numbers), np.nan))
     columns["flag"] = [member.flags.get(index, "") for index in range(len(member.numbers))]

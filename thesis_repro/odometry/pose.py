@@ -1,5 +1,6 @@
-"""Relative motion of a calibrated camera from point correspondences (Section 2.2): essential
-matrix, then motion.
+"""Relative motion of a calibrated camera from point correspondences (Section 2.2).
+
+The essential matrix comes first, then the motion.
 
 As in PySLAM, points of the current frame come first. So the rotation and the unit translation take
 coordinates of the current camera to coordinates of the previous camera. A camera-to-world pose is
@@ -24,8 +25,9 @@ FLOW_ROUNDS = 2  # they leave 0.1 pixels of a turn by 5 degrees; one leaves 10
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of the camera between two frames. If it is not known, `rotation` is None and
-    `problem` says why.
+    """Motion of the camera between two frames.
+
+    If it is not known, `rotation` is None and `problem` says why.
     """
 
     rotation: np.ndarray | None = None  # 3x3
@@ -67,16 +69,20 @@ def essential_matrix(
 
 
 def rotation_and_zoom(current: np.ndarray, previous: np.ndarray) -> tuple[np.ndarray, float]:
-    """Distances (N,) of the current points from where a rotation and a zoom of a camera that stays
-    in its place would move the previous ones, and this zoom (1.01: one per cent closer).
+    """How far the points are from the motion of a camera that only turned or zoomed.
 
-    current, previous: normalised correspondences (N, 2). Rotation and zoom are fitted by least
-    squares. Each round linearises the motion (flow) that they cause (Longuet-Higgins and Prazdny,
-    1980).
+    current, previous: normalised correspondences (N, 2). Returns (distances, zoom). A rotation and
+    a zoom of a camera that stays in its place would move the previous points somewhere. distances
+    (N,) are those of the current points from there, and 1.01 is a zoom that shows everything one
+    per cent closer.
+
+    Rotation and zoom are fitted by least squares. Each round linearises the motion (flow) that they
+    cause (Longuet-Higgins and Prazdny, 1980).
     """
     moved, zoom = previous, 1.0
     for _ in range(FLOW_ROUNDS):
         x, y = moved.T
+        # columns: change of x, then of y, by the three rotations and by the zoom
         flow = np.vstack(
             [
                 np.column_stack([-x * y, 1 + x * x, -y, x]),
@@ -84,8 +90,11 @@ def rotation_and_zoom(current: np.ndarray, previous: np.ndarray) -> tuple[np.nda
             ]
         )
         shift = (current - moved).T.ravel()
-        change = np.linalg.lstsq(flow.T @ flow, flow.T @ shift)[0]  # the normal equations
-        turned = cv2.convertPointsToHomogeneous(moved)[:, 0] @ cv2.Rodrigues(change[:3])[0].T
+        # The normal equations are 4x4, so they are solved in no time. `lstsq` also solves them if
+        # too few points leave them singular, where `solve` would fail.
+        change, *_ = np.linalg.lstsq(flow.T @ flow, flow.T @ shift)
+        rotation, _ = cv2.Rodrigues(change[:3])
+        turned = cv2.convertPointsToHomogeneous(moved)[:, 0] @ rotation.T
         moved = (1 + change[3]) * turned[:, :2] / turned[:, 2:]
         zoom *= 1 + change[3]
     return np.linalg.norm(current - moved, axis=1), zoom
@@ -94,8 +103,9 @@ def rotation_and_zoom(current: np.ndarray, previous: np.ndarray) -> tuple[np.nda
 def recover_pose(
     matrix: np.ndarray, current: np.ndarray, previous: np.ndarray
 ) -> tuple[int, np.ndarray, np.ndarray]:
-    """Motion from an essential matrix: (votes, R, t), equal to cv2.recoverPose(matrix, current,
-    previous) to the bit.
+    """Motion from an essential matrix: (votes, R, t), with the bits of cv2.recoverPose.
+
+    That is cv2.recoverPose(matrix, current, previous).
 
     An essential matrix allows four motions. A point votes for a motion if it lies in front of both
     cameras and nearer than MAX_DEPTH. The motion with most votes wins. OpenCV triangulates every
@@ -105,14 +115,20 @@ def recover_pose(
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
     motions = [
-        (rotation, sign * translation) for sign in (1.0, -1.0) for rotation in (first, second)
+        (first, translation),
+        (second, translation),
+        (first, -translation),
+        (second, -translation),
     ]
-    votes, doubtful = np.zeros(4, np.int64), [np.empty(0, np.int64)] * 2
+    votes = np.zeros(4, np.int64)
+    doubtful = [np.empty(0, np.int64), np.empty(0, np.int64)]  # points, for each rotation
     # A car's rotation is the smaller one. Its votes are counted first; the other's only while it
     # can still win.
-    for index in (0, 1) if np.trace(first) >= np.trace(second) else (1, 0):
+    smaller = int(np.trace(first) < np.trace(second))
+    for index in (smaller, 1 - smaller):
+        rotation, _ = motions[index]
         votes[index], votes[index + 2], doubtful[index] = _count_in_front(
-            current, previous, motions[index][0], translation.ravel(), votes.max()
+            current, previous, rotation, translation.ravel(), votes.max()
         )
     most_certain = votes.max()
     for index, motion in enumerate(motions):
@@ -127,19 +143,21 @@ def recover_pose(
 def _triangulate_and_count(
     current: np.ndarray, previous: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> int:
+    """Number of votes for a motion, counted as OpenCV does."""
     projection = np.hstack([rotation, translation])
     points = cv2.triangulatePoints(np.eye(3, 4), projection, current.T.copy(), previous.T.copy())
     with np.errstate(divide="ignore", invalid="ignore"):
-        good = points[2] * points[3] > 0
+        votes = points[2] * points[3] > 0
         points = points / points[3]
         depth = projection[2] @ points
-        return int((good & (points[2] < MAX_DEPTH) & (depth > 0) & (depth < MAX_DEPTH)).sum())
+        votes &= points[2] < MAX_DEPTH
+        votes &= (depth > 0) & (depth < MAX_DEPTH)
+    return int(votes.sum())
 
 
 @fast
 def _count_in_front(current, previous, rotation, t, least):
-    """Count the votes for (rotation, t) and (rotation, -t), and list the points that are too close
-    to a limit.
+    """Votes for (rotation, t) and (rotation, -t), and the points that are too close to a limit.
 
     Stops as soon as neither motion can reach `least` votes.
     """
@@ -152,7 +170,8 @@ def _count_in_front(current, previous, rotation, t, least):
             break
         # Rows x * P[2] - P[0] and y * P[2] - P[1] of both cameras. The point is the right singular
         # vector of the least singular value.
-        u, v = previous[index, 0], previous[index, 1]
+        u = previous[index, 0]
+        v = previous[index, 1]
         a[0, 0] = -1.0
         a[0, 2] = current[index, 0]
         a[1, 1] = -1.0
@@ -171,27 +190,30 @@ def _count_in_front(current, previous, rotation, t, least):
         depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + t[2] * w
         if w < 0:
             z, w, depth = -z, -w, -depth
+        farthest = MAX_DEPTH * w
+        margin = MAX_DEPTH * LIMIT_MARGIN
         if (
             not sure
             or w < LIMIT_MARGIN
             or abs(z) < LIMIT_MARGIN
             or abs(depth) < LIMIT_MARGIN
-            or abs(abs(z) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN
-            or abs(abs(depth) - MAX_DEPTH * w) < MAX_DEPTH * LIMIT_MARGIN
+            or abs(abs(z) - farthest) < margin
+            or abs(abs(depth) - farthest) < margin
         ):
             doubtful[doubts] = index
             doubts += 1
-        elif 0 < z < MAX_DEPTH * w and 0 < depth < MAX_DEPTH * w:
+        elif 0 < z < farthest and 0 < depth < farthest:
             forward += 1
-        elif 0 < -z < MAX_DEPTH * w and 0 < -depth < MAX_DEPTH * w:
+        elif 0 < -z < farthest and 0 < -depth < farthest:
             backward += 1  # the opposite t changes the signs of w and of both depths
     return forward, backward, doubtful[:doubts]
 
 
 @inner
 def _least_eigenvector(b):
-    """Unit eigenvector of the least eigenvalue of b (lower triangle), after a flag: whether the
-    iteration converged.
+    """Unit eigenvector of the least eigenvalue of b (4, 4; lower triangle), by inverse iteration.
+
+    Returns whether the iteration converged, and the four coordinates of the vector.
     """
     for j in range(4):  # Cholesky
         for k in range(j):

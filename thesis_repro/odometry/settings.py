@@ -3,13 +3,29 @@
 import math
 import numbers
 from dataclasses import dataclass, fields
+from typing import Any
 
 from thesis_repro.errors import InputError
+from thesis_repro.odometry.estimators import ESTIMATORS
 
 CHOICES = {
     "detector": ("shi-tomasi", "orb"),
     "mask_mode": ("detect", "filter"),
-    "estimator": ("thesis", "inliers", "refined"),
+    "estimator": tuple(ESTIMATORS),
+}
+# {name: (least, most)}
+LIMITS = {
+    "max_keypoints": (0, 2**31 - 1),
+    "min_distance": (0, 10_000),
+    "redetect_below": (0, 2**31 - 1),
+    "quality": (0, 1),
+    "threshold": (1e-9, 1e9),
+    "block_size": (1, 31),
+    "window": (3, 101),
+    "levels": (0, 10),
+    "shuffle_seed": (0, 2**32 - 1),
+    "scale_gate": (0, math.inf),
+    "fallback": (False, True),
 }
 
 
@@ -58,37 +74,30 @@ class OdometrySettings:
     scale_gate: float = 0.1
 
     def __post_init__(self) -> None:
-        for name, known in CHOICES.items():
-            if getattr(self, name) not in known:
+        for name, choices in CHOICES.items():
+            value = getattr(self, name)
+            if value not in choices:
                 raise InputError(
-                    f"odometry setting {name}: {getattr(self, name)!r} is unknown; "
-                    f"choose one of {', '.join(known)}"
+                    f"odometry setting {name}: {value!r} is unknown; "
+                    f"choose one of {', '.join(choices)}"
                 )
-        types = {field.name: field.type for field in fields(self)}
-        for name, least, most in (
-            ("max_keypoints", 0, 2**31 - 1),
-            ("min_distance", 0, 10_000),
-            ("redetect_below", 0, 2**31 - 1),
-            ("quality", 0, 1),
-            ("threshold", 1e-9, 1e9),
-            ("block_size", 1, 31),
-            ("window", 3, 101),
-            ("levels", 0, 10),
-            ("shuffle_seed", 0, 2**32 - 1),
-            ("scale_gate", 0, math.inf),
-            ("fallback", False, True),
-        ):
-            value, is_float = getattr(self, name), types[name] is float
-            if value is None and types[name] is not int and not is_float:
-                continue
-            # numbers of numpy are of these abstract kinds, too
-            kind = numbers.Real if is_float else numbers.Integral
-            is_number = isinstance(value, kind)
-            if not is_number or not least <= value <= most:
-                raise InputError(
-                    f"odometry setting {name}: {value!r} is not a "
-                    f"{'' if is_float else 'whole '}number from {least} to {most}"
-                )
+        for field in fields(self):
+            if field.name in LIMITS:
+                _check_number(field.name, getattr(self, field.name), field.type)
+
+
+def _check_number(name: str, value: Any, kind: Any) -> None:
+    """Raise InputError unless a setting is a number of its kind, a type, and within its LIMITS."""
+    if value is None and kind == int | None:
+        return
+    least, most = LIMITS[name]
+    # numbers of numpy are of these abstract kinds, too
+    number: Any = numbers.Real if kind is float else numbers.Integral
+    words = "number" if kind is float else "whole number"
+    if not isinstance(value, number) or not least <= value <= most:
+        raise InputError(
+            f"odometry setting {name}: {value!r} is not a {words} from {least} to {most}"
+        )
 
 
 THESIS = OdometrySettings()

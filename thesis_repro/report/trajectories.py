@@ -163,9 +163,9 @@ def _relative_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
             unit = "deg"
         errors[f"rpe_{statistic}_{unit}"] = value
     segments = metrics.kitti_errors(poses, truth)
-    errors["t_rel_percent"] = segments["translation_percent"]
+    errors["t_rel_percent"] = segments["t_rel"]
     errors["segments"] = segments["segments"]
-    errors["r_rel_deg_per_100m"] = segments["rotation_deg_per_100m"]
+    errors["r_rel_deg_per_100m"] = segments["r_rel"]
     errors["note"] = segments["note"]
     return errors
 

@@ -18,7 +18,7 @@ from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
-from thesis_repro.odometry import THESIS, OdometrySettings, keypoints, metrics
+from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.odometry.pose import normalise
 from thesis_repro.running import results
@@ -27,10 +27,11 @@ from thesis_repro.study import workers
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import measures
+from thesis_repro.study.thesis_tables import percent_change
 
 Run = tuple[OdometrySettings, Masks | None]
 Runs = dict[tuple[str, str, int], Run]  # by method, estimator, repetition
-ESTIMATORS = ("thesis", "inliers", "refined")
+ESTIMATORS = tuple(estimators.ESTIMATORS)
 # the second is for all keypoints with the thesis's estimator
 REPETITIONS, BASELINE_REPETITIONS = 3, 8
 VEGETATION = (ID["vegetation"], ID["terrain"])
@@ -225,7 +226,7 @@ def null_distribution(
     random = np.random.default_rng(0)
     logarithms = random.choice(deviations(runs), (STUDIES, SEQUENCES, widths + 1))
     best = np.exp(logarithms[..., 1:].min(axis=-1))
-    changes = metrics.percent_change(best, np.exp(logarithms[..., 0]))
+    changes = percent_change(best, np.exp(logarithms[..., 0]))
     tail = (100 - LEVEL) / 2
     rows = {}
     for name, summarize in (("mean", np.mean), ("median", np.median), ("sum", np.sum)):

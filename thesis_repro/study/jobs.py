@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import THESIS, OdometrySettings
+from thesis_repro.odometry import THESIS, OdometrySettings, estimators
 from thesis_repro.study import controls
 from thesis_repro.study.sources import Source
 
@@ -23,7 +23,12 @@ from thesis_repro.study.sources import Source
 # was fixed before any run. (The code of appendix A.8 dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
 # the second varies far less
-ESTIMATORS = {"thesis": "thesis's estimator", "refined": "refined estimator"}
+# {name: title} of the estimators that studies compare
+ESTIMATORS = {
+    name: estimator.title
+    for name, estimator in estimators.ESTIMATORS.items()
+    if estimator.is_compared
+}
 KEYPOINT_CONTROLS = ("fewer", "spread")  # as many keypoints as masks leave, without a mask
 UNMASKED = ("baseline", "reduced", *KEYPOINT_CONTROLS)
 PIECES = 4  # passes for each of several workers

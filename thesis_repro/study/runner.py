@@ -18,7 +18,7 @@ from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.passes import poses_of
+from thesis_repro.odometry.passes import is_flagged, poses_of
 from thesis_repro.running import console, results
 from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare, controls, workers
@@ -371,10 +371,10 @@ def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
         "frames": len(frames),
         **metrics.errors(poses, true),
         **metrics.step_errors(poses, true),
-        "t_rel": kitti["translation_percent"],
-        "r_rel": kitti["rotation_deg_per_100m"],
+        "t_rel": kitti["t_rel"],
+        "r_rel": kitti["r_rel"],
         "mean_keypoints": frames["detected"].mean(),
-        "flagged": int((~frames["flag"].isin(["", "stationary"])).sum()),
+        "flagged": int(is_flagged(frames).sum()),
     }
 
 

@@ -44,7 +44,7 @@ class Source:
 
     def sequence_folder(self, sequence: str) -> Path:
         """Return the folder with the files of one sequence."""
-        return masks.folder_of(self.folder, sequence)
+        return masks.folder_of_sequence(self.folder, sequence)
 
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
         """Return the masks of a sequence. dilation_width: pixels, for masks from label maps.

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from thesis_repro.odometry.metrics import percent_change
+
+def percent_change(value: Any, benchmark: Any) -> Any:
+    """Change of a value from a benchmark in percent (Equations 4.1 and 4.2).
+
+    It is negative if the value is smaller.
+    """
+    return (value - benchmark) / benchmark * 100
 
 
 def best_widths(masked: pd.DataFrame) -> pd.DataFrame:

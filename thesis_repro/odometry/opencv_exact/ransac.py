@@ -16,6 +16,7 @@ The margin is a generous estimate, not a proof. The tests compare the results wi
 """
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -32,19 +33,49 @@ OPENCV_SEED = 2**64 - 1  # of its RANSAC's random number generator
 SCORING_BLOCK = 128
 
 
+class _Solution(NamedTuple):
+    """OpenCV's best solution for a sample of five."""
+
+    inliers: int  # among all correspondences
+    matrix: np.ndarray | None  # 3x3
+    mask: np.ndarray | None  # (N, 1) uint8
+
+
+class _Candidate(NamedTuple):
+    """A sample of five, and what is known about the number of inliers of its best solution."""
+
+    sample: np.ndarray | None  # five indices; None before the first sample
+    fewest: int
+    most: int
+    solution: _Solution | None = None  # once OpenCV has computed it; then fewest = most
+
+
 def find_essential_matrix(
     current: np.ndarray, previous: np.ndarray, threshold: float, probability: float
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability,
-    threshold): (E, mask).
+    """Essential matrix and inliers, (E, mask), with the bits of OpenCV's own search.
+
+    That is cv2.findEssentialMat(current, previous, focal=1, pp=(0, 0), cv2.RANSAC, probability,
+    threshold).
 
     current, previous: correspondences (N, 2), float64, normalised coordinates. E: 3x3, or OpenCV's
     stack of solutions for N = 5, or None. mask: (N, 1) uint8, or None.
     """
-    count = len(current)
     columns = np.stack([*current.T, *previous.T])
-    if count < MIN_FOR_SHORTCUT or not np.isfinite(columns).all():
+    solution = None
+    if len(current) >= MIN_FOR_SHORTCUT and np.isfinite(columns).all():
+        solution = _search(columns, threshold, probability)
+    if solution is None:
         return _opencv(current, previous, threshold, probability)
+    return solution.matrix, solution.mask
+
+
+def _search(columns: np.ndarray, threshold: float, probability: float) -> _Solution | None:
+    """OpenCV's solution for the winning sample, or None if OpenCV has to do the whole search.
+
+    columns: correspondences (4, N), rows x, y, u, v. None: no sample won, or the bounds were wrong.
+    """
+    count = columns.shape[1]
     limit = np.float32(threshold * threshold)
     # Correspondences in single precision; the last row says how much an error of the matrix may
     # matter to each.
@@ -52,42 +83,37 @@ def find_essential_matrix(
     with np.errstate(over="ignore"):
         rough = np.vstack([columns, (1 + x + y) * (1 + u + v)]).astype(np.float32)
 
-    def solve_exactly(sample: np.ndarray) -> tuple[int, np.ndarray | None, np.ndarray | None]:
-        return _opencv_solution(columns, sample, threshold, probability, limit)
+    def solve_exactly(candidate: _Candidate) -> _Candidate:
+        solution = _opencv_solution(columns, candidate.sample, threshold, probability, limit)
+        return _Candidate(candidate.sample, solution.inliers, solution.inliers, solution)
 
-    # The best sample so far, `winner`, has between `low` and `high` inliers. The exact number
-    # matters only when another sample comes close, or when it decides whether the search ends. Then
-    # OpenCV's `solution` is computed.
-    state, drawn, low, high, winner, solution = (
-        OPENCV_SEED,
-        0,
-        SAMPLE_SIZE - 1,
-        SAMPLE_SIZE - 1,
-        None,
-        None,
-    )
+    state, drawn = OPENCV_SEED, 0
+    # as in OpenCV, a sample counts only if its own five correspondences are inliers
+    best = _Candidate(None, SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
     while True:
-        enough = (
-            MAX_SAMPLES if winner is None else _samples_needed(probability, (count - high) / count)
-        )
+        enough = MAX_SAMPLES
+        if best.sample is not None:
+            enough = _samples_needed(probability, (count - best.most) / count)
         state, drawn, sample, fewest, most = _next_better(
-            columns, rough, float(limit), np.uint64(state), drawn, enough, low
+            columns, rough, float(limit), np.uint64(state), drawn, enough, best.fewest
         )
-        if most > low and fewest > high:
-            low, high, winner, solution = fewest, most, sample, None
+        if fewest > best.most:
+            best = _Candidate(sample, fewest, most)  # surely better
             continue
-        if winner is not None and solution is None and (most == 0 or low < high):
-            solution = solve_exactly(winner)
-            if not low <= solution[0] <= high:
-                return _opencv(current, previous, threshold, probability)
-            low = high = solution[0]
-        elif most == 0:
-            break
-        if most > low:
-            challenger = solve_exactly(sample)
-            if challenger[0] > low:
-                low, high, winner, solution = challenger[0], challenger[0], sample, challenger
-    return _opencv(current, previous, threshold, probability) if solution is None else solution[1:]
+        is_over = most == 0  # none of the remaining samples may be better
+        if is_over and (best.sample is None or best.solution is not None):
+            return best.solution
+        # Now the exact number of inliers of the best sample matters: it decides whether the search
+        # ends, or whether the new sample is better.
+        if is_over or best.fewest < best.most:
+            solved = solve_exactly(best)
+            if not best.fewest <= solved.fewest <= best.most:
+                return None
+            best = solved
+        if most > best.fewest:
+            challenger = solve_exactly(_Candidate(sample, fewest, most))
+            if challenger.fewest > best.fewest:
+                best = challenger
 
 
 def _opencv(
@@ -105,38 +131,45 @@ def _opencv(
 
 
 def _opencv_solution(
-    columns: np.ndarray, sample: np.ndarray, threshold: float, probability: float, limit: np.float32
-) -> tuple[int, np.ndarray | None, np.ndarray | None]:
-    """OpenCV's best solution for a sample of five: number of inliers among all correspondences,
-    matrix, mask.
-    """
+    columns: np.ndarray,
+    sample: np.ndarray | None,
+    threshold: float,
+    probability: float,
+    limit: np.float32,
+) -> _Solution:
+    """OpenCV's best solution for a sample of five, and its inliers among all correspondences."""
     five = np.ascontiguousarray(columns[:, sample].T)
     stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
     if stack is None:
-        return 0, None, None
+        return _Solution(0, None, None)
     masks = _inlier_masks(stack.reshape(-1, 9), columns, limit)
     inliers = masks.sum(axis=1)
     best = int(inliers.argmax())  # the first one if several are equal, as in OpenCV
-    return int(inliers[best]), stack[3 * best : 3 * best + 3].copy(), masks[best].reshape(-1, 1)
+    matrix = stack[3 * best : 3 * best + 3].copy()
+    return _Solution(int(inliers[best]), matrix, masks[best].reshape(-1, 1))
 
 
 def _samples_needed(probability: float, outliers: float) -> int:
-    """Number of samples among which one is free of outliers with the given probability
-    (`outliers`: their share).
+    """Number of samples among which one is free of outliers with the given probability.
+
+    outliers: their share of the correspondences.
     """
-    missed = 1.0 - math.pow(1.0 - outliers, SAMPLE_SIZE)
-    if missed < np.finfo(float).tiny:
+    tiny = np.finfo(float).tiny
+    missed = 1.0 - math.pow(1.0 - outliers, SAMPLE_SIZE)  # probability that a sample has an outlier
+    if missed < tiny:
         return 0
-    needed, missed = math.log(max(1.0 - probability, np.finfo(float).tiny)), math.log(missed)
-    return (
-        MAX_SAMPLES if missed >= 0 or -needed >= MAX_SAMPLES * -missed else round(needed / missed)
-    )
+    log_missed = math.log(missed)
+    log_failure = math.log(max(1.0 - probability, tiny))
+    if log_missed >= 0 or -log_failure >= MAX_SAMPLES * -log_missed:
+        return MAX_SAMPLES
+    return round(log_failure / log_missed)
 
 
 @fast
 def _inlier_masks(matrices, columns, limit):
-    """Inlier masks (K, N) of K matrices: 1 where the squared Sampson distance, as float32, is
-    within the limit.
+    """Inlier masks (K, N) of K matrices.
+
+    A mask is 1 where the squared Sampson distance, as float32, is within the limit.
     """
     masks = np.empty((len(matrices), columns.shape[1]), np.uint8)
     for index in range(len(matrices)):
@@ -152,10 +185,13 @@ def _inlier_masks(matrices, columns, limit):
 
 @fast
 def draw(state, columns, sample, five):
-    """Draw a sample as OpenCV does: write its five indices and rows, and return the generator's
-    new state.
+    """Draw a sample as OpenCV does.
+
+    Writes the sample's five indices to `sample` and its rows to `five` (5, 4). Returns the
+    generator's new state.
     """
-    count, taken = columns.shape[1], 0
+    count = columns.shape[1]
+    taken = 0
     while taken < SAMPLE_SIZE:
         state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
         index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
@@ -172,8 +208,7 @@ def draw(state, columns, sample, five):
 
 @fast
 def _next_better(columns, rough, limit, state, drawn, samples, best):
-    """Draw samples until one may have more than `best` inliers, or until `samples` of them are
-    drawn.
+    """Draw samples until one may have more than `best` inliers, or `samples` are drawn.
 
     Returns the generator's state, the number of samples drawn, the sample's five indices, and
     bounds of the number of inliers of its best solution (0, 0 if no sample may be better).
@@ -192,7 +227,8 @@ def _next_better(columns, rough, limit, state, drawn, samples, best):
             if not _may_beat(solutions[k], margins[k], rough, limit, max(best, low)):
                 continue
             fewest, most = _bounds(solutions[k], margins[k], columns, limit, max(best, low))
-            low, high = max(low, fewest), max(high, most)
+            low = max(low, fewest)
+            high = max(high, most)
         if high > best:
             return state, drawn, sample, low, high
     return state, drawn, sample, 0, 0
@@ -200,10 +236,12 @@ def _next_better(columns, rough, limit, state, drawn, samples, best):
 
 @inner
 def _may_beat(e, margin, rough, limit, best):
-    """False if surely no matrix within the margin of e has more than `best` inliers: a test in
-    single precision.
+    """False if surely no matrix within the margin of e has more than `best` inliers.
+
+    This test runs in single precision.
     """
-    count, allowed = rough.shape[1], rough.shape[1] - best
+    count = rough.shape[1]
+    allowed = count - best  # outliers
     root = np.sqrt(limit)
     # `doubt` bounds how far the margin (see _bounds_of_block) and nine roundings of 2^-24 may
     # change `algebraic` and `root` times the root of the sum of squares. `wide` allows for the
@@ -231,20 +269,21 @@ def _may_beat(e, margin, rough, limit, best):
 
 @inner
 def _surely_out(matrix, doubt, limit, x, y, u, v, reach):
+    """Number of correspondences that are outliers in spite of all rounding."""
     outliers = np.int32(0)  # of the same width as the distances, so that the loop is vectorised
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
         least = max(abs(algebraic) - doubt * reach[k], np.float32(0))
-        outliers = np.int32(
-            outliers + np.int32(least * least > limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1))
-        )
+        square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
+        outliers = np.int32(outliers + np.int32(least * least > limit * square))
     return outliers
 
 
 @inner
 def _bounds(e, margin, columns, limit, best):
-    """Least and most inliers that any matrix within the margin of e has; (0, 0) if never more
-    than `best`.
+    """Least and most inliers that any matrix within the margin of e has.
+
+    (0, 0) if it never has more than `best`.
     """
     count = columns.shape[1]
     low, high = 0, 0
@@ -268,17 +307,19 @@ def _bounds(e, margin, columns, limit, best):
 
 @inner
 def _bounds_of_block(e, margin, x, y, u, v, limit):
+    """Least and most inliers of `_bounds` among the correspondences of one block."""
     root = np.sqrt(limit)
     matrix = epipolar.entries(e)
     low, high = 0, 0
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
-        excess = algebraic * algebraic - limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
+        excess = algebraic * algebraic - limit * square
         # |algebraic| and the root of the other term each change by less than `change` within the
         # margin.
         change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))
         size = abs(algebraic) + root * (abs(l0) + abs(l1) + abs(m0) + abs(m1)) + change
         doubt = 2 * change * size + 1e-6 * size * size
-        low += 1 if excess < -doubt else 0
-        high += 1 if excess <= doubt else 0
+        low += excess < -doubt
+        high += excess <= doubt
     return low, high

@@ -1,5 +1,4 @@
-"""Essential matrices through five correspondences, with a margin for the rounding errors of
-OpenCV's solutions.
+"""Essential matrices through five correspondences, with margins for OpenCV's rounding errors.
 
 OpenCV takes the same steps with the operations in another order, so its solutions differ in the
 last digits. `ransac` needs a bound of this difference: the margin. It is a first-order error
@@ -23,18 +22,16 @@ MIN_MARGIN, MAX_MARGIN = 1e-9, 1e-3  # for an essential matrix of unit norm
 
 @fast
 def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Essential matrices through five correspondences (5, 4: x, y in the current frame, u, v in the
-    previous frame).
+    """Essential matrices through five correspondences, with margins.
 
-    Returns (sure, matrices (K, 9) of unit norm, K margins). `sure`: OpenCV finds the same K
-    matrices, each within its margin (Frobenius norm, up to sign). If not sure, K = 0.
+    five: (5, 4), rows x, y in the current frame, u, v in the previous frame. Returns (sure,
+    matrices (K, 9) of unit norm, K margins). `sure`: OpenCV finds the same K matrices, each within
+    its margin (Frobenius norm, up to sign). If not sure, K = 0.
     """
-    solutions, margins, b, b_sizes = (
-        np.empty((10, 9)),
-        np.empty(10),
-        np.zeros((3, 13)),
-        np.empty((3, 13)),
-    )
+    solutions = np.empty((10, 9))
+    margins = np.empty(10)
+    b = np.zeros((3, 13))
+    b_sizes = np.empty((3, 13))
     unsure = False, solutions[:0], margins[:0]
     independence, basis = five_point.null_space(five)  # step 1
     if independence == 0:
@@ -50,13 +47,12 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
     solved, roots, extrema = five_point.real_roots(polynomial)  # step 5
     if not solved:
         return unsure
-    work, degree = np.empty((4, 3, 3)), len(polynomial) - 1
+    work = np.empty((4, 3, 3))
+    degree = len(polynomial) - 1
     for k in range(len(extrema)):  # a value as small as rounding: a double root or none
         error = _determinant_error(b, b_sizes, errors, extrema[k], work)
-        if (
-            not abs(five_point.value(polynomial, degree, extrema[k]))
-            > SAFETY_FACTOR * ROUNDING * error
-        ):
+        height = abs(five_point.value(polynomial, degree, extrema[k]))
+        if not height > SAFETY_FACTOR * ROUNDING * error:
             return unsure
     for k in range(len(roots)):
         error = _determinant_error(b, b_sizes, errors, roots[k], work)
@@ -71,18 +67,19 @@ def solve(five: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
 
 @inner
 def _elimination_errors(a):
-    """Rounding errors (6, in units of ROUNDING) of the six rows that B(z) is made from, OpenCV's
-    way included.
+    """Rounding errors (6) of the six rows that B(z) is made from, OpenCV's way included.
 
-    a (10, 20): result of the elimination, with the triangle U of the last six unknowns. An error of
-    one unit in the equations becomes |U^-1| times the size of the result. OpenCV inverts and
-    multiplies, which adds |U^-1| |U| |U^-1|.
+    They are in units of ROUNDING. a (10, 20): result of the elimination, with the triangle U of the
+    last six unknowns. An error of one unit in the equations becomes |U^-1| times the size of the
+    result. OpenCV inverts and multiplies, which adds |U^-1| |U| |U^-1|.
     """
     largest = 1.0
     for k in range(4, 10):
         for j in range(10, 20):
             largest = max(largest, abs(a[k, j]))
-    inverse, sums, total = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    inverse = np.zeros((6, 6))
+    sums = np.zeros(6)
+    total = np.zeros(6)
     for i in range(5, -1, -1):
         inverse[i, i] = 1 / a[4 + i, 4 + i]
         for j in range(i + 1, 6):
@@ -102,11 +99,10 @@ def _elimination_errors(a):
 
 @inner
 def _determinant_error(b, b_sizes, errors, z, work):
-    """Rounding error of det B(z), in units of ROUNDING (Wilkinson's bound: the sum of the sizes of
-    all terms).
+    """Rounding error of det B(z), in units of ROUNDING.
 
-    Also writes to work (4, 3, 3): B(z), the sizes of its terms, its errors in units of ROUNDING,
-    its cofactors.
+    It is Wilkinson's bound: the sum of the sizes of all terms. Also writes to work (4, 3, 3): B(z),
+    the sizes of its terms, its errors in units of ROUNDING, its cofactors.
     """
     values, sizes, wrong, cofactors = work[0], work[1], work[2], work[3]
     size = abs(z)
@@ -115,13 +111,16 @@ def _determinant_error(b, b_sizes, errors, z, work):
         values[i, 0], values[i, 1], values[i, 2] = five_point.row_values(b[i], z)
         sizes[i, 0], sizes[i, 1], sizes[i, 2] = five_point.row_values(b_sizes[i], size)
         error = errors[2 * i] + size * errors[2 * i + 1]
-        wrong[i, 0], wrong[i, 1] = error * powers + sizes[i, 0], error * powers + sizes[i, 1]
+        wrong[i, 0] = error * powers + sizes[i, 0]
+        wrong[i, 1] = error * powers + sizes[i, 1]
         wrong[i, 2] = error * (1 + size * powers) + sizes[i, 2]
     error = 0.0
     for i in range(3):
-        p, q = (i + 1) % 3, (i + 2) % 3
+        p = (i + 1) % 3
+        q = (i + 2) % 3
         for j in range(3):
-            m, n = (j + 1) % 3, (j + 2) % 3
+            m = (j + 1) % 3
+            n = (j + 2) % 3
             cofactors[i, j] = values[p, m] * values[q, n] - values[p, n] * values[q, m]
             error += DETERMINANT_SHARE * abs(cofactors[i, j]) * wrong[i, j]
         error += sizes[i, 0] * (sizes[p, 1] * sizes[q, 2] + sizes[p, 2] * sizes[q, 1])
@@ -130,10 +129,12 @@ def _determinant_error(b, b_sizes, errors, z, work):
 
 @inner
 def _best_row(cofactors):
-    """Index of the largest row of cofactors: the best conditioned normal of the plane that the
-    rows of B(z) span.
+    """Index of the largest row of cofactors.
+
+    It is the best conditioned normal of the plane that the rows of B(z) span.
     """
-    best, largest = 0, -1.0
+    best = 0
+    largest = -1.0
     for i in range(3):
         size = (
             cofactors[i, 0] * cofactors[i, 0]
@@ -141,30 +142,33 @@ def _best_row(cofactors):
             + cofactors[i, 2] * cofactors[i, 2]
         )
         if size > largest:
-            best, largest = i, size
+            best = i
+            largest = size
     return best
 
 
 @inner
 def _solution_error(b, best, z, error, polynomial, work):
-    """First-order rounding error of the essential matrix (unit norm) of a root z, in units of
-    ROUNDING.
+    """First-order rounding error of the essential matrix of a root z, in units of ROUNDING.
 
-    In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal to B(z). An error of z
-    changes it; that error is the error of det B(z) over the slope of det B(z). An error of B(z)
-    changes it by the error over B(z)'s second singular value, which is the norm of the cofactors
-    over the norm of B(z).
+    The matrix has unit norm. In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal
+    to B(z). An error of z changes it; that error is the error of det B(z) over the slope of det
+    B(z). An error of B(z) changes it by the error over B(z)'s second singular value, which is the
+    norm of the cofactors over the norm of B(z).
     """
     values, wrong, cofactors = work[0], work[2], work[3]
-    cofactor_norm, norm = 0.0, 0.0
+    cofactor_norm = 0.0
+    norm = 0.0
     for i in range(3):
         for j in range(3):
             cofactor_norm += cofactors[i, j] * cofactors[i, j]
             norm += values[i, j] * values[i, j]
-    p, q = values[(best + 1) % 3], values[(best + 2) % 3]
+    first = (best + 1) % 3
+    second = (best + 2) % 3
+    p, q = values[first], values[second]
     x, y, w = cofactors[best, 0], cofactors[best, 1], cofactors[best, 2]
-    p0, p1, p2 = _row_slopes(b[(best + 1) % 3], z)
-    q0, q1, q2 = _row_slopes(b[(best + 2) % 3], z)
+    p0, p1, p2 = _row_slopes(b[first], z)
+    q0, q1, q2 = _row_slopes(b[second], z)
     dx = p1 * q[2] - p2 * q[1] + p[1] * q2 - p[2] * q1
     dy = p2 * q[0] - p0 * q[2] + p[2] * q0 - p[0] * q2
     dw = p0 * q[1] - p1 * q[0] + p[0] * q1 - p[1] * q0

@@ -1,3 +1,4 @@
-"""The refined estimator (not in the thesis): the motion is fitted to all points near it and
-checked with a prior.
+"""The refined estimator (not in the thesis).
+
+The motion is fitted to all points near it and checked with a prior.
 """

@@ -1,5 +1,6 @@
-"""A motion fitted to all correspondences that agree with it. (RANSAC's motion is computed from five
-of them.)
+"""A motion fitted to all correspondences that agree with it.
+
+RANSAC's motion is computed from five of them.
 
 The essential matrix is E = [t]x R (Equation 2.5, without its factor). The residual of a
 correspondence (x, y), (u, v) is its signed Sampson distance: its distance, to first order, from a
@@ -11,7 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from llvmlite import binding
 from numba import types
+from numba.extending import get_cython_function_address
 
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
@@ -25,21 +28,16 @@ RESTART_SCALES = (4, 1)  # scales of the second start, in thresholds
 SAME_MOTION_COSINE = np.cos(np.radians(15.0))
 LOWER_COST = 0.99  # of the first start's cost: a smaller difference may be rounding
 POINTS_PER_BLOCK = 64
-# LAPACK's gesv, which np.linalg.solve calls in compiled code; np.linalg.solve itself takes seconds
-# to compile.
-DOUBLE = ord("d")  # here, because `ord` would be compiled too
-_solve: Any = types.ExternalFunction(
-    "numba_xgesv",
-    types.intc(
-        types.char,
-        types.intp,
-        types.intp,
-        types.CPointer(types.float64),
-        types.intp,
-        types.CPointer(types.int32),
-        types.CPointer(types.float64),
-        types.intp,
-    ),
+# LAPACK's gesv, which solves linear equations, as SciPy brings it. np.linalg.solve calls it, too,
+# but takes seconds to compile.
+binding.add_symbol(
+    "gesv_of_scipy", get_cython_function_address("scipy.linalg.cython_lapack", "dgesv")
+)
+_INTEGER, _NUMBERS = types.CPointer(types.int32), types.CPointer(types.float64)
+_gesv: Any = types.ExternalFunction(
+    "gesv_of_scipy",
+    # n, number of right sides, matrix, its stride, pivots, right sides, their stride, status
+    types.void(_INTEGER, _INTEGER, _NUMBERS, _INTEGER, _INTEGER, _NUMBERS, _INTEGER, _INTEGER),
 )
 
 
@@ -56,13 +54,14 @@ class RefinedMotion(Motion):
 
 
 def smaller_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Smaller rotation (3x3) and translation (3, unit length, either sign) of an essential matrix.
+    """Smaller rotation (3x3) of an essential matrix, and its translation.
 
-    The other rotation differs by 180 degrees about the translation (twisted pair). No car turns so
-    far between frames.
+    The translation (3) has unit length and either sign. The other rotation differs by 180 degrees
+    about the translation (twisted pair). No car turns so far between frames.
     """
     first, second, translation = cv2.decomposeEssentialMat(matrix)
-    return (first if np.trace(first) >= np.trace(second) else second), translation.ravel()
+    smaller = first if np.trace(first) >= np.trace(second) else second
+    return smaller, translation.ravel()
 
 
 def fit(
@@ -73,19 +72,16 @@ def fit(
     inliers: np.ndarray,
     threshold: float,
 ) -> RefinedMotion:
-    """Motion refined from a start (see `refine`) whose unit translation may have either sign
-    (see `measured`).
+    """Motion refined from a start, with its uncertainty.
+
+    See `refine` for the arguments. The start's unit translation may have either sign (see
+    `with_uncertainty`).
     """
-    return measured(
-        *refine(rotation, translation, current, previous, inliers, threshold),
-        current,
-        previous,
-        inliers,
-        threshold,
-    )
+    rotation, heading = refine(rotation, translation, current, previous, inliers, threshold)
+    return with_uncertainty(rotation, heading, current, previous, inliers, threshold)
 
 
-def measured(
+def with_uncertainty(
     rotation: np.ndarray,
     heading: np.ndarray,
     current: np.ndarray,
@@ -93,11 +89,13 @@ def measured(
     inliers: np.ndarray,
     threshold: float,
 ) -> RefinedMotion:
-    """The same motion with its uncertainty; the points near it vote on the sign of its heading
-    (`cheirality_votes`).
+    """The same motion with its uncertainty.
+
+    The points near the motion vote on the sign of its heading (`cheirality_votes`).
     """
     support = near(rotation, heading, current, previous, SUPPORT_THRESHOLDS * threshold)
-    current, previous = current.compress(support, axis=0), previous.compress(support, axis=0)
+    current = current.compress(support, axis=0)
+    previous = previous.compress(support, axis=0)
     forward, backward = cheirality_votes(rotation, heading, current, previous, threshold)
     rotation_std, heading_std, condition = _deviations(
         rotation, heading, current, previous, threshold / 2
@@ -122,40 +120,35 @@ def refine(
     inliers: np.ndarray,
     threshold: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Motion (rotation 3x3, unit translation) fitted to all its inliers among normalised
-    correspondences (N, 2).
+    """Motion (rotation 3x3, unit translation) fitted to all its inliers.
 
-    Levenberg-Marquardt over the rotation and the two angles of the translation's direction. It
-    minimises Sampson distances with Cauchy weights at half the threshold. The first fit uses
-    `inliers` (N booleans). Two more fits use the points within SUPPORT_THRESHOLDS, so the result
-    hardly depends on which inliers RANSAC happened to choose.
+    current, previous: normalised correspondences (N, 2). Levenberg-Marquardt over the rotation and
+    the two angles of the translation's direction. It minimises Sampson distances with Cauchy
+    weights at half the threshold. The first fit uses `inliers` (N booleans). Two more fits use the
+    points within SUPPORT_THRESHOLDS, so the result hardly depends on which inliers RANSAC happened
+    to choose.
 
     The cost at this narrow scale has many minima. So a second start fits the first result to all
     correspondences at wider scales first, and the motion with the lower cost is returned. A second
     result with another heading (see SAME_MOTION_COSINE) is another motion and is not used. The sign
     of the given translation is kept, because the cost does not depend on it.
     """
-    first = _rounds(
-        (np.ascontiguousarray(rotation), np.ascontiguousarray(translation)),
-        current,
-        previous,
-        inliers,
-        threshold,
-    )
+    start = np.ascontiguousarray(rotation), np.ascontiguousarray(translation)
+    first = _rounds(start, current, previous, inliers, threshold)
     second = first
     for scale in RESTART_SCALES:
         second = _minimise(*second, current, previous, scale * threshold)
     near_second = near(*second, current, previous, SUPPORT_THRESHOLDS * threshold)
     second = _rounds(second, current, previous, near_second, threshold)
-    first_cost, second_cost = (
-        _normal_equations(*motion, current, previous, threshold / 2)[0]
-        for motion in (first, second)
-    )
-    better = (
-        abs(second[1] @ first[1]) > SAME_MOTION_COSINE and second_cost < LOWER_COST * first_cost
-    )
-    rotation, heading = second if better else first
-    return rotation, heading if heading @ translation >= 0 else -heading
+    first_cost, _, _ = _normal_equations(*first, current, previous, threshold / 2)
+    second_cost, _, _ = _normal_equations(*second, current, previous, threshold / 2)
+    rotation, heading = first
+    is_same_motion = abs(second[1] @ heading) > SAME_MOTION_COSINE
+    if is_same_motion and second_cost < LOWER_COST * first_cost:
+        rotation, heading = second
+    if heading @ translation >= 0:
+        return rotation, heading
+    return rotation, -heading
 
 
 def _rounds(
@@ -165,14 +158,16 @@ def _rounds(
     support: np.ndarray,
     threshold: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A motion (rotation, translation) fitted to its support (N booleans), and again to the
-    points near the result.
+    """A motion (rotation, translation) fitted to its support, and again to the points near it.
+
+    support: N booleans.
     """
     for _ in range(REFINE_ROUNDS):
         if support.sum() < MIN_CORRESPONDENCES:
             break
-        points = (side.compress(support, axis=0) for side in (current, previous))
-        motion = _minimise(*motion, *points, threshold / 2)
+        current_support = current.compress(support, axis=0)
+        previous_support = previous.compress(support, axis=0)
+        motion = _minimise(*motion, current_support, previous_support, threshold / 2)
         support = near(*motion, current, previous, SUPPORT_THRESHOLDS * threshold)
     return motion
 
@@ -183,22 +178,22 @@ def _deviations(
     current: np.ndarray,
     previous: np.ndarray,
     scale: float,
-) -> tuple[float, ...]:
-    """Largest standard deviations (degrees) of rotation and heading, and the condition number of
-    the normal equations.
+) -> tuple[float, float, float]:
+    """Largest standard deviations of rotation and heading, degrees, and the condition number.
 
+    The condition number is that of the normal equations.
     The covariance is the inverse of the Gauss-Newton matrix times scale^2, the variance of the
     residuals.
     """
-    hessian = _normal_equations(rotation, translation, current, previous, scale)[1]
+    _, hessian, _ = _normal_equations(rotation, translation, current, previous, scale)
     values, vectors = np.linalg.eigh(hessian)
     if len(current) < MIN_CORRESPONDENCES or not values[0] > 1e-12 * values[-1]:
         return np.inf, np.inf, np.inf
     covariance = scale * scale * (vectors / values) @ vectors.T
-    return *(
-        float(np.degrees(np.sqrt(np.linalg.eigvalsh(part)[-1])))
-        for part in (covariance[:3, :3], covariance[3:, 3:])
-    ), float(values[-1] / values[0])
+    rotation_std = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    heading_std = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+    condition = float(values[-1] / values[0])
+    return float(np.degrees(rotation_std)), float(np.degrees(heading_std)), condition
 
 
 @fast
@@ -210,23 +205,23 @@ def near(r, t, current, previous, limit):
         x, y = current[index, 0], current[index, 1]
         u, v = previous[index, 0], previous[index, 1]
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(essential, x, y, u, v)
-        mask[index] = algebraic * algebraic < limit * limit * (
-            l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
-        )
+        square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
+        mask[index] = algebraic * algebraic < limit * limit * square
     return mask
 
 
 @fast
 def _minimise(r, t, current, previous, scale):
     """Levenberg-Marquardt iteration: each step solves (H + damping diag H) change = -gradient."""
-    damping, pivots = 1e-4, np.empty(5, np.int32)
+    damping = 1e-4
+    integers = np.empty(8, np.int32)
     cost, hessian, gradient = _normal_equations(r, t, current, previous, scale)
     for _ in range(MAX_ITERATIONS):
         damped = hessian.copy()
         for k in range(5):
             damped[k, k] += damping * hessian[k, k] + 1e-12
         change = -gradient
-        _solve(DOUBLE, 5, 1, damped.ctypes, 5, pivots.ctypes, change.ctypes, 5)
+        _solve(damped, change, integers)
         r_new, t_new = _moved(r, t, change)
         cost_new, hessian_new, gradient_new = _normal_equations(
             r_new, t_new, current, previous, scale
@@ -244,16 +239,28 @@ def _minimise(r, t, current, previous, scale):
     return r, t
 
 
+@inner
+def _solve(matrix, right, integers):
+    """Solve five linear equations with a symmetric matrix; right (5) becomes the solution.
+
+    integers (8): space for the pivots and for the sizes that LAPACK takes by their addresses.
+    """
+    integers[0], integers[1], integers[2] = 5, 1, 0  # equations, right sides, status
+    size, count, status = integers[0:].ctypes, integers[1:].ctypes, integers[2:].ctypes
+    pivots = integers[3:].ctypes
+    _gesv(size, count, matrix.ctypes, size, pivots, right.ctypes, size, status)
+
+
 @fast
 def cheirality_votes(rotation, t, current, previous, parallax):
-    """Numbers of correspondences (N, 2) in front of both cameras under (rotation, t) and under
-    (rotation, -t).
+    """Numbers of points in front of both cameras under (rotation, t) and (rotation, -t).
 
-    Points whose rays meet at less than `parallax` (the sine of the angle) do not determine the
-    sign, so they do not vote. (pose.recover_pose leaves out points beyond 50 translations, which in
-    a slow step are a few metres.)
+    current, previous: correspondences (N, 2). Points whose rays meet at less than `parallax` (the
+    sine of the angle) do not determine the sign, so they do not vote. (pose.recover_pose leaves out
+    points beyond 50 translations, which in a slow step are a few metres.)
     """
-    forward, backward = 0, 0
+    forward = 0
+    backward = 0
     for k in range(len(current)):
         x, y = current[k, 0], current[k, 1]
         # Ray a in the previous camera's coordinates, and ray b; they meet where depth a + t = other
@@ -263,9 +270,8 @@ def cheirality_votes(rotation, t, current, previous, parallax):
         a2 = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
         b0, b1 = previous[k, 0], previous[k, 1]
         n0, n1, n2 = a1 - a2 * b1, a2 * b0 - a0, a0 * b1 - a1 * b0  # a x b
-        if n0 * n0 + n1 * n1 + n2 * n2 <= parallax * parallax * (x * x + y * y + 1) * (
-            b0 * b0 + b1 * b1 + 1
-        ):
+        squared_sine = n0 * n0 + n1 * n1 + n2 * n2  # times both squared lengths
+        if squared_sine <= parallax * parallax * (x * x + y * y + 1) * (b0 * b0 + b1 * b1 + 1):
             continue
         # n (b x t)
         depth = n0 * (b1 * t[2] - t[1]) + n1 * (t[0] - b0 * t[2]) + n2 * (b0 * t[1] - b1 * t[0])
@@ -284,8 +290,9 @@ def cheirality_votes(rotation, t, current, previous, parallax):
 
 @inner
 def _product(a, b, product):
-    """Write and return the product of two 3x3 matrices: np.dot is compiled once, and faster
-    than without `product`.
+    """Write and return the product of two 3x3 matrices.
+
+    So np.dot is compiled once, and it is faster than without `product`.
     """
     return np.dot(a, b, product)
 
@@ -302,7 +309,8 @@ def _skew(v):
 @inner
 def _normalised(v0, v1, v2):
     """Unit vector (3) in the direction of (v0, v1, v2)."""
-    norm, vector = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2), np.empty(3)
+    norm = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+    vector = np.empty(3)
     vector[0], vector[1], vector[2] = v0 / norm, v1 / norm, v2 / norm
     return vector
 
@@ -317,25 +325,28 @@ def _tangents(t):
         x, y, z = -t[2], 0.0, t[0]
     else:
         x, y, z = t[1], -t[0], 0.0
-    first, second = _normalised(x, y, z), np.empty(3)
-    second[0], second[1] = t[1] * first[2] - t[2] * first[1], t[2] * first[0] - t[0] * first[2]
+    first = _normalised(x, y, z)
+    second = np.empty(3)
+    second[0] = t[1] * first[2] - t[2] * first[1]
+    second[1] = t[2] * first[0] - t[0] * first[2]
     second[2] = t[0] * first[1] - t[1] * first[0]
     return first, second
 
 
 @inner
 def _moved(r, t, change):
-    """Motion after a change (5) of its parameters: exp([turn]x) R (Rodrigues' formula), t moved
-    along its tangents.
+    """Motion after a change (5) of its parameters.
+
+    The rotation becomes exp([turn]x) R (Rodrigues' formula). t moves along its tangents.
     """
     angle = np.sqrt(change[0] * change[0] + change[1] * change[1] + change[2] * change[2])
-    cross, rodrigues = _skew(change), np.empty((3, 3))
+    cross = _skew(change)
     square = _product(cross, cross, np.empty((3, 3)))
-    sine, cosine = (
-        (np.sin(angle) / angle, (1 - np.cos(angle)) / (angle * angle))
-        if angle > 1e-12
-        else (1.0, 0.0)
-    )
+    sine, cosine = 1.0, 0.0
+    if angle > 1e-12:
+        sine = np.sin(angle) / angle
+        cosine = (1 - np.cos(angle)) / (angle * angle)
+    rodrigues = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             rodrigues[i, j] = (i == j) + sine * cross[i, j] + cosine * square[i, j]
@@ -350,11 +361,14 @@ def _moved(r, t, change):
 
 @inner
 def _essential_and_derivatives(r, t):
-    """E = [t]x R and its five derivatives (6, 9), row by row: three [t]x [unit]x R, two
-    [tangent]x R.
+    """E = [t]x R and its five derivatives (6, 9), row by row.
+
+    Three derivatives are [t]x [unit]x R, by the rotation. Two are [tangent]x R, by the direction.
     """
-    matrices, unit = np.empty((6, 3, 3)), np.zeros((3, 3))
-    cross, (first, second) = _skew(t), _tangents(t)
+    matrices = np.empty((6, 3, 3))
+    unit = np.zeros((3, 3))
+    cross = _skew(t)
+    first, second = _tangents(t)
     _product(cross, r, matrices[0])
     for k in range(3):
         unit[k, k] = 1.0
@@ -373,7 +387,9 @@ def _normal_equations(r, t, current, previous, scale):
     """
     matrices = _essential_and_derivatives(r, t)
     essential = epipolar.entries(matrices[0])
-    cost, hessian, gradient = 0.0, np.zeros((5, 5)), np.zeros(5)
+    cost = 0.0
+    hessian = np.zeros((5, 5))
+    gradient = np.zeros(5)
     # Points are handled in blocks, one quantity after the other, so that these loops are
     # vectorised. The sums go point by point, so the bits are those of one loop over all points.
     size = POINTS_PER_BLOCK
@@ -416,7 +432,13 @@ def _normal_equations(r, t, current, previous, scale):
                 gradient[k] += weight[i] * residual[i] * jacobian[k, i]
                 for j in range(k + 1):
                     hessian[k, j] += weight[i] * jacobian[k, i] * jacobian[j, i]
+    _mirror(hessian)
+    return cost, hessian, gradient
+
+
+@inner
+def _mirror(matrix):
+    """Copy the lower triangle of a matrix (5, 5) to the upper one."""
     for k in range(5):
         for j in range(k):
-            hessian[j, k] = hessian[k, j]
-    return cost, hessian, gradient
+            matrix[j, k] = matrix[k, j]

@@ -24,8 +24,9 @@ def ransac_with_prior(
     max_rotation: float,
     max_heading: float,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Motion (rotation 3x3, unit translation) with most inliers near an expected motion, or None if
-    there is none.
+    """Motion (rotation 3x3, unit translation) with most inliers near an expected motion.
+
+    None if no motion is near it.
 
     current, previous: normalised correspondences (N, 2), N >= 5. rotation, translation: the
     expected motion.
@@ -33,16 +34,15 @@ def ransac_with_prior(
     translation's direction, whose sign is ignored.
     """
     columns = np.ascontiguousarray(np.hstack([current, previous]).T)
-    state, sample, five, solutions = (
-        OPENCV_SEED,
-        np.empty(SAMPLE_SIZE, np.int64),
-        np.empty((SAMPLE_SIZE, 4)),
-        [],
-    )
+    state = OPENCV_SEED
+    sample = np.empty(SAMPLE_SIZE, np.int64)
+    five = np.empty((SAMPLE_SIZE, 4))
+    solutions = []
     # in Python: `solve` within another compiled function would be compiled once more
     for _ in range(MAX_SAMPLES):
         state = draw(np.uint64(state), columns, sample, five)
-        solutions.append(solve(five)[1])  # no solutions if it is not sure
+        _, matrices, _ = solve(five)  # no matrices if it is not sure
+        solutions.append(matrices)
     most, best_rotation, best_translation = _best(
         np.concatenate(solutions),
         columns,
@@ -59,19 +59,16 @@ def ransac_with_prior(
 def _best(
     solutions, columns, limit, rotation, translation, min_rotation_cosine, min_heading_cosine
 ):
-    """Most inliers of any motion near the expected motion, and that motion (rotation,
-    translation).
-    """
+    """Most inliers of any motion near the expected one, and that motion (rotation, translation)."""
     r, t = np.empty((3, 3)), np.empty(3)
     most, best_r, best_t = 0, np.empty((3, 3)), np.empty(3)
     for index in range(len(solutions)):
-        e, is_near = epipolar.entries(solutions[index]), False
+        e = epipolar.entries(solutions[index])
         _translation(e, t)
-        if (
-            abs(t[0] * translation[0] + t[1] * translation[1] + t[2] * translation[2])
-            < min_heading_cosine
-        ):
+        cosine = t[0] * translation[0] + t[1] * translation[1] + t[2] * translation[2]
+        if abs(cosine) < min_heading_cosine:
             continue
+        is_near = False
         for _ in range(2):  # t with one rotation, -t with the other
             _rotation(e, t, r)
             product = 0.0
@@ -89,9 +86,8 @@ def _best(
             algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(
                 e, columns[0, k], columns[1, k], columns[2, k], columns[3, k]
             )
-            inliers += (
-                1 if algebraic * algebraic <= limit * (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) else 0
-            )
+            square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
+            inliers += algebraic * algebraic <= limit * square
         if inliers > most:
             most, best_r, best_t = inliers, r.copy(), t.copy()
     return most, best_r, best_t
@@ -99,8 +95,9 @@ def _best(
 
 @inner
 def _translation(e, t):
-    """Write the unit translation, with either sign, of an essential matrix: it is normal to all
-    columns.
+    """Write the unit translation of an essential matrix, with either sign.
+
+    It is normal to all columns.
     """
     largest = -1.0
     for a in range(3):  # use the best conditioned pair of columns
@@ -124,10 +121,11 @@ def _rotation(e, t, r):
     """
     size = np.sqrt(2.0)  # the norm of [t]x R
     for i in range(3):
-        i1, i2 = 3 * ((i + 1) % 3), 3 * ((i + 2) % 3)
+        p = (i + 1) % 3
+        q = (i + 2) % 3
         for j in range(3):
-            j1, j2 = (j + 1) % 3, (j + 2) % 3
-            cofactor = e[i1 + j1] * e[i2 + j2] - e[i1 + j2] * e[i2 + j1]
-            r[i, j] = size * size * cofactor - size * (
-                t[(i + 1) % 3] * e[i2 + j] - t[(i + 2) % 3] * e[i1 + j]
-            )
+            m = (j + 1) % 3
+            n = (j + 2) % 3
+            cofactor = e[3 * p + m] * e[3 * q + n] - e[3 * p + n] * e[3 * q + m]
+            product = t[p] * e[3 * q + j] - t[q] * e[3 * p + j]  # of [t]x E
+            r[i, j] = size * size * cofactor - size * product

@@ -31,21 +31,24 @@ AMBIGUOUS, NOT_DETERMINED = "ambiguous motion", "motion not determined"  # flags
 
 
 class MotionPrior(NamedTuple):
-    """Last consistent step: `rotation` (3x3), unit `translation` and `scale` (metres). The next
-    step should be similar.
+    """Last consistent step. The next step should be similar."""
 
-    Before the first step, `scale` is 0 and the camera is expected to move straight ahead.
-    """
+    rotation: np.ndarray  # 3x3
+    translation: np.ndarray  # 3, unit length
+    scale: float  # metres; 0 before the first step
 
-    rotation: np.ndarray = np.eye(3)
-    translation: np.ndarray = np.array([0.0, 0.0, 1.0])
-    scale: float = 0.0
+    @classmethod
+    def straight_ahead(cls) -> "MotionPrior":
+        """Expected motion before the first step."""
+        return cls(np.eye(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
     def expected_rotation(self, scale: float) -> np.ndarray:
         """Expected rotation (3x3) of a step of `scale` metres on the same curve."""
         if not self.scale:
             return self.rotation
-        return cv2.Rodrigues(cv2.Rodrigues(self.rotation)[0] * (scale / self.scale))[0]
+        vector, _ = cv2.Rodrigues(self.rotation)
+        rotation, _ = cv2.Rodrigues(vector * (scale / self.scale))
+        return rotation
 
 
 def check_consistency(
@@ -56,8 +59,9 @@ def check_consistency(
     threshold: float,
     prior: MotionPrior,
 ) -> tuple[RefinedMotion, MotionPrior, str]:
-    """Return the motion to use, the prior of the next step, and a flag ("" if the refined `motion`
-    is consistent).
+    """Return the motion to use, the prior of the next step, and a flag.
+
+    The flag is "" if the refined `motion` is consistent.
 
     current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers.
     scale: metres.
@@ -84,48 +88,58 @@ def check_consistency(
             motion = replace(again, inliers=motion.inliers)
     else:
         flag = AMBIGUOUS
-        start = ransac_with_prior(
-            current,
-            previous,
-            threshold,
-            rotation,
-            translation,
-            _max_rotation(prior),
-            MAX_HEADING_CHANGE,
-        )
-        if start:
-            other = fit(
-                *start, current, previous, near(*start, current, previous, threshold), threshold
-            )
-            if is_consistent(other, scale, prior) and (
-                other.support >= MIN_SUPPORT * motion.support or not _determined(motion)
-            ):
+        other = _consistent_motion(current, previous, scale, threshold, prior)
+        if other is not None:
+            has_support = other.support >= MIN_SUPPORT * motion.support
+            if has_support or not _is_determined(motion):
                 motion = other
-    if _determined(motion):
-        # a fitted motion has both
-        assert motion.rotation is not None and motion.translation is not None
-        return motion, MotionPrior(motion.rotation, motion.translation, scale), flag
-    return replace(motion, rotation=rotation, translation=translation), prior, NOT_DETERMINED
+    if not _is_determined(motion):
+        expected = replace(motion, rotation=rotation, translation=translation)
+        return expected, prior, NOT_DETERMINED
+    # a fitted motion has both
+    assert motion.rotation is not None and motion.translation is not None
+    return motion, MotionPrior(motion.rotation, motion.translation, scale), flag
+
+
+def _consistent_motion(
+    current: np.ndarray, previous: np.ndarray, scale: float, threshold: float, prior: MotionPrior
+) -> RefinedMotion | None:
+    """The motion with most inliers that is consistent with the prior, or None if there is none."""
+    start = ransac_with_prior(
+        current,
+        previous,
+        threshold,
+        prior.expected_rotation(scale),
+        prior.translation,
+        _max_rotation(prior),
+        MAX_HEADING_CHANGE,
+    )
+    if start is None:
+        return None
+    inliers = near(*start, current, previous, threshold)
+    motion = fit(*start, current, previous, inliers, threshold)
+    return motion if is_consistent(motion, scale, prior) else None
 
 
 def is_consistent(motion: RefinedMotion, scale: float, prior: MotionPrior) -> bool:
-    """Whether a step of `scale` metres is determined by its points and within the limits of the
-    expected motion.
+    """Whether a motion is determined by its points and near the expected motion.
+
+    scale: length of the step, metres.
     """
     assert motion.rotation is not None and motion.translation is not None
-    turned = _degrees((np.trace(prior.expected_rotation(scale).T @ motion.rotation) - 1) / 2)
-    return bool(
-        _determined(motion)
-        and turned <= _max_rotation(prior)
-        and _degrees(prior.translation @ motion.translation) <= MAX_HEADING_CHANGE
-    )
+    if not _is_determined(motion):
+        return False
+    difference = prior.expected_rotation(scale).T @ motion.rotation
+    turned = _degrees((np.trace(difference) - 1) / 2)
+    heading_change = _degrees(prior.translation @ motion.translation)
+    return bool(turned <= _max_rotation(prior) and heading_change <= MAX_HEADING_CHANGE)
 
 
 def _max_rotation(prior: MotionPrior) -> float:
     return MAX_ROTATION_CHANGE if prior.scale else MAX_FIRST_ROTATION
 
 
-def _determined(motion: RefinedMotion) -> bool:
+def _is_determined(motion: RefinedMotion) -> bool:
     return motion.rotation_std_deg < MAX_ROTATION_STD and motion.heading_std_deg < MAX_HEADING_STD
 
 
