@@ -325,7 +325,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             dilation_width=masks.dilation_width,
             frames=results.listing(masks.frame_paths),
             code=results.code("thesis_repro.masks"),
-            **results.made_with("opencv-python-headless"),
+            **results.made_with("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
             if not is_whole(folder / path.name):

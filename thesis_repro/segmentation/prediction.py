@@ -99,7 +99,7 @@ def _open(
 
 def _arithmetic() -> dict[str, Any]:
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
-    return results.made_with("tensorflow", "keras", "opencv-python-headless") | {
+    return results.made_with("tensorflow", "keras", "opencv") | {
         "code": results.code("thesis_repro.segmentation.prediction"),
         "arithmetic": segmentation.arithmetic(),
     }

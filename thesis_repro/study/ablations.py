@@ -96,7 +96,7 @@ def _measure(
         folder,
         options=options,
         code=results.code("thesis_repro.study.ablations"),
-        **results.made_with("opencv-python-headless", "numpy", "numba"),
+        **results.made_with("opencv", "numpy", "numba"),
         sequence=results.listing(sequence.files),
         labels=results.listing([labels / path.name for path in sequence.frame_paths]),
         model=results.made_from(labels),
