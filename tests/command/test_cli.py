@@ -37,6 +37,20 @@ def test_the_console_script_prints_the_version():
     assert outputs[0] == outputs[1] == f"thesis-repro {metadata.version('thesis-repro')}\n"
 
 
+@pytest.mark.parametrize(
+    "module, name, advice",
+    [
+        ("cv2", "run", "pip install opencv-python-headless"),
+        ("keras", "build_unet", 'pip install "thesis-repro[segmentation]"'),
+    ],
+)
+def test_a_missing_package_is_named_in_one_line(module, name, advice):
+    program = f"import sys; sys.modules[{module!r}] = None; import thesis_repro; thesis_repro.{name}"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    *_, line = result.stderr.splitlines()
+    assert line.startswith("thesis_repro.errors.InputError: ") and advice in line
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_shows_two_valid_examples_and_takes_no_abbreviations(name):
     examples = [shlex.split(line) for line in COMMANDS[name].epilog.splitlines()[1:]]
