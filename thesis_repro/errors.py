@@ -18,9 +18,9 @@ EXTRAS = {
 
 
 def one_line(text: object) -> str:
-    """Return a text as one printable line.
+    r"""Return a text as one printable line.
 
-    Line breaks and control characters become escape sequences such as \\n.
+    Line breaks and control characters become escape sequences such as \n.
     """
     letters = []
     for letter in str(text):

@@ -452,22 +452,24 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
     """Print a result as JSON or with a template, and name the written files on standard error."""
     from thesis_repro.report import texts
 
-    if vars(options).get("json"):
-        text = json.dumps(record)
-    else:
+    text = json.dumps(record)
+    if not vars(options).get("json"):
         text = texts.render(template, record=record, **values).rstrip()
-    outputs = _output_files(options)
     print(text)
-    for name, path in outputs.items():
+    for name, path in _output_files(options).items():
         console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
+
+
+def _replace_closed_streams() -> None:
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            null = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  stays open as the stream
+            setattr(sys, stream, null)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    for stream in ("stdout", "stderr"):
-        if getattr(sys, stream) is None:  # it was closed
-            null = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  stays open as the stream
-            setattr(sys, stream, null)
+    _replace_closed_streams()
     if arguments is None:
         arguments = sys.argv[1:]
     options = build_parser(COMMANDS).parse_args(arguments)
