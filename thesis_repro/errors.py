@@ -2,22 +2,39 @@
 
 from typing import Any
 
+# modules that only some commands need, by the extra of this package that installs them
+EXTRAS = {
+    "segmentation": (
+        "tensorflow",
+        "keras",
+        "h5py",
+        "segmentation_models",
+        "albumentations",
+        "psutil",
+    ),
+    "notebooks": ("IPython", "ipywidgets", "nbconvert", "nbformat", "latex2mathml", "livelossplot"),
+    "cluster": ("dask", "distributed"),
+}
+
 
 def one_line(text: object) -> str:
-    """Return a text as one printable line: line breaks and control characters become escape
-    sequences such as \\n.
+    r"""Return a text as one printable line.
+
+    Line breaks and control characters become escape sequences such as \n.
     """
-    return "".join(
-        letter
-        if letter.isprintable()
-        else letter.encode("unicode_escape", "surrogatepass").decode()
-        for letter in str(text)
-    )
+    letters = []
+    for letter in str(text):
+        if letter.isprintable():
+            letters.append(letter)
+        else:
+            letters.append(letter.encode("unicode_escape", "surrogatepass").decode())
+    return "".join(letters)
 
 
 class InputError(ValueError):
-    """Bad input. The message is one line that names the file or setting, the problem, and what
-    to do.
+    """Bad input.
+
+    The message is one line that names the file or setting, the problem, and what to do.
     """
 
     def __str__(self) -> str:
@@ -34,3 +51,23 @@ def need(name: str, value: object, kind: Any) -> None:
         raise InputError(
             f"{name}: must be {getattr(kind, '__name__', kind)}, not {type(value).__name__}"
         )
+
+
+def missing_package(error: ImportError) -> InputError | None:
+    """Return an InputError that says what to install, or None if another import failed.
+
+    OpenCV is missing if none of its four distributions is installed, or if the system lacks a
+    library that the installed one needs.
+    """
+    module = (error.name or "").partition(".")[0]
+    if module == "cv2":
+        return InputError(
+            f"OpenCV: cannot be imported ({error}); run pip install opencv-python-headless, or "
+            "another of its distributions"
+        )
+    for extra, modules in EXTRAS.items():
+        if module in modules:
+            return InputError(
+                f'{module}: is not installed; run pip install "thesis-repro[{extra}]"'
+            )
+    return None

@@ -318,7 +318,7 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             dilation_width=masks.dilation_width,
             frames=results.digest_of_files(masks.frame_paths),
             code=results.digest_of_code("thesis_repro.masks"),
-            **results.made_with("opencv-python-headless"),
+            **results.made_with("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
             if not is_whole(folder / path.name):

@@ -39,6 +39,22 @@ def test_the_console_script_prints_the_version():
     assert outputs[0] == outputs[1] == f"thesis-repro {metadata.version('thesis-repro')}\n"
 
 
+@pytest.mark.parametrize(
+    "module, name, advice",
+    [
+        ("cv2", "run", "pip install opencv-python-headless"),
+        ("keras", "build_unet", 'pip install "thesis-repro[segmentation]"'),
+    ],
+)
+def test_a_missing_package_is_named_in_one_line(module, name, advice):
+    program = (
+        f"import sys; sys.modules[{module!r}] = None; import thesis_repro; thesis_repro.{name}"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    *_, line = result.stderr.splitlines()
+    assert line.startswith("thesis_repro.errors.InputError: ") and advice in line
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_shows_two_valid_examples_and_takes_no_abbreviations(name):
     examples = [shlex.split(line) for line in COMMANDS[name].epilog.splitlines()[1:]]
@@ -120,7 +136,7 @@ def test_without_ground_truth_there_are_no_errors(
 def test_public_names():
     assert set(tr.__all__) <= set(dir(tr)) and not hasattr(tr, "mistyped")
     assert (
-        tr.THESIS == tr.OdometrySettings() and tr.Sequence.__module__ == "thesis_repro.data.kitti"
+        tr.OdometrySettings() == tr.THESIS and tr.Sequence.__module__ == "thesis_repro.data.kitti"
     )
     assert tr.keypoint_mask(np.full((8, 8), 7, np.uint8), (16, 32), 3).shape == (16, 32)
     assert tr.build_unet((32, 32, 1), 35, 2).output_shape == (None, 32, 32, 35)
@@ -153,8 +169,9 @@ def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, caps
 
 @pytest.mark.parametrize("text", ["README.md", "docs/answer.md"])
 def test_ratios_in_texts_are_in_recorded_tables(text):
-    """Each "1.09 (95 % CI 0.98-1.32)" is in one line of a table that `make figures` does not
-    rewrite, rounded to two digits.
+    """Each "1.09 (95 % CI 0.98-1.32)" is in one line of a table, rounded to two digits.
+
+    `make figures` does not rewrite these tables.
     """
     ratios = re.findall(
         r"(\d+\.\d\d) \(95 % CI (\d+\.\d\d)-(\d+\.\d\d)\)", (ROOT / text).read_text()

@@ -492,13 +492,19 @@ def test_wrong_settings_are_named(setting, value):
         replace(THESIS, **{setting: value})
 
 
+def test_a_mask_may_be_of_booleans(drive):
+    masks = Stripes(40)
+    booleans = [masks[index] > 0 for index in range(len(drive))]
+    assert_same(odometry.run(drive, SMALL, masks), odometry.run(drive, SMALL, booleans))
+
+
 def test_wrong_frames_and_masks_are_named(drive):
     follower = Odometry(drive.intrinsics)
     follower.step(drive.frame(0))
     frame = drive.frame(1)
     for arguments in (
         (frame, 0.4, np.zeros((10, 10), np.uint8)),
-        (frame, 0.4, np.zeros(frame.shape, bool)),
+        (frame, 0.4, np.zeros(frame.shape)),
         (frame[:80], 0.4),
         (frame / 255, 0.4),
         (frame, float("nan")),

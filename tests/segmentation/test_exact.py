@@ -23,10 +23,42 @@ pytestmark = pytest.mark.slow
 # Operations that move values, handle variables, or compute with whole numbers; and those on data
 # sets, whose names say so
 MOVING = set(
-    """_Arg _DeviceArg _Retval _EagerConst _Send _Recv ArgMax AssignVariableOp BroadcastTo Cast
-    ConcatOffset ConcatV2 Const GatherV2 Greater Identity MakeIterator NoOp OneHot Pack
-    PartitionedCall Prod PyFunc RandomShuffle Range ReadVariableOp Reshape Shape ShapeN Slice Squeeze
-    StridedSlice VarHandleOp VarIsInitializedOp""".split()
+    [
+        "_Arg",
+        "_DeviceArg",
+        "_Retval",
+        "_EagerConst",
+        "_Send",
+        "_Recv",
+        "ArgMax",
+        "AssignVariableOp",
+        "BroadcastTo",
+        "Cast",
+        "ConcatOffset",
+        "ConcatV2",
+        "Const",
+        "GatherV2",
+        "Greater",
+        "Identity",
+        "MakeIterator",
+        "NoOp",
+        "OneHot",
+        "Pack",
+        "PartitionedCall",
+        "Prod",
+        "PyFunc",
+        "RandomShuffle",
+        "Range",
+        "ReadVariableOp",
+        "Reshape",
+        "Shape",
+        "ShapeN",
+        "Slice",
+        "Squeeze",
+        "StridedSlice",
+        "VarHandleOp",
+        "VarIsInitializedOp",
+    ]
 )
 ON_DATA = ("Dataset", "Iterator", "Optional")
 # Operations that add, multiply, compare, divide by a / b or take square roots, in Eigen or oneDNN.
@@ -36,19 +68,58 @@ ON_DATA = ("Dataset", "Iterator", "Optional")
 # logarithms of complex numbers, and to optimisers in C++, but to none of these names. A new name
 # goes here only if that is true of it, and if `tools/emulated.py` still finds equal bits.
 EXACT = set(
-    """Add AddN AddV2 AssignAddVariableOp AssignSubVariableOp BiasAdd BiasAddGrad DivNoNan Mean Mul Neg
-    Pow RealDiv Relu ReluGrad Sqrt SqrtGrad Square SquaredDifference Sub Sum _MklNativeConv2D
-    _MklNativeConv2DBackpropFilter _MklNativeConv2DBackpropFilterWithBias
-    _MklNativeConv2DBackpropInput _MklNativeFusedConv2D _MklNativeMaxPool _MklNativeMaxPoolGrad
-    _MklSoftmax""".split()
+    [
+        "Add",
+        "AddN",
+        "AddV2",
+        "AssignAddVariableOp",
+        "AssignSubVariableOp",
+        "BiasAdd",
+        "BiasAddGrad",
+        "DivNoNan",
+        "Mean",
+        "Mul",
+        "Neg",
+        "Pow",
+        "RealDiv",
+        "Relu",
+        "ReluGrad",
+        "Sqrt",
+        "SqrtGrad",
+        "Square",
+        "SquaredDifference",
+        "Sub",
+        "Sum",
+        "_MklNativeConv2D",
+        "_MklNativeConv2DBackpropFilter",
+        "_MklNativeConv2DBackpropFilterWithBias",
+        "_MklNativeConv2DBackpropInput",
+        "_MklNativeFusedConv2D",
+        "_MklNativeMaxPool",
+        "_MklNativeMaxPoolGrad",
+        "_MklSoftmax",
+    ]
 )
 
 
 # XLA compiles the loss. It divides exactly (a test below shows it), and its logarithm is a
 # polynomial. Its Rsqrt is approximate.
 EXACT_IN_XLA = set(
-    """BroadcastGradientArgs DynamicStitch Fill FloorMod GreaterEqual LessEqual Log Maximum Minimum
-    Reciprocal SelectV2 Tile ZerosLike""".split()
+    [
+        "BroadcastGradientArgs",
+        "DynamicStitch",
+        "Fill",
+        "FloorMod",
+        "GreaterEqual",
+        "LessEqual",
+        "Log",
+        "Maximum",
+        "Minimum",
+        "Reciprocal",
+        "SelectV2",
+        "Tile",
+        "ZerosLike",
+    ]
 )
 
 

@@ -1,6 +1,4 @@
-"""The training: its loss and batches, resuming, the same bits on any processor and number of cores,
-and the memory that it needs.
-"""
+"""The training: its loss and batches, resuming, its bits on any number of cores, its memory."""
 
 import json
 import os
@@ -25,8 +23,9 @@ from thesis_repro.segmentation.unet import build_unet
 
 pytestmark = pytest.mark.slow
 
-
 SIZE = 16
+# where another process finds this file and what it imports
+FOLDERS = [str(Path(__file__).parent), str(Path(emulated.__file__).parent)]
 
 
 def street(count, seed):
@@ -41,8 +40,9 @@ SETS = (*street(9, 0), *street(4, 1))
 
 
 def network(filters):
-    """Return a small network with the U-Net's kinds of layers; the U-Net takes ten times as
-    long to compile.
+    """Return a small network with the U-Net's kinds of layers.
+
+    The U-Net takes ten times as long to compile.
     """
     layers = [
         keras.Input((SIZE, SIZE, 1), name="image"),
@@ -73,8 +73,9 @@ def prepared(sets=SETS, filters=2, rate=0.01, loss=None, strategy=None):
 
 
 def train(folder, epochs=3, patience=5, pause=0, **options):
-    """Run the fit of notebook 4; pause: seconds after each batch, which leave time to kill the
-    process.
+    """Run the fit of notebook 4.
+
+    pause: seconds after each batch, which leave time to kill the process.
     """
     model, batches, validation = prepared(**options)
     stop = keras.callbacks.EarlyStopping(patience=patience)
@@ -184,7 +185,7 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
 
 def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_when):
     code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
+        f"import sys; sys.path[:0] = {FOLDERS}; "
         "from thesis_repro import segmentation; import test_training as t; "
         f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)"
     )
@@ -201,6 +202,7 @@ def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_whe
 
 def test_several_devices_share_each_batch(tmp_path):
     code = (
+        f"import sys; sys.path[:0] = {FOLDERS}; "
         "import tensorflow as tf; cpu, = tf.config.list_physical_devices('CPU'); "
         "tf.config.set_logical_device_configuration(cpu, [tf.config.LogicalDeviceConfiguration()] * 2); "
         "import test_training as t; "

@@ -6,13 +6,14 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
-from thesis_repro.errors import InputError
+from thesis_repro.errors import InputError, missing_package
 from thesis_repro.running import console
 from thesis_repro.running.settings import PROFILES, SEED, check_outside
 
@@ -31,7 +32,7 @@ OUTPUT_FILES = {
 
 
 def synthesize(options: Any) -> None:
-    """write the embedded world, a rendered street, in the folder layouts of KITTI and Cityscapes"""
+    """Write the embedded world, a rendered street, in the layouts of KITTI and Cityscapes."""
     import street_world
 
     with console.logged(options.out, options.command_line) as run:
@@ -44,8 +45,9 @@ def synthesize(options: Any) -> None:
 
 
 def check_data(options: Any) -> int:
-    """check folders of KITTI, Cityscapes or KITTI's street scenes: their content, damage, and
-    what can be run
+    """Check folders of KITTI, Cityscapes or KITTI's street scenes.
+
+    Says what they hold, what is damaged, and what can be run.
     """
     from thesis_repro.checks import check
 
@@ -54,12 +56,14 @@ def check_data(options: Any) -> int:
         raise InputError(
             "no folder to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic"
         )
-    return 0 if check.report(*roots, options.deep) else 1
+    is_complete = check.report(*roots, options.deep)
+    return int(not is_complete)
 
 
 def predict(options: Any) -> None:
-    """predict label maps (Cityscapes ids as 8-bit PNG, 320x320, named like the frames) for
-    images or sequences
+    """Predict label maps for images or sequences.
+
+    Label maps hold Cityscapes ids as 8-bit PNG, 320x320, named like the frames.
     """
     from thesis_repro.segmentation import quietly
     from thesis_repro.study import workers
@@ -71,35 +75,35 @@ def predict(options: Any) -> None:
         raise InputError("--images: two folders have the same name; use two commands")
     # sequences of a KITTI folder always get subfolders, even if there is only one
     has_subfolders = [folder for folder, _ in images] != options.images[:1]
-    sequences = [
-        (paths[: options.frames], options.folder / name if has_subfolders else options.folder)
-        for name, (_, paths) in zip(names, images)
-    ]
-    _check_outputs(
-        options, *options.images, *(paths[0].parent for paths, _ in sequences), options.model
-    )
+    sequences = []
+    for name, (_, paths) in zip(names, images):
+        output = options.folder
+        if has_subfolders:
+            output /= name
+        sequences.append((paths[: options.frames], output))
+    image_folders = [paths[0].parent for paths, _ in sequences]
+    _check_outputs(options, *options.images, *image_folders, options.model)
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
     model_file = options.model or prediction.SHIPPED
     with console.logged(options.folder, options.command_line) as run:
+        new = 0
         if options.dask:
             with workers.open_pool(1, options.dask) as pool:
                 new = prediction.spread_label_maps(pool.run, model_file, sequences)
         else:
             model = training.load_model(model_file)
-            new = sum(
-                prediction.write_label_maps(model, paths, output) for paths, output in sequences
-            )
+            for paths, output in sequences:
+                new += prediction.write_label_maps(model, paths, output)
         total = sum(len(paths) for paths, _ in sequences)
-        run.end(
-            "\n".join(f"{output}: {len(paths)} label maps" for paths, output in sequences),
-            total - new,
-        )
+        lines = [f"{output}: {len(paths)} label maps" for paths, output in sequences]
+        run.end("\n".join(lines), total - new)
 
 
 def masks(options: Any) -> None:
-    """write the keypoint masks of a sequence (appendix A.8): 8-bit PNG images, 255 keeps
-    keypoints, 0 ignores them
+    """Write the keypoint masks of a sequence (appendix A.8).
+
+    Masks are 8-bit PNG images: 255 keeps keypoints, 0 ignores them.
     """
     from thesis_repro.masks import LabelMasks, write_masks
 
@@ -114,13 +118,16 @@ def masks(options: Any) -> None:
     _warn(_print_oddities(sequence, mask_sets))
     for label_masks in mask_sets:
         width = label_masks.dilation_width
-        folder = options.folder if len(mask_sets) == 1 else options.folder / f"mask{width}"
+        folder = options.folder
+        if len(mask_sets) > 1:
+            folder /= f"mask{width}"
         write_masks(label_masks, folder)
         print(f"{folder}: {len(label_masks)} masks{f' of width {width}' * bool(options.dilation)}")
 
 
 def odometry(options: Any) -> None:
-    """run the visual odometry on one sequence and print its errors, number of keypoints and time"""
+    """Run the visual odometry on one sequence; print its errors, number of keypoints and time."""
+    _load_evo()
     from thesis_repro import odometry
     from thesis_repro.checks import oddities
     from thesis_repro.data import kitti
@@ -128,14 +135,17 @@ def odometry(options: Any) -> None:
     from thesis_repro.odometry import metrics
     from thesis_repro.report.record import run_record
 
-    changes = {
-        field.name: vars(options)[field.name]
-        for field in fields(odometry.OdometrySettings)
-        if vars(options).get(field.name) is not None
-    }
+    changes = {}
+    for field in fields(odometry.OdometrySettings):
+        value = vars(options).get(field.name)
+        if value is not None:
+            changes[field.name] = value
     settings = replace(odometry.THESIS, **changes)
     sequence = _sequence(options)
     masks = _masks(options, sequence)
+    mask_sets = []
+    if masks:
+        mask_sets = [masks]
     _check_outputs(
         options,
         sequence.poses_path,
@@ -145,7 +155,7 @@ def odometry(options: Any) -> None:
         sequence.folder,
         sequence.frame_paths[0].parent,
     )
-    _warn(_print_oddities(sequence, [masks] if masks else []))
+    _warn(_print_oddities(sequence, mask_sets))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
         write_kitti_poses(options.output, result.poses)
@@ -162,8 +172,10 @@ def odometry(options: Any) -> None:
     if options.plot:
         from thesis_repro.report import style, trajectories
 
-        truth = sequence.poses if sequence.has_truth else None
-        poses = result.poses if truth is None else metrics.shifted(result.poses, truth)
+        truth, poses = None, result.poses
+        if sequence.has_truth:
+            truth = sequence.poses
+            poses = metrics.shifted(poses, truth)
         with style.applied():
             drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
             style.write_figure(drawing, options.plot)
@@ -178,8 +190,9 @@ def odometry(options: Any) -> None:
 
 
 def study(options: Any) -> int:
-    """compare your own label maps or masks with all keypoints and with controls, in tables,
-    figures and a page
+    """Compare your own label maps or masks with all keypoints and with controls.
+
+    Writes tables, figures and a page.
     """
     from thesis_repro.data import kitti
     from thesis_repro.running import results
@@ -197,8 +210,12 @@ def study(options: Any) -> int:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     if options.invert and "masks" not in kinds:
         raise InputError("--invert: needs --masks DIR")
-    # one of any width, if masks have none
-    all_widths = (options.controls or 1,) if options.keep == "static" else ALL_WIDTHS
+    widths: set[int] = set()
+    if has_labels:
+        all_widths = ALL_WIDTHS
+        if options.keep == "static":
+            all_widths = (options.controls or 1,)  # one of any width, because masks have none
+        widths = widths.union(*options.widths or [all_widths])
     names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
@@ -206,7 +223,7 @@ def study(options: Any) -> int:
         sources.named(
             options.sources, options.name, _mask_settings(options, has_labels), options.invert
         ),
-        tuple(sorted(set().union(*options.widths or [all_widths] if has_labels else []))),
+        tuple(sorted(widths)),
         options.controls,
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
@@ -219,24 +236,26 @@ def study(options: Any) -> int:
     from thesis_repro.report import study
 
     with console.logged(folder, options.command_line) as run, results.claimed(folder):
-        warnings = [
-            line
-            for sequence, masks in planned.shown_masks()
-            for line in _print_oddities(sequence, masks)
-        ]
+        warnings = []
+        for sequence, masks in planned.shown_masks():
+            warnings += _print_oddities(sequence, masks)
         warnings = _warn(warnings)
         outcome = planned.run(folder, options.jobs or cores(), options.dask)
         warnings += _warn(planned.path_oddities(outcome.table, folder))
         page = study.write(planned, outcome.table, folder, warnings)
-        failed = f", {outcome.failed:,} failed (see above)" * (outcome.failed > 0)
+        failed = ""
+        if outcome.failed:
+            failed = f", {outcome.failed:,} failed (see above)"
         run.end(f"{len(outcome.table):,} runs{failed}; open {page} in a browser", outcome.kept)
-    return 1 if failed else 0
+    return int(bool(failed))
 
 
 def evaluate(options: Any) -> None:
-    """compare trajectories with the ground truth: the thesis's RMSE and MAE, ATE, RPE, KITTI's
-    t_rel and r_rel
+    """Compare trajectories with the ground truth.
+
+    Prints the thesis's RMSE and MAE, ATE, RPE, KITTI's t_rel and r_rel.
     """
+    _load_evo()
     from thesis_repro.checks import oddities
     from thesis_repro.data.kitti import true_path
     from thesis_repro.report import style, trajectories
@@ -291,6 +310,12 @@ COMMANDS = {
 # Helpers of several commands
 
 
+def _load_evo() -> None:
+    """Import evo, which prints a line when it first writes its settings into the home folder."""
+    with redirect_stdout(sys.stderr):
+        import_module("evo.main_ape")
+
+
 def _sequence(options: Any) -> Any:
     from thesis_repro.data.kitti import Sequence
 
@@ -326,9 +351,9 @@ def _warn(lines: Iterable[str]) -> list[str]:
 
 
 def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
-    """Yield (folder, its images) for a folder of images, a sequence, or each sequence of a KITTI
-    folder or of a folder of sequences.
+    """Yield (folder, its images) for each sequence that a path names.
 
+    The path is a folder of images, a sequence, a KITTI folder or a folder of sequences.
     Raises InputError if there are no images, or if frames of a sequence are missing.
     """
     from thesis_repro.data import kitti
@@ -337,7 +362,9 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     folders = [root]
     if root.is_dir() and not kitti.has_frames(root):
         parent = kitti.folder_of(root)
-        folders = kitti.folders_with_frames(parent if parent.is_dir() else root) or [root]
+        if not parent.is_dir():
+            parent = root
+        folders = kitti.folders_with_frames(parent) or [root]
     for folder in folders:
         image_folder = kitti.images_of(folder)
         paths = files.images(image_folder)
@@ -381,9 +408,13 @@ def _masks(options: Any, sequence: Any) -> Any:
     if options.invert and not options.masks:
         raise InputError("--invert: needs --masks DIR")
     if options.labels:
-        width = 1 if options.dilation is None else options.dilation
+        width = options.dilation
+        if width is None:
+            width = 1  # masks of what cannot move have no width
         return LabelMasks(options.labels, sequence, width, settings)
-    return MaskFolder(options.masks, sequence, options.invert) if options.masks else None
+    if options.masks:
+        return MaskFolder(options.masks, sequence, options.invert)
+    return None
 
 
 def _output_files(options: Any) -> dict[str, Path]:
@@ -391,8 +422,9 @@ def _output_files(options: Any) -> dict[str, Path]:
 
 
 def _check_outputs(options: Any, *inputs: Path | None) -> None:
-    """Raise InputError, before anything runs, if an output cannot be written or would overwrite
-    or mix with inputs.
+    """Raise InputError if an output cannot be written, or would overwrite or mix with inputs.
+
+    It is called before anything runs.
     """
     from thesis_repro.running.files import check_output
 
@@ -424,25 +456,28 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
     """Print a result as JSON or with a template, and name the written files on standard error."""
     from thesis_repro.report import texts
 
-    text = (
-        json.dumps(record)
-        if vars(options).get("json")
-        else texts.render(template, record=record, **values).rstrip()
-    )
-    outputs = _output_files(options)
+    text = json.dumps(record)
+    if not vars(options).get("json"):
+        text = texts.render(template, record=record, **values).rstrip()
     print(text)
-    for name, path in outputs.items():
+    for name, path in _output_files(options).items():
         console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
-def main(arguments: list[str] | None = None) -> int:
+def _replace_closed_streams() -> None:
     for stream in ("stdout", "stderr"):
-        if getattr(sys, stream) is None:  # it was closed
-            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))
+        if getattr(sys, stream) is None:
+            null = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  stays open as the stream
+            setattr(sys, stream, null)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command in the arguments (default: of this process), and return its exit status."""
+    _replace_closed_streams()
+    if arguments is None:
+        arguments = sys.argv[1:]
     options = build_parser(COMMANDS).parse_args(arguments)
-    options.command_line = shlex.join(
-        ["thesis-repro", *(sys.argv[1:] if arguments is None else arguments)]
-    )
+    options.command_line = shlex.join(["thesis-repro", *arguments])
     console.print_messages()
     try:
         try:
@@ -450,16 +485,24 @@ def main(arguments: list[str] | None = None) -> int:
         except FileNotFoundError:
             raise InputError("the working folder was deleted; change to another one") from None
         with console.stoppable():
-            console.need_addresses(4 if options.function is predict else 2)
+            gigabytes = 2
+            if options.function is predict:
+                gigabytes = 4
+            console.need_addresses(gigabytes)
             code = options.function(options) or 0
             sys.stdout.flush()
             return code
     except BrokenPipeError:  # the reader of the output has ended, such as head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
+    except ImportError as error:
+        return console.report_error(missing_package(error) or error)
     except Exception as error:
         return console.report_error(error)
     except KeyboardInterrupt as stop:
         with suppress(OSError):  # the terminal may be gone
             print("stopped; run the same command again to resume", file=sys.stderr)
-        return 128 + (stop.args[0] if stop.args else signal.SIGINT)
+        number = signal.SIGINT
+        if stop.args:
+            number = stop.args[0]
+        return 128 + number

@@ -19,8 +19,9 @@ from thesis_repro.running.settings import (
 
 
 class _Parser(argparse.ArgumentParser):
-    """An ArgumentParser with one-line errors, without abbreviated options, and with a check for
-    empty paths.
+    """An ArgumentParser with one-line errors and without abbreviated options.
+
+    It refuses empty paths.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -38,8 +39,9 @@ def _path(text: str) -> Path:
 
 
 def _setting(read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Let argparse show the InputError of a function that reads an option, instead of "invalid
-    value".
+    """Let argparse show the InputError of a function that reads an option.
+
+    By itself it would say "invalid value".
     """
 
     def read_text(text: str) -> Any:
@@ -343,23 +345,25 @@ def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
     for name, function in functions.items():
         # python -OO leaves docstrings out
         description = " ".join((function.__doc__ or "").split())
+        own_examples = [line for line in examples if line.startswith(f"thesis-repro {name} ")]
         sub = commands.add_parser(
             name,
             help=description,
             description=textwrap.fill(description, 80),
-            epilog="\n".join(
-                [
-                    "examples:",
-                    *(line for line in examples if line.startswith(f"thesis-repro {name} ")),
-                ]
-            ),
+            epilog="\n".join(["examples:", *own_examples]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         sub.set_defaults(function=function)
-        exclusive = sub.add_mutually_exclusive_group() if name in EXCLUSIVE else sub
+        exclusive_names: tuple[str, ...] = ()
+        if name in EXCLUSIVE:
+            exclusive_names = EXCLUSIVE[name]
+            exclusive = sub.add_mutually_exclusive_group()
         mask_options = sub.add_argument_group("how masks are made from label maps")
         for option, arguments in COMMANDS[name].items():
-            is_exclusive = option in EXCLUSIVE.get(name, ())
-            group = mask_options if option in MASK_OPTIONS else exclusive if is_exclusive else sub
-            group.add_argument(option, **arguments)
+            if option in MASK_OPTIONS:
+                mask_options.add_argument(option, **arguments)
+            elif option in exclusive_names:
+                exclusive.add_argument(option, **arguments)
+            else:
+                sub.add_argument(option, **arguments)
     return parser

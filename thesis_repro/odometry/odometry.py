@@ -90,9 +90,10 @@ class Odometry:
     """Monocular visual odometry, frame by frame.
 
     `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since
-    the previous frame in metres, and an optional mask of the same size (keypoints are forbidden
-    where it is 0). It returns a Step. It calls `observe`, `estimate` and `compose`. `estimate` uses
-    no state of earlier steps. With settings.fallback, `compose` may estimate a step anew.
+    the previous frame in metres, and an optional mask of the same size, uint8 or bool (keypoints
+    are forbidden where it is 0). It returns a Step. It calls `observe`, `estimate` and `compose`.
+    `estimate` uses no state of earlier steps. With settings.fallback, `compose` may estimate a
+    step anew.
     """
 
     def __init__(
@@ -146,6 +147,8 @@ class Odometry:
         frame = np.asarray(frame)  # cv2.imread returns None for a missing file
         if mask is not None:
             mask = np.asarray(mask)
+            if mask.dtype == bool:
+                mask = mask.view(np.uint8)
         need(f"frame {self.count}: scale", np.asarray(scale)[()], Real)
         self._check(frame, scale, mask)
         step = Step(frame=self.count, scale=float(scale))

@@ -44,7 +44,7 @@ def read_color(path: str | Path) -> np.ndarray:
 
     Raises what `read_gray` raises.
     """
-    return _read(path, "RGB", cv2.IMREAD_COLOR_RGB)
+    return _read(path, "RGB", cv2.IMREAD_COLOR)
 
 
 def read_ids(path: str | Path) -> np.ndarray:
@@ -99,6 +99,8 @@ def _read(path: str | Path, mode: str, flag: int) -> np.ndarray:
         if pixels is None:
             Image.open(file).load()  # raises if the file is damaged; OpenCV gives no reason
             raise MemoryError
+        if mode == "RGB":
+            return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
         return pixels
 
 

@@ -22,6 +22,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import pandas as pd
 
@@ -29,6 +30,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.running import console
 from thesis_repro.running.files import TEMPORARY, atomic, progress, write_text
 from thesis_repro.running.folders import LOG, RECORD
+from thesis_repro.running.settings import ROOT
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -336,9 +338,34 @@ def _is_no_code(statement: ast.stmt) -> bool:
     return isinstance(statement.value.value, str)
 
 
+OPENCV = (
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+)
+
+
 def made_with(*packages: str) -> dict[str, Any]:
-    """Return the versions of packages that results depend on."""
-    return {"versions": {name: importlib.metadata.version(name) for name in packages}}
+    """Return the versions of packages that results depend on.
+
+    "opencv" stands for the distributions of OpenCV that are installed.
+    """
+    versions: dict[str, str] = {}
+    for name in packages:
+        if name == "opencv":
+            versions |= _opencv_versions()
+        else:
+            versions[name] = importlib.metadata.version(name)
+    return {"versions": versions}
+
+
+def _opencv_versions() -> dict[str, str]:
+    versions = {}
+    for name in OPENCV:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions or {"opencv": cv2.__version__}  # built by the user or the system
 
 
 def digest_of_files(paths: Iterable[str | Path]) -> str:
@@ -424,16 +451,36 @@ def _remember(new: dict[_Version, str]) -> None:
 
 @contextmanager
 def _digest_database() -> Iterator[sqlite3.Connection]:
-    """Open the database of digests. The caller ignores its errors and then reads the files
-    again.
+    """Open the database of digests.
+
+    The caller ignores its errors and then reads the files again.
     """
-    folder = Path(os.environ.get("THESIS_REPRO_BUILD") or _PACKAGE.parent / "build")
+    folder = _digest_folder()
     folder.mkdir(parents=True, exist_ok=True)
     with closing(sqlite3.connect(folder / "digests.sqlite", timeout=2)) as database, database:
         database.execute(
             "CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, identity TEXT, digest TEXT)"
         )
         yield database
+
+
+def _digest_folder() -> Path:
+    """Return the build folder, or the user's cache folder if the package is installed without one.
+
+    Raises OSError if the user has no folders.
+    """
+    build = os.environ.get("THESIS_REPRO_BUILD")
+    if build:
+        return Path(build)
+    if (ROOT / "pyproject.toml").is_file() and (ROOT / "notebooks").is_dir():  # a checkout
+        return ROOT / "build"
+    cache = os.environ.get("XDG_CACHE_HOME")
+    if cache:
+        return Path(cache) / "thesis-repro"
+    try:
+        return Path.home() / ".cache" / "thesis-repro"
+    except RuntimeError as error:
+        raise OSError("this user has no home folder") from error
 
 
 def _sha256(path: Path) -> str:

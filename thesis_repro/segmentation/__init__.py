@@ -1,5 +1,7 @@
-"""Semantic segmentation (appendix A.3 to A.7): augmentation, the U-Net, its training, label
-maps and their quality.
+"""Semantic segmentation (appendix A.3 to A.7).
+
+Augmentation, the U-Net, its training, label maps and their quality. The first import sets the
+environment variables that TensorFlow and the other libraries read when they are imported.
 """
 
 import os
@@ -27,18 +29,25 @@ if platform.machine() in ("x86_64", "AMD64"):
         "ONEDNN_MAX_CPU_ISA": "AVX2",
         "XLA_FLAGS": "--xla_cpu_max_isa=AVX2",
     }
-# Libraries read these variables when they are imported. Values of the user are kept.
-for _name, _value in {
-    # too late for a TensorFlow that is loaded; its record then lacks them
-    **(ARITHMETIC if "tensorflow" not in sys.modules else {}),
+OTHER_VARIABLES = {
     "TF_CPP_MIN_LOG_LEVEL": "3",  # errors of TensorFlow are Python exceptions as well
     "TF_FORCE_GPU_ALLOW_GROWTH": "true",  # do not take all memory of a GPU at the start
     "SM_FRAMEWORK": "tf.keras",  # of segmentation-models
     "NO_ALBUMENTATIONS_UPDATE": "1",  # the search for a newer release needs a network
-}.items():
-    os.environ.setdefault(_name, _value)
+}
 
-os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
+
+def _set_variables() -> None:
+    """Set the variables that the libraries read at their import. Values of the user are kept."""
+    variables = dict(OTHER_VARIABLES)
+    if "tensorflow" not in sys.modules:  # otherwise too late; the record of results lacks them
+        variables |= ARITHMETIC
+    for name, value in variables.items():
+        os.environ.setdefault(name, value)
+    os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
+
+
+_set_variables()
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
 
 
@@ -49,11 +58,10 @@ def arithmetic() -> dict[str, str | None]:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level;
-    errors are raised.
+    """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level.
 
-    The message that there is no GPU is hidden too. Raises InputError under python -OO, which one of
-    the libraries cannot be imported with.
+    Errors are raised. The message that there is no GPU is hidden too.
+    Raises InputError under python -OO, which one of the libraries cannot be imported with.
     """
     if sys.flags.optimize > 1:
         raise InputError("python -OO: the segmentation's libraries need docstrings; use python -O")

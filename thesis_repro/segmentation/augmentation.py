@@ -62,12 +62,15 @@ def transform_list(size: int, fill_mask: int = NOTHING) -> list:
 
 
 class Augmenter:
-    """Transforms whose result depends only on the image and the seed. Use one Augmenter a
-    thread.
+    """Transforms whose result depends only on the image and the seed.
+
+    Use one Augmenter a thread.
     """
 
     def __init__(self, transforms: list | A.Compose) -> None:
-        self._compose = transforms if isinstance(transforms, A.Compose) else A.Compose(transforms)
+        if not isinstance(transforms, A.Compose):
+            transforms = A.Compose(transforms)
+        self._compose = transforms
 
     def to_dict(self) -> dict:
         """Return the transforms and their settings in Albumentations' format (JSON values)."""
@@ -76,8 +79,9 @@ class Augmenter:
     def __call__(
         self, image: np.ndarray, label: np.ndarray, seed: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Augment one image (height, width[, channels]) uint8 and its label map (height, width)
-        uint8.
+        """Augment one image and its label map.
+
+        The image is (height, width[, channels]) uint8, the label map (height, width) uint8.
         """
         self._compose.set_random_seed(int(seed))
         result = self._compose(image=image, mask=label)
@@ -103,13 +107,13 @@ def validation_augmenter() -> Augmenter:
 def augment_set(
     images: np.ndarray, labels: np.ndarray, augmenter: Augmenter, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Augment every image of a set once (A.3): images (n, size, size, channels) and labels (n,
-    size, size), uint8.
+    """Augment every image of a set once (A.3).
 
-    Returns new arrays of the same shapes. Each image has a seed that depends only on `seed` and its
-    index.
+    images: (n, size, size, channels) uint8. labels: (n, size, size) uint8. Returns new arrays of
+    the same shapes. Each image has a seed that depends only on `seed` and its index.
     """
-    augmented_images, augmented_labels = np.empty_like(images), np.empty_like(labels)
+    augmented_images = np.empty_like(images)
+    augmented_labels = np.empty_like(labels)
     for index in progress(range(len(images)), "augmenting", unit="image"):
         augmented_images[index], augmented_labels[index] = augmenter(
             images[index], labels[index], image_seed(seed, index)
@@ -123,7 +127,9 @@ def image_seed(seed: int, index: int, epoch: int = 0) -> int:
 
 
 def one_hot(label_maps: np.ndarray, n_classes: int) -> np.ndarray:
-    """Return label maps (..., height, width) one-hot encoded, float32 (..., n_classes); NOTHING
-    becomes zeros.
+    """Return label maps (..., height, width) one-hot encoded, float32 (..., n_classes).
+
+    NOTHING becomes zeros.
     """
-    return (label_maps[..., None] == np.arange(n_classes, dtype=np.uint8)).astype(np.float32)
+    classes = np.arange(n_classes, dtype=np.uint8)
+    return (label_maps[..., None] == classes).astype(np.float32)

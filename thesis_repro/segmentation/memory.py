@@ -24,8 +24,7 @@ MALLOC_OPTIONS = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 2**28}
 
 
 def keep_freed() -> None:
-    """Make the C library keep freed memory for the next batch instead of returning it to the
-    system.
+    """Make the C library keep freed memory for the next batch.
 
     On a CPU, TensorFlow allocates every tensor anew. By default glibc requests each large one from
     the system, which fills it with zeros; that takes half the time of a training step. Without
@@ -37,8 +36,9 @@ def keep_freed() -> None:
 
 
 def available() -> int:
-    """Return the bytes that this process can still allocate, on the machine or within its
-    container's limit.
+    """Return the bytes that this process can still allocate.
+
+    The machine or the limit of its container decides.
     """
     free = psutil.virtual_memory().available
     with suppress(OSError, ValueError):  # no cgroup files, or "max", which means no limit
@@ -48,12 +48,13 @@ def available() -> int:
 
 
 def needed(model: Any, batch_size: int) -> int:
-    """Return the least bytes that a training step takes: the outputs of all layers, and some of
-    their gradients.
+    """Return the least bytes that a training step takes.
+
+    They hold the outputs of all layers, and some of their gradients.
     """
-    values = sum(
-        math.prod(size for size in layer.output.shape[1:] if size) for layer in model.layers
-    )
+    values = 0
+    for layer in model.layers:
+        values += math.prod(size for size in layer.output.shape[1:] if size)
     return int(GRADIENTS * batch_size * FLOAT * values)
 
 

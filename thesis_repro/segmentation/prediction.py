@@ -26,17 +26,19 @@ PART = 256
 
 
 def load_shipped() -> Any:
-    """Return the model in the package, for users without a trained model; weights/README.md
-    describes it.
+    """Return the model in the package, for users without a trained model.
+
+    weights/README.md describes it.
     """
     return training.load_model(SHIPPED)
 
 
 def predict(model: Any, images: np.ndarray, batch_size: int = 16) -> np.ndarray:
-    """Return label maps (n, size, size) uint8 for images (n, size, size, channels) uint8 of the
-    model's input size.
+    """Return the label maps of images.
 
-    The class of a pixel is the most probable one. Raises InputError for images of another shape.
+    images: (n, size, size, channels) uint8, of the model's input size. Label maps: (n, size, size)
+    uint8. The class of a pixel is the most probable one.
+    Raises InputError for images of another shape.
     """
     if images.shape[1:] != model.input_shape[1:]:
         raise InputError(
@@ -52,9 +54,9 @@ def predict(model: Any, images: np.ndarray, batch_size: int = 16) -> np.ndarray:
 def write_label_maps(
     model: Any, paths: list[Path], output_dir: str | Path, batch_size: int = 16
 ) -> int:
-    """Write the label map of each image as output_dir/NAME.png: 320x320, 8 bit, Cityscapes ids
-    (A.7.2).
+    """Write the label map of each image as output_dir/NAME.png (A.7.2).
 
+    Label maps are 320x320 pixels of 8 bits, Cityscapes ids.
     Images of any size are stretched to the model's input, as in the appendix. A killed run resumes:
     complete batches are skipped, and of an incomplete batch all images are predicted again, because
     the bits depend on the batch, but only missing files are written. The folder is a stage (see
@@ -75,10 +77,12 @@ def write_label_maps(
 def _open(
     weights: str, paths: list[Path], output_dir: str | Path, batch_size: int
 ) -> list[list[tuple[Path, Path]]]:
-    """Make the folder of label maps a stage; return its incomplete batches of (image, label
-    map) paths.
+    """Make the folder of label maps a stage; return its incomplete batches.
+
+    A batch is a list of (image, label map) paths.
     """
-    paths, output_dir = [Path(path).absolute() for path in paths], Path(output_dir).absolute()
+    paths = [Path(path).absolute() for path in paths]
+    output_dir = Path(output_dir).absolute()
     targets = [output_dir / f"{path.stem}.png" for path in paths]
     if len(set(targets)) < len(targets):
         raise InputError(
@@ -99,7 +103,7 @@ def _open(
 
 def _arithmetic() -> dict[str, Any]:
     """Return the versions of the libraries and the code that the bits of label maps depend on."""
-    return results.made_with("tensorflow", "keras", "opencv-python-headless") | {
+    return results.made_with("tensorflow", "keras", "opencv") | {
         "code": results.digest_of_code("thesis_repro.segmentation.prediction"),
         "arithmetic": segmentation.arithmetic(),
     }
@@ -108,10 +112,10 @@ def _arithmetic() -> dict[str, Any]:
 def _write_batches(
     model: Any, batches: list[list[tuple[Path, Path]]], done: Callable[[int], Any]
 ) -> None:
-    """Predict and write batches of (image, label map) paths; done: called with the length of
-    each written batch.
-    """
+    """Predict and write batches of (image, label map) paths.
 
+    done: called with the length of each written batch.
+    """
     run, shape = _compiled(model), model.input_shape[1:]
     with ThreadPoolExecutor() as pool:
         for batch in batches:
@@ -135,9 +139,9 @@ def spread_label_maps(
     sequences: list[tuple[list[Path], Path]],
     batch_size: int = 16,
 ) -> int:
-    """Write the label maps of many sequences on many workers; processors of one kind give
-    `write_label_maps`' bits.
+    """Write the label maps of many sequences on many workers.
 
+    Processors of one kind give `write_label_maps`' bits.
     run: function of (function, list of argument tuples), like `run` of the pools in
     `study.workers`. It calls the function on the workers and yields (index, returned value or
     reason why the worker was lost).
@@ -150,22 +154,20 @@ def spread_label_maps(
     """
     model_file = Path(model_file).absolute()
     weights = training.weights_digest(training.load_model(model_file))
-    calls, missing, failures = [], 0, []
-    total, step = sum(len(paths) for paths, _ in sequences), max(1, PART // batch_size)
+    calls: list[tuple] = []
+    failures: list[str] = []
+    missing = 0
+    total = sum(len(paths) for paths, _ in sequences)
+    step = max(1, PART // batch_size)
     with ExitStack() as held:
         for paths, folder in sequences:
             held.enter_context(results.claimed(folder))
             batches = _open(weights, paths, folder, batch_size)
             missing += sum(map(len, batches))
-            calls += [
-                (
-                    model_file,
-                    Path(folder).absolute(),
-                    results.record(folder),
-                    batches[start : start + step],
-                )
-                for start in range(0, len(batches), step)
-            ]
+            record, absolute = results.record(folder), Path(folder).absolute()
+            for start in range(0, len(batches), step):
+                part = batches[start : start + step]
+                calls.append((model_file, absolute, record, part))
         bar = held.enter_context(files.progress(None, "label maps", total, initial=total - missing))
         for index, failed in run(_write_part, calls):
             if failed:
@@ -186,8 +188,9 @@ _load_once = lru_cache(maxsize=1)(training.load_model)
 def _write_part(
     model_file: Path, folder: Path, record: dict[str, Any], batches: list[list[tuple[Path, Path]]]
 ) -> str | None:
-    """Write some batches of a sequence, here or on another machine; return the reason of a
-    failure, or None.
+    """Write some batches of a sequence, here or on another machine.
+
+    Returns the reason of a failure, or None.
     """
     try:
         results.check_worker(folder, record)
@@ -201,9 +204,9 @@ def _write_part(
 
 @lru_cache(maxsize=4)
 def _compiled(model: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from uint8 images to uint8 label maps, with the bits of `model.predict` and
-    argmax.
+    """Return a function from uint8 images to uint8 label maps.
 
+    It gives the bits of `model.predict` and argmax.
     For small networks `model.predict` takes two to four times as long, because every call has a
     set-up and returns 35 probabilities a pixel.
     """
@@ -216,9 +219,13 @@ def _compiled(model: Any) -> Callable[[np.ndarray], np.ndarray]:
         return tf.cast(tf.argmax(probabilities, axis=-1, output_type=tf.int32), tf.uint8)
 
     def run(images: np.ndarray) -> np.ndarray:
-        step = len(images) if tf.config.list_physical_devices("GPU") else CALL
-        return np.concatenate(
-            [call(images[start : start + step]).numpy() for start in range(0, len(images), step)]
-        )
+        step = CALL
+        if tf.config.list_physical_devices("GPU"):
+            step = len(images)
+        parts = []
+        for start in range(0, len(images), step):
+            part = call(images[start : start + step])
+            parts.append(part.numpy())
+        return np.concatenate(parts)
 
     return run

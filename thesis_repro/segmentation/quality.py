@@ -1,5 +1,6 @@
-"""Quality of a model on a set of images: the scores of segmentation-models and those of the
-Cityscapes benchmark.
+"""Quality of a model on a set of images.
+
+The scores are those of segmentation-models and those of the Cityscapes benchmark.
 """
 
 from dataclasses import dataclass
@@ -33,9 +34,9 @@ class Quality:
 
 
 def quality(model: Any, images: np.ndarray, labels: np.ndarray, batch_size: int = 16) -> Quality:
-    """Measure a model on images (n, size, size, channels) and true label maps (n, size, size), both
-    uint8.
+    """Measure a model on images and true label maps.
 
+    images: (n, size, size, channels) uint8. labels: (n, size, size) uint8.
     Only the scores of segmentation-models depend on the batch size (Sections 3.3 and 4.1).
     Raises InputError for an empty set, and for shapes that do not fit the model.
     """
@@ -67,17 +68,18 @@ def quality(model: Any, images: np.ndarray, labels: np.ndarray, batch_size: int 
 
 
 def confusion_matrix(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Return pixel counts by true class (rows) and predicted class (columns); pixels without a
-    class do not count.
+    """Return pixel counts by true class (rows) and predicted class (columns).
+
+    Pixels without a class do not count.
     """
     known = true < N_CLASSES
     pairs = true[known].astype(np.int64) * N_CLASSES + predicted[known]
-    return np.bincount(pairs, minlength=N_CLASSES**2).reshape(N_CLASSES, N_CLASSES)
+    counts = np.bincount(pairs, minlength=N_CLASSES**2)
+    return counts.reshape(N_CLASSES, N_CLASSES)
 
 
 def cityscapes_scores(confusion: np.ndarray) -> tuple[float, float, pd.DataFrame]:
-    """Return mean IoU, pixel accuracy and a table by class, as the Cityscapes benchmark defines
-    them.
+    """Return the Cityscapes benchmark's mean IoU, pixel accuracy and scores by class.
 
     Pixels whose true class is not evaluated are ignored. The mean is over the evaluated classes in
     the true label maps. A pixel that is wrongly given a class that is not evaluated is an error of
@@ -102,4 +104,5 @@ def cityscapes_scores(confusion: np.ndarray) -> tuple[float, float, pd.DataFrame
         },
         index=pd.Index([LABELS[number].name for number in present], name="class"),
     )
-    return float(table["iou"].mean()), float(right.sum() / true.sum()), table
+    accuracy = float(right.sum() / true.sum())
+    return float(table["iou"].mean()), accuracy, table

@@ -1,5 +1,6 @@
-"""Loss, metrics and input batches of the training (A.5), and the checkpoints that let a stopped
-training resume.
+"""Loss, metrics and input batches of the training (A.5), and its checkpoints.
+
+A stopped training resumes from a checkpoint.
 """
 
 import io
@@ -61,18 +62,21 @@ def fused_loss(loss: Any) -> Callable:
 
 
 def metrics() -> list:
-    """Return the library's IoU and F1 scores: means over all 35 classes of a batch; absent
-    classes score 1.
+    """Return the library's IoU and F1 scores.
+
+    They are means over all 35 classes of a batch; absent classes score 1.
     """
     return [sm.metrics.IOUScore(threshold=0.5), sm.metrics.FScore(threshold=0.5)]
 
 
 def strategy() -> tf.distribute.Strategy:
-    """Return a `tf.distribute` strategy that shares each batch between all GPUs, or the default
-    one.
+    """Return a `tf.distribute` strategy that shares each batch between all GPUs.
+
+    With fewer than two GPUs it is the default one.
     """
-    several = len(tf.config.list_logical_devices("GPU")) > 1
-    return tf.distribute.MirroredStrategy() if several else tf.distribute.get_strategy()
+    if len(tf.config.list_logical_devices("GPU")) > 1:
+        return tf.distribute.MirroredStrategy()
+    return tf.distribute.get_strategy()
 
 
 class Batches:
@@ -141,8 +145,9 @@ class Batches:
         return tuple(array[index] for array in self.sets[number])
 
     def dataset(self) -> tf.data.Dataset:
-        """Return the batches as a `tf.data.Dataset` of float images and one-hot masks,
-        prefetched during training.
+        """Return the batches as a `tf.data.Dataset` of float images and one-hot masks.
+
+        They are prefetched during training.
         """
         shape = self.sets[0][0].shape[1:]
         signature = (
@@ -160,15 +165,21 @@ class Batches:
 
 
 def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, Any]:
-    """Return everything that the training of a compiled model on Batches depends on, for its stage
-    (JSON values).
+    """Return all that the training of a compiled model on Batches depends on, as JSON values.
 
-    The number of epochs is not part of it, because a longer training begins like a shorter one. The
-    loss is described by its value for a made-up batch.
+    It is the record of the training's stage. The number of epochs is not part of it, because a
+    longer training begins like a shorter one. The loss is described by its value for a made-up
+    batch.
     """
     random = np.random.default_rng(0)
     true = augmentation.one_hot(random.integers(0, N_CLASSES, (2, 16, 16), np.uint8), N_CLASSES)
     predicted = random.dirichlet(np.ones(N_CLASSES), true.shape[:3]).astype(np.float32)
+    pixels = []
+    for pair in (*batches.sets, *validation.sets):
+        pixels += [zlib.crc32(np.ascontiguousarray(array).data) for array in pair]
+    fresh_augmentation = None
+    if batches.augmenter:
+        fresh_augmentation = batches.augmenter.to_dict()
     return {
         "code": results.digest_of_code("thesis_repro.segmentation.training"),
         "arithmetic": segmentation.arithmetic(),
@@ -177,22 +188,19 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
         # Keras numbers the names: adam, adam_1
         "optimizer": model.optimizer.get_config() | {"name": ""},
         "loss": float(np.asarray(model.loss(true, predicted)).mean()),
-        "pixels": [
-            zlib.crc32(np.ascontiguousarray(array).data)
-            for pair in (*batches.sets, *validation.sets)
-            for array in pair
-        ],
+        "pixels": pixels,
         "batch_size": batches.batch_size,
         "seed": batches.seed,
-        "fresh_augmentation": batches.augmenter.to_dict() if batches.augmenter else None,
+        "fresh_augmentation": fresh_augmentation,
     }
 
 
 def weights_digest(model: Any) -> str:
     """Return a digest of a model's weights, twelve letters."""
-    return sha256(b"".join(variable.numpy().tobytes() for variable in model.variables)).hexdigest()[
-        :12
-    ]
+    digest = sha256()
+    for variable in model.variables:
+        digest.update(variable.numpy().tobytes())
+    return digest.hexdigest()[:12]
 
 
 class ResumableTraining(keras.callbacks.Callback):
@@ -210,9 +218,10 @@ class ResumableTraining(keras.callbacks.Callback):
     def __init__(
         self, folder: str | Path, model: Any, batches: Batches, others: Collection = ()
     ) -> None:
-        """model: compiled, with a built optimizer; others: EarlyStopping and ModelCheckpoint, as
-        given to `fit`.
+        """Continue the training of a checkpoint in the folder, if there is one.
 
+        model: compiled, with a built optimizer. others: EarlyStopping and ModelCheckpoint, as given
+        to `fit`.
         Raises InputError if the folder holds a damaged checkpoint or that of another network.
         """
         super().__init__()
@@ -238,16 +247,17 @@ class ResumableTraining(keras.callbacks.Callback):
         return pd.DataFrame(self.rows)
 
     def first_epoch(self, epochs: int) -> int:
-        """Return the epoch to resume with, for `fit`; `epochs` if early stopping has ended the
-        training.
+        """Return the epoch to resume with, for `fit`.
+
+        It is `epochs` if early stopping has ended the training.
         """
-        stopped = any(
-            counters.get("stopped_epoch") and counters["wait"] >= other.patience
-            for other, counters in zip(self.others, self._counters)
-        )
-        return epochs if stopped else min(len(self.rows), epochs)
+        for other, counters in zip(self.others, self._counters):
+            if counters.get("stopped_epoch") and counters["wait"] >= other.patience:
+                return epochs
+        return min(len(self.rows), epochs)
 
     def on_train_begin(self, logs: Any = None) -> None:
+        """Lock the folder, restore the counters of the other callbacks, and show the bar."""
         self._open.enter_context(results.claimed(self.folder))
         # ModelCheckpoint itself writes in place
         self.model.save = partial(_save_atomically, self.model)
@@ -264,24 +274,20 @@ class ResumableTraining(keras.callbacks.Callback):
         )
 
     def on_epoch_begin(self, epoch: int, logs: Any = None) -> None:
+        """Tell the batches which epoch they belong to."""
         self.batches.epoch = epoch
 
     def on_train_batch_end(self, batch: int, logs: Any = None) -> None:
+        """Move the progress bar."""
         self._bar.update()
 
     def on_epoch_end(self, epoch: int, logs: Any = None) -> None:
+        """Write the history and the checkpoint."""
         self._bar.set_postfix_str(f"epoch {epoch + 1}, loss {logs['loss']:.3f}")
         self.rows.append(
             {"epoch": epoch + 1} | {name: float(value) for name, value in logs.items()}
         )
-        self._counters = [
-            {
-                name: float(value)
-                for name, value in vars(other).items()
-                if name in self.COUNTERS and value is not None
-            }
-            for other in self.others
-        ]
+        self._counters = [self._counters_of(other) for other in self.others]
         files.write_text(self.folder / HISTORY, self.history.to_csv(index=False))
         results.store(
             self.folder / STATE,
@@ -289,7 +295,12 @@ class ResumableTraining(keras.callbacks.Callback):
             {f"{index}": variable.numpy() for index, variable in enumerate(self._variables)},
         )
 
+    def _counters_of(self, callback: Any) -> dict[str, float]:
+        values = {name: vars(callback).get(name) for name in self.COUNTERS}
+        return {name: float(value) for name, value in values.items() if value is not None}
+
     def on_train_end(self, logs: Any = None) -> None:
+        """Close the progress bar and give the folder back."""
         self._open.close()
 
 
@@ -299,14 +310,15 @@ def _save_atomically(model: Any, path: str | Path, **options: Any) -> None:
 
 
 def _check_unpacked_size(path: Any) -> None:
-    """Raise ValueError if a model file would unpack to far more bytes than weights can be
-    compressed to.
-    """
-    most, sizes, weights = 10 * Path(path).stat().st_size + 100 * 2**20, [], path
+    """Raise ValueError if a model file would unpack to more bytes than weights can be packed to."""
+    most = 10 * Path(path).stat().st_size + 100 * 2**20
+    sizes: list[int] = []
+    weights = path
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            sizes = [member.file_size for member in archive.infolist()]
-            weights = io.BytesIO(archive.read("model.weights.h5") if sum(sizes) <= most else b"")
+            sizes += [member.file_size for member in archive.infolist()]
+            if sum(sizes) <= most:
+                weights = io.BytesIO(archive.read("model.weights.h5"))
     if sum(sizes) <= most:
         with h5py.File(weights, "r") as file:  # its arrays may be compressed as well
             file.visititems(lambda _, item: sizes.append(getattr(item, "nbytes", 0)))

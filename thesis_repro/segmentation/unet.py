@@ -33,7 +33,8 @@ def build_unet(
             f"multiples of {2**DEPTH}"
         )
     inputs = layers.Input(input_shape, name="input_2")
-    x, skips = inputs, []
+    x = inputs
+    skips = []
     for level in range(DEPTH):
         x = _conv_block(x, base_filters * 2**level, 2 * level, corrected_blocks)
         skips.append(x)
@@ -53,8 +54,9 @@ def build_unet(
 def _conv_block(inputs: Any, filters: int, number: int, corrected: bool) -> Any:
     x = inputs
     for index in (number, number + 1):
-        # the thesis's mistake: the second convolution reads the block's input
-        source = x if corrected else inputs
+        source = inputs  # the thesis's mistake: the second convolution reads the block's input
+        if corrected:
+            source = x
         x = layers.Conv2D(filters, 3, padding="same", name=_numbered("conv2d", index))(source)
         x = layers.BatchNormalization(name=_numbered("batch_normalization", index))(x)
         x = layers.Activation("relu", name=_numbered("activation", index))(x)
@@ -62,26 +64,34 @@ def _conv_block(inputs: Any, filters: int, number: int, corrected: bool) -> Any:
 
 
 def _numbered(name: str, number: int) -> str:
-    return f"{name}_{number}" if number else name
+    """Return a layer's name as Keras numbers them: the first has no number."""
+    if number == 0:
+        return name
+    return f"{name}_{number}"
 
 
 def summary_rows(model: Any) -> list[dict[str, Any]]:
-    """Return a model's rows in the format of Figure A.1: dicts of layer, output_shape, params
-    and connected_to.
+    """Return a model's rows in the format of Figure A.1.
+
+    A row is a dict of layer, output_shape, params and connected_to.
     """
     rows = []
     for layer in model.layers:
         kind = type(layer).__name__
         shape = f"{tuple(layer.output.shape)}"
-        sources = [] if kind == "InputLayer" else layer._inbound_nodes[0].input_tensors
+        sources = []
+        if kind == "InputLayer":
+            shape = f"[{shape}]"
+        else:
+            tensors = layer._inbound_nodes[0].input_tensors
+            sources = [f"{tensor._keras_history.operation.name}[0][0]" for tensor in tensors]
+        kind = kind.replace("BatchNormalization", "BatchNormal")
         rows.append(
             {
-                "layer": f"{layer.name} ({kind.replace('BatchNormalization', 'BatchNormal')})",
-                "output_shape": f"[{shape}]" if kind == "InputLayer" else shape,
+                "layer": f"{layer.name} ({kind})",
+                "output_shape": shape,
                 "params": layer.count_params(),
-                "connected_to": " ".join(
-                    f"{tensor._keras_history.operation.name}[0][0]" for tensor in sources
-                ),
+                "connected_to": " ".join(sources),
             }
         )
     return rows

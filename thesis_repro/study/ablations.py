@@ -100,7 +100,7 @@ def _measure(
         folder,
         options=options,
         code=results.digest_of_code("thesis_repro.study.ablations"),
-        **results.made_with("opencv-python-headless", "numpy", "numba"),
+        **results.made_with("opencv", "numpy", "numba"),
         sequence=results.digest_of_files(sequence.files),
         labels=results.digest_of_files([labels / path.name for path in sequence.frame_paths]),
         model=results.made_from(labels),

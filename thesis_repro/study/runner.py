@@ -226,7 +226,7 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
 def _versions() -> dict[str, Any]:
     return {
         "code": results.digest_of_code("thesis_repro.odometry", "thesis_repro.study.jobs"),
-        **results.made_with("opencv-python-headless", "numpy", "numba"),
+        **results.made_with("opencv", "numpy", "numba"),
     }
 
 
