@@ -97,6 +97,7 @@ def _place(address: int, maps: list[str]) -> str:
 
 
 def main() -> None:
+    """Print both digests and the places, and raise InputError if the digests differ."""
     emulator = shutil.which(EMULATOR)
     if emulator is None:
         raise InputError(f"{EMULATOR}: not found; install it (Debian and Ubuntu: qemu-user)")
