@@ -29,7 +29,7 @@ ROWS_SHOWN = 36  # the gallery only links to longer tables
 # ids of the artefacts at the top of a page
 OPENING = ("figure_4_05", "findings", "figure-comparison", "table-summary")
 # packages that affect the numbers most
-PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")
+PACKAGES = ("tensorflow", "keras", *results.OPENCV, "numpy")
 
 
 def update(settings: Settings) -> None:
@@ -228,9 +228,11 @@ def _made(executed: list[Path] | None = None, in_git: bool = False) -> dict[str,
     """Return the packages and, for a page outside git, the machine, commit and day of the
     results.
     """
-    made: dict[str, Any] = {
-        "packages": {name: importlib.metadata.version(name) for name in PACKAGES}
-    }
+    versions = {}
+    for name in PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):  # a study needs no TensorFlow
+            versions[name] = importlib.metadata.version(name)
+    made: dict[str, Any] = {"packages": versions}
     if in_git:
         return made
     made |= {
