@@ -74,7 +74,7 @@ def installed(request, source, wheel, tmp_path_factory):
 @pytest.fixture
 def drive(tmp_path):
     """A folder with a short sequence of KITTI, and a label map for each frame."""
-    street = Street(4)
+    street = Street()
     sequence = tmp_path / "kitti/sequences/00"
     for folder in (sequence / "image_0", tmp_path / "labels"):
         folder.mkdir(parents=True)
@@ -83,7 +83,7 @@ def drive(tmp_path):
         cv2.imwrite(str(tmp_path / f"labels/{index:06d}.png"), Stripes(40)[index] // 255 * 7)
     projection = np.c_[street.intrinsics, np.zeros(3)].ravel()
     (sequence / "calib.txt").write_text("P0: " + " ".join(map(str, projection)) + "\n")
-    (sequence / "times.txt").write_text("".join(f"{0.1 * index}\n" for index in range(4)))
+    (sequence / "times.txt").write_text("".join(f"{0.1 * index}\n" for index in range(len(street))))
     write_kitti_poses(tmp_path / "kitti/poses/00.txt", street.poses)
     return tmp_path
 
@@ -107,10 +107,13 @@ def test_an_installed_package_runs_without_the_extras(installed, drive):
     record = json.loads(succeed(command("odometry", *odometry), drive, **home).stdout)
     assert record["rmse_m"] < 0.05
     succeed(command("evaluate", *where, "00.txt"), drive, **home)
+    study = ["--kitti", "kitti", "--masks", "written", "--repetitions", 1, "--jobs", 1]
+    succeed(command("study", *study, "--output", "study"), drive, **home)
+    assert (drive / "study/index.html").is_file()
     example = re.findall(r"```python\n(.*?)```", (ROOT / "docs/own-masks.md").read_text(), re.S)[0]
     (drive / "frames").symlink_to(drive / "kitti/sequences/00/image_0")
     positions = succeed([installed / "bin/python", "-c", example], drive, **home).stdout
-    assert len(positions.splitlines()) == 4
+    assert len(positions.splitlines()) == len(Street())
     predicted = run(command("predict", "--images", "kitti", "--output", "predicted"), drive, **home)
     refused(predicted, "thesis-repro[segmentation]")
     assert files() == before

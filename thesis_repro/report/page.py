@@ -31,7 +31,7 @@ ROWS_SHOWN = 36  # the gallery only links to longer tables
 # ids of the artefacts at the top of a page
 OPENING = ("figure_4_05", "findings", "figure-comparison", "table-summary")
 # packages that affect the numbers most
-PACKAGES = ("tensorflow", "keras", "opencv-python-headless", "numpy")
+PACKAGES = ("tensorflow", "keras", *results.OPENCV, "numpy")
 
 
 def update(settings: Settings) -> None:
@@ -299,8 +299,11 @@ def _made(executed: list[Path] | None = None, in_git: bool = False) -> dict[str,
 
     For a page outside git, also their machine, commit and day.
     """
-    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
-    made: dict[str, Any] = {"packages": packages}
+    versions = {}
+    for name in PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):  # a study needs no TensorFlow
+            versions[name] = importlib.metadata.version(name)
+    made: dict[str, Any] = {"packages": versions}
     if in_git:
         return made
     made["python"] = platform.python_version()
