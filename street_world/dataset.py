@@ -213,7 +213,7 @@ def _pictures(
         for index in range(frames or drives.DRIVES[name].frames):
             render = partial(render_frame, name, index, frames, scale, seed)
             file = f"{index:06d}.png"
-            yield Picture(render, folder / "image_0" / file, folder / "labels_0" / file)
+            yield Picture(render, folder / "image_0" / file, folder / kitti.TRUE_LABELS / file)
     folder = root / "cityscapes"
     for split, count in (("train", train_images), ("val", validation_images)):
         cities = CITIES[split]

@@ -36,6 +36,7 @@ FRAME_COUNTS = dict(
 
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
+TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
 MAX_MISSING_NAMED = 10_000  # frames
 MAX_SPEED = 10_000  # metres a second

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.masks import MaskSettings, dilate
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import SharedKeypoints
@@ -34,7 +34,7 @@ def true_labels(kitti: Path, name: str) -> Path:
 
     Only sequences of the embedded world have one. kitti: the root of the sequences.
     """
-    return Path(kitti) / "sequences" / name / "labels_0"
+    return Path(kitti) / "sequences" / name / TRUE_LABELS
 
 
 class OtherFrame:
