@@ -373,7 +373,10 @@ def environment(world, build):
 
 def run(world, build, *texts):
     threads = code("04", {}).split("# Knobs")[0]  # TensorFlow takes them only before its first use
-    settings = environment(world, build) | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    paths = (
+        f"{ROOT}{os.pathsep}{ROOT / 'notebooks'}"  # a kernel starts in the folder of its notebook
+    )
+    settings = environment(world, build) | {"PYTHONPATH": paths, "MPLBACKEND": "agg"}
     return subprocess.run(
         [sys.executable, "-c", "\n".join([threads, *texts])],
         env=os.environ | settings,

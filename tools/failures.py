@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.odometry import THESIS, Odometry, metrics, pose, scales
-from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, measured, near
+from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, near, with_uncertainty
 from thesis_repro.report import style
 
 SETTINGS = replace(THESIS, estimator="refined")
@@ -50,7 +50,7 @@ def measure(sequence, masks):
         true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
         for kind, step in steps.items():
             current, previous, agreeing = _agreeing(step, reference, sequence)
-            fit = measured(
+            fit = with_uncertainty(
                 reference.rotation,
                 reference.translation,
                 current[agreeing],
