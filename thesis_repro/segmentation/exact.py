@@ -1,4 +1,4 @@
-"""Batch normalisation with the same bits on every processor, for the networks that ask for it.
+"""Batch normalisation by exact division, for the networks that ask for it.
 
 TensorFlow computes 1 / v and 1 / sqrt(v) with the instructions RCPPS and RSQRTPS. These are
 approximations, and Intel and AMD approximate differently. Keras' layer for batch normalisation asks
