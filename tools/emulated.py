@@ -3,11 +3,10 @@
 usage: python tools/emulated.py        needs qemu-x86_64 (Debian and Ubuntu: package qemu-user)
 
 Intel and AMD differ in two instructions, RCPPS and RSQRTPS, which approximate 1 / v and
-1 / sqrt(v). QEMU computes both exactly. So equal digests mean that no approximation reaches a
-result, and a processor of another maker gives the same bits as this one. The command also counts
-which of these instructions the emulated training has executed at all. It takes about ten minutes on
-a quiet core. The exit status is 0 if the digests are equal and no such
-instruction can have made a number.
+1 / sqrt(v). QEMU computes both exactly. So equal digests mean that no approximation reaches the
+result of this training. The command also lists which of these instructions the emulated training
+came to, and in which files. It takes about ten minutes on a quiet core. The exit status is 0 if the
+digests are equal and no such instruction lies in TensorFlow or in code that it made.
 """
 
 import hashlib
@@ -26,7 +25,7 @@ from thesis_repro.running import console
 
 EMULATOR = "qemu-x86_64"
 DIGEST = re.compile("[0-9a-f]{12}")
-# a package that Albumentations loads; it tries these instructions, and computes nothing here
+# a package that Albumentations loads; the training does not call it
 HARMLESS = "simsimd"
 APPROXIMATE = re.compile(r"\bv?r(?:cp|sqrt)(?:14|28)?[ps][sd]\b")  # in QEMU's log of instructions
 
@@ -61,7 +60,8 @@ def emulated_digest(emulator: str) -> tuple[str, list[str]]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
         os.mkfifo(log)  # the log has gigabytes, so it is read while it is written
-        reader = threading.Thread(target=_read, args=(log, places))
+        # a daemon, because it waits forever if QEMU does not start
+        reader = threading.Thread(target=_read, args=(log, places), daemon=True)
         reader.start()
         output = subprocess.run(
             [emulator, "-cpu", "max", "-d", "in_asm", "-D", log, sys.executable, "-c", code],
