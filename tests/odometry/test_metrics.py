@@ -97,6 +97,24 @@ def test_errors_of_single_steps():
         assert metrics.step_errors(failing, ahead(9))["failed"] == 100
 
 
+def test_a_small_angle_is_exact():
+    small = 1e-4 * np.arange(1, 50)
+    rotations = Rotation.from_rotvec(np.outer(small, [0, 1, 0]), degrees=True).as_matrix()
+    assert metrics.angles(rotations) == pytest.approx(small, rel=1e-6)
+
+
+def test_a_flip_at_walking_pace_is_a_lost_run():
+    true = ahead(9, 0.1)
+    flipped = true.copy()
+    flipped[4:, :3, :3] = np.diag([-1.0, 1.0, -1.0])
+    errors = metrics.step_errors(flipped, true)
+    assert errors["lost"] == 1 and np.isnan(errors["failed"])  # no step is long enough
+    assert metrics.step_errors(true, true)["lost"] == 0
+    # a camera in the hand turns more than a car, and the estimate follows it
+    assert metrics.step_errors(ahead(9, turn=8.0), ahead(9, turn=8.0))["lost"] == 0
+    assert metrics.step_errors(ahead(9, turn=5.0), ahead(9))["lost"] == 0
+
+
 def test_errors_of_a_run():
     true, estimated = winding(), winding(seed=0)
     errors = metrics.errors(estimated, true)

@@ -12,6 +12,7 @@ from evo.main_rpe import rpe as evo_rpe
 from scipy.spatial.transform import Rotation
 
 from thesis_repro.errors import InputError
+from thesis_repro.odometry.odometry import MAX_TURN
 
 
 def rmse(estimated: np.ndarray, true: np.ndarray) -> float:
@@ -222,11 +223,16 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     median angle between estimated and true direction of motion, degrees. across, down: median
     difference to the right and downwards, degrees (audit row 30). failed: percent of steps with a
     rotation error above FAILED_ROTATION or a backward motion. steps: their number.
+
+    lost: 1 if a step of any length is estimated to turn by more than MAX_TURN, which a car cannot
+    do, and this is wrong by more than FAILED_ROTATION; otherwise 0. Such a turn is often a flip by
+    180 degrees at walking pace, which `failed` does not see.
     """
     steps = np.linalg.inv(estimated[:-1]) @ estimated[1:]
     true_steps = np.linalg.inv(true[:-1]) @ true[1:]
     rotation_error = angles(np.linalg.inv(true_steps) @ steps)
     turn = angles(true_steps)
+    impossible = (angles(steps) > MAX_TURN) & (rotation_error > FAILED_ROTATION)
     directed = np.linalg.norm(true_steps[:, :3, 3], axis=1) >= MIN_DIRECTED_STEP
     heading = _directions(steps[directed, :3, 3])
     true_heading = _directions(true_steps[directed, :3, 3])
@@ -244,6 +250,7 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
         "down": offset[1],
         "failed": 100 * _mean((rotation_error[directed] > FAILED_ROTATION) | (cosine < 0)),
         "steps": int(directed.sum()),
+        "lost": int(impossible.any()),
     }
 
 
@@ -264,9 +271,12 @@ def travelled(poses: np.ndarray) -> np.ndarray:
 
 
 def angles(rotations: np.ndarray) -> np.ndarray:
-    """Rotation angles in degrees of rotations (..., 3, 3) or poses (..., 4, 4)."""
-    trace = np.trace(rotations[..., :3, :3], axis1=-2, axis2=-1)
-    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    """Rotation angles in degrees of rotations (..., 3, 3) or poses (..., 4, 4).
+
+    They are the lengths of the rotation vectors. The arccosine of the trace would be wrong by up to
+    0.03 degrees for small angles, because it is flat there.
+    """
+    return np.degrees(Rotation.from_matrix(rotations[..., :3, :3]).magnitude())
 
 
 KITTI_LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)  # metres
