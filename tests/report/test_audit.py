@@ -151,6 +151,8 @@ def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
         ["method", "estimator", "metric"]
     )
     audited = pd.DataFrame(audit.measured(runs, "study"))
+    null = pd.DataFrame(audit.of_study(runs, runs[runs["method"] == "baseline"]))
+    assert len(null[null["row"] == "39"]) == 3
     for row, method in (("15", "masked"), ("40", "fewer"), ("50", "corrected")):
         lines = audited[(audited["row"] == row) & (audited["metric"] == "RMSE")]
         for line in lines[lines["quantity"].str.endswith("over all keypoints")].itertuples():

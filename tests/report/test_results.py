@@ -14,6 +14,9 @@ from thesis_repro.study.jobs import ESTIMATORS
 AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres
 ELEVEN = [f"{number:02d}" for number in range(11)]
 CONTROLS = compare.SEGMENTATION_FREE_CONTROLS
+NEVER_SHUFFLED = made_up.runs(
+    ["00"], lambda *_: 1.0, {"baseline": [None]}, estimators=["thesis"], repetitions=1
+)
 
 
 def best_of(runs):
@@ -51,8 +54,10 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
             else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
         ),
     )
-    table = tables.table_of_change(best_of(runs), runs, metric, "thesis").set_index("sequence")
-    for column in list(table)[2:]:
+    table = tables.table_of_change(runs, NEVER_SHUFFLED, metric, "thesis").set_index("sequence")
+    changes = [column for column in table if column.startswith("change")]
+    assert len(changes) == 3  # no column for masks that did nothing
+    for column in changes:
         assert table.loc["sum (the thesis's aggregate)", column] == pytest.approx(total, abs=0.06)
         assert table.loc[["mean", "median"], column].tolist() == pytest.approx(
             [mean, median], abs=0.05
@@ -70,9 +75,48 @@ def test_the_literal_procedure_is_that_of_repetition_0():
     # the mean is lowest at width 10, repetition 0 at width 5
     for width, errors in ((5, [0.6, 3, 3]), (10, [0.7, 0.1, 0.1]), (15, [1, 1, 1])):
         runs.loc[masked & (runs["dilation_width"] == width), "rmse"] = errors
-    shown = tables.table_of_change(best_of(runs), runs, "rmse", "thesis").iloc[0]
+    shown = tables.table_of_change(runs, NEVER_SHUFFLED, "rmse", "thesis").iloc[0]
     assert shown["change (%)"] == pytest.approx(-70)
     assert shown["change (%), one run each"] == pytest.approx(-40)
+
+
+def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
+    runs = runs_of(ELEVEN, lambda *_: 1.0, noise=0.2)
+    shuffled = made_up.runs(
+        ELEVEN,
+        lambda *_: 1.0,
+        {"baseline": [None]},
+        estimators=["thesis"],
+        repetitions=30,
+        noise=0.2,
+    )
+    table = tables.table_of_change(runs, shuffled, "rmse", "thesis").set_index("sequence")
+    studies = thesis_tables.changes_if_masks_did_nothing(shuffled, 3, "rmse")
+    null = table["change (%), one run each, if masks did nothing"]
+    assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
+    assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
+    text = texts.findings(runs, compare.comparisons(runs), "real", shuffled=shuffled)
+    assert f"{null['mean']:+.1f} %" in text
+    assert "procedure" not in texts.findings(runs, compare.comparisons(runs), "real")
+
+
+def test_a_lost_run_is_counted_and_never_improves():
+    runs = runs_of(ELEVEN, halved)
+    is_lost = (runs["sequence"] == "03") & (runs["method"] == "masked")
+    runs.loc[is_lost & (runs["repetition"] == 0), "lost"] = 1
+    table = tables.table_of_change(runs, NEVER_SHUFFLED, "rmse", "thesis").set_index("sequence")
+    assert table.loc["03", "lost runs, best mask"] == "1 of 3"
+    for column in ("change (%)", "change (%), one run each"):
+        assert table.loc["03", column] < 0 and table.loc["sequences improved", column] == 10
+    assert tables.table_4_1(runs, "thesis").set_index("sequence").loc["03", "lost runs"] == "1 of 3"
+    compared = comparison.table_comparison(compare.comparisons(runs))
+    of_masks = compared[(compared["keypoints"] == "masks, width 10")].iloc[0]
+    assert (
+        of_masks["lost runs"] == "1 of 33" and of_masks["lost runs of the reference"] == "0 of 33"
+    )
+    assert comparison.table_widths(runs).set_index("sequence").loc["lost runs"].iloc[4] == "1 of 33"
+    errors = tables.table_errors(runs)
+    assert errors["lost runs"].value_counts()["1 of 3"] == 6  # three widths, two estimators
 
 
 def test_ratios_in_the_tables_equal_the_comparison():
@@ -99,7 +143,7 @@ def test_ratios_in_the_tables_equal_the_comparison():
     )
     unknown = runs_of(["77"], lambda *_: 1.0)  # a sequence that the thesis does not have
     assert np.isnan(
-        tables.table_of_change(best_of(unknown), unknown, "rmse", "thesis").loc[
+        tables.table_of_change(unknown, NEVER_SHUFFLED, "rmse", "thesis").loc[
             0, "change (%), thesis"
         ]
     )

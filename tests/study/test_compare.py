@@ -93,13 +93,28 @@ def test_intervals_that_exclude_the_true_mean_by_chance():
         return random.normal(0, 0.1, shape) + 2.5 * (random.random(shape) < 1 / 6)
 
     percent = pd.DataFrame(index=[6, 8, 11])
+    ranks = percent.copy()
     for name, draw in draws.items():
         for count in percent.index:
-            intervals = np.array([compare.mean_interval(row) for row in draw((2000, count))])
+            studies = draw((2000, count))
+            intervals = np.array([compare.mean_interval(row) for row in studies])
             low, high = intervals.T
             percent.loc[count, name] = 100 * ((low > 0) | (high < 0)).mean()
-    print(percent.T)
+            p_values = np.array([compare.rank_test(row) for row in studies[:500]])
+            ranks.loc[count, name] = 100 * (p_values < 0.05).mean()
+    print(percent.T, "rank test", ranks.T, sep="\n")
     assert percent["normal"].between(4, 6).all() and (percent["heavy tails"] < 5).all()
+    assert (ranks[["normal", "heavy tails", "either lost"]] < 7.5).all(axis=None)
+
+
+def test_the_rank_test_sees_a_small_loss_everywhere_that_one_lost_sequence_hides():
+    ratios = [1.024, 15.95, 1.171, 1.012, 1.014, 1.017, 1.101, 1.033]
+    result = compare.geometric_mean(ratios)
+    assert result["verdict"] == "no clear difference"
+    assert result["above"] == result["n"] == 8
+    assert result["rank_p"] == pytest.approx(2 / 2**8)  # all on one side
+    assert compare.geometric_mean([1.0, 2.0])["above"] == 1
+    assert np.isnan(compare.geometric_mean([1.0, 1.0])["rank_p"])
 
 
 def test_the_interval_is_students_t():
@@ -250,6 +265,30 @@ def test_other_repetitions_confirm_a_real_optimum_and_no_chance():
     masked, baseline = parts_of(separate_optimum)  # only one width has repetitions
     repeated = masked[(masked["repetition"] == 0) | (masked["dilation_width"] == 10)]
     assert thesis_tables.stability(repeated, baseline).isna().all(axis=None)
+
+
+def test_the_literal_procedure_uses_one_repetition_alone():
+    masked, baseline = parts_of(lambda name, width: 1.0 if width is None else 0.5 + width / 10)
+    masked.loc[(masked["repetition"] == 1) & (masked["dilation_width"] == 7), "rmse"] = 0.2
+    for repetition, change in ((0, -40), (1, -80)):
+        changes = thesis_tables.changes_of_repetition(masked, baseline, "rmse", repetition)
+        assert changes.tolist() == pytest.approx([change] * 11)
+
+
+def test_the_best_of_many_widths_looks_better_if_masks_do_nothing():
+    _, baseline = parts_of(lambda *_: 1.0, repetitions=400, noise=0.2)
+    studies = thesis_tables.changes_if_masks_did_nothing(baseline, 15, "rmse")
+    assert studies.shape == (thesis_tables.STUDIES, 11)
+    # a standard normal's least of 15 is -1.736 on average, its median 0
+    expected = 100 * (np.exp(-1.736 * 0.2) - 1)
+    assert studies.median(axis=1).mean() == pytest.approx(expected, abs=2.5)
+    single = thesis_tables.changes_if_masks_did_nothing(baseline, 1, "rmse")
+    assert single.median(axis=1).mean() == pytest.approx(0, abs=2)
+    # the width is chosen by the RMSE, and another error judges it
+    other = baseline.assign(mae=1 / baseline["rmse"])
+    assert (thesis_tables.changes_if_masks_did_nothing(other, 15, "mae").mean() > 0).all()
+    once = baseline[baseline["repetition"] == 0]
+    assert thesis_tables.changes_if_masks_did_nothing(once, 15, "rmse").empty
 
 
 def test_time_savings_are_negative_percentages_over_all_sequences():

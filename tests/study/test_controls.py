@@ -134,7 +134,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 
 def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
-    runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2, baseline_repetitions=3)
+    runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2)
     settings, thesis_masks = runs["masked", "thesis", 0]
     assert settings == THESIS
     expected = masks.LabelMasks(small_labels / "00", sequence, 10)

@@ -226,8 +226,11 @@ def _of_changes(metric: str, key: str) -> list[dict[str, Any]]:
     ]
 
 
-def of_study(runs: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return rows 2, 31, 35 and those that audit.json lists, from the runs of notebook 08."""
+def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return rows 2, 31, 35, 39 and those that audit.json lists, from the runs of notebook 08.
+
+    shuffled: its repetitions of all keypoints, see `ablations.null_distribution`.
+    """
     masked = compare.of_method(runs, "masked")
     baseline = compare.of_method(runs, "baseline")
     best = thesis_tables.of_chosen_width(masked)
@@ -247,24 +250,23 @@ def of_study(runs: pd.DataFrame) -> list[dict[str, Any]]:
         ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
         measurement("2", "same best", stability["same_best"], "%"),
     ]
-    return _with_frames(measurements, runs) + measured(runs, "study")
-
-
-def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return rows 14, 39 and those that audit.json lists, from the runs of `ablations.measure`."""
-    measurements = []
-    spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
-    for estimator, factors in spread.groupby("estimator")["factor"]:
-        measurements.append(ratio("14", "spread", factors, metric="RMSE", estimator=estimator))
-    baseline = compare.of_method(runs, "baseline", "thesis")
     reported = pd.Series(REPORTED["table_4_2_rmse_percent_change"])
-    null = ablations.null_distribution(baseline, reported)
+    null = ablations.null_distribution(shuffled, reported)
     for name in ("mean", "median"):
         row = null.loc[name]
-        interval = {"low": row["low"], "high": row["high"], "n": ablations.STUDIES}
+        interval = {"low": row["low"], "high": row["high"], "n": thesis_tables.STUDIES}
         measurements.append(
             measurement("39", f"null {name}", row["expected"], "%", metric="RMSE", **interval)
         )
     as_low = null.loc["mean", "share_as_low"]
     measurements.append(measurement("39", "as low", as_low, "%", metric="RMSE"))
+    return _with_frames(measurements, runs) + measured(runs, "study")
+
+
+def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return row 14 and those that audit.json lists, from the runs of `ablations.measure`."""
+    measurements = []
+    spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
+    for estimator, factors in spread.groupby("estimator")["factor"]:
+        measurements.append(ratio("14", "spread", factors, metric="RMSE", estimator=estimator))
     return _with_frames(measurements, runs) + measured(runs, "ablations")

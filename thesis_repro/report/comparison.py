@@ -130,6 +130,7 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
         row = {"masks": source, "keypoints": f"{keypoints:.0f} of {total:.0f}"}
         row |= _ratios(pair)
         row["verdict"] = compare.overall(pair["verdict"])
+        row |= _lost(pair.iloc[0])
         of_source = controls[controls["source"] == source]
         for _, best in of_source.nsmallest(1, "ratio").iterrows():
             row["best control"] = f"{compare.METHODS[best['method']]} {texts.number(best['ratio'])}"
@@ -140,9 +141,10 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios of each method to all keypoints, and of masks to each control.
 
-    It has one column a metric. A ratio is a text, "1.09 (0.98-1.32)". The last columns are the
-    verdict on all judging metrics (`compare.overall`) and each sequence's ratio of the first
-    metric.
+    It has one column a metric. A ratio is a text, "1.09 (0.98-1.32)". Beside each judging metric
+    stand the number of sequences with a ratio above 1 and the p-value of the rank test. The last
+    columns are the verdict on all judging metrics (`compare.overall`), the lost runs of the method
+    and of its reference, and each sequence's ratio of the first metric.
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
     rows = rows.assign(label=_labels(rows))
@@ -166,13 +168,14 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
                 "number": round(first["keypoints"]),
                 "over": over,
                 "sequences": pair["n"].max(),
-                **_ratios(pair),
+                **_ratios_and_counts(pair),
                 "verdict": verdict,
+                **_lost(first),
                 **by_sequence.add_prefix("sequence "),
             }
         )
     shown = pd.DataFrame(lines)
-    last = ["verdict", *(f"sequence {name}" for name in sequences)]
+    last = ["verdict", *LOST, *(f"sequence {name}" for name in sequences)]
     others = [name for name in shown if name not in last]
     return shown.reindex(columns=[*others, *last])
 
@@ -180,6 +183,27 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
 def _ratios(pair: pd.DataFrame) -> dict[str, Any]:
     """Return {name of the metric: ratio as a text} for two methods, which have one row a metric."""
     return {compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()}
+
+
+def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
+    """Return `_ratios`; behind a judging metric stand "6 of 8" above 1 and the rank test's p."""
+    cells: dict[str, Any] = {}
+    for _, row in pair.iterrows():
+        name = compare.METRICS[row["metric"]]
+        cells[name] = _short(row)
+        if row["metric"] in compare.JUDGING_METRICS:
+            cells[f"{name}: above 1"] = f"{row['above']} of {row['n']}"
+            cells[f"{name}: rank test, p"] = texts.two_digits(row["rank_p"])
+    return cells
+
+
+# columns of the lost runs of a method and of its reference
+LOST = {"lost runs": "lost", "lost runs of the reference": "reference_lost"}
+
+
+def _lost(row: pd.Series) -> dict[str, str]:
+    """Return the lost runs of a comparison, "2 of 40", by the names of their columns."""
+    return {name: row[column] for name, column in LOST.items()}
 
 
 def _short(row: dict[str, Any] | pd.Series) -> Any:
@@ -191,8 +215,9 @@ def _short(row: dict[str, Any] | pd.Series) -> Any:
 def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios of errors to all keypoints with three choices of the width, by sequence.
 
-    The choices are the best, the left-out and the fixed width. The last two rows of each source
-    have the geometric mean with its interval, and the number of sequences with a lower error.
+    The choices are the best, the left-out and the fixed width. The last rows of each source have
+    the geometric mean with its interval, the number of sequences with a lower error, and that of
+    lost runs.
     """
     tables = {}
     for source in compare.sources(runs) or [""]:
@@ -212,12 +237,14 @@ def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     chosen = thesis_tables.chosen_widths(masked, baseline)
     stability = thesis_tables.stability(masked, baseline)
     metrics = [name for name in ("rmse", "se3") if name in masked]
-    columns = {}
+    columns, lost = {}, {}
     for choice, label in CHOICES.items():
         rows = thesis_tables.of_chosen_width(masked, chosen[choice])
         for metric in metrics:
             ratios = compare.ratios(rows, baseline, metric)
-            columns[f"{label}: {compare.METRICS[metric]}"] = ratios
+            name = f"{label}: {compare.METRICS[metric]}"
+            columns[name] = ratios
+            lost[name] = compare.lost(rows)
     columns["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]
     table = pd.DataFrame(columns, index=chosen.index).dropna(axis=1, how="all")
     shown = table.map(texts.number, na_action="ignore").astype(object)
@@ -227,6 +254,7 @@ def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
         lower[name] = f"{(ratios < 1).sum()} of {ratios.count()}"
     shown.loc["geometric mean"] = means
     shown.loc["lower in"] = lower
+    shown.loc["lost runs"] = lost
     widths = chosen[list(CHOICES)].rename(columns=CHOICES)
     widths["same best width in two repetitions (%)"] = stability["same_best"].round()
     widths = widths.dropna(axis=1, how="all").convert_dtypes()

@@ -21,13 +21,15 @@ def table_4_1(runs: pd.DataFrame, reported_as: str) -> pd.DataFrame:
 
     The last columns have the thesis's numbers; reported_as: how to name them.
     """
-    best = thesis_tables.best_widths(compare.of_method(runs, "masked"))
+    masked = compare.of_method(runs, "masked")
+    best = thesis_tables.best_widths(masked)
     reported = pd.DataFrame(REPORTED["table_4_1"]).set_index("sequence")
     reported = reported.reindex(best.index).astype("Int64")
     table = pd.DataFrame(index=best.index)
     table["frames"] = best["frames"]
     table["dilation width (pixels)"] = best["dilation_width"]
     table["mean keypoints"] = best["mean_keypoints"].round().astype(int)
+    table["lost runs"] = _lost_of(thesis_tables.of_chosen_width(masked))
     table[f"width, {reported_as}"] = reported["dilation_width"]
     table[f"mean keypoints, {reported_as}"] = reported["mean_keypoints"]
     return table.reset_index()
@@ -40,50 +42,101 @@ REPORTED_CHANGES = {
 
 
 def table_of_change(
-    best: pd.DataFrame, runs: pd.DataFrame, metric: str, reported_as: str
+    runs: pd.DataFrame, shuffled: pd.DataFrame, metric: str, reported_as: str
 ) -> pd.DataFrame:
     """Tables 4.2 and 4.3: a metric with all keypoints and with the best mask, and Equation 4.1.
 
     The metric ("rmse" or "mae") is in metres, Equation 4.1 in percent. The column "one run each"
     has the thesis's literal procedure: one run of all keypoints and of each width (repetition 0),
-    also for the choice of the width.
-    best: the rows of each sequence's best width (`thesis_tables.of_chosen_width`). The last rows
-    have the sum of the percentages (the thesis's "aggregate"), their mean with Student's t
-    interval, and their median.
+    also for the choice of the width. Beside it stands what this procedure gives if masks do nothing
+    (`thesis_tables.changes_if_masks_did_nothing`), simulated from `shuffled`: runs with all
+    keypoints, many repetitions.
+    The last rows have the sum of the percentages (the thesis's "aggregate"), their mean with
+    Student's t interval, and their median. A lost run counts as not improved.
     """
-    baseline = compare.of_method(runs, "baseline")
-    first_runs = runs[runs["repetition"] == 0]
-    first_best = thesis_tables.of_chosen_width(compare.of_method(first_runs, "masked"))
-    first_baseline = compare.of_method(first_runs, "baseline")
+    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    best = thesis_tables.of_chosen_width(masked)
+    single = masked[masked["repetition"] == 0]
+    first_best = thesis_tables.of_chosen_width(single)
+    widths = masked["dilation_width"].nunique()
+    studies = thesis_tables.changes_if_masks_did_nothing(shuffled, widths, metric)
     columns = {
         "change (%)": thesis_tables.changes(best, baseline, metric),
-        "change (%), one run each": thesis_tables.changes(first_best, first_baseline, metric),
+        SINGLE: thesis_tables.changes_of_repetition(masked, baseline, metric),
+        NULL: studies.mean(),
         f"change (%), {reported_as}": pd.Series(REPORTED[REPORTED_CHANGES[metric]]),
     }
-    errors = {}
+    table = pd.DataFrame(index=sorted(baseline["sequence"].unique()))
     for method, rows in {"all keypoints": baseline, "best mask": best}.items():
         mean = rows.groupby("sequence")[metric].mean()
-        errors[f"{metric.upper()}, {method} (m)"] = mean.map(_three_digits)
-    table = pd.DataFrame(errors)
+        table[f"{metric.upper()}, {method} (m)"] = mean.map(_three_digits)
+        table[f"lost runs, {method}"] = _lost_of(rows)
+    lost = {"change (%)": _is_lost(best), SINGLE: _is_lost(first_best)}
+    summary = {}
     for name, changes in columns.items():
         table[name] = changes.reindex(table.index)
-    summary = {name: _summary(changes) for name, changes in columns.items()}
+        summary[name] = _summary(changes, lost.get(name))
+    if len(studies.columns):
+        summary[NULL] = _summary_of_studies(studies)
+    else:
+        del summary[NULL], table[NULL]
     last_rows = pd.DataFrame(summary, dtype=float).reindex(columns=table.columns)
-    table = pd.concat([table, last_rows]).round(dict.fromkeys(columns, 2))
+    table = pd.concat([table.astype(object), last_rows.astype(object)])
+    table[list(summary)] = table[list(summary)].astype(float).round(2)
+    errors = [name for name in table if name.endswith("(m)")]
+    table[errors] = table[errors].astype(float)
     return table.rename_axis("sequence").reset_index()
 
 
-def _summary(changes: pd.Series) -> dict[str, float]:
-    """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%)."""
+SINGLE = "change (%), one run each"
+NULL = "change (%), one run each, if masks did nothing"
+
+
+def _lost_of(runs: pd.DataFrame) -> pd.Series:
+    """Return the lost runs of each sequence as a text, "2 of 5"."""
+    lost = {name: compare.lost(rows) for name, rows in runs.groupby("sequence")}
+    return pd.Series(lost, dtype=str)
+
+
+def _is_lost(runs: pd.DataFrame) -> pd.Series:
+    """Return for each sequence whether one of its runs is lost."""
+    return runs.groupby("sequence")["lost"].any()
+
+
+CI = f"mean, {compare.LEVEL} % CI over sequences"
+
+
+def _summary(changes: pd.Series, is_lost: pd.Series | None = None) -> dict[str, float]:
+    """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%).
+
+    is_lost: by sequence; a lost sequence has not improved.
+    """
     low, high = compare.mean_interval(changes)
-    interval = f"mean, {compare.LEVEL} % CI over sequences"
+    improved = changes < 0
+    if is_lost is not None:
+        improved &= ~is_lost.reindex(changes.index).astype(bool)
     return {
         "sum (the thesis's aggregate)": changes.sum(min_count=1),
         "mean": changes.mean(),
-        f"{interval}, from": low,
-        f"{interval}, to": high,
+        f"{CI}, from": low,
+        f"{CI}, to": high,
         "median": changes.median(),
-        "sequences improved": (changes < 0).sum(),
+        "sequences improved": improved.sum(),
+    }
+
+
+def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
+    """Return the last rows for simulated studies (%), one row a study: means over the studies."""
+    means = studies.mean(axis=1)
+    tail = (100 - compare.LEVEL) / 200
+    middle = f"mean, middle {compare.LEVEL} % of {len(studies)} simulated studies"
+    return {
+        "sum (the thesis's aggregate)": studies.sum(axis=1).mean(),
+        "mean": means.mean(),
+        f"{middle}, from": means.quantile(tail),
+        f"{middle}, to": means.quantile(1 - tail),
+        "median": studies.median(axis=1).mean(),
+        "sequences improved": (studies < 0).sum(axis=1).mean(),
     }
 
 
@@ -113,6 +166,8 @@ def table_errors(runs: pd.DataFrame) -> pd.DataFrame:
         label = f"{compare.METRICS[name]} ({compare.UNITS[name]})"
         table[label] = means[name].map(_three_digits)
     table["flagged frames"] = means["flagged"].round(1)
+    groups = rows.groupby(keys, dropna=False)
+    table["lost runs"] = [compare.lost(runs_of_row) for _, runs_of_row in groups]
     return table
 
 

@@ -47,6 +47,13 @@ def number(value: float) -> str:
     return f"{value:.{digits}f}"
 
 
+def two_digits(value: float) -> str:
+    """Return a number as text with two digits that are not zero, such as 0.0078; "" if missing."""
+    if pd.isna(value):
+        return ""
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def ratio(row: dict[str, Any] | pd.Series) -> str:
     """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high.
 
@@ -72,6 +79,7 @@ def ratio_and_far_off(row: dict[str, Any] | pd.Series) -> str:
 
 TEMPLATES.filters["ratio"] = ratio_and_far_off
 TEMPLATES.filters["number"] = number
+TEMPLATES.filters["two_digits"] = two_digits
 
 
 class _Renderer(mistune.HTMLRenderer):
@@ -107,12 +115,14 @@ def findings(
     data: str,
     label_maps: list[dict[str, Any]] | tuple[()] = (),
     trainings: list[dict[str, Any]] | tuple[()] = (),
+    shuffled: pd.DataFrame | None = None,
 ) -> str:
     """Return the findings of a run, a study or the evidence as Markdown.
 
     table: `compare.comparisons` of the runs. data: one line with the origin of the data.
     label_maps: the quality of the label maps, rows of `gap.label_map_quality`.
-    trainings: what other trainings of the network give, from `trainings.summary`.
+    trainings: what other trainings of the network give, from `trainings.summary`. shuffled: runs
+    with all keypoints, to simulate the thesis's procedure if masks did nothing.
     """
     baseline = runs[runs["method"] == "baseline"]
     with_masks = set(runs.loc[runs["method"] == "masked", "source"])
@@ -136,8 +146,49 @@ def findings(
         deciding=deciding,
         estimators_run=set(table["estimator"]),
         sources=sources,
+        procedure=[] if shuffled is None else _thesis_procedure(runs, shuffled),
         against_each_other=_sources_against_each_other(table),
     )
+
+
+def _thesis_procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return what the thesis's literal procedure gives (Tables 4.2 and 4.3), one dict a metric.
+
+    Changes are in percent: mean, median and improved (sequences) of repetition 0; lowest and
+    highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
+    nothing (`thesis_tables.changes_if_masks_did_nothing`).
+    """
+    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    widths = masked["dilation_width"].nunique()
+    repetitions = sorted(baseline["repetition"].unique())
+    tail = (100 - compare.LEVEL) / 200
+    rows = []
+    for metric in ("rmse", "mae"):
+        by_repetition = [
+            thesis_tables.changes_of_repetition(masked, baseline, metric, repetition)
+            for repetition in repetitions
+        ]
+        means = [changes.mean() for changes in by_repetition]
+        studies = thesis_tables.changes_if_masks_did_nothing(shuffled, widths, metric)
+        null_means = studies.mean(axis=1)
+        row = {
+            "name": compare.METRICS[metric],
+            "widths": widths,
+            "sequences": len(by_repetition[0]),
+            "mean": means[0],
+            "median": by_repetition[0].median(),
+            "improved": (by_repetition[0] < 0).sum(),
+            "lowest": min(means),
+            "highest": max(means),
+            "repetitions": len(means),
+            "studies": len(studies),
+            "null_mean": null_means.mean(),
+            "null_low": null_means.quantile(tail),
+            "null_high": null_means.quantile(1 - tail),
+            "null_improved": (studies < 0).sum(axis=1).mean(),
+        }
+        rows.append(row)
+    return rows
 
 
 def _shuffle_spread(runs: pd.DataFrame) -> dict[str, dict[str, float]]:
@@ -185,6 +236,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
         "verdict": compare.overall(judged["verdict"]),
         "width": compare.tested_width(runs),
         "masked": of_masks.to_dict("records"),
+        "lost": of_masks.drop_duplicates("estimator").to_dict("records"),
         "corrected": of_corrected.to_dict("records"),
         "controls": verdicts.to_dict(),
         "widths": widths,

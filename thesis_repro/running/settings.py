@@ -193,7 +193,7 @@ class Settings:
     @property
     def data_note(self) -> str:
         """One line for captions that names the data and the sizes of the run."""
-        odometry = "the user's KITTI folder"
+        odometry = "real KITTI frames"
         if self.kitti_is_embedded:
             odometry = "embedded world (rendered)"
         labels = "training: the user's Cityscapes folder"

@@ -27,13 +27,11 @@ from thesis_repro.study import workers
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import measures
-from thesis_repro.study.thesis_tables import percent_change
+from thesis_repro.study.thesis_tables import STUDIES, percent_change
 
 Run = tuple[OdometrySettings, Masks | None]
 Runs = dict[tuple[str, str, int], Run]  # by method, estimator, repetition
 ESTIMATORS = tuple(estimators.ESTIMATORS)
-# the second is for all keypoints with the thesis's estimator
-REPETITIONS, BASELINE_REPETITIONS = 3, 8
 VEGETATION = (ID["vegetation"], ID["terrain"])
 FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesis's 2000
 
@@ -128,16 +126,14 @@ def runs_of(
     sequence: Sequence,
     labels: Path,
     *,
-    repetitions: int = REPETITIONS,
-    baseline_repetitions: int = BASELINE_REPETITIONS,
+    repetitions: int = 1,
     dilation_width: int = CONTROL_WIDTH,
 ) -> Runs:
     """Return the runs over one sequence: {(method, estimator, repetition): (settings, masks)}.
 
     labels: folder of the sequence's label maps. "baseline" (all keypoints) and "masked" use each of
     ESTIMATORS, other methods the thesis's and the refined one. A repetition other than 0 is the
-    seed that shuffles the matched points. `null_distribution` needs the `baseline_repetitions` with
-    all keypoints and the thesis's estimator.
+    seed that shuffles the matched points.
     """
     runs: Runs = {}
     for method, (settings, method_masks) in _methods(sequence, labels, dilation_width).items():
@@ -145,10 +141,7 @@ def runs_of(
         if method in ("baseline", "masked"):
             estimators = ESTIMATORS
         for estimator in estimators:
-            count = repetitions
-            if method == "baseline" and estimator == "thesis":
-                count = max(repetitions, baseline_repetitions)
-            for repetition in range(count):
+            for repetition in range(repetitions):
                 seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
                 runs[method, estimator, repetition] = seeded, method_masks
     return runs
@@ -202,7 +195,6 @@ def _mean_number(sequence: Sequence, frame_masks: Masks) -> int:
 # Results of the thesis's procedure if masks did nothing (Section 4.2, Tables 4.2 and 4.3)
 
 SEQUENCES, WIDTHS = 11, 15  # of the thesis
-STUDIES = 4000  # simulated ones
 
 
 def null_distribution(

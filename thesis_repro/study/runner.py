@@ -363,14 +363,20 @@ def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
 
     frames: the table of `odometry.Result`.
     true: poses (n, 4, 4). The errors are those of `metrics.errors` and `metrics.step_errors`; t_rel
-    (percent) and r_rel (degrees per 100 m) are those of `metrics.kitti_errors`.
+    (percent) and r_rel (degrees per 100 m) are those of `metrics.kitti_errors`. A lost run has its
+    RMSE in place of the aligned ATE: the alignment absorbs a wrong turn near the start of the path,
+    so that a lost run would look better than any other.
     """
     poses = poses_of(frames)
+    errors = metrics.errors(poses, true)
+    step_errors = metrics.step_errors(poses, true)
+    if step_errors["lost"]:
+        errors["se3"] = errors["rmse"]
     kitti = metrics.kitti_errors(poses, true)
     return {
         "frames": len(frames),
-        **metrics.errors(poses, true),
-        **metrics.step_errors(poses, true),
+        **errors,
+        **step_errors,
         "t_rel": kitti["t_rel"],
         "r_rel": kitti["r_rel"],
         "mean_keypoints": frames["detected"].mean(),

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+STUDIES = 4000  # simulated ones
+
 
 def percent_change(value: Any, benchmark: Any) -> Any:
     """Change of a value from a benchmark in percent (Equations 4.1 and 4.2).
@@ -53,6 +55,47 @@ def changes(rows: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> pd.Serie
     means = rows.groupby("sequence")[metric].mean()
     baseline_means = baseline.groupby("sequence")[metric].mean()
     return percent_change(means, baseline_means)
+
+
+def changes_of_repetition(
+    masked: pd.DataFrame, baseline: pd.DataFrame, metric: str, repetition: int = 0
+) -> pd.Series:
+    """Return the change (%) by the thesis's literal procedure, by sequence.
+
+    All keypoints and each width are run once: only the runs of one repetition are used, also to
+    choose the width.
+    """
+    best = of_chosen_width(masked[masked["repetition"] == repetition])
+    return changes(best, baseline[baseline["repetition"] == repetition], metric)
+
+
+def changes_if_masks_did_nothing(baseline: pd.DataFrame, widths: int, metric: str) -> pd.DataFrame:
+    """Simulate the changes (%) that the thesis's literal procedure reports if masks do nothing.
+
+    Then a run with masks is a run with all keypoints whose matched points are shuffled in another
+    way. For each sequence, one of its runs with all keypoints is drawn as the benchmark, and
+    another for each of `widths` widths, always with replacement. The one with the lowest RMSE is
+    the best width. Returns STUDIES rows, one column a sequence, without those that were run only
+    once. A sequence's own runs limit how good its best width can be, so few repetitions make the
+    simulated changes too small.
+    """
+    random = np.random.default_rng(0)
+    columns = {}
+    for name, runs in baseline.groupby("sequence"):
+        if len(runs) < 2:
+            continue
+        errors, rmse = runs[metric].to_numpy(), runs["rmse"].to_numpy()
+        drawn = random.integers(len(runs), size=(STUDIES, widths + 1))
+        benchmark, of_widths = drawn[:, 0], drawn[:, 1:]
+        best_column = rmse[of_widths].argmin(axis=1)
+        best = of_widths[np.arange(STUDIES), best_column]
+        columns[name] = percent_change(errors[best], errors[benchmark])
+    return pd.DataFrame(columns)
+
+
+def lost_runs(runs: pd.DataFrame) -> pd.Series:
+    """Return the number of lost runs (see `metrics.step_errors`), by sequence."""
+    return runs.groupby("sequence")["lost"].sum()
 
 
 def chosen_widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
