@@ -82,7 +82,8 @@ help:
 	@echo "make lint        check format and style (Ruff) and types (mypy)"
 	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each)"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
-	@echo "make evidence    write the answer and the audit on real frames, KITTI=/path, to figures/kitti_excerpts; LABELS='/path /path' adds label maps"
+	@echo "make evidence    make figures PROFILE=thesis from real frames, KITTI=/path, and keep what shows no frame in figures/kitti_excerpts;"
+	@echo "                 LABELS='/path /path' compares further label maps"
 	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (half an hour)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
@@ -220,7 +221,8 @@ bench: setup
 
 evidence: setup
 	@$(if $(KITTI),,echo "KITTI must name the folder of the KITTI odometry benchmark (sequences, poses)" >&2; exit 1)
-	@$(BIN)/python tools/evidence.py $(foreach folder,$(LABELS),"$(folder)")
+	@$(MAKE) figures PROFILE=thesis
+	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py $(foreach folder,$(LABELS),"$(folder)")
 
 # The network and the drives come from make figures.
 trainings: setup

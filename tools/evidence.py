@@ -1,16 +1,13 @@
-"""Evidence on real frames for the repository: tables, plots and findings.
+"""Evidence on real frames for the repository: what `make figures` gives on them, and more.
 
-They contain no frame of the data.
-
-`make evidence KITTI=...` uses all sequences of a KITTI folder and the label maps of the model in
-the package. It runs the thesis's masks, the controls of one width with both estimators, and the
-audit's ablations. LABELS=... names further folders of label maps, whose masks are compared with
-those of the package on the sequences that they have. A stopped run resumes.
+`make evidence KITTI=...` runs `make figures PROFILE=thesis` with all sequences of a KITTI folder
+and the label maps of the model in the package. Then this program copies the tables, the runs and
+the figures that show no frame of the data. It adds the steps on which masks fail, what the streets
+show, and masks from other label maps (LABELS=...). A stopped run resumes.
 """
 
-import os
 import sys
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +17,26 @@ import failures
 import label_quality
 from thesis_repro import masks
 from thesis_repro.data import kitti
-from thesis_repro.data.cityscapes import read_label_map
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
-from thesis_repro.report import audit, comparison, style, texts
+from thesis_repro.report import style, texts
 from thesis_repro.running import console, results
-from thesis_repro.running.files import write_text
-from thesis_repro.running.settings import PREFIX, ROOT, read_settings
-from thesis_repro.segmentation import prediction
-from thesis_repro.study import ablations, compare, controls, jobs, runner, thesis_tables
-from thesis_repro.study.sources import Source, named
+from thesis_repro.running.files import needed, write_text
+from thesis_repro.running.settings import ROOT, read_settings
+from thesis_repro.study import jobs, runner
+from thesis_repro.study.sources import named
 
-# BUILD: label maps and runs
-FOLDER, BUILD = ROOT / "figures" / "kitti_excerpts", ROOT / "build" / "evidence"
-# pixels, of masks with the thesis's estimator
-WIDTHS = (3, 5, 7, 9, jobs.CONTROL_WIDTH, 11, 13, 15)
-SAMPLED_FRAMES = 12  # frames of each sequence in which boundaries and tracks are measured
+FOLDER = ROOT / "figures" / "kitti_excerpts"
+# Figures and tables of notebooks 8 and 9. Other notebooks draw frames, which are not ours to give.
+KEPT = (
+    *(f"figure_4_{number:02d}" for number in (6, 7, *range(9, 18))),
+    *(f"table_4_{number}" for number in (1, 2, 3)),
+    "comparison",
+    "widths",
+    "audit",
+    "budget",
+)
+RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build folder
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
     "00": "a residential street with parked cars",
@@ -52,68 +53,19 @@ texts.TEMPLATES.loader.searchpath.append(str(Path(__file__).parent))
 
 
 @style.applied()
-def write(root, folder, build, frames=None, repetitions=5, processes=1, others=()):
-    """Run the missing jobs and write all tables, plots and findings into a folder.
+def write(settings, folder, others=()):
+    """Write all tables, plots and findings into a folder.
 
-    root: the KITTI folder. build: keeps label maps and runs; folder and build are absolute paths.
-    frames: how many frames of each sequence to use, None for all. others: further sources of label
-    maps, for some or all sequences. Raises InputError if one is for none.
+    settings: of a finished `make figures` on real frames. others: further sources of label maps,
+    for some or all sequences. Raises InputError if one is for none, or if a file is missing.
     """
-    results.stage(build, results="evidence")
-    labels, model = build / "labels", prediction.load_shipped()
-    sequences = [kitti.Sequence(root, name).subset(frames) for name in kitti.sequences(root)]
-    for sequence in sequences:
-        prediction.write_label_maps(model, sequence.frame_paths, labels / sequence.name)
-    names = [sequence.name for sequence in sequences]
-    covered = {
-        source.name: [name for name in names if source.sequence_folder(name).is_dir()]
-        for source in others
-    }
-    for source in others:
-        if not covered[source.name]:
-            raise InputError(
-                f"{source.folder}: holds no folder of label maps of {', '.join(names)}"
-            )
-    run = partial(
-        runner.run_jobs,
-        sequences=sequences,
-        sources=[Source(labels), *others],
-        folder=build / "odometry",
-        processes=processes,
-    )
-    runs = _runs(run, sequences, repetitions)
-    other_runs = {
-        source: run(
-            [
-                jobs.Job(
-                    name,
-                    "masked",
-                    jobs.CONTROL_WIDTH,
-                    estimator="refined",
-                    repetition=repetition,
-                    source=source,
-                )
-                for name in source_names
-                for repetition in range(repetitions)
-            ]
-        ).table
-        for source, source_names in covered.items()
-    }
-    ablated = ablations.measure(
-        sequences,
-        labels,
-        build / "audit",
-        repetitions=repetitions,
-        baseline_repetitions=max(10, repetitions),
-        processes=processes,
-    )
-    measurements = [
-        *audit.of_tables(),
-        *audit.of_ablations(ablated),
-        *audit.of_study(runs),
-        *audit.measured(_boundaries(sequences, labels), "boundaries"),
-        *audit.measured(_tracks(sequences, labels), "tracks"),
+    sequences = [
+        kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames)
+        for name in kitti.sequences(settings.kitti)
     ]
+    labels = needed(settings.build / "labels", "05_prediction")
+    runs = _read(settings, "runs")
+    other_runs = _other_runs(settings, sequences, others)
     label_masks = [
         masks.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH)
         for sequence in sequences
@@ -121,62 +73,75 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
     steps = pd.concat(map(failures.measure, sequences, label_masks), ignore_index=True)
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
-    table, qualities = compare.comparisons(runs), label_quality.table(runs, other_runs)
+    qualities = label_quality.table(runs, other_runs)
     streets = _streets(sequences)
     results.sweep(folder)
+    for name in KEPT:
+        _copy(settings.figures, name, folder)
     style.save_all(
         {
-            "comparison": comparison.figure_comparison(table),
             "failures": failures.figure(steps, sequences, label_masks),
             "label_quality": label_quality.figure(qualities),
         },
-        {
-            "comparison": comparison.table_comparison(table),
-            "failures": failures.table(steps),
-            "widths": comparison.table_widths(runs),
-            "streets": streets,
-            "label_quality": qualities,
-            "audit": audit.table(measurements),
-        },
+        {"failures": failures.table(steps), "streets": streets, "label_quality": qualities},
         folder,
         note,
     )
-    for name, rows in {"runs": runs, "switches": ablated}.items():
+    for name in RUNS:
+        rows = _read(settings, name)
         # six digits are enough: shuffling the matched points changes more
-        write_text(
-            folder / f"{name}.csv",
-            rows.to_csv(index=False, lineterminator="\n", float_format="%.6g"),
-        )
+        text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
+        write_text(folder / f"{name}.csv", text)
+    findings = needed(settings.figures / "findings.md", "08_results").read_text(encoding="utf-8")
     write_text(
         folder / "README.md",
         texts.render(
             "evidence.md.j2",
-            findings=texts.findings(runs, table, note),
+            findings=findings,
             streets=style.markdown(streets),
             width=jobs.CONTROL_WIDTH,
+            tables={
+                name: (folder / f"{name}.md").read_text(encoding="utf-8")
+                for name in KEPT
+                if name.startswith("table")
+            },
         ),
     )
 
 
-def _runs(run, sequences, repetitions):
-    """Return the runs of the comparison. run: returns the runs of jobs.
+def _read(settings, name):
+    path = needed(settings.build / f"{name}.csv", "08_results and 09_audit")
+    return pd.read_csv(path, dtype={"sequence": str, "source": str}).fillna({"source": ""})
 
-    The runs with masks decide the jobs with fewer keypoints.
-    """
-    planned = jobs.first_jobs(
-        sequences,
-        {"thesis": WIDTHS, "refined": []},
-        tested=jobs.CONTROL_WIDTH,
-        repetitions=repetitions,
-    )
-    runs = run(planned).table
-    planned += jobs.reduced_jobs(
-        thesis_tables.best_widths(compare.of_method(runs, "masked")), repetitions
-    )
-    planned += jobs.keypoint_control_jobs(
-        compare.keypoints_left(runs), sequences, repetitions, width=jobs.CONTROL_WIDTH
-    )
-    return run(planned).table
+
+def _copy(source, name, folder):
+    """Copy the files of a figure or table. Raises InputError if there are none."""
+    paths = sorted(source.glob(f"{name}.*"))
+    if not paths:
+        raise InputError(f"{source / name}: is missing; make figures on the same data writes it")
+    for path in paths:
+        write_text(folder / path.name, path.read_text(encoding="utf-8"))
+
+
+def _other_runs(settings, sequences, others):
+    """Return {source: runs with its masks} on the sequences that a source has label maps of."""
+    listed = {}
+    for source in others:
+        covered = [each.name for each in sequences if source.sequence_folder(each.name).is_dir()]
+        if not covered:
+            wanted = ", ".join(each.name for each in sequences)
+            raise InputError(f"{source.folder}: holds no folder of label maps of {wanted}")
+        job = jobs.Job("", "masked", jobs.CONTROL_WIDTH, estimator="refined", source=source.name)
+        listed[source.name] = [
+            replace(job, sequence=name, repetition=repetition)
+            for name in covered
+            for repetition in range(settings.sizes.repetitions)
+        ]
+    folder = settings.build / "other_label_maps"
+    return {
+        name: runner.run_jobs(source_jobs, sequences, others, folder, processes=settings.jobs).table
+        for name, source_jobs in listed.items()
+    }
 
 
 def _streets(sequences):
@@ -196,50 +161,13 @@ def _streets(sequences):
     return pd.DataFrame(rows)
 
 
-def _boundaries(sequences, labels):
-    """Return the measures of `ablations.boundaries` in SAMPLED_FRAMES frames of each sequence."""
-    rows = []
-    for sequence in sequences:
-        step = max(1, len(sequence) // SAMPLED_FRAMES)
-        for index in range(0, len(sequence), step):
-            label_map = read_label_map(labels / sequence.name / sequence.frame_paths[index].name)
-            measures = ablations.boundaries(label_map, sequence.size)
-            rows.append({"sequence": sequence.name, "frame": index} | measures)
-    return pd.DataFrame(rows)
-
-
-def _tracks(sequences, labels):
-    rows = []
-    for sequence in sequences:
-        label_maps, width = labels / sequence.name, jobs.CONTROL_WIDTH
-        masks_by_name = {
-            "all keypoints": None,
-            "masks": masks.LabelMasks(label_maps, sequence, width),
-            "exact boundaries": masks.LabelMasks(
-                label_maps, sequence, width, masks.MaskSettings("exact")
-            ),
-            "random lines": controls.masks_of_method(
-                "random-lines", Source(labels), sequence, width
-            ),
-        }
-        rows.append(ablations.tracks(sequence, masks_by_name, SAMPLED_FRAMES))
-    return pd.concat(rows, ignore_index=True)
-
-
 def main():
     """Write the evidence with the settings of the environment."""
-    # all frames, unless FRAMES is set
-    settings = read_settings(os.environ | {f"{PREFIX}PROFILE": "thesis"})
-    with results.claimed(BUILD), console.logged(BUILD, "tables, plots and findings") as run:
-        write(
-            settings.kitti,
-            FOLDER,
-            BUILD,
-            settings.sizes.frames,
-            settings.sizes.repetitions,
-            settings.jobs,
-            named([("labels", Path(path)) for path in sys.argv[1:]], [], masks.MaskSettings()),
-        )
+    settings = read_settings()
+    others = named([("labels", Path(path)) for path in sys.argv[1:]], [], masks.MaskSettings())
+    folder = settings.build / "evidence"
+    with results.claimed(folder), console.logged(folder, "tables, plots and findings") as run:
+        write(settings, FOLDER, others)
         run.end(f"tables, plots and findings: {FOLDER}")
 
 

@@ -12,7 +12,8 @@ import train_shipped
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.study import compare, jobs
+from thesis_repro.running.settings import read_settings
+from thesis_repro.study import compare, jobs, runner
 from thesis_repro.study.sources import Source
 
 pytestmark = pytest.mark.slow
@@ -88,49 +89,52 @@ def test_keypoints_on_movable_things_are_counted(small_world, small_labels, tmp_
         moving.table(small_world / "kitti", tmp_path / "nowhere", tmp_path)
 
 
-def test_evidence_has_every_method_and_error_and_no_frames(
+def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
     small_world, small_labels, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(evidence, "WIDTHS", (5, jobs.CONTROL_WIDTH))
-    arguments = (small_world / "kitti", tmp_path / "out", tmp_path / "build")
+    settings = read_settings(
+        {
+            "THESIS_REPRO_PROFILE": "smoke",
+            "THESIS_REPRO_FRAMES": "6",
+            "THESIS_REPRO_KITTI": str(small_world / "kitti"),
+            "THESIS_REPRO_BUILD": str(tmp_path / "build"),
+            "THESIS_REPRO_FIGURES": str(tmp_path / "figures"),
+        }
+    )
+    settings.build.mkdir(parents=True)
+    (settings.build / "labels").symlink_to(small_labels)
+    sequences = [Sequence(settings.kitti, name).subset(6) for name in ("00", "01")]
+    listed = jobs.first_jobs(sequences, {"thesis": [], "refined": []}, tested=jobs.CONTROL_WIDTH)
+    runs = runner.run_jobs(listed, sequences, small_labels, tmp_path / "odometry").table
+    for name in evidence.RUNS:
+        runs.to_csv(settings.build / f"{name}.csv", index=False)
+    settings.figures.mkdir(parents=True)
+    for name in [*evidence.KEPT, "figure_4_05", "findings"]:
+        for ending in ("csv", "md"):
+            (settings.figures / f"{name}.{ending}").write_text(name)
     (tmp_path / "exact").mkdir()
     (tmp_path / "exact/01").symlink_to(small_labels / "01")  # a further source for one sequence
-    options = {"frames": 6, "repetitions": 1, "others": [Source(tmp_path / "exact", name="exact")]}
-    evidence.write(*arguments, **options)
-    files = list((tmp_path / "out").iterdir())
-    assert {path.stem for path in files} == {
-        "README",
-        "audit",
-        "comparison",
-        "failures",
-        "label_quality",
-        "runs",
-        "streets",
-        "switches",
-        "widths",
-    }
-    failures = pd.read_csv(tmp_path / "out" / "failures.csv")
+    others = [Source(tmp_path / "exact", name="exact")]
+    out = tmp_path / "out"
+    evidence.write(settings, out, others)
+    names = {"README", "failures", "label_quality", "streets", *evidence.KEPT, *evidence.RUNS}
+    assert {path.stem for path in out.iterdir()} == names
+    failures = pd.read_csv(out / "failures.csv")
     assert list(failures["steps"][:2]) == ["00", "01"]
     assert failures["number"][:2].sum() == failures["number"][2:].sum() == 10
     assert (failures["tracked, masks"] < failures["tracked, all keypoints"]).all()
     assert (failures["agreeing, masks"] <= failures["tracked, masks"]).all()
-    runs = pd.read_csv(tmp_path / "out" / "runs.csv", dtype={"sequence": str})
-    assert set(runs["sequence"]) == {"00", "01"} and set(runs["frames"]) == {6}
-    assert set(compare.METHODS) <= set(runs["method"]) and {
-        *compare.JUDGING_METRICS,
-        "rmse",
-    } <= set(runs)
-    corrected = runs[runs["method"] == "corrected"]
-    assert set(corrected["dilation_width"]) == {jobs.CONTROL_WIDTH}
-    assert set(corrected["estimator"]) == set(jobs.ESTIMATORS)
-    before = {path.name: path.read_bytes() for path in files}
-    quality = pd.read_csv(tmp_path / "out" / "label_quality.csv")
-    assert set(runs["source"].dropna()) == set() and len(quality) == 6
-    assert list(quality["sequences"][:4]) == ["00, 01", "01", "01", "01"]
+    quality = pd.read_csv(out / "label_quality.csv")
+    assert len(quality) == 6 and list(quality["sequences"][:4]) == ["00, 01", "01", "01", "01"]
     rotation = quality[compare.METRICS["rotation"]][:4].str.extract(r"^([\d.]+)")[0].astype(float)
     assert rotation[3] == pytest.approx(rotation[2] / rotation[1], abs=0.02)
-    streets = pd.read_csv(tmp_path / "out" / "streets.csv")
+    streets = pd.read_csv(out / "streets.csv")
     assert (streets["frames"] == 6).all() and (streets["metres"] > 0).all()
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
     monkeypatch.setattr(odometry, "run_many", None)  # would fail
-    evidence.write(*arguments, **options)
-    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    evidence.write(settings, out, others)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    (settings.figures / "audit.csv").unlink()
+    (settings.figures / "audit.md").unlink()
+    with pytest.raises(InputError, match="audit"):
+        evidence.write(settings, out, others)

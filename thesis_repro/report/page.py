@@ -13,6 +13,7 @@ import platform
 import re
 import subprocess
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +28,8 @@ from thesis_repro.running.settings import ROOT, Settings, read_settings
 
 PAGE, GALLERY = "index.html", "README.md"
 ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex"), "text": (".md",)}
+REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence.py)
+REAL_CHAPTER = "Chapter 4 on real frames"
 ROWS_SHOWN = 36  # the gallery only links to longer tables
 # ids of the artefacts at the top of a page
 OPENING = ("figure_4_05", "findings", "figure-comparison", "table-summary")
@@ -101,9 +104,14 @@ def notebook_html(path: Path, page: Path) -> str:
 
 
 def _chapters(settings: Settings) -> dict[str, list[dict[str, Any]]]:
-    """Return the described artefacts of each chapter, {title: artefacts}."""
+    """Return the described artefacts of each chapter, {title: artefacts}.
+
+    The figures in git begin with chapter 4 on real frames.
+    """
     numbers = tables.beside_the_thesis(settings)
     chapters = {}
+    if settings.figures_in_git:
+        chapters[REAL_CHAPTER] = _of_real_frames(settings)
     for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items():
         chapters[title] = [
             _describe(settings.figures, artefact, settings, numbers) for artefact in artefacts
@@ -111,10 +119,28 @@ def _chapters(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     return chapters
 
 
+def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
+    """Return the described artefacts of the evidence on real frames that is in git."""
+    folder = settings.figures / REAL
+    real = replace(settings, figures=folder, kitti_is_embedded=False)
+    numbers = tables.beside_the_thesis(real)
+    chapter = [
+        *captions.CHAPTERS["Chapter 4: results"],
+        *(artefact for artefact in captions.ADDED if artefact["name"] in ("comparison", "widths")),
+    ]
+    described = [_describe(folder, artefact, real, numbers) for artefact in chapter]
+    for artefact in described:
+        artefact["id"] = f"real-{artefact['id']}"
+        artefact["files"] = [f"{REAL}/{name}" for name in artefact["files"]]
+        artefact["opens"] = False
+    return [artefact for artefact in described if artefact["there"]]
+
+
 def build(settings: Settings) -> str:
     """Return the page of a run as HTML, made from the files in its folders."""
     chapters = _chapters(settings)
-    artefacts = list(itertools.chain(*chapters.values()))
+    of_run = [described for title, described in chapters.items() if title != REAL_CHAPTER]
+    artefacts = list(itertools.chain(*of_run))
     of_thesis = [artefact for artefact in artefacts if artefact["number"] is not None]
     shown = sum(artefact["there"] for artefact in of_thesis)
     missing = [
