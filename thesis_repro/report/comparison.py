@@ -127,7 +127,7 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for source, pair in judged.groupby("source", sort=False):
         keypoints = pair["keypoints"].iloc[0]
-        row = {"masks": source, "keypoints": f"{keypoints:.0f} of {total:.0f}"}
+        row = {"masks": source, "keypoints": f"{keypoints:.0f} instead of {total:.0f}"}
         row |= _ratios(pair)
         row["verdict"] = compare.overall(pair["verdict"])
         row |= _lost(pair.iloc[0])
