@@ -151,7 +151,7 @@ def write(root, folder, build, frames=None, repetitions=5, processes=1, others=(
         folder / "README.md",
         texts.render(
             "evidence.md.j2",
-            findings=texts.findings(runs, table, note),
+            findings=texts.findings(runs, table, note, embedded=False),
             streets=style.markdown(streets),
             width=jobs.CONTROL_WIDTH,
         ),
