@@ -95,9 +95,9 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     null = table["change (%), one run each, if masks did nothing"]
     assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
     assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
-    text = texts.findings(runs, compare.comparisons(runs), "real", shuffled=shuffled)
+    text = texts.findings(runs, compare.comparisons(runs), "real", False, shuffled=shuffled)
     assert f"{null['mean']:+.1f} %" in text
-    assert "procedure" not in texts.findings(runs, compare.comparisons(runs), "real")
+    assert "procedure" not in texts.findings(runs, compare.comparisons(runs), "real", False)
 
 
 def test_a_lost_run_is_counted_and_never_improves():
@@ -172,7 +172,8 @@ def test_findings_follow_the_verdict(errors, names, verdict, sources):
     table = compare.comparisons(runs)
     for source in sources:
         assert compare.overall(compare.primary_comparison(table, source)["verdict"]) == verdict
-    text = texts.findings(runs, table, "made up")
+    text = texts.findings(runs, table, "KITTI folder embedded, made up", False)
+    assert "no evidence" not in text
     assert text.count("Masks help here") == (verdict == compare.LOWER) * len(sources)
     assert text.count("do worse than all") == (verdict == compare.HIGHER) * len(sources)
     row = compare.primary_comparison(table, sources[0]).iloc[0]
@@ -190,8 +191,8 @@ def test_findings_name_only_what_was_run():
         runs[runs["method"] == "baseline"],
         runs.assign(se3=np.nan),
     ):
-        text = texts.findings(part, compare.comparisons(part), "embedded world")
-        assert "embedded world" in text
+        text = texts.findings(part, compare.comparisons(part), "made up", True)
+        assert "no evidence" in text
         assert ("refined" in text) == (part["estimator"] == "refined").any()
         assert compare.METRICS["se3"] not in text or part["se3"].notna().any()
 

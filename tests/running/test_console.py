@@ -10,6 +10,7 @@ import signal
 import warnings
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from thesis_repro import odometry
@@ -194,13 +195,27 @@ def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, ca
 
 
 @pytest.mark.parametrize(
-    "text", ["", "frame,x\n0,1.0\n1,2", "frame,x\n0,1.0\n1,two\n", "frame,x\n0,1.0\n"]
+    "text",
+    [
+        "",
+        "frame,x\n0,1.0\n1,2",  # cut off
+        "frame,x\n0,10.0\n1,11.0\n",  # shifted
+        "frame,x\n1,2.0\n0,1.0\n",  # reversed
+        "frame,x\n0,1\n1,2\n",  # fewer digits
+        "frame\n0\n1\n",  # without a column
+    ],
 )
-def test_a_damaged_table_is_not_kept(tmp_path, text):
-    for content, whole in (("frame,x\n0,1.0\n1,2.0\n", True), (text, False)):
-        (tmp_path / "a.csv").write_text(content)
-        assert (results.kept_table(tmp_path / "a.csv", rows=2) is not None) == whole
-    assert results.kept_table(tmp_path / "b.csv") is None
+def test_a_table_that_was_changed_is_moved_aside(tmp_path, text):
+    path, other = tmp_path / "a.csv", tmp_path / "b.csv"
+    assert not results.has_table(path)
+    for written in (path, other):
+        results.write_table(written, pd.DataFrame({"frame": [0, 1], "x": [1.0, 2.0]}))
+    assert results.has_table(path)
+    path.write_text(text)
+    assert not results.has_table(path) and not path.exists() and results.has_table(other)
+    assert (tmp_path / "a.csv.old-1").read_text() == text
+    (tmp_path / folders.DIGESTS).unlink()  # as in a folder of an earlier version
+    assert not results.has_table(other) and not other.exists()
 
 
 def test_a_folder_is_locked_by_one_process(tmp_path):

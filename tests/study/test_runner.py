@@ -3,6 +3,7 @@
 import shutil
 import time
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -68,10 +69,13 @@ def test_only_missing_runs_are_run_again(small_world, small_labels, finished, mo
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*.csv")}
     lost = folder / "00" / "masked-05-0.csv"
     lost.unlink()
+    changed = folder / "01" / "masked-15-0.csv"
+    table = pd.read_csv(changed, keep_default_na=False)
+    table.assign(x=table["x"] + 9).to_csv(changed, index=False)
     again = runner.run_jobs(jobs, opened(small_world), small_labels, folder)
-    assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost}
+    assert {path for path in times if path.stat().st_mtime_ns != times[path]} == {lost, changed}
     pd.testing.assert_frame_equal(again.table, summary)
-    assert (again.made, again.kept, again.failed) == (1, len(jobs) - 1, 0)
+    assert (again.made, again.kept, again.failed) == (2, len(jobs) - 2, 0)
 
 
 @pytest.mark.parametrize("error", [OSError("pulled the plug"), KeyboardInterrupt()])
@@ -137,6 +141,44 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     assert "sequence 00, masked-00-0: failed: dilation width 0" in printed
     with pytest.raises(InputError, match="all 1 odometry runs failed; the first: dilation width 0"):
         runner.run_jobs(jobs[-1:], opened(small_world), small_labels, tmp_path / "none")
+
+
+def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
+    shutil.copytree(tiny_kitti / "sequences" / "00", tiny_kitti / "sequences" / "01")
+    shutil.copy(tiny_kitti / "poses" / "00.txt", tiny_kitti / "poses" / "01.txt")
+    for path in (tiny_kitti / "sequences" / "01" / "image_0").iterdir():
+        cv2.imwrite(str(path), np.full((48, 64), 128, np.uint8))
+    sequences = [Sequence(tiny_kitti, name) for name in ("00", "01")]
+    jobs = [Job(name, "baseline", repetition=number) for name in ("00", "01") for number in (0, 1)]
+    for made, kept in ((2, 0), (0, 2)):
+        outcome = runner.run_jobs(jobs, sequences, tmp_path / "none", tmp_path / "runs")
+        assert (outcome.made, outcome.kept, outcome.failed) == (made, kept, 2)
+        assert set(outcome.table["sequence"]) == {"00"}
+        assert len(outcome.warnings) == 1 and "sequence 01, " in outcome.warnings[0]
+    with pytest.raises(InputError, match="sequences/01: "):
+        runner.run_jobs(jobs[2:], sequences, tmp_path / "none", tmp_path / "runs")
+
+
+def test_a_pass_resumes_although_some_of_its_masks_are_missing(tiny_kitti, tmp_path, monkeypatch):
+    monkeypatch.setattr(odometry.passes, "CHECKPOINT", 2)
+    read, raised = [], []
+
+    def frame(self, index, original=Sequence.frame):
+        read.append(index)
+        if index == 3 and not raised:
+            raised.append(True)
+            raise KeyboardInterrupt
+        return original(self, index)
+
+    monkeypatch.setattr(Sequence, "frame", frame)
+    jobs = [Job("00", "masked", 3), Job("00", "baseline")]
+    inputs = jobs, [Sequence(tiny_kitti, "00")], tmp_path / "none", tmp_path / "runs"
+    with pytest.raises(KeyboardInterrupt):
+        runner.run_jobs(*inputs)
+    outcome = runner.run_jobs(*inputs)
+    assert read == [0, 1, 2, 3, 2, 3]
+    assert (outcome.made, outcome.failed) == (1, 1)
+    assert not list(tmp_path.rglob("pass-*"))
 
 
 def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path):

@@ -252,6 +252,12 @@ def test_bad_input_is_one_line_before_anything_runs(
     )
 
 
+def test_a_sequence_named_like_a_column_is_refused(tiny_kitti):
+    (tiny_kitti / "sequences" / "00").rename(tiny_kitti / "sequences" / "low")
+    with pytest.raises(InputError, match="sequences/low: "):
+        Study(tiny_kitti, ("low",), (), ()).check()
+
+
 def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_labels, tmp_path):
     shutil.copytree(small_labels / "00", tmp_path / "labels" / "00")
     damaged = tmp_path / "labels" / "00" / "000002.png"

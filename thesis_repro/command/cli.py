@@ -241,7 +241,7 @@ def study(options: Any) -> int:
             warnings += _print_oddities(sequence, masks)
         warnings = _warn(warnings)
         outcome = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += _warn(planned.path_oddities(outcome.table, folder))
+        warnings += outcome.warnings + _warn(planned.path_oddities(outcome.table, folder))
         page = study.write(planned, outcome.table, folder, warnings)
         failed = ""
         if outcome.failed:

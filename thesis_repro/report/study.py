@@ -34,7 +34,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     Returns the page's path. warnings: lines for the top of the page.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
-    world = results.record(study.kitti.absolute().parent) or {}
+    world = results.record(study.kitti.resolve().parent) or {}
     embedded = "train_images" in world
     data = f"KITTI folder {study.kitti.name}"
     if embedded:
@@ -45,7 +45,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     ]
     note = f"odometry: {data}; masks: {', '.join(masks)}"
     table = compare.comparisons(runs)
-    write_text(folder / "findings.md", texts.findings(runs, table, note))
+    write_text(folder / "findings.md", texts.findings(runs, table, note, embedded))
     write_paths(study, runs, folder)
     figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}

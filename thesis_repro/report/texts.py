@@ -113,6 +113,7 @@ def findings(
     runs: pd.DataFrame,
     table: pd.DataFrame,
     data: str,
+    embedded: bool,
     label_maps: list[dict[str, Any]] | tuple[()] = (),
     trainings: list[dict[str, Any]] | tuple[()] = (),
     shuffled: pd.DataFrame | None = None,
@@ -120,6 +121,7 @@ def findings(
     """Return the findings of a run, a study or the evidence as Markdown.
 
     table: `compare.comparisons` of the runs. data: one line with the origin of the data.
+    embedded: whether the frames are those of the embedded world, which is no evidence about KITTI.
     label_maps: the quality of the label maps, rows of `gap.label_map_quality`.
     trainings: what other trainings of the network give, from `trainings.summary`. shuffled: runs
     with all keypoints, to simulate the thesis's procedure if masks did nothing.
@@ -137,7 +139,7 @@ def findings(
         "findings.md.j2",
         **OF_COMPARISONS,
         data=data,
-        embedded="embedded" in data.split(";")[0],
+        embedded=embedded,
         label_maps=label_maps,
         trainings=trainings,
         frames=baseline.groupby("sequence")["frames"].first().to_dict(),

@@ -1,4 +1,4 @@
-"""What stands in a folder of results beside them: the record of their inputs, and the log.
+"""What stands in a folder of results beside them: the record of their inputs, digests, and the log.
 
 This module imports only the standard library, as `console` does.
 """
@@ -7,6 +7,7 @@ from pathlib import Path
 
 RECORD = "made-from.json"  # see `results.stage`
 LOG = "log.txt"  # see `console.logged`
+DIGESTS = "digests.txt"  # of tables, see `results.write_table`
 
 
 def holds_results(folder: Path) -> bool:

@@ -29,7 +29,7 @@ import pandas as pd
 from thesis_repro.errors import InputError
 from thesis_repro.running import console
 from thesis_repro.running.files import TEMPORARY, atomic, progress, write_text
-from thesis_repro.running.folders import LOG, RECORD
+from thesis_repro.running.folders import DIGESTS, LOG, RECORD
 from thesis_repro.running.settings import ROOT
 
 _PACKAGE = Path(__file__).parents[1]
@@ -82,13 +82,19 @@ def _move_aside(folder: Path, changed: str) -> None:
     if len(paths) < 2:  # there is only the record
         return
     # beside the folder itself, not beside a link to it, which may lie on another disk
-    place, number = folder.resolve(), 1
-    while (aside := place.with_name(f"{place.name}.old-{number}")).exists():
-        number += 1
+    aside = _unused(folder.resolve())
     aside.mkdir()
     for path in paths:
         path.rename(aside / path.name)
     console.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
+
+
+def _unused(path: Path) -> Path:
+    """Return the first path of PATH.old-1, PATH.old-2, ... that does not exist."""
+    number = 1
+    while (aside := path.with_name(f"{path.name}.old-{number}")).exists():
+        number += 1
+    return aside
 
 
 def record(folder: str | Path) -> Any:
@@ -188,27 +194,35 @@ def locked(path: str | Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-TEXT_COLUMNS = ("sequence", "run", "method", "estimator", "stage", "flag")
+def write_table(path: str | Path, table: pd.DataFrame) -> None:
+    """Write a table as CSV, and append its digest to the list DIGESTS beside it."""
+    with atomic(path) as temporary:
+        temporary.write_text(table.to_csv(index=False), encoding="utf-8")
+        # before the table has its name, so that no table lacks its digest; several processes append
+        with open(temporary.with_name(DIGESTS), "a", encoding="utf-8") as file:
+            file.write(_line_of_digest(temporary, Path(path).name))
 
 
-def kept_table(path: str | Path, rows: int | None = None, **options: Any) -> pd.DataFrame | None:
-    """Return the table that an earlier run wrote to a CSV file.
+def has_table(path: str | Path) -> bool:
+    """Return whether a file holds a table as `write_table` wrote it.
 
-    Returns None if there is none or it is damaged. Damaged means empty, cut off, with another
-    number of rows than `rows`, or with text outside TEXT_COLUMNS.
+    A file that was changed since, or that is not in the list of digests, is moved aside.
     """
     path = Path(path)
     if not path.is_file():
-        return None
-    with suppress(ValueError, UnicodeError):  # pandas' errors are ValueErrors
-        table = pd.read_csv(path, **options)
-        numeric = all(
-            name in TEXT_COLUMNS or pd.api.types.is_numeric_dtype(table[name]) for name in table
-        )
-        if numeric and rows in (None, len(table)) and path.read_bytes().endswith(b"\n"):
-            return table
-    console.log.warning(f"{path}: is damaged and will be made again")
-    return None
+        return False
+    written = path.with_name(DIGESTS)
+    if written.is_file() and _line_of_digest(path, path.name).encode() in written.read_bytes():
+        return True
+    aside = _unused(path)
+    path.rename(aside)
+    console.log.warning(f"{path}: was changed; moved to {aside.name}, to be made again")
+    return False
+
+
+def _line_of_digest(path: Path, name: str) -> str:
+    """Return a line as sha256sum writes it, for the content of a file under a name."""
+    return f"{_sha256(path)}  {name}\n"
 
 
 # Checkpoints

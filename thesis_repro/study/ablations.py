@@ -22,7 +22,7 @@ from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoint
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.odometry.pose import normalise
 from thesis_repro.running import results
-from thesis_repro.running.files import progress, write_text
+from thesis_repro.running.files import progress
 from thesis_repro.study import workers
 from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import CONTROL_WIDTH
@@ -104,7 +104,7 @@ def _measure(
         model=results.made_from(labels),
     )
     path = folder / "runs.csv"
-    if results.kept_table(path) is None:
+    if not results.has_table(path):
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **options)
         run_results = odometry.run_many(
@@ -118,7 +118,7 @@ def _measure(
             row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]
             rows.append(row)
         table = pd.DataFrame(rows).assign(sequence=sequence.name)
-        write_text(path, table.to_csv(index=False))
+        results.write_table(path, table)
     return pd.read_csv(path, dtype={"sequence": str})
 
 

@@ -20,7 +20,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import is_flagged, poses_of
 from thesis_repro.running import console, results
-from thesis_repro.running.files import listed, progress, write_text
+from thesis_repro.running.files import listed, progress
 from thesis_repro.study import compare, controls, workers
 from thesis_repro.study.jobs import (
     ESTIMATORS,
@@ -41,13 +41,14 @@ class Outcome:
     """What `run_jobs` did.
 
     table: all runs that succeeded, one row a job. made, kept, failed: numbers of jobs that were run
-    now, that had a result from before, and that failed.
+    now, that had a result from before, and that failed. warnings: lines that say why they failed.
     """
 
     table: pd.DataFrame
     made: int
     kept: int
     failed: int
+    warnings: list[str]
 
 
 class Failure(NamedTuple):
@@ -94,35 +95,37 @@ def run_jobs(
     with results.claimed(folder):
         for sequence in opened.values():
             _stage(folder, sequence, sources_by_name)
-        for job in jobs:
-            _delete_if_damaged(result_file(folder, job), len(opened[job.sequence]))
-        finished = sum(result_file(folder, job).is_file() for job in jobs)
+        finished = {job for job in jobs if results.has_table(result_file(folder, job))}
         failures = _run_passes(jobs, opened, sources_by_name, folder, processes, scheduler)
-    rows = []
+    rows = {}
     for job in jobs:
         path = result_file(folder, job)
-        if path.is_file():
-            # an empty flag stays a text, an empty number becomes NaN
-            numbers = {"detected": "", "tracked": ""}
-            frames = pd.read_csv(path, keep_default_na=False, na_values=numbers)
-            errors = measures(frames, opened[job.sequence].poses)
-            rows.append({"sequence": job.sequence, "run": job.name, **asdict(job), **errors})
+        if not path.is_file():
+            continue
+        # an empty flag stays a text, an empty number becomes NaN
+        numbers = {"detected": "", "tracked": ""}
+        frames = pd.read_csv(path, keep_default_na=False, na_values=numbers)
+        sequence = opened[job.sequence]
+        if frames["detected"].isna().all():  # the path is a point, whatever the method
+            failures[job] = Failure(
+                f"{sequence.folder}: no frame has any structure (all are black, white or of one "
+                "gray); check how they were written"
+            )
+            continue
+        errors = measures(frames, sequence.poses)
+        rows[job] = {"sequence": job.sequence, "run": job.name, **asdict(job), **errors}
+    warnings = _report(failures)
     if not rows:
         first = next(iter(failures.values()))
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {first.reason}")
+    kept = len(finished & rows.keys())
     return Outcome(
-        pd.DataFrame(rows),
-        made=len(rows) - finished,
-        kept=finished,
+        pd.DataFrame(rows.values()),
+        made=len(rows) - kept,
+        kept=kept,
         failed=len(jobs) - len(rows),
+        warnings=warnings,
     )
-
-
-def _delete_if_damaged(path: Path, frames: int) -> None:
-    """Delete a result file that cannot be used, so that it is made again."""
-    table = results.kept_table(path, frames)
-    if table is None or not np.isfinite(poses_of(table)).all():
-        path.unlink(missing_ok=True)
 
 
 def keypoint_controls(
@@ -155,10 +158,7 @@ def _run_passes(
     processes: int,
     scheduler: str | None,
 ) -> dict[Job, Failure]:
-    """Run the jobs without a result and print which of them failed; returns these.
-
-    Raises InputError if the machine caused a failure.
-    """
+    """Run the jobs without a result; returns which of them failed, and why."""
     failures: dict[Job, Failure] = {}
     with workers.open_pool(processes, scheduler) as pool:
         passes = _passes(jobs, sequences, folder, pool.size)
@@ -175,23 +175,28 @@ def _run_passes(
                     pass_failures = dict.fromkeys(passes[index], Failure(pass_failures))
                 failures |= pass_failures
                 bar.update(frames[index])
-    _print_failures(failures)
-    for failure in failures.values():
-        if failure.by_machine:  # a study without these runs could mislead
-            raise InputError(failure.reason)
     return failures
 
 
-def _print_failures(failures: Mapping[Job, Failure]) -> None:
-    """Print one line for the failed runs of a sequence that have the same reason."""
+def _report(failures: Mapping[Job, Failure]) -> list[str]:
+    """Print and return one line for the failed runs of a sequence that have the same reason.
+
+    Raises InputError if the machine caused a failure.
+    """
     by_reason: dict[tuple[str, str], list[str]] = {}
     for job, failure in failures.items():
         by_reason.setdefault((job.sequence, failure.reason), []).append(job.name)
+    lines = []
     for (name, reason), runs in by_reason.items():
         shown = ", ".join(runs[:3])
         if len(runs) > 3:
             shown += f" and {len(runs) - 3} more"
-        console.log.warning(f"sequence {name}, {shown}: failed: {reason}")
+        lines.append(f"sequence {name}, {shown}: failed: {reason}")
+        console.log.warning(lines[-1])
+    for failure in failures.values():
+        if failure.by_machine:  # a study without these runs could mislead
+            raise InputError(failure.reason)
+    return lines
 
 
 def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None:
@@ -322,17 +327,17 @@ def _run_pass(
     record: of the sequence's results, as the main process sees it.
     """
     cv2.setNumThreads(1)  # the processes already use every core
-    digest = hashlib.sha256("\n".join(job.name for job in jobs).encode()).hexdigest()[:12]
-    checkpoint = folder / sequence.name / f"pass-{digest}.npz"
     failures: dict[Job, Failure] = {}
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
         waiting = jobs
-        if not checkpoint.is_file():  # a checkpoint can be resumed only with all of its jobs
+        # a checkpoint can be resumed only with all of its jobs
+        if not _checkpoint(folder / sequence.name, jobs).is_file():
             waiting = _unfinished(jobs, folder)
         masks_by_job, failures = checked_masks(waiting, sequence, sources)
         if not masks_by_job:  # also if Dask repeats a finished pass because it lost the answer
             return failures
+        checkpoint = _checkpoint(folder / sequence.name, masks_by_job)
         run_results = odometry.run_many(
             sequence,
             {job.name: (job.settings, masks) for job, masks in masks_by_job.items()},
@@ -340,11 +345,18 @@ def _run_pass(
         )
         for job in _unfinished(masks_by_job, folder):
             frames = run_results.pop(job.name).frames
-            write_text(result_file(folder, job), frames.to_csv(index=False))
+            results.write_table(result_file(folder, job), frames)
         checkpoint.unlink(missing_ok=True)
     except Exception as error:  # report any error as the reason, and let other passes run
         failures = dict.fromkeys(_unfinished(jobs, folder), _failure_of(error)) | failures
     return failures
+
+
+def _checkpoint(folder: Path, jobs: Iterable[Job]) -> Path:
+    """Return the checkpoint of a pass with these jobs. folder: of the sequence's results."""
+    names = "\n".join(job.name for job in jobs)
+    digest = hashlib.sha256(names.encode()).hexdigest()[:12]
+    return folder / f"pass-{digest}.npz"
 
 
 def _unfinished(jobs: Iterable[Job], folder: Path) -> list[Job]:

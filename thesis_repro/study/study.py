@@ -11,7 +11,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import results
 from thesis_repro.running.settings import MOST_REPETITIONS
-from thesis_repro.study import jobs, runner, sources
+from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
 RUNS = "runs"  # folder of the results of the runs
@@ -55,6 +55,10 @@ class Study:
             if len(sequence) < 3:
                 raise InputError(
                     f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
+                )
+            if sequence.name in compare.COLUMNS:
+                raise InputError(
+                    f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
                 )
         widths = list(self.widths)
         if self.tested:
@@ -153,11 +157,6 @@ class Study:
 
     def _check_runs(self, runs: pd.DataFrame) -> None:
         """Raise InputError if the runs leave nothing to compare."""
-        if runs["mean_keypoints"].isna().all():
-            raise InputError(
-                f"{self.kitti}: no frame has any structure (all are black, white or of one gray); "
-                "check how they were written"
-            )
         if not (runs["method"] == "masked").any():
             raise InputError(
                 "every run with masks failed (see above), so there is nothing to compare"

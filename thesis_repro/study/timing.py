@@ -73,9 +73,10 @@ def time_runs(
 def _time_jobs(
     jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
 ) -> pd.DataFrame:
-    earlier = results.kept_table(path, dtype={"sequence": str})
-    if earlier is not None and {job.name for job in jobs} <= set(earlier["run"]):
-        return earlier
+    if results.has_table(path):
+        earlier = pd.read_csv(path, dtype={"sequence": str})
+        if {job.name for job in jobs} <= set(earlier["run"]):
+            return earlier
     scales = odometry.scales(sequence)
     masks_by_job, _ = checked_masks(jobs, sequence, sources)
     odometries = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
@@ -102,7 +103,7 @@ def _time_jobs(
         }
         for job, job_seconds in seconds.items()
     ]
-    write_text(path, pd.DataFrame(rows).to_csv(index=False))
+    results.write_table(path, pd.DataFrame(rows))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
