@@ -1,12 +1,14 @@
 """The ways in: the command line, the public names, the example and the numbers of the README."""
 
 import json
+import os
 import re
 import shlex
 import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -131,6 +133,46 @@ def test_without_ground_truth_there_are_no_errors(
     summary = json.loads(capsys.readouterr().out)
     assert summary["rmse_m"] is None and summary["mae_m"] is None
     assert (cv2.imread("path.png") is not None) == ("--plot" in options)
+
+
+def test_only_the_folder_that_holds_a_sequence_is_closed_to_outputs(tiny_kitti, tmp_path, capsys):
+    above = tmp_path / "sequences"
+    above.mkdir()
+    root = tiny_kitti.rename(above / "kitti")
+    sequence = root / "sequences/00"
+    for where in (["--kitti", root, "--sequence", "00"], ["--sequence", sequence]):
+        for inside in (root / "sequences/new.txt", root / "poses/07.txt", sequence / "new.txt"):
+            assert run("odometry", *where, "--output", inside) == 1
+            assert str(inside) in capsys.readouterr().err and not inside.exists()
+        for outside in (tmp_path / "path.txt", above / "path.txt"):
+            assert run("odometry", *where, "--output", outside) == 0
+            assert outside.read_text()
+
+
+NOT_UTF8 = os.fsdecode(b"caf\xe9\n\x1b")
+
+
+def test_names_that_are_not_utf8_are_shown_escaped(tiny_kitti, tmp_path, capsys):
+    root = tiny_kitti.rename(tmp_path / NOT_UTF8)
+    for place in ("sequences/{}", "poses/{}.txt"):
+        (root / place.format("00")).rename(root / place.format(NOT_UTF8))
+    labels = tmp_path / f"labels {NOT_UTF8}" / NOT_UTF8
+    labels.mkdir(parents=True)
+    for index in range(4):
+        label_map = np.repeat([[7], [23]], 24, axis=0).repeat(64, axis=1).astype(np.uint8)
+        (labels / f"{index:06d}.png").write_bytes(cv2.imencode(".png", label_map)[1].tobytes())
+    where = ["--kitti", root, "--sequence", NOT_UTF8]
+    masks = ["--labels", labels.parent, "--dilation", 3]
+    path, drawing = tmp_path / "path.txt", tmp_path / "path.svg"
+    assert run("check-data", "--kitti", root) == 0
+    assert run("masks", *where, *masks, "--output", tmp_path / f"masks {NOT_UTF8}") == 0
+    assert run("odometry", *where, *masks, "--output", path, "--plot", drawing) == 0
+    link = tmp_path / f"{NOT_UTF8}.txt"
+    link.symlink_to(path)
+    assert run("evaluate", *where, path, link, "--plot", drawing) == 0
+    printed = capsys.readouterr().out
+    assert "caf\\udce9\\n\\x1b" in printed and "\x1b" not in printed
+    assert ElementTree.parse(drawing)
 
 
 def test_public_names():

@@ -4,6 +4,8 @@ Drives are read alone, as a folder of drives, or through a link.
 """
 
 import shutil
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -138,6 +140,63 @@ def test_a_folder_of_frames_needs_no_layout(tiny_kitti, tmp_path):
     assert np.array_equal(kitti.true_path(None, folder)[0], kitti.true_path(tiny_kitti, "0")[0])
     official = kitti.Sequence(None, tiny_kitti / "sequences/00")
     assert official.has_truth and official.name == "00"
+
+
+def _replace_by_link(path, target="gone"):
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+    path.symlink_to(target)
+
+
+def _replace_by_folder(path):
+    path.unlink(missing_ok=True)
+    path.mkdir()
+
+
+def _mix_kinds(folder):
+    shutil.rmtree(folder / "image_0")
+    for name in ("a.png", "a.jpg"):
+        (folder / name).touch()
+
+
+@pytest.mark.parametrize(
+    "damage, place, named",
+    [
+        # links to a disk that is not there, or to itself
+        (_replace_by_link, "sequences/01", "sequences/01"),
+        (partial(_replace_by_link, target="01"), "sequences/01", "sequences/01"),
+        (_replace_by_link, "sequences/01/image_0", "sequences/01"),
+        (_replace_by_link, "sequences/01/times.txt", "01/times.txt"),
+        (_replace_by_link, "poses/01.txt", "poses/01.txt"),
+        (_replace_by_folder, "sequences/01/times.txt", "01/times.txt"),
+        (_replace_by_folder, "poses/01.txt", "poses/01.txt"),
+        (_mix_kinds, "sequences/01", "sequences/01"),
+    ],
+)
+def test_a_broken_sequence_is_named_and_leaves_the_others(tiny_kitti, damage, place, named):
+    shutil.copytree(tiny_kitti / "sequences/00", tiny_kitti / "sequences/01")
+    shutil.copy(tiny_kitti / "poses/00.txt", tiny_kitti / "poses/01.txt")
+    damage(tiny_kitti / place)
+    with pytest.raises(InputError, match=named):
+        kitti.Sequence(tiny_kitti, "01")
+    assert kitti.sequences(tiny_kitti) == ["00", "01"]
+    facts, problems = check.check_kitti(tiny_kitti)
+    assert all(named in problem for problem in problems) and problems
+    assert facts[-1].endswith("with 00")
+
+
+@pytest.mark.parametrize("place", ["sequences/01", "sequences/01/image_0"])
+def test_a_folder_that_may_not_be_read_is_named(tiny_kitti, monkeypatch, place):
+    shutil.copytree(tiny_kitti / "sequences/00", tiny_kitti / "sequences/01")
+    shutil.copy(tiny_kitti / "poses/00.txt", tiny_kitti / "poses/01.txt")
+    # root may read all
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tiny_kitti / place)
+    with pytest.raises(InputError, match=f"{place}: may not be read"):
+        kitti.Sequence(tiny_kitti, "01")
+    facts, problems = check.check_kitti(tiny_kitti)
+    assert len(problems) == 1 and place in problems[0] and facts[-1].endswith("with 00")
 
 
 # Raw drives

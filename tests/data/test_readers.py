@@ -82,6 +82,28 @@ def test_any_text_as_times(path, text):
         )
 
 
+POSE, BAD_POSE = "1 0 0 0 0 1 0 0 0 0 1 0\n", "2 0 0 0 0 1 0 0 0 0 1 0\n"
+TUM, FRAMES = "{} 0 0 0 0 0 0 1\n", np.arange(9.0)
+
+
+@pytest.mark.parametrize(
+    "function, text, line",
+    [
+        (trajectories.read_poses, f"\n\n{POSE}\n{BAD_POSE}", 5),
+        (trajectories.read_poses, f"\n{POSE}1 2 3\n", 3),
+        (trajectories.read_poses, f"{POSE}# no comment\n", 2),
+        (trajectories.read_times, "0\n\n1\n \n1\n", 5),
+        (trajectories.read_times, "0\n\n1\nnan\n", 4),
+        (lambda path: trajectories.read_tum(path, FRAMES), f"# a\n\n{TUM.format(1) * 2}", 4),
+        (lambda path: trajectories.read_tum(path, FRAMES), " # a\n1 0 0 0 0 0 0 9 # b\n", 2),
+    ],
+)
+def test_messages_count_all_lines_of_a_file(path, function, text, line):
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"{path}, line {line}: "):
+        function(path)
+
+
 @given(
     TEXTS | st.binary() | st.lists(WORDS, min_size=11, max_size=13).map(" ".join),
     st.booleans(),

@@ -1,12 +1,15 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
+import html
+
 import made_up
 import numpy as np
 import pandas as pd
 import pytest
 
 from drawing import chapter4
-from thesis_repro.report import comparison, tables, texts
+from thesis_repro.errors import one_line
+from thesis_repro.report import comparison, style, tables, texts
 from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
@@ -293,3 +296,40 @@ def test_the_table_of_times_has_sums():
         "frames a second"
     ].tolist() == [25, 16.7]
     assert np.isnan(table.loc["segmentation (ms)", "all keypoints"])
+
+
+HOSTILE = [
+    "![a](http:x.png)",
+    "![a][b]",
+    "[a](http:x)",
+    "__a__",
+    "*a*",
+    "`a`",
+    "a|b",
+    "<img src=x>",
+    "a\\|b",
+    "~~a~~",
+    "=1+1",
+    "NA",
+    "007",
+    "caf\udce9",
+    "a\nb\r\x1b",
+]
+
+
+def test_names_stay_names_in_texts_and_tables(tmp_path):
+    shown = [html.escape(one_line(name)) for name in HOSTILE]
+    rows = pd.DataFrame({"sequence": HOSTILE, "masks": HOSTILE, "ate": -1.0})
+    style.save_table(rows, tmp_path, "table", HOSTILE[0])
+    read = texts.html((tmp_path / "table.md").read_text(encoding="utf-8"))
+    assert read.count("<td") == 3 * len(HOSTILE) and f"<p>{shown[0]}</p>" in read
+    assert all(read.count(f">{name}</td>") == 2 for name in shown)
+    # a spreadsheet must not calculate with it, and the page shows it as it is in the file
+    table = tables.read(tmp_path / "table.csv")
+    in_file = [name.encode(errors="backslashreplace").decode() for name in HOSTILE]
+    in_file[HOSTILE.index("=1+1")] = "'=1+1"
+    assert list(table["sequence"]) == list(table["masks"]) == in_file
+    runs = runs_of(HOSTILE[:5], lambda *_: 1.0, widths=(5,), repetitions=1)
+    found = texts.html(texts.findings(runs, compare.comparisons(runs), HOSTILE[5]))
+    assert all(f" {name} (100 frames)" in found for name in shown[:5])
+    assert f"Data: {shown[5]}." in found

@@ -184,8 +184,8 @@ FILES = [
     ({"ours/07.tum": "\ufeff# t x y z\n" + tum(np.array)}, None),
     ({"ours/07.tum": tum(np.array), "ours/07.txt": "1"}, "07.t"),
     ({"ours/07.tum": tum(lambda rows: rows * [1000, 1, 1, 1, 1, 1, 1, 1])}, "07.tum: 1 of 160"),
-    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1, 1, 1, 1, 0])}, "07.tum, pose 1"),
-    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1e300, 1, 1, 1, 1])}, "07.tum, pose 2"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1, 1, 1, 1, 0])}, "07.tum, line 1"),
+    ({"ours/07.tum": tum(lambda rows: rows * [1, 1, 1, 1e300, 1, 1, 1, 1])}, "07.tum, line 2"),
     ({"ours/07.tum": tum(doubled)}, "07.tum, line 6"),
     ({"ours/07.tum": tum(np.array), "kitti/sequences/07/times.txt": TIMES + "16\n"}, "times.txt"),
     ({"ours/07.tum": tum(np.array), "kitti/sequences/07/times.txt": TIMES[:-5]}, "times.txt"),
@@ -231,3 +231,18 @@ def test_trajectories_that_cannot_be_compared_are_named(files, capsys):
     assert "poses/11.txt" in capsys.readouterr().err
     with pytest.raises(InputError, match="alignment='sim'"):
         trajectories.evaluate({"good": (np.arange(160), winding())}, winding(), "sim")
+
+
+def test_a_tum_file_may_begin_with_empty_lines(tmp_path):
+    poses, times = winding(12), np.arange(12.0)
+    write_tum(tmp_path / "a.tum", poses, times)
+    text = (tmp_path / "a.tum").read_text()
+    (tmp_path / "a.tum").write_text(f"\n # a comment\n{text}")
+    assert len(trajectories.read(tmp_path / "a.tum", times).poses) == 12
+
+
+def test_every_path_is_in_the_legend():
+    poses = winding(12)
+    drawing = trajectories.figure({"_hidden": poses, "a\x1b": poses}, None, "sequence \x1b")
+    labels = [text.get_text() for text in drawing.legends[0].get_texts()]
+    assert [label.strip() for label in labels] == ["_hidden", "a\\x1b"]

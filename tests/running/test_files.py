@@ -109,6 +109,28 @@ def test_output_to_streams_and_into_folders_of_results_is_refused(tmp_path):
             files.check_output(Path(path))
 
 
+def test_the_name_of_an_output_must_be_utf8(tmp_path):
+    path = tmp_path / os.fsdecode(b"caf\xe9.webm")
+    with pytest.raises(InputError):
+        files.check_output(path)
+
+
+def test_a_temporary_name_is_short_and_recognised(tmp_path):
+    for name in ("a.txt", "a.", f"a.{'n' * 253}", f"{'n' * 251}.txt", "a.b-c", "é" * 127):
+        files.write_text(tmp_path / name, "text")
+        temporary = files.temporary_path(tmp_path / name)
+        assert files.TEMPORARY.fullmatch(temporary.name) and len(os.fsencode(temporary.name)) < 255
+
+
+def test_a_folder_that_may_not_be_listed_is_named(tmp_path, monkeypatch):
+    for city in ("bonn", "ulm"):
+        files.write_text(tmp_path / city / "a.png", "")
+    assert len(files.listed(tmp_path, "*/*.png")) == 2
+    monkeypatch.setattr("os.access", lambda path, mode: path.name != "ulm")
+    with pytest.raises(InputError, match="ulm: "):
+        files.listed(tmp_path, "*/*.png")
+
+
 def test_progress_is_written_to_the_named_file(tmp_path, monkeypatch):
     monkeypatch.setenv("THESIS_REPRO_PROGRESS", str(tmp_path / "log"))
     monkeypatch.setattr("thesis_repro.running.files.BAR_DELAY", 0)

@@ -190,7 +190,7 @@ def test_a_command_that_writes(words, tmp_path, name, kills):
 # Odd surroundings; data must not be changed
 
 ODD = 'it\'s "50%" <script>&$x$_ é漢\n{b} #[1]*'
-SEQUENCE = "<b>&\"'$_$ %s é"
+SEQUENCE = "=<b>&\"'$_$ %s é|![a](http:x.png)\n" + os.fsdecode(b"caf\xe9")
 
 
 def without_network():
@@ -292,7 +292,7 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
     }
     page = (out / "study" / "index.html").read_text()
     assert "&lt;b&gt;&amp;" in page and "&lt;i&gt;&amp;" in page
-    assert not any(tag in page for tag in ("<script", "<b>", "<i>"))
+    assert not any(tag in page for tag in ("<script", "<b>", "<i>", 'src="http'))
 
 
 @pytest.mark.torture

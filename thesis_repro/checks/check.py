@@ -3,6 +3,7 @@
 The report names missing, wrong and odd files, and the commands that can be run.
 """
 
+import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -80,8 +81,10 @@ def _check_sequence(root: Path, name: str, needs_truth: bool, deep: bool) -> tup
     """
     _, folder, poses = kitti.locate(root, name)
     problems = _Problems()
-    frame_folder = kitti.images_of(folder)
-    paths = problems.call(files.images, frame_folder)
+    frame_folder = problems.call(kitti.images_of, folder)
+    paths = None
+    if frame_folder is not None:
+        paths = problems.call(files.images, frame_folder)
     if not paths:
         no_frames = [f"{frame_folder}: holds no PNG or JPEG frames"]
         return f"sequence {name}: no frames", problems or no_frames
@@ -91,7 +94,8 @@ def _check_sequence(root: Path, name: str, needs_truth: bool, deep: bool) -> tup
     rows: dict[Path, Any] = {}  # one a frame
     if needs_truth:
         rows[poses] = problems.call(kitti.truth_of, poses)
-    if times.is_file():
+    has_times = os.path.lexists(times)
+    if has_times:
         rows[times] = problems.call(kitti.times_of, times)
     counts = {path: len(values) for path, values in rows.items() if values is not None}
     missing = _missing_frames(paths, counts, problems)
@@ -107,7 +111,7 @@ def _check_sequence(root: Path, name: str, needs_truth: bool, deep: bool) -> tup
         notes.append(f"an excerpt of {complete}")
     if not needs_truth:
         notes.append("no ground truth, so step lengths follow from --speed, or are 1 m")
-    if not times.is_file():
+    if not has_times:
         notes.append(f"no {times.name}, so {1 / kitti.FRAME_TIME:g} frames a second")
     return f"sequence {name}: {'; '.join(notes)}", problems
 
@@ -219,7 +223,7 @@ def report(
         facts, problems = check(root, deep)
         can = "cannot" if problems else "can"
         facts.append(f"{can} be run: make figures {option}={root}")
-        print("\n  ".join([str(root), *facts]))
+        print("\n  ".join(map(one_line, [root, *facts])))
         for problem in problems:
             print(f"wrong: {one_line(problem)}", file=sys.stderr)
         has_problems = has_problems or bool(problems)

@@ -9,11 +9,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, replace
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
-from thesis_repro.errors import InputError, missing_package
+from thesis_repro.errors import InputError, missing_package, one_line
 from thesis_repro.running import console
 from thesis_repro.running.settings import PROFILES, SEED, check_outside
 
@@ -122,7 +123,8 @@ def masks(options: Any) -> None:
         if len(mask_sets) > 1:
             folder /= f"mask{width}"
         write_masks(label_masks, folder)
-        print(f"{folder}: {len(label_masks)} masks{f' of width {width}' * bool(options.dilation)}")
+        of_width = f" of width {width}" * bool(options.dilation)
+        print(f"{one_line(folder)}: {len(label_masks)} masks{of_width}")
 
 
 def odometry(options: Any) -> None:
@@ -429,13 +431,8 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
     from thesis_repro.running.files import check_output
 
     data = [path for path in (vars(options).get("kitti"), *inputs) if path]
-    # a sequence given alone belongs to the folder above sequences/
-    data += [
-        above.parent
-        for path in data
-        for above in path.resolve().parents
-        if above.name == "sequences"
-    ]
+    for path in list(data):
+        data += _layout_around(path.resolve())
     folder, used = vars(options).get("folder"), set()
     if folder:
         check_outside(f"--output {folder}", folder, data)
@@ -450,6 +447,16 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
         if path.resolve() in used:
             raise InputError(f"--{name} {path}: is another output of this command; name another")
         used.add(path.resolve())
+
+
+def _layout_around(path: Path) -> list[Path]:
+    """Return the folders sequences and poses of the KITTI layout that holds a sequence, or []."""
+    from thesis_repro.data import kitti
+
+    for inner, folder in pairwise([path, *path.parents]):
+        if folder.name == "sequences" and inner.is_dir() and kitti.has_frames(inner):
+            return [folder, folder.with_name("poses")]
+    return []
 
 
 def _print(options: Any, record: Any, template: str, **values: Any) -> None:

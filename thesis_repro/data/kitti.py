@@ -1,5 +1,6 @@
 """KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
+import os
 from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
@@ -13,7 +14,7 @@ import numpy as np
 from thesis_repro.data import kitti_raw
 from thesis_repro.data.trajectories import read_poses, read_times
 from thesis_repro.errors import InputError, need
-from thesis_repro.running.files import images, numbers_of, read_gray
+from thesis_repro.running.files import check_readable, images, numbers_of, read_gray
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
 # distortion.
@@ -52,7 +53,7 @@ def sequences(root: str | Path) -> list[str]:
     names = []
     for name in with_frames(root):
         _, _, poses = locate(root, name)
-        if name in FRAME_COUNTS or poses.exists():
+        if name in FRAME_COUNTS or os.path.lexists(poses):
             names.append(name)
     if not names:
         raise InputError(
@@ -75,18 +76,35 @@ def with_frames(root: str | Path) -> list[str]:
 
 
 def folders_with_frames(parent: Path) -> list[Path]:
-    """Folders of sequences in a folder, in sorted order."""
-    return sorted(folder for folder in parent.iterdir() if folder.is_dir() and has_frames(folder))
+    """Folders of sequences in a folder, in sorted order.
+
+    A broken link counts, so that `Sequence` reports it.
+    """
+    return sorted(
+        folder
+        for folder in parent.iterdir()
+        if (folder.is_dir() and has_frames(folder)) or _is_broken_link(folder)
+    )
+
+
+def _is_broken_link(path: Path) -> bool:
+    return path.is_symlink() and not path.exists()
 
 
 def has_frames(folder: Path) -> bool:
     """Whether a folder is that of a sequence, or holds images itself.
 
-    A sequence with frames of the right camera only counts, so that its lack of others is reported.
+    A sequence counts if it has frames of the right camera only, or cannot be read: `Sequence`
+    reports it then, and other sequences can still be used.
     """
-    if images_of(folder) != folder or images(folder):
+    try:
+        if images_of(folder) != folder or images(folder):
+            return True
+    except InputError:
         return True
-    return (folder / "image_1").is_dir()
+    return (folder / "image_1").is_dir() or any(
+        _is_broken_link(folder / camera) for camera in IMAGE_FOLDERS
+    )
 
 
 def folder_of(root: str | Path) -> Path:
@@ -106,9 +124,11 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     """Folder of a sequence's frames.
 
     The default is the left camera's, gray or else colour. If neither exists, it is the sequence's
-    folder itself. Raises InputError if the camera is unknown or the folder is missing.
+    folder itself. Raises InputError if the camera is unknown, or if the folder is missing or may
+    not be read.
     """
     folder = Path(folder)
+    check_readable(folder, os.X_OK)
     cameras, inner = IMAGE_FOLDERS, ""
     if kitti_raw.is_drive(folder):
         cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
@@ -181,12 +201,13 @@ class Sequence:
         check_numbering(self.frame_paths)
         self.calibration_path, times_path = texts_of(self.folder, frame_folder)
         self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
-        self.has_times = times_path.is_file()
+        # a broken link or a folder is reported when it is read
+        self.has_times = os.path.lexists(times_path)
         self.times = FRAME_TIME * np.arange(len(self))
         if self.has_times:
             self.times = times_of(times_path)
             check_count(times_path, len(self.times), self.frame_paths)
-        self.has_truth = self.poses_path.exists()
+        self.has_truth = os.path.lexists(self.poses_path)
         if self.has_truth:
             self._poses = truth_of(self.poses_path)
             check_count(self.poses_path, len(self._poses), self.frame_paths)
@@ -326,7 +347,7 @@ def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np
     if kitti_raw.is_drive(folder):
         frame_folder = images_of(folder)
     _, times_path = texts_of(folder, frame_folder)
-    if not times_path.is_file():
+    if not os.path.lexists(times_path):
         return poses, FRAME_TIME * np.arange(len(poses))
     times = times_of(times_path)
     if len(times) != len(poses):
@@ -338,7 +359,7 @@ def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np
 
 def truth_of(path: Path) -> np.ndarray:
     """Ground truth, (n, 4, 4), from a file of poses, or from the folder of a raw drive's OXTS."""
-    if path.is_dir():
+    if path.match(kitti_raw.OXTS):
         return kitti_raw.read_poses(path.parents[1])
     return read_poses(path)
 

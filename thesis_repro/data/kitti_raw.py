@@ -6,6 +6,7 @@ link. `kitti.Sequence` reads the frames. Poses follow KITTI's development kit (G
 meets robotics: The KITTI dataset, 2013).
 """
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ def is_drive(folder: str | Path) -> bool:
 
     It then has the measurements of the OXTS, a GPS with inertial sensors.
     """
-    return (Path(folder) / OXTS).is_dir()
+    return os.path.isdir(Path(folder) / OXTS)  # False also if the folder may not be read
 
 
 def calibration(folder: str | Path, name: str = "cam_to_cam") -> Path:

@@ -1,6 +1,7 @@
 """Trajectory files: reads and writes poses in the formats of KITTI and TUM, and reads times."""
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -17,31 +18,70 @@ MAX_DIFFERENCE = 0.01  # seconds between a pose and its frame, evo's default
 MIN_MATCHED = 0.3, 0.1
 
 
-def _read_numbers(path: str | Path, columns: int, comments: str | None = None) -> np.ndarray:
+def _read_numbers(
+    path: str | Path, columns: int, comments: str | None = None
+) -> tuple[np.ndarray, list[int]]:
+    """Return the numbers of a file, (n, columns), and the number of the line of each row.
+
+    Empty lines are skipped, and what follows the sign of a comment.
+    """
     try:
         # some editors begin a file with a byte order mark
-        with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
-            rows = np.loadtxt(file, np.float64, comments=comments, ndmin=2)
+        with open(path, encoding="utf-8-sig") as file:
+            lines = filled_lines(file, comments)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be read: {reason}") from None
+    rows = _parsed(list(lines.values()), columns)
+    if rows is not None:
+        return rows, list(lines)
+    place = ""
+    for number, line in lines.items():
+        if _parsed([line], columns) is None:
+            place = f", line {number}"
+            break
+    raise InputError(f"{path}{place}: must hold {columns} finite numbers a line, one line a frame")
+
+
+def filled_lines(file: Iterable[str], comments: str | None = None) -> dict[int, str]:
+    """Return {number: line} of the lines that are not empty, without comments.
+
+    comments: the sign with which a comment begins. Lines count from 1, as in an editor.
+    """
+    lines = {}
+    for number, line in enumerate(file, 1):
+        if comments is not None:
+            line = line.partition(comments)[0]
+        if line.strip():
+            lines[number] = line
+    return lines
+
+
+def _parsed(lines: list[str], columns: int) -> np.ndarray | None:
+    """Return the numbers in lines, (n, columns), or None if there are others than asked for."""
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            rows = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
+    except ValueError:
+        return None
     if not rows.size or rows.shape[1] != columns or not np.isfinite(rows).all():
-        raise InputError(f"{path}: must hold {columns} finite numbers a line, one line a frame")
+        return None
     return rows
 
 
 def read_times(path: str | Path) -> np.ndarray:
     """Times of the frames, (n,), seconds, one a line. Raises InputError unless they increase."""
-    times = _read_numbers(path, 1)[:, 0]
-    _check_increase(path, times)
-    return times
+    rows, line_numbers = _read_numbers(path, 1)
+    _check_increase(path, rows[:, 0], line_numbers)
+    return rows[:, 0]
 
 
-def _check_increase(path: str | Path, times: np.ndarray) -> None:
+def _check_increase(path: str | Path, times: np.ndarray, line_numbers: list[int]) -> None:
     steps_back = np.flatnonzero(np.diff(times) <= 0)
     if len(steps_back):
         raise InputError(
-            f"{path}, line {steps_back[0] + 2}: time does not increase; mend or remove the file"
+            f"{path}, line {line_numbers[steps_back[0] + 1]}: time does not increase; mend or remove "
+            "the file"
         )
 
 
@@ -51,13 +91,14 @@ def read_poses(path: str | Path) -> np.ndarray:
     These are the first three rows of each pose. Raises InputError if a line is not a right-handed
     rotation and a position.
     """
-    rows = _read_numbers(path, 12)
+    rows, line_numbers = _read_numbers(path, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows.reshape(-1, 3, 4)
-    bad_lines = np.flatnonzero(~are_poses(poses))
-    if len(bad_lines):
+    bad_rows = np.flatnonzero(~are_poses(poses))
+    if len(bad_rows):
         raise InputError(
-            f"{path}, line {bad_lines[0] + 1}: must be a right-handed rotation and a position in metres"
+            f"{path}, line {line_numbers[bad_rows[0]]}: must be a right-handed rotation and a position "
+            "in metres"
         )
     return poses
 
@@ -110,16 +151,16 @@ def read_tum(
     from evo.core.sync import matching_time_indices  # takes 0.4 s to load
     from evo.core.trajectory import PoseTrajectory3D
 
-    rows = _read_numbers(path, 8, "#")
+    rows, line_numbers = _read_numbers(path, 8, "#")
     stamps, positions, quaternions = rows[:, 0], rows[:, 1:4], rows[:, 4:]
-    _check_increase(path, stamps)
+    _check_increase(path, stamps, line_numbers)
     is_far = np.abs(positions).max(axis=1) > MAX_POSITION
     lengths = np.linalg.norm(quaternions, axis=1)
     is_no_unit = np.abs(lengths - 1) > QUATERNION_TOLERANCE
-    bad_lines = np.flatnonzero(is_far | is_no_unit)
-    if len(bad_lines):
+    bad_rows = np.flatnonzero(is_far | is_no_unit)
+    if len(bad_rows):
         raise InputError(
-            f"{path}, pose {bad_lines[0] + 1}: must be a time, a position in metres and a unit "
+            f"{path}, line {line_numbers[bad_rows[0]]}: must be a time, a position in metres and a unit "
             "quaternion (x, y, z, w)"
         )
     w_first = np.roll(quaternions, 1, axis=1)

@@ -3,6 +3,7 @@
 Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
 
+import re
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +14,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from thesis_repro.data.trajectories import read_poses, write_kitti_poses, write_tum
-from thesis_repro.errors import InputError
+from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, page, style, tables, texts, trajectories
@@ -43,10 +44,12 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     masks = [
         f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources
     ]
-    note = f"odometry: {data}; masks: {', '.join(masks)}"
+    note = one_line(f"odometry: {data}; masks: {', '.join(masks)}")
+    write_paths(study, runs, folder)
+    # for texts and tables
+    runs = runs.assign(sequence=runs["sequence"].map(one_line))
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", texts.findings(runs, table, note, embedded))
-    write_paths(study, runs, folder)
     figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
     for name, figure in figures.items():
@@ -65,6 +68,8 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         latex = rows.to_latex(
             index=False, escape=True, na_rep="", float_format="{:g}".format, **layout
         )
+        # after the end of a row, these would be its options
+        latex = re.sub(r"^(?=[\[*])", "{}", latex, flags=re.MULTILINE)
         write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
     names = style.save_all(figures, numbers, folder, note)
     widths = sorted(runs["dilation_width"].dropna().astype(int).unique())

@@ -18,6 +18,7 @@ from matplotlib.ticker import Locator, LogLocator, MaxNLocator, NullLocator
 from PIL import ExifTags, Image
 
 from thesis_repro.data.cityscapes import LABELS, colorize
+from thesis_repro.report.texts import in_markdown
 from thesis_repro.running.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
@@ -293,8 +294,10 @@ def write_figure(figure: plt.Figure, path: Path, **options: Any) -> None:
 
 def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
     """Write folder/name.csv and folder/name.md with the data note under the Markdown table."""
-    write_text(folder / f"{name}.csv", table.to_csv(index=False, lineterminator="\n"))
-    write_text(folder / f"{name}.md", f"{markdown(table)}\n{note}\n")
+    # spreadsheets take a text that begins so for a formula
+    cells = table.replace("^([=+@-])", r"'\1", regex=True)
+    write_text(folder / f"{name}.csv", cells.to_csv(index=False, lineterminator="\n"))
+    write_text(folder / f"{name}.md", f"{markdown(table)}\n{in_markdown(note)}\n")
 
 
 def save_all(
@@ -322,7 +325,7 @@ def markdown(table: pd.DataFrame) -> str:
     Numbers are aligned to the right, and missing values are empty. Names are no HTML.
     """
     numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table]
-    rows = [list(table.columns), ["---:" if right else ":---" for right in numeric]]
+    rows = [list(map(_cell, table.columns)), ["---:" if right else ":---" for right in numeric]]
     rows += [list(map(_cell, row)) for row in table.itertuples(index=False)]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
@@ -332,4 +335,4 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, float):
         return f"{value:g}"
-    return str(value).replace("<", "&lt;")
+    return in_markdown(value)

@@ -196,7 +196,10 @@ def read(path: Path) -> pd.DataFrame:
     """
     if not path.is_file():
         return pd.DataFrame()
-    return pd.read_csv(path, dtype={"sequence": str}).convert_dtypes()
+    # a name may look like a number or a missing value
+    texts = dict.fromkeys(("sequence", "masks", "source"), str)
+    table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""])
+    return table.convert_dtypes()
 
 
 def html(table: pd.DataFrame) -> Markup:

@@ -4,16 +4,20 @@ Their conditions depend only on what was run and on the verdicts. A run, a study
 masks and the evidence on real frames share one template for their findings.
 """
 
+import os
 import re
+import shlex
 from math import ceil, log10
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import mistune
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from thesis_repro.errors import one_line
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
@@ -73,10 +77,28 @@ def ratio_and_far_off(row: dict[str, Any] | pd.Series) -> str:
     """
     text = ratio(row)
     for name in row["far_off"]:
-        text += f", sequence {name} alone {number(row[name])}"
+        text += f", sequence {in_markdown(name)} alone {number(row[name])}"
     return text
 
 
+def in_markdown(text: object) -> str:
+    """Return a name as one line that Markdown shows as it is.
+
+    It then makes no link, picture, HTML tag, emphasis or cell of a table.
+    """
+    special = r"[\\`*<>|&~]|\](?=[(\[])|(?<![^\W_])_|_(?![^\W_])"
+    return re.sub(special, r"\\\g<0>", one_line(text))
+
+
+def in_url(name: str) -> str:
+    """Return the name of a file for a link, whatever its bytes."""
+    return quote(os.fsencode(name))
+
+
+TEMPLATES.filters["in_markdown"] = in_markdown
+TEMPLATES.filters["in_shell"] = shlex.quote
+TEMPLATES.filters["one_line"] = one_line
+TEMPLATES.filters["urlencode"] = in_url
 TEMPLATES.filters["ratio"] = ratio_and_far_off
 TEMPLATES.filters["number"] = number
 TEMPLATES.filters["two_digits"] = two_digits

@@ -11,8 +11,8 @@ from evo import EvoException
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thesis_repro.data.trajectories import read_poses, read_tum
-from thesis_repro.errors import InputError
+from thesis_repro.data.trajectories import filled_lines, read_poses, read_tum
+from thesis_repro.errors import InputError, one_line
 from thesis_repro.odometry import metrics
 from thesis_repro.report.style import TRUTH, line_style, new_figure
 from thesis_repro.running.files import listed
@@ -109,9 +109,8 @@ def read(file: Path, times: np.ndarray, frames: int | None = None, **matching: A
 def _columns(file: Path) -> int:
     """Return how many words the first line has that is no comment; 0 if it cannot be read."""
     with suppress(OSError, ValueError), open(file, encoding="utf-8-sig") as lines:
-        for line in lines:
-            if not line.startswith("#"):
-                return len(line.split())
+        for line in filled_lines(lines, "#").values():
+            return len(line.split())
     return 0  # `read_poses` reports the error
 
 
@@ -219,6 +218,8 @@ def table(rows: list[dict[str, Any]], alignment: str = "none") -> pd.DataFrame:
     if alignment not in ("sim3", "scale"):
         del columns["scale"]
     table = pd.DataFrame(rows, columns=["trajectory", "sequence", "poses", *columns])
+    for name in ("trajectory", "sequence"):
+        table[name] = table[name].map(one_line)
     return table.astype(dict.fromkeys(columns, float)).rename(columns=columns)
 
 
@@ -239,7 +240,10 @@ def figure(
     drawing, panels = new_figure(1, columns, height=3.4, squeeze=False)
     above = panels[0, 0]
     for index, (name, poses) in enumerate(paths.items()):
-        above.plot(poses[:, 0, 3], poses[:, 2, 3], label=name, **line_style(index))
+        label = one_line(name)
+        if label.startswith("_"):
+            label = f" {label}"  # matplotlib leaves others out of a legend
+        above.plot(poses[:, 0, 3], poses[:, 2, 3], label=label, **line_style(index))
     if true is not None:
         above.plot(
             true[:, 0, 3],
@@ -251,7 +255,7 @@ def figure(
             zorder=1,
         )
         _draw_distances(panels[0, 1], paths, true, frames)
-    above.set(xlabel="x (m)", ylabel="z (m)", title=f"{title} from above")
+    above.set(xlabel="x (m)", ylabel="z (m)", title=f"{one_line(title)} from above")
     above.set_aspect("equal", adjustable="datalim")
     drawing.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return drawing

@@ -29,13 +29,14 @@ ROOM, ACCESS = (
     "make room on its disk, or name a folder on another",
     "name a folder that you may write to",
 )
+PERMISSION = "get the permission (chmod, chown), or name another file or folder"
 REMEDIES = {
     errno.ENOSPC: ROOM,
     errno.EDQUOT: ROOM,
     errno.EFBIG: "allow larger files (ulimit -f)",
     errno.EROFS: ACCESS,
-    errno.EACCES: ACCESS,
-    errno.EPERM: ACCESS,
+    errno.EACCES: PERMISSION,
+    errno.EPERM: PERMISSION,
     errno.EMFILE: "allow more open files (ulimit -n)",
     errno.EIO: "check its disk, or the connection to it",
 }
@@ -77,6 +78,8 @@ def print_messages() -> None:
     """
     if not prints_messages():
         log.addHandler(_Printer())
+    if hasattr(sys.stdout, "reconfigure"):  # names of files may hold what the terminal has not
+        sys.stdout.reconfigure(errors="backslashreplace")
     log.setLevel(logging.INFO)
     log.propagate = False
 
@@ -180,7 +183,9 @@ class _LogFile(MemoryHandler):
     def __init__(self, folder: Path, has_results: bool) -> None:
         super().__init__(
             1,
-            target=logging.FileHandler(folder / LOG, delay=True, encoding="utf-8"),
+            target=logging.FileHandler(
+                folder / LOG, delay=True, encoding="utf-8", errors="backslashreplace"
+            ),
             flushOnClose=False,
         )
         self.target.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))

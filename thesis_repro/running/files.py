@@ -141,9 +141,21 @@ def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, ImageFile.ImageFile]]:
 def listed(folder: str | Path, pattern: str = "*.png") -> list[Path]:
     """Return the files of a folder that match a pattern, in sorted order.
 
-    Hidden (temporary) files are left out.
+    Hidden (temporary) files are left out. Raises InputError if a folder may not be listed, because
+    its files would silently be missing.
     """
+    folders = [Path(folder)]
+    if "/" in pattern:
+        folders += Path(folder).glob(pattern.rpartition("/")[0])
+    for place in folders:
+        check_readable(place)
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
+
+
+def check_readable(folder: Path, access: int = os.R_OK | os.X_OK) -> None:
+    """Raise InputError for a folder whose files this user may not list (R_OK) or open (X_OK)."""
+    if os.path.isdir(folder) and not os.access(folder, access):
+        raise InputError(f"{folder}: may not be read; change its permissions (chmod u+rx)")
 
 
 def images(folder: str | Path) -> list[Path]:
@@ -224,7 +236,8 @@ def atomic(path: str | Path) -> Iterator[Path]:
 
 def temporary_path(path: Path) -> Path:
     """Return a temporary path beside `path`, with a random name that nobody can predict."""
-    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix}")
+    ending = path.suffix if re.fullmatch(r"\.\w{1,8}", path.suffix) else ""
+    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{ending}")
 
 
 def check_output(path: Path) -> None:
@@ -241,6 +254,10 @@ def check_output(path: Path) -> None:
         raise InputError(
             f"{path}: cannot be written; name a file in a folder that you may write to"
         )
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:  # OpenCV would crash
+        raise InputError(f"{path}: is no UTF-8; choose another name") from None
     if any(map(holds_results, folders)):
         raise InputError(
             f"{path}: is in a folder of results, with which it could be moved; name a file elsewhere"
@@ -248,9 +265,9 @@ def check_output(path: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text as UTF-8."""
+    r"""Write a text as UTF-8. A byte of a file's name that is not UTF-8 is written as \udcff."""
     with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:

@@ -386,7 +386,7 @@ def digest_of_files(paths: Iterable[str | Path]) -> str:
     """Return one digest of the names and contents of files."""
     files = [Path(path) for path in paths]
     lines = [f"{path.name}:{digest}\n" for path, digest in zip(files, digests(files), strict=True)]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
+    return hashlib.sha256(os.fsencode("".join(lines))).hexdigest()[:12]
 
 
 def digest_of_file(path: str | Path) -> str:

@@ -306,7 +306,7 @@ def _run_name(folders: dict[str, Path], profile: str, sizes: Profile) -> str:
         # make and shells treat other characters specially
         letters = re.sub(r"[^\w.+-]+", "-", folder.name)
         # for folders of the same name
-        path_digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:6]
+        path_digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:6]
         kind = name.lower().removeprefix("kitti_")
         data.append(f"{kind}-{letters}-{path_digest}")
     parts = ["_".join(data), profile]

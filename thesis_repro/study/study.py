@@ -1,5 +1,6 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
+import os
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,6 +15,7 @@ from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
+LONGEST_NAME = 200  # bytes of a sequence's name, which results have in the names of their files
 RUNS = "runs"  # folder of the results of the runs
 
 
@@ -59,6 +61,11 @@ class Study:
             if sequence.name in compare.COLUMNS:
                 raise InputError(
                     f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
+                )
+            if len(os.fsencode(sequence.name)) > LONGEST_NAME:
+                raise InputError(
+                    f"{sequence.folder}: its name is too long for names of files; make a link to it with "
+                    "a shorter one"
                 )
         widths = list(self.widths)
         if self.tested:
