@@ -14,9 +14,10 @@ from types import SimpleNamespace
 from urllib.parse import unquote
 
 import nbformat
+import pandas as pd
 import pytest
 
-from thesis_repro.report import captions, page
+from thesis_repro.report import captions, page, tables
 from thesis_repro.running.settings import ROOT, read_settings
 
 SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><path d="M0 0"/></svg>'
@@ -318,7 +319,27 @@ def test_a_table_shows_the_numbers_of_its_file(run):
     assert rows == [
         ["00", "0.5", "-3.25", "1"],
         ["01", "12.0", "4.50", ""],
-        ["sequences improved", "", "1.00", "0"],
+        ["sequences improved", "", "1", "0"],
+    ]
+
+
+def test_counts_are_whole_and_the_digits_of_a_column_are_equal():
+    table = pd.DataFrame(
+        {
+            "measure": ["images", "IoU", "pixels (%)", "improved"],
+            "here": [20.0, 0.31, 92.0, 9.0],
+            "package": [99.0, 0.5, 91.7, 6.7],
+            "ratio": [12.0, 1.0, 0.9971, 5.0],
+        }
+    )
+    cells = re.findall(
+        "<td>(.*?)</td>", tables.html(table.astype({n: "Float64" for n in table.columns[1:]}))
+    )
+    assert [cells[i : i + 4] for i in range(0, 16, 4)] == [
+        ["images", "20", "99", "12"],
+        ["IoU", "0.31", "0.5", "1.0000"],
+        ["pixels (%)", "92.00", "91.7", "0.9971"],
+        ["improved", "9", "6.7", "5"],
     ]
 
 
