@@ -148,8 +148,9 @@ def build(settings: Settings) -> str:
     ]
     executed = _executed(settings)
     notebooks = {}
-    for path in executed:
-        notebooks[path.stem] = os.path.relpath(path.with_suffix(".html"), settings.figures)
+    if not settings.figures_in_git:  # a clone has no executed notebooks
+        for path in executed:
+            notebooks[path.stem] = os.path.relpath(path.with_suffix(".html"), settings.figures)
     return texts.render(
         "page.html.j2",
         title=f"Keypoint masks, {settings.run}",
