@@ -119,7 +119,7 @@ def test_the_answer_comes_first_and_41_artefacts_in_the_order_of_the_thesis(run)
     assert "41 of 41" in shown.text and shown.text.count("What it shows") == 1
 
 
-PROBE = """<iframe src="index.html" style="width: 400px; border: 0"></iframe>
+PROBE = """<iframe src="index.html" style="width: 390px; border: 0"></iframe>
 <iframe src="index.html" style="width: 1400px; border: 0"></iframe><pre></pre><script>onload = () => {
 const faults = [];
 for (const frame of document.querySelectorAll("iframe")) {
@@ -128,6 +128,8 @@ for (const frame of document.querySelectorAll("iframe")) {
     if (page.documentElement.scrollWidth > width) faults.push(`wider than ${width}`);
     for (const image of page.images)
         if (!image.naturalWidth) faults.push(`no image ${image.getAttribute("src")} at ${width}`);
+        else if (image.width < Math.min(image.naturalWidth, image.closest("figure, p").clientWidth) - 1)
+            faults.push(`small image ${image.getAttribute("src")} at ${width}`);
     for (const link of page.querySelectorAll('a[href^="#"]'))
         if (!page.getElementById(link.hash.slice(1))) faults.push(`dead link ${link.hash} at ${width}`);
     const blocks = [...page.querySelectorAll("h1, h2, h3, h4, p, figcaption, dl, ul, summary, img, .scroll")];
@@ -145,9 +147,10 @@ document.querySelector("pre").textContent = JSON.stringify(faults); }</script>""
 
 
 def faults_in_a_browser(folder, scratch):
-    """Faults of a page at 400 and 1400 pixels, unfolded.
+    """Faults of a page at 390 and 1400 pixels, unfolded.
 
-    They are a page that is too wide, missing images, dead links and overlapping texts.
+    They are a page that is too wide, missing or needlessly small images, dead links and overlapping
+    texts.
     """
     (folder / "probe.html").write_text(PROBE)  # a window cannot be as narrow
     dumped = subprocess.run(
@@ -175,19 +178,19 @@ def faults_in_a_browser(folder, scratch):
 def test_a_browser_shows_the_page_of_the_repository_without_faults(tmp_path):
     figures = tmp_path / "figures"
     shutil.copytree(ROOT / "figures", figures)
-    (figures / page.PAGE).write_text(
-        page.build(replace(read_settings({}), figures=figures, build=tmp_path))
-    )
+    (figures / page.PAGE).write_text(page.build(replace(read_settings({}), build=tmp_path)))
     assert faults_in_a_browser(figures, tmp_path / "scratch") == []
     folded = (
         '<p style="height: 0">Folded <img src="none.svg"></p><p>over <a href="#nowhere">it</a></p>'
     )
     (figures / page.PAGE).write_text(
         f'<details>{folded}</details><div style="width: 900px">wide</div>'
+        '<p><img src="figure_4_05.webp" width="100"></p>'
     )
     faults = faults_in_a_browser(figures, tmp_path / "scratch")
     assert {fault.split(" at ")[0] for fault in faults} >= {
-        "wider than 400",
+        "wider than 390",
+        "small image figure_4_05.webp",
         "no image none.svg",
         "dead link #nowhere",
     }
@@ -281,6 +284,22 @@ def test_the_page_in_git_does_not_depend_on_the_machine_or_day(run):
     files = [link for link in links if not re.match("#|https:", link)]
     missing = [link for link in files if not (ROOT / "figures" / link.split("#")[0]).is_file()]
     assert len(files) > 80 and missing == []
+    assert {link[1:] for link in links if link.startswith("#")} <= shown.ids
+    # the numbers of the answer on real frames are seen before anything is unfolded
+    places = [
+        before.index(text)
+        for text in (
+            'id="real-frames"',
+            "<table>",
+            'id="answer"',
+            'id="findings"',
+            'id="chapter-4-on-real-frames"',
+            'id="real-table-comparison"',
+            'id="chapter-4"',
+            'id="table-comparison"',
+        )
+    ]
+    assert places == sorted(places)
     assert str(Path("my build", "embedded-demo", "notebooks")) in shown.text
 
 
