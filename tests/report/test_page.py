@@ -14,9 +14,10 @@ from types import SimpleNamespace
 from urllib.parse import unquote
 
 import nbformat
+import pandas as pd
 import pytest
 
-from thesis_repro.report import captions, page
+from thesis_repro.report import captions, page, tables
 from thesis_repro.running.settings import ROOT, read_settings
 
 SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><path d="M0 0"/></svg>'
@@ -118,7 +119,7 @@ def test_the_answer_comes_first_and_41_artefacts_in_the_order_of_the_thesis(run)
     assert "41 of 41" in shown.text and shown.text.count("What it shows") == 1
 
 
-PROBE = """<iframe src="index.html" style="width: 400px; border: 0"></iframe>
+PROBE = """<iframe src="index.html" style="width: 390px; border: 0"></iframe>
 <iframe src="index.html" style="width: 1400px; border: 0"></iframe><pre></pre><script>onload = () => {
 const faults = [];
 for (const frame of document.querySelectorAll("iframe")) {
@@ -127,6 +128,8 @@ for (const frame of document.querySelectorAll("iframe")) {
     if (page.documentElement.scrollWidth > width) faults.push(`wider than ${width}`);
     for (const image of page.images)
         if (!image.naturalWidth) faults.push(`no image ${image.getAttribute("src")} at ${width}`);
+        else if (image.width < Math.min(image.naturalWidth, image.closest("figure, p").clientWidth) - 1)
+            faults.push(`small image ${image.getAttribute("src")} at ${width}`);
     for (const link of page.querySelectorAll('a[href^="#"]'))
         if (!page.getElementById(link.hash.slice(1))) faults.push(`dead link ${link.hash} at ${width}`);
     const blocks = [...page.querySelectorAll("h1, h2, h3, h4, p, figcaption, dl, ul, summary, img, .scroll")];
@@ -144,9 +147,10 @@ document.querySelector("pre").textContent = JSON.stringify(faults); }</script>""
 
 
 def faults_in_a_browser(folder, scratch):
-    """Faults of a page at 400 and 1400 pixels, unfolded.
+    """Faults of a page at 390 and 1400 pixels, unfolded.
 
-    They are a page that is too wide, missing images, dead links and overlapping texts.
+    They are a page that is too wide, missing or needlessly small images, dead links and overlapping
+    texts.
     """
     (folder / "probe.html").write_text(PROBE)  # a window cannot be as narrow
     dumped = subprocess.run(
@@ -174,19 +178,19 @@ def faults_in_a_browser(folder, scratch):
 def test_a_browser_shows_the_page_of_the_repository_without_faults(tmp_path):
     figures = tmp_path / "figures"
     shutil.copytree(ROOT / "figures", figures)
-    (figures / page.PAGE).write_text(
-        page.build(replace(read_settings({}), figures=figures, build=tmp_path))
-    )
+    (figures / page.PAGE).write_text(page.build(replace(read_settings({}), build=tmp_path)))
     assert faults_in_a_browser(figures, tmp_path / "scratch") == []
     folded = (
         '<p style="height: 0">Folded <img src="none.svg"></p><p>over <a href="#nowhere">it</a></p>'
     )
     (figures / page.PAGE).write_text(
         f'<details>{folded}</details><div style="width: 900px">wide</div>'
+        '<p><img src="figure_4_05.webp" width="100"></p>'
     )
     faults = faults_in_a_browser(figures, tmp_path / "scratch")
     assert {fault.split(" at ")[0] for fault in faults} >= {
-        "wider than 400",
+        "wider than 390",
+        "small image figure_4_05.webp",
         "no image none.svg",
         "dead link #nowhere",
     }
@@ -277,10 +281,25 @@ def test_the_page_in_git_does_not_depend_on_the_machine_or_day(run):
     assert page.build(in_git) == before and "2030" in page.build(run.settings)
     shown = Reader(before)
     links = shown.values("a", "href") + shown.values("img", "src")
-    # links to executed notebooks work only where these are
-    files = [link for link in links if not re.match("#|https:", link) and "my%20build" not in link]
+    files = [link for link in links if not re.match("#|https:", link)]
     missing = [link for link in files if not (ROOT / "figures" / link.split("#")[0]).is_file()]
     assert len(files) > 80 and missing == []
+    assert {link[1:] for link in links if link.startswith("#")} <= shown.ids
+    # the numbers of the answer on real frames are seen before anything is unfolded
+    places = [
+        before.index(text)
+        for text in (
+            'id="real-frames"',
+            "<table>",
+            'id="answer"',
+            'id="findings"',
+            'id="chapter-4-on-real-frames"',
+            'id="real-table-comparison"',
+            'id="chapter-4"',
+            'id="table-comparison"',
+        )
+    ]
+    assert places == sorted(places)
     assert str(Path("my build", "embedded-demo", "notebooks")) in shown.text
 
 
@@ -318,7 +337,27 @@ def test_a_table_shows_the_numbers_of_its_file(run):
     assert rows == [
         ["00", "0.5", "-3.25", "1"],
         ["01", "12.0", "4.50", ""],
-        ["sequences improved", "", "1.00", "0"],
+        ["sequences improved", "", "1", "0"],
+    ]
+
+
+def test_counts_are_whole_and_the_digits_of_a_column_are_equal():
+    table = pd.DataFrame(
+        {
+            "measure": ["images", "IoU", "pixels (%)", "improved"],
+            "here": [20.0, 0.31, 92.0, 9.0],
+            "package": [99.0, 0.5, 91.7, 6.7],
+            "ratio": [12.0, 1.0, 0.9971, 5.0],
+        }
+    )
+    cells = re.findall(
+        "<td>(.*?)</td>", tables.html(table.astype({n: "Float64" for n in table.columns[1:]}))
+    )
+    assert [cells[i : i + 4] for i in range(0, 16, 4)] == [
+        ["images", "20", "99", "12"],
+        ["IoU", "0.31", "0.5", "1.0000"],
+        ["pixels (%)", "92.00", "91.7", "0.9971"],
+        ["improved", "9", "6.7", "5"],
     ]
 
 

@@ -32,7 +32,7 @@ REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence
 REAL_CHAPTER = "Chapter 4 on real frames"
 ROWS_SHOWN = 36  # the gallery only links to longer tables
 # ids of the artefacts at the top of a page
-OPENING = ("figure_4_05", "findings", "figure-comparison", "table-summary")
+OPENING = ("findings", "figure_4_05", "figure-comparison", "table-summary")
 # packages that affect the numbers most
 PACKAGES = ("tensorflow", "keras", *results.OPENCV, "numpy")
 
@@ -148,8 +148,9 @@ def build(settings: Settings) -> str:
     ]
     executed = _executed(settings)
     notebooks = {}
-    for path in executed:
-        notebooks[path.stem] = os.path.relpath(path.with_suffix(".html"), settings.figures)
+    if not settings.figures_in_git:  # a clone has no executed notebooks
+        for path in executed:
+            notebooks[path.stem] = os.path.relpath(path.with_suffix(".html"), settings.figures)
     return texts.render(
         "page.html.j2",
         title=f"Keypoint masks, {settings.run}",
@@ -167,9 +168,9 @@ def build(settings: Settings) -> str:
     )
 
 
-def _documents(settings: Settings) -> dict[str, tuple[Markup, Markup]]:
+def _documents(settings: Settings) -> dict[str, "Content"]:
     """Return the texts of the folder docs that a page has, if links from it reach the folder."""
-    documents: dict[str, tuple[Markup, Markup]] = {}
+    documents: dict[str, Content] = {}
     if not settings.figures.is_relative_to(ROOT):
         return documents
     if settings.figures_in_git:
@@ -178,14 +179,14 @@ def _documents(settings: Settings) -> dict[str, tuple[Markup, Markup]]:
     return documents
 
 
-def _document(name: str, settings: Settings) -> tuple[Markup, Markup]:
-    """Return a text of the folder docs for a page: its first paragraph and the rest, as HTML."""
+def _document(name: str, settings: Settings) -> "Content":
+    """Return a text of the folder docs for a page, without its title."""
     text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
     # links are relative to docs
     folder = quote(os.path.relpath(ROOT / "docs", settings.figures))
     text = re.sub(r"\]\((?!\w+:|#)", f"]({folder}/", text)
-    _, first, rest = text.split("\n\n", 2)
-    return texts.html(first), texts.html(rest)
+    _, _, text = text.partition("\n")
+    return _text(text)
 
 
 def build_study(folder: Path, names: list[tuple[str, str]], **facts: Any) -> str:
@@ -225,7 +226,7 @@ def _describe(
     files = [path for path in paths if path.is_file()]
     content = Content()
     if files and kind == "text":
-        content = _text(files[0])
+        content = _text(files[0].read_text(encoding="utf-8"))
     elif files and kind == "table" and files[0].suffix == ".csv":
         content = _table(files)
     there = bool(files) and (kind == "figure" or content.html is not None)
@@ -267,9 +268,9 @@ class Content(NamedTuple):
     markdown: str | None = None  # of a table that is short enough for the gallery
 
 
-def _text(file: Path) -> Content:
+def _text(text: str) -> Content:
     """Return a text in Markdown; the page folds the part after the first heading."""
-    first, _, rest = file.read_text(encoding="utf-8").partition("\n## ")
+    first, _, rest = text.partition("\n## ")
     if not rest:
         return Content(texts.html(first))
     return Content(texts.html(first), texts.html(f"## {rest}"))

@@ -205,14 +205,18 @@ def read(path: Path) -> pd.DataFrame:
 def html(table: pd.DataFrame) -> Markup:
     """Return a table as HTML with escaped texts.
 
-    The numbers of a column have the same number of digits.
+    The numbers of a column have the same number of digits. Where most numbers of a row are whole,
+    these are counts and stay whole.
     """
+    floats = table.select_dtypes("Float64").astype(float)
+    is_whole = floats.eq(floats.round())
+    has_counts = is_whole.sum(axis=1) > floats.notna().sum(axis=1) / 2
     shown = {}
     numeric = 0
     for name, cells in table.items():
         numeric += pd.api.types.is_numeric_dtype(cells.dtype)
-        if cells.dtype == "Float64":
-            shown[name] = cells.astype(float)
+        if name in floats:
+            shown[name] = _equal_digits(floats[name], has_counts & is_whole[name])
         else:
             shown[name] = cells.astype(object).where(cells.notna(), "")
     style = "words"
@@ -222,6 +226,19 @@ def html(table: pd.DataFrame) -> Markup:
         index=False, border=0, na_rep="", justify="unset", classes=style
     )
     return Markup(text)
+
+
+def _equal_digits(numbers: pd.Series, is_count: pd.Series) -> pd.Series:
+    """Return numbers as texts with as many digits after the point as most fractions have.
+
+    Counts have none. A number that was written with more digits keeps them (at most six), so that
+    0.9971 does not become 1.00. Missing numbers are empty.
+    """
+    decimals = numbers.map(lambda number: len(f"{number:.6f}".rstrip("0").partition(".")[2]))
+    common = decimals[decimals > 0].mode().max()
+    decimals = decimals.clip(lower=common).mask(is_count, 0)
+    shown = [f"{number:.{places}f}" for number, places in zip(numbers, decimals, strict=True)]
+    return pd.Series(shown, numbers.index).mask(numbers.isna(), "")
 
 
 def beside_the_thesis(settings: Settings) -> dict[str, Any]:
