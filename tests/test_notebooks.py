@@ -320,9 +320,10 @@ def test_notebooks_in_git_have_no_outputs_and_set_what_libraries_read(name):
 def test_every_call_of_the_appendix_is_in_the_notebook_that_the_table_names():
     table = (ROOT / "docs" / "appendix-calls.md").read_text()
     rows = re.findall(r"^\|[^|]*\|(?: `[^|]*` \|)? (\d\d) \| `([^|]*)` \|", table, re.MULTILINE)
-    code = {name[:2]: "".join("\n".join(cells(name, "code")).split()) for name in NOTEBOOKS}
+    code = {name[:2]: "\n".join(cells(name, "code")) for name in NOTEBOOKS}
     assert len(rows) > 70
-    assert [row for row in rows if "".join(row[1].split()) not in code[row[0]]] == []
+    # as a reader's search finds it
+    assert [row for row in rows if row[1] not in code[row[0]]] == []
 
 
 # Edits of cells

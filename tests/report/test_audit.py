@@ -3,17 +3,29 @@
 Also the gap between domains, and the recorded trainings.
 """
 
+import ast
+import inspect
+import re
+from dataclasses import fields
 from types import SimpleNamespace
 
+import albumentations
+import cv2
 import made_up
 import numpy as np
 import pandas as pd
 import pytest
 
+import thesis_repro as tr
+from thesis_repro.data import cityscapes
+from thesis_repro.masks import MaskSettings
+from thesis_repro.odometry import metrics
 from thesis_repro.report import audit, gap, style, trainings
 from thesis_repro.running import results
 from thesis_repro.running.settings import ROOT
-from thesis_repro.study import ablations, compare
+from thesis_repro.segmentation import augmentation, quality
+from thesis_repro.segmentation.training import sm
+from thesis_repro.study import ablations, compare, thesis_tables, timing
 
 
 def test_rows_are_numbered_and_every_measurement_has_a_row():
@@ -28,6 +40,60 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
         for spec in audit.WORDS["measured"]
         if "unit" not in spec and "label" not in spec
     )
+
+
+NAMES = {
+    "A": albumentations,
+    "cv2": cv2,
+    "sm": sm,
+    "ablations": ablations,
+    "augmentation": augmentation,
+    "cityscapes": cityscapes,
+    "metrics": metrics,
+    "quality": quality,
+    "thesis_tables": thesis_tables,
+    "timing": timing,
+    "MaskSettings": MaskSettings,
+    "build_unet": tr.build_unet,
+    "transform": albumentations.Compose([]),  # so called in the appendix
+}
+OPTIONS = [field.name for field in (*fields(MaskSettings), *fields(tr.OdometrySettings))]
+CALL = re.compile(r"([\w.]+)\(((?:[^()]|\([^()]*\))*)\)")
+
+
+def named(path):
+    """What a name with points stands for."""
+    first, *attributes = path.split(".")
+    value = NAMES[first]
+    for attribute in attributes:
+        value = getattr(value, attribute)
+    return value
+
+
+def test_a_switch_that_looks_like_code_can_be_used():
+    for switch in (row["switch"] for row in audit.WORDS["rows"]):
+        for name in re.findall(r"[A-Za-z_]\w*\.\w+", CALL.sub("", switch)):
+            named(name)
+        for name, arguments in CALL.findall(switch):
+            call = ast.parse(f"f({arguments})", mode="eval").body
+            if not name.startswith("cv2."):  # has no signature
+                keywords = {keyword.arg: None for keyword in call.keywords}
+                inspect.signature(named(name)).bind_partial(*call.args, **keywords)
+        for option in re.findall(r"(\w+)=", CALL.sub("", switch)):
+            assert option in [*OPTIONS, "dilation_width"], switch
+
+
+def test_the_interval_of_a_share_holds_no_impossible_share():
+    shares = {"86": [1.0, 2.0, 60.0], "65": [40.0, 98.0, 99.0], "10": [50.0, 51.0, 52.0]}
+    kept = {row: audit.share(row, "sky", values) for row, values in shares.items()}
+    plain = {row: audit.measurement(row, "sky", values, "%") for row, values in shares.items()}
+    assert plain["86"]["low"] < 0 == kept["86"]["low"]
+    assert plain["65"]["high"] > 100 == kept["65"]["high"]
+    assert plain["10"] == kept["10"]
+    assert np.isnan(audit.share("86", "sky", [1.0])["low"])
+    table = pd.DataFrame({"sequence": ["00", "01", "02"], "frame": 0, "small": shares["86"]})
+    (row,) = audit.measured(table, "shares")
+    assert row["low"] == 0
 
 
 @pytest.mark.parametrize(

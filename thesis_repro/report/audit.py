@@ -50,6 +50,17 @@ def measurement(
     }
 
 
+def share(row: str, quantity: str, percentages: Any, **more: Any) -> dict[str, Any]:
+    """Return one measurement for a row of the audit: the mean of shares in percent.
+
+    The interval is cut at 0 and 100, which no share exceeds. A transform that needs no cut (the
+    logit) is not defined for shares of exactly 0 or 100, which occur.
+    """
+    mean = measurement(row, quantity, percentages, "%", **more)
+    low, high = np.clip([mean["low"], mean["high"]], 0, 100).tolist()
+    return {**mean, "low": low, "high": high}
+
+
 def ratio(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the geometric mean of one ratio a sequence."""
     mean = compare.geometric_mean(ratios)
@@ -93,8 +104,8 @@ def rounded(value: float) -> float:
 def measured(table: pd.DataFrame, kind: str) -> list[dict[str, Any]]:
     """Return the measurements that audit.json lists for one kind of table.
 
-    Where audit.json gives a unit, they are means over sequences. Otherwise they are ratios to a
-    reference method, or to another column ("over") of the same rows.
+    Where audit.json gives a unit, they are means over sequences; "%" is a share. Otherwise they are
+    ratios to a reference method, or to another column ("over") of the same rows.
     kind: "ablations" (`ablations.measure`), "study" (`runner.run_jobs`), "tracks" and "boundaries"
     (as in `ablations`), "shares" (of pixels, one row a frame).
     """
@@ -137,6 +148,8 @@ def _measure(
     names = {"metric": label, "estimator": estimator}
     if "unit" in spec:
         means = rows.groupby("sequence")[metric].mean()
+        if spec["unit"] == "%":
+            return share(spec["row"], spec["quantity"], means, **names)
         return measurement(spec["row"], spec["quantity"], means, spec["unit"], **names)
     if "over" in spec:
         reference = rows.assign(**{metric: rows[spec["over"]]})
@@ -248,7 +261,7 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
         measurement("31", "other width", (by_rmse != by_mae).sum(), "sequences"),
         measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences"),
         ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
-        measurement("2", "same best", stability["same_best"], "%"),
+        share("2", "same best", stability["same_best"]),
     ]
     reported = pd.Series(REPORTED["table_4_2_rmse_percent_change"])
     null = ablations.null_distribution(shuffled, reported)
