@@ -265,14 +265,15 @@ def quiet() -> Iterator[None]:
 
 # The end of a process
 
+STOP_SIGNALS = signal.SIGTERM, signal.SIGHUP, signal.SIGINT
+
 
 @contextmanager
 def stoppable() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that worker processes end too.
 
     They raise KeyboardInterrupt with the signal's number. An ignored signal (nohup) stays ignored.
-    The exception is lost in a callback of compiled code, such as Numba's compiler; then
-    `check_stop` raises it again.
+    The exception is lost in a callback of compiled code; then `check_stop` raises it again.
     """
 
     def stop(number: int, _: object) -> None:
@@ -281,7 +282,7 @@ def stoppable() -> Iterator[None]:
 
     handlers = {
         number: signal.getsignal(number)
-        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+        for number in STOP_SIGNALS
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
     }
     for number in handlers:
@@ -302,6 +303,40 @@ def check_stop() -> None:
     """Raise KeyboardInterrupt if a signal to stop has arrived (see `stoppable`)."""
     if _stops:
         raise KeyboardInterrupt(_stops[0])
+
+
+@contextmanager
+def held_signals() -> Iterator[None]:
+    """Hold back the signals that stop a program until the end of the block.
+
+    Python's handler for Ctrl-C and that of `stoppable` raise an exception. If they run while
+    compiled code makes Python objects, that code goes on without them: the process ends in
+    SystemError or a segmentation fault. So one frame of the odometry is finished first.
+    """
+    if threading.current_thread() is not threading.main_thread():  # handlers run in no other thread
+        yield
+        return
+    arrived: list[int] = []
+    handlers = {
+        number: signal.getsignal(number)
+        for number in STOP_SIGNALS
+        if callable(signal.getsignal(number))
+    }
+    for number in handlers:
+        signal.signal(number, lambda number, _: arrived.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in arrived:
+            signal.raise_signal(number)
+
+
+def leave_ctrl_c_to_parent() -> None:
+    """Let this worker process ignore Ctrl-C, which reaches its parent too, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 def end_with_parent() -> None:
