@@ -166,10 +166,8 @@ define execute
 $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 	@mkdir -p $$(@D)
 	@for needed in $(2); do [ -e $$$$needed ] || { rm -f $$@; exit 0; }; done; \
-	if $(BIN)/jupyter-nbconvert --to notebook --execute --log-level=CRITICAL \
-	  --NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution \
-	  --Execution.log_file=$$(@D)/$(basename $(1)).log --output-dir $$(@D) --output .$(1) $$<; \
-	then mv $$(@D)/.$(1) $$@; else status=$$$$?; rm -f $$@; [ $$$$status = 1 ] || exit $$$$status; fi
+	$(BIN)/python -m thesis_repro.report.execute $$< $$@ || { \
+	  status=$$$$?; rm -f $$@; [ $$$$status = 1 ] || exit $$$$status; }
 endef
 previous :=
 $(foreach notebook,$(notdir $(NOTEBOOKS)),\
