@@ -378,3 +378,23 @@ def test_a_run_in_a_thread_leaves_signals_alone(tiny_kitti):
     with ThreadPoolExecutor() as pool:
         result = pool.submit(odometry.run, Sequence(tiny_kitti, "00")).result()
     assert len(result.poses) == 4
+
+
+@pytest.mark.parametrize(
+    "name, good, bad",
+    [
+        ("OMP_NUM_THREADS", "2", "abc"),
+        ("NUMBA_NUM_THREADS", "1", "0"),
+        ("OPENCV_FOR_THREADS_NUM", "0", "abc"),
+        ("TQDM_MININTERVAL", "0.5", "abc"),
+        ("SOURCE_DATE_EPOCH", "", "1.5"),
+    ],
+)
+def test_a_variable_that_a_library_would_fail_with_is_named(monkeypatch, name, good, bad):
+    monkeypatch.setenv("MPLBACKEND", "bogus")
+    monkeypatch.setenv(name, good)
+    console.check_environment()
+    assert os.environ["MPLBACKEND"] == "agg"
+    monkeypatch.setenv(name, bad)
+    with pytest.raises(InputError, match=f"{name}={bad}"):
+        console.check_environment()

@@ -44,6 +44,15 @@ WORKER_KILLED = (
     "a process was killed, most likely because memory ran out; start again with fewer processes (--jobs, "
     "JOBS) to resume"
 )
+# variables that libraries read, their type and their least value; others end in a long traceback
+NUMBERS: dict[str, tuple[type, int]] = {
+    "LOKY_MAX_CPU_COUNT": (int, 1),
+    "NUMBA_NUM_THREADS": (int, 1),
+    "OMP_NUM_THREADS": (int, 1),
+    "OPENCV_FOR_THREADS_NUM": (int, 0),
+    "SOURCE_DATE_EPOCH": (int, 0),
+    "TQDM_MININTERVAL": (float, 0),
+}
 # texts of libraries' own errors
 NO_MEMORY_TEXTS = (
     "MemoryError",
@@ -157,10 +166,32 @@ def report_error(error: Exception) -> int:
     return 1
 
 
+def check_environment() -> None:
+    """Raise InputError for a variable that a library would fail with.
+
+    Programs draw only into files, so another backend of matplotlib is not used.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    for name, (kind, least) in NUMBERS.items():
+        text = os.environ.get(name)
+        if not text:
+            continue
+        try:
+            is_good = kind(text) >= least
+        except ValueError:
+            is_good = False
+        if not is_good:
+            words = "a whole number" if kind is int else "a number"
+            raise InputError(
+                f"{name}={text[:60]}: must be {words} from {least}; change or unset it"
+            )
+
+
 def run_main(main: Callable[[], object]) -> None:
     """Call the function of a program, and end the process with `report_error` if it fails."""
     print_messages()
     try:
+        check_environment()
         main()
     except Exception as error:
         sys.exit(report_error(error))
@@ -329,8 +360,8 @@ def held_signals() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        for number in arrived:
-            signal.raise_signal(number)
+        for stop in arrived:
+            signal.raise_signal(stop)
 
 
 def leave_ctrl_c_to_parent() -> None:
