@@ -10,7 +10,12 @@ BIN := .venv/bin
 # Refuse a wrong or missing Python, and another one than that of .venv.
 version = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
 INSTALLED := $(if $(wildcard .venv/ready),$(call version,$(BIN)/python))
+PLACE := $(shell cat .venv/ready 2>/dev/null)
 ifneq (,$(filter-out help clean,$(MAKECMDGOALS)))
+# The programs of a copied .venv run the original's package; those of a moved one do not run.
+ifneq ($(realpath .venv),$(or $(PLACE),$(realpath .venv)))
+$(error .venv was installed in $(PLACE) and works only there: delete it (rm -r .venv), and make installs it here)
+endif
 ifneq (,$(if $(INSTALLED),$(filter command line,$(origin PYTHON)),no .venv))
 GIVEN_VERSION := $(call version,$(PYTHON))
 ifeq (,$(filter 3.11 3.12 3.13,$(GIVEN_VERSION)))
@@ -21,6 +26,9 @@ $(error $(PYTHON) is $(GIVEN_VERSION), but .venv has Python $(INSTALLED): run ma
 endif
 endif
 endif
+
+# Other programs' settings in the environment may have these names. THESIS_REPRO_BUILD and THESIS_REPRO_FIGURES are taken.
+$(foreach name,BUILD FIGURES GPU,$(if $(filter environment,$(origin $(name))),$(eval $(name) :=)))
 
 # Refuse a misspelled setting, for which the default would silently be used.
 SIZES := IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
@@ -105,7 +113,7 @@ install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --
 	@$(BIN)/pip install --quiet --disable-pip-version-check $$(grep -o '^uv==[0-9.]*' environment.txt) 2>/dev/null || true
 	@$(call install,-r environment.txt)
 	@$(call install,--no-build-isolation -e .)
-	@touch $@
+	@(cd .venv && pwd -P) > $@
 
 .venv/ready-gpu: environment-gpu.txt .venv/ready
 	@echo "installing CUDA for an NVIDIA GPU into .venv (about 2.5 GB to download)"
@@ -167,10 +175,8 @@ define execute
 $(RUN)/notebooks/$(1): notebooks/$(1) $(2) $(RUN)/checked $(SOURCES)
 	@mkdir -p $$(@D)
 	@for needed in $(2); do [ -e $$$$needed ] || { rm -f $$@; exit 0; }; done; \
-	if $(BIN)/jupyter-nbconvert --to notebook --execute --log-level=CRITICAL \
-	  --NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution \
-	  --Execution.log_file=$$(@D)/$(basename $(1)).log --output-dir $$(@D) --output .$(1) $$<; \
-	then mv $$(@D)/.$(1) $$@; else status=$$$$?; rm -f $$@; [ $$$$status = 1 ] || exit $$$$status; fi
+	$(BIN)/python -m thesis_repro.report.execute $$< $$@ || { \
+	  status=$$$$?; rm -f $$@; [ $$$$status = 1 ] || exit $$$$status; }
 endef
 previous :=
 $(foreach notebook,$(notdir $(NOTEBOOKS)),\

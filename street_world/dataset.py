@@ -237,7 +237,9 @@ def _write_missing(missing: list[Picture], jobs: int) -> None:
         # compiles the rasteriser once, for all worker processes
         bar.update(_write_pictures(missing[:1]))
         parallel = Parallel(
-            n_jobs=workers, return_as="generator_unordered", initializer=console.end_with_parent
+            n_jobs=workers,
+            return_as="generator_unordered",
+            initializer=console.leave_ctrl_c_to_parent,
         )
         # Ten at a time, because pictures of one sequence share its street.
         starts = range(1, len(missing), 10)

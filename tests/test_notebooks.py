@@ -26,7 +26,7 @@ FIGURES = [
     "figure_a_01",
 ]
 WITHOUT_DATA = {*(f"figure_2_{n:02d}" for n in (1, 3, 4, 5, 6, 7)), "figure_3_04", "figure_a_01"}
-EXECUTED = re.compile(r"nbconvert .* --output \.(\d\d)_")  # in the output of make
+EXECUTED = re.compile(r"report\.execute notebooks/(\d\d)_")  # in the output of make
 # a call that saves a figure, at the start of a line
 SAVED = re.compile(r"^(?:style\.save_figure\(|keep\((?:\w+\.)?figure|keep_paths\()", re.MULTILINE)
 JUPYTER = ROOT / ".venv" / "bin" / "jupyter-nbconvert"

@@ -134,3 +134,33 @@ def test_a_type_checker_sees_the_types_of_the_main_names(tmp_path):
     result = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, text=True)
     wrong = re.findall(r"user\.py:(\d): error: .*\[([\w-]+)\]", result.stdout)
     assert wrong == [("2", "arg-type"), ("3", "arg-type"), ("4", "attr-defined")]
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A folder with the Makefile, and an environment that make takes for its own."""
+    for name in ("Makefile", "environment.txt", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / ".venv").mkdir()
+    (tmp_path / ".venv/bin").symlink_to(Path(sys.executable).parent)
+    (tmp_path / ".venv/ready").write_text(f"{tmp_path}/.venv\n")
+    return tmp_path
+
+
+def test_a_copied_or_moved_checkout_does_not_use_the_environment_of_the_original(checkout):
+    assert run(["make", "-n", "setup"], checkout).returncode == 0
+    moved = checkout.rename(checkout.with_name("moved"))
+    result = run(["make", "-n", "setup"], moved)
+    assert result.returncode == 2 and f"installed in {checkout}/.venv" in result.stderr
+    assert run(["make", "-n", "help"], moved).returncode == 0
+
+
+def test_settings_of_other_programs_are_none_of_make(checkout):
+    for folder in ("thesis_repro", "street_world", "notebooks"):
+        (checkout / folder).symlink_to(ROOT / folder)
+    others = {"GPU": "nvidia", "BUILD": "/elsewhere", "FIGURES": "/elsewhere", "MAKEFLAGS": None}
+    for target in ("help", "figures"):
+        result = succeed(["make", "-n", target], checkout, **others)
+        assert "/elsewhere" not in result.stdout
+    taken = {"THESIS_REPRO_BUILD": checkout / "mine", "MAKEFLAGS": None}
+    assert f"{checkout}/mine" in succeed(["make", "-n", "figures"], checkout, **taken).stdout

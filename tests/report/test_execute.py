@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import nbformat
 import psutil
@@ -17,33 +16,20 @@ from thesis_repro.running.settings import ROOT
 
 pytestmark = pytest.mark.slow
 
-COMMAND = [
-    str(Path(sys.executable).parent / "jupyter-nbconvert"),
-    "--to",
-    "notebook",
-    "--execute",
-    "--log-level=CRITICAL",
-    "--NotebookExporter.default_preprocessors=thesis_repro.report.execute.Execution",
-    "--Execution.log_file=out/done.log",
-    "--output-dir",
-    "out",
-    "--output",
-    "done",
-    "one.ipynb",
-]
+COMMAND = [sys.executable, "-m", "thesis_repro.report.execute", "one.ipynb", "out/done.ipynb"]
 
 
 @pytest.fixture
 def start(tmp_path):
-    """Return a function that starts nbconvert, as the Makefile does, on a notebook of its cells.
+    """Return a function that executes a notebook of its cells, as the Makefile does.
 
-    command: another command that does so.
+    command: another command that does so. variables: of the environment.
     """
 
-    def started(*cells, command=COMMAND):
+    def started(*cells, command=COMMAND, **variables):
         cells = [nbformat.v4.new_code_cell(cell) for cell in cells]
         nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "one.ipynb")
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        environment = os.environ | {"PYTHONPATH": str(ROOT)} | variables
         # processes in the background of a shell script ignore SIGINT
         return subprocess.Popen(
             command,
@@ -88,6 +74,40 @@ def test_a_failure_leaves_one_line_and_a_log_and_no_notebook(start, tmp_path):
         in (tmp_path / "out" / "log.txt").read_text()
     )
     assert "raise InputError" in log and "more of it" in log and "\x1b" not in log
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"done.log", "log.txt"}
+
+
+def test_settings_of_the_user_let_no_failure_pass(start, tmp_path):
+    allow = (
+        "c = get_config()\nc.Execution.allow_errors = c.ExecutePreprocessor.allow_errors = True\n"
+    )
+    home = tmp_path / "home"
+    kernel = home / "kernels/python3/kernel.json"
+    startup = home / "profile_default/startup/x.py"
+    for path, text in (
+        (tmp_path / "jupyter_nbconvert_config.py", allow),
+        (home / "jupyter_nbconvert_config.py", allow),
+        (home / "jupyter_config.py", allow),
+        (startup, "surprise = 1"),
+        (home / "startup.py", "surprise = 1"),
+        (
+            home / "profile_default/ipython_kernel_config.py",
+            "get_config().IPKernelApp.exec_lines = ['surprise = 1']",
+        ),
+        (kernel, '{"argv": ["false"], "display_name": "x", "language": "python"}'),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    process = start(
+        "assert 'surprise' not in globals()\nprint('as it should')\n1 / 0",
+        JUPYTER_CONFIG_DIR=str(home),
+        JUPYTER_PATH=str(home),
+        IPYTHONDIR=str(home),
+        PYTHONSTARTUP=str(home / "startup.py"),
+        MPLBACKEND="bogus",
+    )
+    _, stderr = process.communicate()
+    assert process.returncode == 1 and "one failed: ZeroDivisionError" in stderr, stderr
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"done.log", "log.txt"}
 
 

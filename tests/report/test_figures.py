@@ -273,3 +273,13 @@ def test_the_map_shows_the_ground_truth_if_there_is_one(drive):
     del drive.poses
     without = list(video.pictures(drive))[-1][160:]
     assert painted(without, BLUE).sum() > 20 and (without != last).any()
+
+
+@pytest.mark.parametrize("ending", ["svg", "pdf", "png"])
+def test_figures_carry_no_date(tmp_path, ending):
+    with style.applied():
+        for name in ("a", "b"):
+            style.write_figure(style.new_figure()[0], tmp_path / f"{name}.{ending}")
+    written = (tmp_path / f"a.{ending}").read_bytes()
+    assert b"CreationDate" not in written and b"dc:date" not in written
+    assert written == (tmp_path / f"b.{ending}").read_bytes()

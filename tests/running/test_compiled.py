@@ -9,7 +9,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from thesis_repro.running import compiled
+from thesis_repro import errors
+from thesis_repro.running import compiled, console, folders
 
 CALL = "from thesis_repro.odometry.outer import f; print(f(1.0))"
 OUTER = (
@@ -57,7 +58,9 @@ def project(tmp_path):
         folder.mkdir(parents=True)
     for folder in (running.parent, running, below.parent, below):
         (folder / "__init__.py").touch()
-    shutil.copy(compiled.__file__, running)
+    for module in (compiled, console, folders):
+        shutil.copy(module.__file__, running)
+    shutil.copy(errors.__file__, running.parent)
     (below.parent / "outer.py").write_text(OUTER)
     for name in ("street_world", "neighbour"):
         (tmp_path / name).mkdir()

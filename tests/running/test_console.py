@@ -8,6 +8,8 @@ import os
 import shutil
 import signal
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,7 +18,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.running import console, files, folders, results
+from thesis_repro.running import compiled, console, files, folders, results
 
 
 def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
@@ -342,3 +344,72 @@ def test_a_signal_that_compiled_code_loses_stops_at_the_next_frame(tiny_kitti, n
         with pytest.raises(KeyboardInterrupt):
             odometry.run(Sequence(tiny_kitti, "00"))
     assert len(odometry.run(Sequence(tiny_kitti, "00")).poses) == 4
+
+
+class Interrupting:
+    """Masks, frames and a function of Numba that get Ctrl-C; done: how often nothing was raised."""
+
+    def __init__(self, frame):
+        self.frame, self.done = frame, 0
+
+    def interrupt(self, *_, **__):
+        signal.raise_signal(signal.SIGINT)
+        self.done += 1
+        return self.frame
+
+    __getitem__ = __array__ = compile = interrupt
+
+
+@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN])
+def test_ctrl_c_waits_for_compiled_code_and_then_has_its_usual_effect(
+    tiny_kitti, tmp_path, monkeypatch, handler
+):
+    """For Python's own handler in a user's script; an ignored signal stays ignored."""
+    monkeypatch.setattr(compiled, "_forget_stale_once", lambda *_: None)
+    sequence = Sequence(tiny_kitti, "00")
+    sent = Interrupting(sequence.frame(0) // 128 * 255)
+    compiled._check_cache_before_use(sent, tmp_path)
+    sent.stats = SimpleNamespace(cache_path=tmp_path)
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        for call in (
+            lambda: odometry.run(sequence, masks=sent),
+            lambda: odometry.Odometry(sequence.intrinsics).step(sent),
+            lambda: sent.compile(()),
+        ):
+            sent.done = 0
+            if handler is signal.SIG_IGN:
+                call()
+            else:
+                with pytest.raises(KeyboardInterrupt):
+                    call()
+                assert sent.done == 1
+            assert signal.getsignal(signal.SIGINT) is handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_run_in_a_thread_leaves_signals_alone(tiny_kitti):
+    with ThreadPoolExecutor() as pool:
+        result = pool.submit(odometry.run, Sequence(tiny_kitti, "00")).result()
+    assert len(result.poses) == 4
+
+
+@pytest.mark.parametrize(
+    "name, good, bad",
+    [
+        ("OMP_NUM_THREADS", "2", "abc"),
+        ("NUMBA_NUM_THREADS", "1", "0"),
+        ("OPENCV_FOR_THREADS_NUM", "0", "abc"),
+        ("TQDM_MININTERVAL", "0.5", "abc"),
+        ("SOURCE_DATE_EPOCH", "", "1.5"),
+    ],
+)
+def test_a_variable_that_a_library_would_fail_with_is_named(monkeypatch, name, good, bad):
+    monkeypatch.setenv("MPLBACKEND", "bogus")
+    monkeypatch.setenv(name, good)
+    console.check_environment()
+    assert os.environ["MPLBACKEND"] == "agg"
+    monkeypatch.setenv(name, bad)
+    with pytest.raises(InputError, match=f"{name}={bad}"):
+        console.check_environment()

@@ -1,12 +1,14 @@
 """Files are written whole; images and label maps are read as they are, or refused by name."""
 
 import os
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from trials import run
 
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
@@ -212,3 +214,10 @@ def test_train_ids_become_label_ids(tmp_path):
         cv2.imwrite(str(tmp_path / "a.png"), np.array([[value]], np.uint8))
         with pytest.raises(InputError, match="a.png: .*--ids"):
             cityscapes.read_label_map(tmp_path / "a.png", train_ids)
+
+
+def test_a_limit_of_opencv_is_not_taken_for_a_damaged_file(tiny_kitti):
+    path = tiny_kitti / "sequences/00/image_0/000000.png"
+    code = f"from thesis_repro.running import files; files.read_gray({str(path)!r})"
+    result = run([sys.executable, "-c", code], tiny_kitti, OPENCV_IO_MAX_IMAGE_PIXELS=100)
+    assert "CV_IO_MAX_IMAGE_PIXELS" in result.stderr and "complete" not in result.stderr

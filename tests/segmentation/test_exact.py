@@ -6,6 +6,8 @@ machine of one maker tells what a machine of the other would do. `tools/emulated
 results with those of an emulator.
 """
 
+import json
+import sys
 from collections import Counter
 
 import keras
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 import tensorflow as tf
 from tensorflow.python.eager import context
+from trials import succeed
 
 from thesis_repro.segmentation import prediction, training
 from thesis_repro.segmentation.exact import same_bits
@@ -248,3 +251,15 @@ def test_xla_divides_exactly():
     expected = (1 / values, 1 / values, np.sqrt(1 / values), np.float32(3) / values)
     for ours, exact in zip(compiled(tf.constant(values)), expected, strict=True):
         assert np.array_equal(ours, exact)
+
+
+def test_settings_of_keras_in_the_home_folder_and_the_environment_change_nothing(tmp_path):
+    settings = {"floatx": "float16", "epsilon": 0.1, "image_data_format": "channels_first"}
+    (tmp_path / "keras.json").write_text(json.dumps(settings | {"backend": "jax"}))
+    code = (
+        "from thesis_repro.segmentation import unet\nimport keras\nc = keras.config\n"
+        "print(c.floatx(), c.epsilon(), c.image_data_format(), c.backend(), c.max_epochs())"
+    )
+    variables = {"KERAS_HOME": tmp_path, "KERAS_BACKEND": "torch", "KERAS_MAX_EPOCHS": 1}
+    done = succeed([sys.executable, "-c", code], tmp_path, **variables)
+    assert done.stdout.split() == ["float32", "1e-07", "channels_last", "tensorflow", "None"]

@@ -1,6 +1,7 @@
 """The runs of a study: resuming, failures, their settings and their times."""
 
 import shutil
+import signal
 import time
 
 import cv2
@@ -14,7 +15,7 @@ from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.running import console
 from thesis_repro.segmentation import prediction, training
-from thesis_repro.study import compare, controls, runner, thesis_tables, timing
+from thesis_repro.study import compare, controls, runner, thesis_tables, timing, workers
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
 
@@ -302,3 +303,9 @@ def test_recorded_timings_are_kept(tmp_path):
     assert timing.recorded(first, path, keep=True)[[*first]].equals(first)  # nothing was recorded
     assert timing.recorded(second, path, keep=True)[[*first]].equals(first)
     assert timing.recorded(second, path, keep=False)[[*first]].equals(second)
+
+
+def test_worker_processes_leave_ctrl_c_to_their_parent():
+    with workers.open_pool(2) as pool:
+        handlers = dict(pool.run(signal.getsignal, [(signal.SIGINT,), (signal.SIGINT,)]))
+    assert set(handlers.values()) == {signal.SIG_IGN}

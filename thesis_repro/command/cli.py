@@ -492,6 +492,7 @@ def main(arguments: list[str] | None = None) -> int:
         except FileNotFoundError:
             raise InputError("the working folder was deleted; change to another one") from None
         with console.stoppable():
+            console.check_environment()
             gigabytes = 2
             if options.function is predict:
                 gigabytes = 4

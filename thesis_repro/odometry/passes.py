@@ -188,12 +188,13 @@ def _run_pass(
         indices = progress(indices, description, total=len(sequence), initial=done)
     for index in indices:
         console.check_stop()
-        frame = sequence.frame(index)
-        if shared is not None:
-            starts = [(leader.odometry.previous, leader.odometry.points) for leader in leaders]
-            shared.expect(frame, starts)
-        for group in groups:
-            _step_group(group, index, frame, step_lengths[index])
+        with console.held_signals():
+            frame = sequence.frame(index)
+            if shared is not None:
+                starts = [(leader.odometry.previous, leader.odometry.points) for leader in leaders]
+                shared.expect(frame, starts)
+            for group in groups:
+                _step_group(group, index, frame, step_lengths[index])
         if checkpoint and (index + 1) % CHECKPOINT == 0:
             _store(checkpoint, index + 1, members, leaders)
     blank = () if shared is None else SHARED_TIMES

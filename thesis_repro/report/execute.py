@@ -1,6 +1,7 @@
 """Execution of notebooks by `make figures`: progress bars, one line on failure, a log file.
 
-The Makefile calls `jupyter nbconvert --to notebook --execute` with `Execution` as its preprocessor.
+Usage: python -m thesis_repro.report.execute NOTEBOOK OUTPUT. The log file stands beside the output.
+The user's settings of Jupyter and IPython are not read. One of them lets failing cells pass.
 """
 
 import logging
@@ -10,14 +11,18 @@ import sys
 import time
 import traceback
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import nbformat
+from jupyter_client import AsyncKernelManager
+from jupyter_client.kernelspec import KernelSpecManager
 from nbclient.exceptions import CellExecutionError, DeadKernelError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import ExecutePreprocessor
-from traitlets import Unicode
 
 from thesis_repro.running import console, results
+from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import PREFIX
 
 
@@ -27,12 +32,18 @@ class Execution(ExecutePreprocessor):
     Exits with status 1 if a cell fails and with 130 if it is interrupted.
     """
 
-    # the notebook may name a kernel that is not installed here
-    kernel_name = Unicode("python3").tag(config=True)
     # without it nbconvert shows the picture that stands for sliders
     store_widget_state = False
-    # for the output of libraries and the traceback of a failure
-    log_file = Unicode("execution.log").tag(config=True)
+
+    def __init__(self, log_file: Path, ipython_folder: str) -> None:
+        """Prepare an execution.
+
+        log_file: for the output of libraries and the traceback of a failure. ipython_folder: an
+        empty folder.
+        """
+        super().__init__()
+        self.log_file = log_file
+        self.ipython_folder = ipython_folder
 
     def preprocess(
         self, nb: Any, resources: Any = None, km: Any = None
@@ -43,9 +54,8 @@ class Execution(ExecutePreprocessor):
         # shell that runs it
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         console.interrupt_without(os.getppid())
-        sys.excepthook = _print_error  # nbconvert may fail to write the executed notebook
         name = resources["metadata"]["name"]
-        path = Path(self.log_file)
+        path = self.log_file
         started = time.monotonic()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,12 +82,27 @@ class Execution(ExecutePreprocessor):
             f"{failure}\nthe traceback is in {os.path.relpath(path)}; the same command resumes"
         )
 
+    def create_kernel_manager(self) -> AsyncKernelManager:
+        """Choose the kernel of this Python, as nbclient asks for.
+
+        The notebook, or a folder of the user's, may name another one.
+        """
+        specifications = KernelSpecManager(kernel_dirs=[])
+        self.km = AsyncKernelManager(kernel_name="python3", kernel_spec_manager=specifications)
+        return self.km
+
     def setup_kernel(self, **options: Any) -> Any:
         """Start the kernel with an environment and outputs of its own, as nbclient asks for."""
         # compiled libraries log into the log file, not into the outputs of cells
         self.extra_arguments = ["--IPKernelApp.capture_fd_output=False"]
-        # progress bars (`files.progress`) go to the standard error of this program
-        environment = os.environ | {f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2"}
+        environment = os.environ | {
+            # progress bars (`files.progress`) go to the standard error of this program
+            f"{PREFIX}PROGRESS": f"/proc/{os.getpid()}/fd/2",
+            # without files that every kernel of the user executes at its start
+            "IPYTHONDIR": self.ipython_folder,
+            "PYTHONSTARTUP": "",
+            "MPLBACKEND": "module://matplotlib_inline.backend_inline",
+        }
         return super().setup_kernel(
             env=environment,
             stdout=self._log,
@@ -85,10 +110,6 @@ class Execution(ExecutePreprocessor):
             preexec_fn=console.end_with_parent,
             **options,
         )
-
-
-def _print_error(kind: type[BaseException], error: BaseException, _traceback: Any) -> None:
-    print(console.explain(error) or f"{kind.__name__}: {error}", file=sys.stderr)
 
 
 def _reason(error: Exception) -> str:
@@ -99,3 +120,17 @@ def _reason(error: Exception) -> str:
     if isinstance(error, CellExecutionError):
         name, text = error.ename, error.evalue
     return f"{name}: {text}".splitlines()[0]
+
+
+def main() -> None:
+    """Execute a notebook, and write it with its outputs."""
+    source, output = map(Path, sys.argv[1:])
+    resources = {"metadata": {"name": source.stem, "path": str(source.parent)}}
+    with TemporaryDirectory() as ipython_folder:
+        execution = Execution(output.with_suffix(".log"), ipython_folder)
+        executed, _ = execution.preprocess(nbformat.read(source, 4), resources)
+    write_text(output, nbformat.writes(executed) + "\n")
+
+
+if __name__ == "__main__":
+    console.run_main(main)

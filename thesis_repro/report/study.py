@@ -53,7 +53,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
     for name, figure in figures.items():
-        style.write_figure(figure, folder / f"{name}.pdf", metadata={"CreationDate": None})
+        style.write_figure(figure, folder / f"{name}.pdf")
     numbers = {
         "summary": comparison.table_summary(table, runs),
         "comparison": comparison.table_comparison(table),

@@ -47,6 +47,7 @@ SETTINGS: dict[Any, Any] = {
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
+DATES = {".svg": "Date", ".pdf": "CreationDate"}  # matplotlib's names
 # note of figures that show no data
 DIAGRAM = "drawn by the notebook; it does not depend on the data at hand"
 # style of keypoints on a frame
@@ -280,14 +281,17 @@ def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
         options: dict[str, Any] = {"pil_kwargs": {"quality": 75, "exif": note_in_file}}
     else:
         ending, other = ".svg", ".webp"
-        options = {"metadata": {"Date": None, "Creator": None, "Description": note}}
+        options = {"metadata": {"Creator": None, "Description": note}}
     write_figure(figure, folder / f"{name}{ending}", **options)
     # an earlier run may have written the other format
     (folder / f"{name}{other}").unlink(missing_ok=True)
 
 
-def write_figure(figure: plt.Figure, path: Path, **options: Any) -> None:
-    """Write a figure in the format that the path's ending names."""
+def write_figure(figure: plt.Figure, path: str | Path, **options: Any) -> None:
+    """Write a figure in the format that the path's ending names, without a date."""
+    ending = Path(path).suffix.lower()
+    if ending in DATES:
+        options["metadata"] = {DATES[ending]: None} | options.get("metadata", {})
     with atomic(path) as temporary:
         figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
 

@@ -10,6 +10,8 @@ from typing import Any
 import numba
 from numba.extending import is_jitted
 
+from thesis_repro.running import console
+
 DIGEST_NAME = "compiled-from"  # a file in each folder of Numba's cache
 _PACKAGE = Path(__file__).parents[1]
 _IMPORTED = time.time_ns()
@@ -62,13 +64,15 @@ def _check_cache_before_use(dispatcher: Any, room: Path) -> None:
     """Let a compiled function call `forget_stale` before it looks into its cache.
 
     Numba calls `compile` for each new combination of types. It loads the machine code or makes it.
+    A signal waits until it has, because callbacks of the compiler lose exceptions.
     """
     load_or_compile = dispatcher.compile
 
     @wraps(load_or_compile)
     def check_and_compile(types: Any) -> Any:
-        _forget_stale_once(Path(dispatcher.stats.cache_path), room)
-        return load_or_compile(types)
+        with console.held_signals():
+            _forget_stale_once(Path(dispatcher.stats.cache_path), room)
+            return load_or_compile(types)
 
     dispatcher.compile = check_and_compile
 

@@ -45,6 +45,15 @@ WORKER_KILLED = (
     "a process was killed, most likely because memory ran out; start again with fewer processes (--jobs, "
     "JOBS) to resume"
 )
+# variables that libraries read, their type and their least value; others end in a long traceback
+NUMBERS: dict[str, tuple[type, int]] = {
+    "LOKY_MAX_CPU_COUNT": (int, 1),
+    "NUMBA_NUM_THREADS": (int, 1),
+    "OMP_NUM_THREADS": (int, 1),
+    "OPENCV_FOR_THREADS_NUM": (int, 0),
+    "SOURCE_DATE_EPOCH": (int, 0),
+    "TQDM_MININTERVAL": (float, 0),
+}
 # texts of libraries' own errors
 NO_MEMORY_TEXTS = (
     "MemoryError",
@@ -160,10 +169,32 @@ def report_error(error: Exception) -> int:
     return 1
 
 
+def check_environment() -> None:
+    """Raise InputError for a variable that a library would fail with.
+
+    Programs draw only into files, so another backend of matplotlib is not used.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    for name, (kind, least) in NUMBERS.items():
+        text = os.environ.get(name)
+        if not text:
+            continue
+        try:
+            is_good = kind(text) >= least
+        except ValueError:
+            is_good = False
+        if not is_good:
+            words = "a whole number" if kind is int else "a number"
+            raise InputError(
+                f"{name}={text[:60]}: must be {words} from {least}; change or unset it"
+            )
+
+
 def run_main(main: Callable[[], object]) -> None:
     """Call the function of a program, and end the process with `report_error` if it fails."""
     print_messages()
     try:
+        check_environment()
         main()
     except Exception as error:
         sys.exit(report_error(error))
@@ -270,14 +301,15 @@ def quiet() -> Iterator[None]:
 
 # The end of a process
 
+STOP_SIGNALS = signal.SIGTERM, signal.SIGHUP, signal.SIGINT
+
 
 @contextmanager
 def stoppable() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that worker processes end too.
 
     They raise KeyboardInterrupt with the signal's number. An ignored signal (nohup) stays ignored.
-    The exception is lost in a callback of compiled code, such as Numba's compiler; then
-    `check_stop` raises it again.
+    The exception is lost in a callback of compiled code; then `check_stop` raises it again.
     """
 
     def stop(number: int, _: object) -> None:
@@ -286,7 +318,7 @@ def stoppable() -> Iterator[None]:
 
     handlers = {
         number: signal.getsignal(number)
-        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+        for number in STOP_SIGNALS
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
     }
     for number in handlers:
@@ -307,6 +339,40 @@ def check_stop() -> None:
     """Raise KeyboardInterrupt if a signal to stop has arrived (see `stoppable`)."""
     if _stops:
         raise KeyboardInterrupt(_stops[0])
+
+
+@contextmanager
+def held_signals() -> Iterator[None]:
+    """Hold back the signals that stop a program until the end of the block.
+
+    Python's handler for Ctrl-C and that of `stoppable` raise an exception. If they run while
+    compiled code makes Python objects, that code goes on without them: the process ends in
+    SystemError or a segmentation fault. So one frame of the odometry is finished first.
+    """
+    if threading.current_thread() is not threading.main_thread():  # handlers run in no other thread
+        yield
+        return
+    arrived: list[int] = []
+    handlers = {
+        number: signal.getsignal(number)
+        for number in STOP_SIGNALS
+        if callable(signal.getsignal(number))
+    }
+    for number in handlers:
+        signal.signal(number, lambda number, _: arrived.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for stop in arrived:
+            signal.raise_signal(stop)
+
+
+def leave_ctrl_c_to_parent() -> None:
+    """Let this worker process ignore Ctrl-C, which reaches its parent too, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 def end_with_parent() -> None:

@@ -122,6 +122,8 @@ def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, ImageFile.ImageFile]]:
         raise
     except Image.DecompressionBombError:
         raise InputError(f"{path}: claims more pixels than any camera has; remove it") from None
+    except cv2.error as error:  # such as a limit that OPENCV_IO_MAX_IMAGE_PIXELS sets
+        raise InputError(f"{path}: cannot be read: OpenCV: {error.err}") from None
     except (
         OSError,
         SyntaxError,
@@ -129,7 +131,6 @@ def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, ImageFile.ImageFile]]:
         EOFError,
         IndexError,
         struct.error,
-        cv2.error,
     ) as error:
         reason = (
             getattr(error, "strerror", None)

@@ -45,6 +45,8 @@ def _set_variables() -> None:
     for name, value in variables.items():
         os.environ.setdefault(name, value)
     os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
+    for name in ("KERAS_MAX_EPOCHS", "KERAS_MAX_STEPS_PER_EPOCH"):  # end a training early, unsaid
+        os.environ.pop(name, None)
 
 
 _set_variables()

@@ -12,6 +12,11 @@ from typing import Any
 import keras
 import tensorflow as tf
 
+# Keras' own defaults: a user's keras.json may hold others
+keras.config.set_floatx("float32")
+keras.config.set_epsilon(1e-7)
+keras.config.set_image_data_format("channels_last")
+
 
 def same_bits(model: Any) -> Any:
     """Let the batch normalisation of one model divide exactly; return the model.

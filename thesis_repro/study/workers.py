@@ -81,7 +81,7 @@ def _here(size: int, function: Callable, calls: Calls) -> Results:
 
 
 def _start_process(prints_messages: bool) -> None:
-    console.end_with_parent()
+    console.leave_ctrl_c_to_parent()
     if prints_messages:
         console.print_messages()
 
