@@ -71,6 +71,9 @@ $(foreach name,JOBS DASK_SCHEDULER $(SIZES),$(if $($(name)),$(eval export THESIS
 DATA_OPTIONS := $(if $(KITTI),--kitti "$$THESIS_REPRO_KITTI") \
                 $(if $(CITYSCAPES),--cityscapes "$$THESIS_REPRO_CITYSCAPES") \
                 $(if $(KITTI_SEMANTIC),--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC")
+# Everything runs the package of this checkout. Folders of the user's in PYTHONPATH could hold other versions of it and
+# of the libraries.
+export PYTHONPATH := $(CURDIR)
 # Silence the libraries.
 export PYTHONWARNINGS := ignore
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
