@@ -118,7 +118,9 @@ def _explain_one(error: BaseException) -> str | None:
     """Do what `explain` does, without the causes of the error."""
     number, path = number_of(error), getattr(error, "filename", None)
     text = f"{type(error).__name__}: {error}"
-    if number == errno.ENOMEM or any(words in text for words in NO_MEMORY_TEXTS):
+    # a text with a number of the system may hold the name of a file
+    tells_of_memory = number is None and any(words in text for words in NO_MEMORY_TEXTS)
+    if number == errno.ENOMEM or tells_of_memory:
         return NO_MEMORY
     if text.startswith("TerminatedWorkerError"):  # of joblib
         return WORKER_KILLED
