@@ -14,7 +14,12 @@ from thesis_repro.study import compare
 REAL, RENDERED = "real frames", "embedded world (rendered)"
 ALL_KEYPOINTS, EXACT = compare.METHODS["baseline"], compare.METHODS["true-labels"]
 PACKAGE = "the model in the package"
-# Mean IoU that the data at hand cannot give, by name of the folder of label maps.
+# names of known folders of label maps; others have the folder's
+NAMES = {
+    "labels_espnetv2": "ESPNetv2, trained on Cityscapes",
+    "labels_version_0_6": "an earlier model of the package (0.6)",
+}
+# mean IoU that the data at hand cannot give, by folder of label maps
 MEASURED_ELSEWHERE = {
     "labels_espnetv2": (
         0.43,
@@ -55,7 +60,7 @@ def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
             ratios[label] = texts.ratio(mean)
     mean_iou, where = quality.get(name, (float("nan"), "not known"))
     return {
-        "label maps": name,
+        "label maps": NAMES.get(name, name),
         "mean IoU": mean_iou,
         "mean IoU from": where,
         "odometry": REAL,
@@ -107,6 +112,7 @@ def figure(table):
     table: from `table`.
     """
     rows = table[(table["over"] == ALL_KEYPOINTS) & table["mean IoU"].notna()]
+    same_quality = rows.groupby("mean IoU").cumcount()
     labels = [label for label in compare.JUDGING_METRICS.values() if label in rows]
     drawing, panels = style.new_figure(1, len(labels), height=3.6, squeeze=False)
     for panel, label in zip(panels[0], labels):
@@ -117,12 +123,15 @@ def figure(table):
             marker, filling = "s", "white"
             if row["odometry"] == REAL:
                 marker, filling = "o", color
-            panel.plot([row["mean IoU"]] * 2, [low, high], color=color, linewidth=1.6)
+            # sources of one quality stand side by side
+            x = row["mean IoU"] + 0.012 * same_quality[index]
+            panel.plot([x, x], [low, high], **style.interval_style(color, "_"))
             panel.plot(
-                row["mean IoU"],
+                x,
                 ratio,
                 marker,
                 color=color,
+                markersize=4,
                 markerfacecolor=filling,
                 label=f"{row['label maps']}; {row['odometry']}: {row['sequences']}",
             )

@@ -148,7 +148,8 @@ def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
     positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
     figure, axes = style.new_figure(height=3.8)
     axes.plot(*positions.T, "o", markersize=4, color="black")
-    axes.quiver(*positions.T, *ahead.T, color=BLUE, angles="xy", scale=18, width=0.006, zorder=3)
+    look: dict[str, Any] = {"angles": "xy", "units": "height", "scale": 11, "width": 0.01}
+    axes.quiver(*positions.T, *ahead.T, color=BLUE, zorder=3, **look)
     for index, position in enumerate(positions):
         axes.annotate(f"$C_{{{index}}}$", position, 16 * right[index], **FORMULA)
     for index in range(1, len(poses)):
@@ -157,9 +158,18 @@ def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
         xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)"
     )
     axes.set_title(title)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.2)
-    legend = axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=0.8)
+    # a square around the path, with room for the formulas
+    x, z = (positions.max(axis=0) + positions.min(axis=0)) / 2
+    room = 0.65 * max(np.ptp(positions, axis=0).max(), 1)
+    axes.set(xlim=(x - room, x + room), ylim=(z - room, z + room), aspect="equal")
+    legend = axes.legend(
+        title="motion: length, turn",
+        loc="center left",
+        bbox_to_anchor=(1, 0.5),
+        handlelength=0,
+        handletextpad=0,
+    )
+    legend.get_title().set_fontsize(8)
     # rc_context would also reset whether notebooks show figures
     plt.setp(legend.get_texts(), parse_math=True)
     return figure
@@ -187,7 +197,7 @@ def _draw_motion(axes: plt.Axes, poses: np.ndarray, index: int) -> None:
     offset = 11 * left / max(length, 1e-9)
     axes.annotate(formula, beside, offset, color=RED, **FORMULA)
     text = f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°"
-    axes.plot([], [], color=RED, label=text)
+    axes.plot([], [], " ", label=text)
 
 
 def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure:
@@ -207,6 +217,7 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
     both = np.vstack([first, gap, second])
     offset = (0, first.shape[0] + gap.shape[0])
     figure, (axes,) = style.frame_panels(both)
+    figure.set_figheight(figure.get_figheight() + 0.55)  # of the colour scale
     heading = f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
     style.show_image(axes, both, heading)
     ends = []
@@ -217,7 +228,7 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
     lines = LineCollection(ends, array=distances, cmap="plasma", linewidth=0.8)
     axes.add_collection(lines)
     label = "descriptor bits that differ, of 256"
-    figure.colorbar(lines, ax=axes, shrink=0.7, pad=0.01, label=label)
+    figure.colorbar(lines, ax=axes, location="bottom", shrink=0.5, aspect=40, pad=0.02, label=label)
     return figure
 
 

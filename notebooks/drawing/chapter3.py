@@ -24,11 +24,11 @@ def figure_3_03(
     intersection, union = both.sum(), (true | predicted).sum()
     iou = intersection / max(union, 1)
     panels = {
-        f"label map: {true.sum():,} pixels": {BLUE: true},
-        f"prediction: {predicted.sum():,} pixels": {BLUE: predicted},
+        f"label map: {true.sum():,} pixels": {ORANGE: true},
+        f"prediction: {predicted.sum():,} pixels": {SKY: predicted},
         f"IoU = {intersection:,} / {union:,} = {iou:.2f}": {
-            ORANGE: true & ~predicted,
-            SKY: predicted & ~true,
+            ORANGE: true,
+            SKY: predicted,
             BLUE: both,
         },
     }
@@ -40,9 +40,9 @@ def figure_3_03(
             picture[area] = 255 * np.array(to_rgb(color))
         style.show_image(panel, picture, title)
     handles = [
-        Patch(color=BLUE, label="intersection"),
-        Patch(color=ORANGE, label="only in the label map"),
-        Patch(color=SKY, label="only in the prediction"),
+        Patch(color=ORANGE, label="label map"),
+        Patch(color=SKY, label="prediction"),
+        Patch(color=BLUE, label="both: the intersection"),
     ]
     figure.legend(
         handles=handles,
@@ -61,12 +61,12 @@ def figure_3_06(
     mask: np.ndarray,
     dilation_width: int,
 ) -> Figure:
-    """Figure 3.6: a frame, its predicted label map, its Canny edges and the edges dilated."""
+    """Figure 3.6: a frame, its predicted label map, its edges and the edges dilated."""
     pictures = {
         "frame": frame,
         "predicted label map": style.label_colors(label_map, frame),
         # thin lines would drop out where the picture is reduced
-        "Canny edges (5, 15) of the label map, drawn wider": dilate(edge_image, 5),
+        "edges of the label map, drawn wider": dilate(edge_image, 5),
         f"edges dilated by {dilation_width}x{dilation_width}": mask,
     }
     return style.pictures(frame, pictures, columns=2, label_maps=[label_map])

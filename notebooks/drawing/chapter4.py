@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from drawing.flicker import View
 from thesis_repro.data.cityscapes import colorize
 from thesis_repro.odometry import THESIS
-from thesis_repro.report import style
+from thesis_repro.report import style, texts
 from thesis_repro.report.style import (
     BASELINE,
     EDGE_COLOR,
@@ -37,6 +37,17 @@ METHODS = {
     "reduced": ("plainly reduced", REDUCED, "\\\\"),
 }
 BAND = "lowest to highest of the repetitions"
+# cross on a lost run (see `metrics.step_errors`), and on a mean over runs of which one is lost
+LOST: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "x",
+    "color": "black",
+    "markersize": 6,
+    "markeredgewidth": 1.4,
+    "zorder": 4,
+    "clip_on": False,
+    "label": "lost run",
+}
 
 
 def figure_4_02(
@@ -108,6 +119,7 @@ def figure_4_05(
     return style.pictures(frame, pictures, keypoints, label_maps=[prediction])
 
 
+MARKERS = "os^Dv"  # of lines, beside their colours and dashes
 # around a keypoint of the frame before
 RING: dict[str, Any] = {"s": 34, "facecolors": "none", "edgecolors": PINK, "linewidths": 1.1}
 
@@ -157,7 +169,8 @@ def figure_paths(
     Small errors are enlarged in the paths, by a factor that is in the panel's title.
     truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method;
     repetition 0 is bold, the other repetitions are faint. paths: {(sequence, run): estimated
-    positions (n, 3)}.
+    positions (n, 3)}. All paths of a sequence, also those of other methods, choose its factor and
+    the limits of its panel, so that the figures can be compared.
     """
     groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
     columns = min(4, len(groups))
@@ -165,7 +178,7 @@ def figure_paths(
     figure, axes = style.new_figure(
         2 * count,
         columns,
-        height=count * (PAGE_WIDTH / columns * 0.85 + 1.1) + 0.4,
+        height=count * (PAGE_WIDTH / columns * 0.85 + 1.25) + 0.4,
         squeeze=False,
         height_ratios=[2, 1] * count,
     )
@@ -177,16 +190,23 @@ def figure_paths(
     for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
         true = truths[name]
         above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
-        estimates = [paths[name, run] for run in runs["run"]]
-        factor = _draw_estimates(above, below, true, estimates, METHODS[method][1])
-        row = errors.loc[name]
-        span = ""
+        # paths meet at frame 1, as for the RMSE
+        differences = {
+            run: positions - positions[1] - (true - true[1])
+            for (sequence, run), positions in paths.items()
+            if sequence == name
+        }
+        factor = _enlargement(true, differences)
+        for difference in differences.values():
+            above.update_datalim((true + factor * difference)[:, [0, 2]])
+        _draw_estimates(above, below, true, differences, factor, runs)
+        mean, *span = map(texts.two_digits, errors.loc[name])
         if len(runs) > 1:
-            span = f" ({row['lowest']:.2g}-{row['highest']:.2g})"
+            mean += f" ({'-'.join(span)})"
         enlarged = "errors not enlarged"
         if factor > 1:
             enlarged = f"errors x{factor} in the path"
-        above.set_title(f"{name}: {row['mean']:.2g}{span} m\n{enlarged}", fontsize=8)
+        above.set_title(f"{name}{_setting(runs)}\n{mean} m\n{enlarged}", fontsize=8)
         above.set_aspect("equal", adjustable="datalim")
         below.set_ylim(0, None)
         below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
@@ -196,42 +216,65 @@ def figure_paths(
     for above, below in pairs[::columns]:
         above.set_ylabel("z (m) over x (m)", fontsize=7.5)
         below.set_ylabel("distance (m)", fontsize=7.5)
-    style.legend_below(figure, axes[0, :1], 3)
+    style.legend_below(figure, [above for above, _ in pairs[: len(groups)]], 4)
     repeated = ""
     if rows["repetition"].any():
         repeated = ", mean (lowest-highest of the repetitions)"
-    figure.suptitle(f"sequence: RMSE{repeated}", fontsize=9)
+    figure.suptitle(f"RMSE of each sequence{repeated}", fontsize=9)
     return figure
 
 
-def _draw_estimates(
-    above: plt.Axes, below: plt.Axes, true: np.ndarray, estimates: list[np.ndarray], color: str
-) -> int:
-    """Draw estimated paths from above, and below their distances to the true path.
+def _enlargement(true: np.ndarray, differences: dict[str, np.ndarray]) -> int:
+    """Return by how much errors are enlarged in a path.
 
-    true, estimates: positions (n, 3). Returns the factor by which errors are enlarged above.
+    true: positions (n, 3). differences: {run: (n, 3)}, the errors of all its estimates.
     """
-    # paths meet at frame 1, as for the RMSE
-    differences = [estimate - estimate[1] - (true - true[1]) for estimate in estimates]
-    largest = max(np.abs(differences).max(), 1e-9)
+    largest = max(np.abs(list(differences.values())).max(), 1e-9)
     extent = np.ptp(true[:, [0, 2]], axis=0).max()
     room = max(0.15 * extent / largest, 1)
-    factor = max(scale for scale in ENLARGEMENTS if scale <= room)
+    return max(scale for scale in ENLARGEMENTS if scale <= room)
+
+
+def _setting(runs: pd.DataFrame) -> str:
+    """Return what is special in a sequence's runs: the width of the mask or number of keypoints."""
+    run = runs.iloc[0]
+    if run["method"] == "masked":
+        return f", width {run['dilation_width']:.0f}"
+    if run["method"] == "reduced":
+        return f", {run['max_keypoints']:.0f} keypoints"
+    return ""
+
+
+def _draw_estimates(
+    above: plt.Axes,
+    below: plt.Axes,
+    true: np.ndarray,
+    differences: dict[str, np.ndarray],
+    factor: int,
+    runs: pd.DataFrame,
+) -> None:
+    """Draw the estimated paths of a sequence from above, and below their distances to the true one.
+
+    true: positions (n, 3). differences: {run: (n, 3)} from it, enlarged by the factor above.
+    """
     steps = np.linalg.norm(np.diff(true, axis=0), axis=1)
     along = np.concatenate([[0], np.cumsum(steps)])
-    for repetition, difference in enumerate(differences):
+    for run in runs.itertuples():
         line: dict[str, Any] = {
-            "color": color,
+            "color": METHODS[run.method][1],
             "linewidth": 0.6,
             "alpha": 0.45,
             "label": "matched points shuffled",
         }
-        if repetition == 0:
+        if run.repetition == 0:
             line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
-        drawn = true + factor * difference
+        drawn = true + factor * differences[run.run]
+        distance = np.linalg.norm(differences[run.run], axis=1)
         above.plot(drawn[:, 0], drawn[:, 2], **line)
-        below.plot(along, np.linalg.norm(difference, axis=1), **line)
-    return factor
+        below.plot(along, distance, **line)
+        if run.lost:
+            above.plot(drawn[-1, 0], drawn[-1, 2], **LOST)
+            below.plot(along[-1], distance[-1], **LOST)
 
 
 def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
@@ -245,8 +288,7 @@ def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
     axes.set(
         xlabel="dilation width (pixels)",
         ylabel=f"keypoints, part of {THESIS.max_keypoints}",
-        ylim=(0, None),
-        title="Keypoints kept by masks of increasing dilation width",
+        title="Keypoints kept by masks of increasing dilation width, by sequence",
     )
     return figure
 
@@ -270,13 +312,12 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     axes.set(
         xlabel="dilation width (pixels)",
         ylabel=label,
-        ylim=(0, None),
-        title=f"{metric.upper()} against dilation width",
+        title=f"{metric.upper()} against dilation width, by sequence",
     )
     _, panels = style.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
         of_sequence = masked[masked["sequence"] == name]
-        _draw_repetitions(panel, compare.spread(of_sequence, metric, by="dilation_width"))
+        _draw_repetitions(panel, of_sequence, metric)
         row = baseline.loc[name]
         band: dict[str, Any] = {"color": BASELINE, "alpha": 0.2, "linewidth": 0}
         panel.axhspan(row["lowest"], row["highest"], **band, label=f"all keypoints, {BAND}")
@@ -288,16 +329,17 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     return figure
 
 
-def _draw_repetitions(panel: plt.Axes, errors: pd.DataFrame) -> None:
-    """Draw the errors with masks against dilation width.
-
-    errors: mean, lowest and highest, one row a width.
-    """
+def _draw_repetitions(panel: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
+    """Draw the errors with masks of one sequence against dilation width."""
+    errors = compare.spread(runs, metric, by="dilation_width")
     bar: dict[str, Any] = {"color": MASKED, "alpha": 0.35, "linewidth": 4}
     lowest, highest = errors["lowest"], errors["highest"]
     panel.vlines(errors.index, lowest, highest, **bar, label=f"masked, {BAND}")
     line: dict[str, Any] = {"color": MASKED, "marker": "o", "markersize": 2, "linewidth": 1.1}
     panel.plot(errors.index, errors["mean"], **line, label="masked, mean")
+    lost = errors["mean"][runs.groupby("dilation_width")["lost"].any()]
+    if len(lost):
+        panel.plot(lost.index, lost, **LOST)
 
 
 def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
@@ -313,7 +355,7 @@ def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
     axes.set_xticks(range(len(names)), names)
     axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
     axes.grid(axis="x", visible=False)
-    style.legend_below(figure, [axes], 3)
+    style.legend_below(figure, [axes], 4)
     return figure
 
 
@@ -330,7 +372,7 @@ def figure_of_sequences(runs: pd.DataFrame, metric: str) -> plt.Figure:
         panel.set_xticks([])
         panel.grid(axis="x", visible=False)
     figure.supylabel(f"{metric.upper()} (m)", fontsize=8)
-    style.legend_below(figure, panels, 3)
+    style.legend_below(figure, panels, 4)
     return figure
 
 
@@ -341,23 +383,51 @@ def _by_width(runs: pd.DataFrame, column: str) -> pd.DataFrame:
 
 def _lines(axes: plt.Axes, table: pd.DataFrame) -> None:
     """Draw one line for each row of a table with one column for each dilation width."""
-    for index, (name, row) in enumerate(table.iterrows()):
-        axes.plot(row.index, row, marker="o", markersize=2.5, label=name, **style.line_style(index))
+    for index, (_, row) in enumerate(table.iterrows()):
+        marker = MARKERS[index % len(MARKERS)]
+        axes.plot(row.index, row, marker=marker, markersize=3.5, **style.line_style(index))
     axes.set_xticks(table.columns.astype(int))
-    axes.legend(title="sequence", loc="center left", bbox_to_anchor=(1, 0.5))
+    axes.set_ylim(0, None)
+    _name_lines(axes, table)
+
+
+def _name_lines(axes: plt.Axes, table: pd.DataFrame) -> None:
+    """Write a line's name to the right of its end, as far from other names as is needed to read."""
+    colors = [line.get_color() for line in axes.lines]
+    lines = table.ffill(axis=1).assign(color=colors)
+    width = table.columns[-1]
+    lines = lines.sort_values(width)
+    height = axes.get_ylim()[1]
+    distance = height / max(len(lines), 18)
+    places = lines[width].to_numpy(copy=True)
+    for index in range(1, len(places)):
+        places[index] = max(places[index], places[index - 1] + distance)
+    highest = height + distance * np.arange(1 - len(places), 1)
+    leader: dict[str, Any] = {"arrowstyle": "-", "relpos": (0, 0.5), "shrinkA": 1, "shrinkB": 3}
+    for (name, line), place in zip(lines.iterrows(), np.minimum(places, highest), strict=True):
+        axes.annotate(
+            str(name),
+            (width, line[width]),
+            (1.02, place),
+            textcoords=axes.get_yaxis_transform(),
+            va="center",
+            fontsize=8,
+            arrowprops=leader | {"color": line["color"]},
+        )
 
 
 def _spread_by_method(runs: pd.DataFrame, metric: str) -> tuple[list[str], dict[str, pd.DataFrame]]:
     """Return the sequences and a table for each method of the thesis.
 
-    A table has one row a sequence: mean, lowest, highest.
+    A table has one row a sequence: mean, lowest, highest, and whether a run is lost.
     """
     tables = {}
     for method in METHODS:
         rows = compare.of_method(runs, method)
         if method == "masked":
             rows = thesis_tables.of_chosen_width(rows)
-        tables[method] = compare.spread(rows, metric)
+        lost = rows.groupby("sequence")["lost"].any()
+        tables[method] = compare.spread(rows, metric).assign(lost=lost)
     names = sorted(tables["baseline"].index)
     return names, {method: table.reindex(names) for method, table in tables.items()}
 
@@ -373,6 +443,9 @@ def _bar(
     label, color, hatch = METHODS[method]
     look: dict[str, Any] = {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0}
     axes.bar(positions, table["mean"], width, label=label, **look)
+    lost = table["lost"].eq(True).to_numpy()
+    if lost.any():
+        axes.plot(np.array(positions)[lost], table["mean"][lost], **LOST)
     table = table.where(table["highest"] > table["lowest"])  # a single run has no error bar
     mean = table["mean"]
     errors = [mean - table["lowest"], table["highest"] - mean]

@@ -3,6 +3,8 @@
 Also the axes that figures share, and the video of the odometry.
 """
 
+import re
+
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
@@ -127,6 +129,25 @@ def test_the_iou_figure_shows_areas_and_their_ratio():
     assert all(number in shown for number in ("200 / 300", "0.67", "200 pixels", "300 pixels"))
 
 
+def test_the_colours_of_the_iou_figure_are_those_of_its_legend():
+    label_map, prediction = (np.full((20, 20), ID["road"], np.uint8) for _ in range(2))
+    label_map[:10], prediction[5:15] = ID["car"], ID["car"]
+    figure = chapter3.figure_3_03(label_map, label_map, prediction, LABELS[ID["car"]])
+    of_label_map, of_prediction, of_both = (
+        np.array(patch.get_facecolor()[:3]) * 255 for patch in figure.legends[0].get_patches()
+    )
+    first, second, third = (axes.images[0].get_array() for axes in figure.axes)
+    for picture, row, color in (
+        (first, 0, of_label_map),
+        (first, 7, of_label_map),
+        (second, 7, of_prediction),
+        (third, 0, of_label_map),
+        (third, 7, of_both),
+        (third, 12, of_prediction),
+    ):
+        assert np.abs(picture[row, 0] - color).max() < 1
+
+
 @pytest.mark.slow
 def test_the_unet_figure_shows_the_sizes_of_the_model():
     from thesis_repro.segmentation.unet import build_unet
@@ -187,6 +208,21 @@ def test_saved_figures_have_repeatable_bytes_and_a_note(tmp_path):
         "picture.svg",
         "plot.svg",
     ]
+
+
+def test_a_long_note_widens_no_figure(tmp_path):
+    widths = []
+    for note in ("short", "00 (200 frames), " * 30):
+        style.save_figure(chapter2.figure_2_08(turning(), "title"), tmp_path, "plot", note)
+        head = (tmp_path / "plot.svg").read_text(encoding="utf-8")[:1000]
+        widths.append(float(re.search(r'width="([\d.]+)pt"', head)[1]))
+    assert widths[1] == pytest.approx(widths[0], abs=1)
+
+
+def test_lines_of_a_figure_differ():
+    styles = [tuple(style.line_style(index).values()) for index in range(44)]
+    assert len(set(styles)) == 44
+    assert len({color for color, _ in styles[:11]}) == 11
 
 
 @pytest.mark.parametrize(

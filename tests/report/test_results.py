@@ -3,9 +3,11 @@
 import html
 
 import made_up
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from drawn import problems
 
 from drawing import chapter4
 from thesis_repro.errors import one_line
@@ -218,8 +220,8 @@ def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources
             chapter4.figure_of_methods,
             chapter4.figure_of_sequences,
         ):
-            draw(runs, "rmse").draw_without_rendering()
-        chapter4.figure_4_07(runs).draw_without_rendering()
+            assert problems(draw(runs, "rmse")) == []
+        assert problems(chapter4.figure_4_07(runs)) == []
     figure = comparison.figure_comparison(table)
     figure.draw_without_rendering()
     assert all(edge > 0 for axes in figure.axes for edge in axes.get_xlim())
@@ -239,6 +241,8 @@ def test_the_comparison_figure_shows_ratios_and_their_interval():
     assert dots.get_xdata() == pytest.approx(row[ELEVEN].astype(float).to_numpy())
     assert interval.get_xdata() == pytest.approx([row["low"], row["high"]])
     assert marker.get_xdata() == pytest.approx([row["ratio"]])
+    # so that the ends of an interval shorter than the marker are seen
+    assert interval.get_markersize() > 1.5 * marker.get_markersize()
 
 
 def test_the_figure_of_paths_shows_repetitions_and_their_errors():
@@ -264,6 +268,56 @@ def test_small_errors_are_enlarged_in_the_paths():
     _, path = figure.axes[0].lines
     assert path.get_xdata()[-1] == pytest.approx(20 * 0.02) and "x20" in figure.axes[0].get_title()
     assert figure.axes[1].lines[0].get_ydata()[-1] == pytest.approx(0.02)
+
+
+def test_errors_of_all_methods_are_enlarged_alike():
+    runs = runs_of(["00", "drive0005"], lambda *_: 1.0, widths=[7], repetitions=1)
+    runs.loc[runs["method"] == "reduced", "max_keypoints"] = 512
+    chosen = {method: compare.of_method(runs, method) for method in chapter4.METHODS}
+    errors = {"baseline": 0.02, "masked": 0.2, "reduced": 0.01}  # metres
+    paths = {
+        (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [errors[method], 0, 0]]
+        for method, rows in chosen.items()
+        for row in rows.itertuples()
+    }
+    truths = {"00": AHEAD, "drive0005": AHEAD}
+    limits, titles = set(), {}
+    for method, rows in chosen.items():
+        figure = chapter4.figure_paths(truths, rows, paths, method)
+        limits.add(figure.axes[0].dataLim.bounds)
+        titles[method] = figure.axes[0].get_title()
+        assert "x2 " in titles[method] and problems(figure) == []
+    assert len(limits) == 1
+    assert "width 7" in titles["masked"] and "512 keypoints" in titles["reduced"]
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_lost_run_is_marked_where_runs_are_drawn(lost):
+    runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.1)
+    rows = (runs["method"] == "baseline") & (runs["sequence"] == "05")
+    masked_rows = (runs["method"] == "masked") & (runs["sequence"] == "05")
+    runs.loc[(rows | masked_rows) & (runs["repetition"] == 1), "lost"] = lost
+    of_all = compare.of_method(runs, "baseline")
+    paths = {(row.sequence, row.run): AHEAD for row in of_all.itertuples()}
+    truths = {"00": AHEAD, "05": AHEAD}
+    for figure in (
+        chapter4.figure_paths(truths, of_all, paths, "baseline"),
+        chapter4.figure_of_methods(runs, "rmse"),
+        chapter4.figure_of_sequences(runs, "mae"),
+        chapter4.figure_against_width(runs, "rmse"),
+    ):
+        crosses = [line for line in figure.findobj(plt.Line2D) if line.get_marker() == "x"]
+        words = [text.get_text() for text in figure.findobj(plt.Text)]
+        assert bool(crosses) == bool(lost) and words.count("lost run") == lost
+
+
+def test_every_line_is_named_at_its_end():
+    runs = runs_of(ELEVEN, lambda *_: 1.0)  # the lines lie on one another
+    for figure in (chapter4.figure_4_07(runs), chapter4.figure_against_width(runs, "rmse")):
+        names = figure.axes[0].texts
+        assert sorted(name.get_text() for name in names) == ELEVEN
+        colors = {name.get_text(): name.arrow_patch.get_edgecolor() for name in names}
+        assert len(set(colors.values())) == 11
 
 
 def test_error_bars_span_the_repetitions():

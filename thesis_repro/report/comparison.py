@@ -66,9 +66,8 @@ def _draw_ratios(panel: Axes, rows: pd.DataFrame, order: list[str], sequences: l
         }
         panel.plot(values, [y - 0.22] * len(values), "o", **dots)
         interval = [row["low"], row["high"]]
-        panel.plot(interval, [y + 0.1] * 2, color=color, linewidth=2.2)
-        mean: dict[str, Any] = {"color": color, "markersize": 5, "markeredgecolor": "white"}
-        panel.plot(row["ratio"], y + 0.1, "D", **mean)
+        panel.plot(interval, [y + 0.15] * 2, **style.interval_style(color, "|"))
+        panel.plot(row["ratio"], y + 0.15, "D", color=color, markersize=4, markeredgewidth=0)
     panel.axvline(1, color="black", linewidth=0.8)
     panel.grid(axis="y", visible=False)
     panel.set_yticks(range(len(order)), order)

@@ -7,6 +7,7 @@ from base64 import b64encode
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -22,6 +23,7 @@ from thesis_repro.report.texts import in_markdown
 from thesis_repro.running.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
+NOTE_LETTERS = 22  # of a note, in an inch
 # of matplotlib, see `use`; what is not listed has matplotlib's default
 SETTINGS: dict[Any, Any] = {
     "font.size": 9,
@@ -46,6 +48,8 @@ SETTINGS: dict[Any, Any] = {
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
+# four of Paul Tol's, for figures of more lines
+INDIGO, OLIVE, WINE, GRAY = "#332288", "#999933", "#882255", "#888888"
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
 DATES = {".svg": "Date", ".pdf": "CreationDate"}  # matplotlib's names
 # note of figures that show no data
@@ -77,10 +81,20 @@ def applied() -> Iterator[None]:
 def line_style(index: int) -> dict[str, Any]:
     """Return colour and dash of the index-th line of a figure.
 
-    28 styles differ; neighbours also differ in dashes.
+    44 styles differ; neighbours also differ in dashes.
     """
-    colors, dashes = (BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK), ("-", "--", "-.", ":")
+    colors = BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK, INDIGO, OLIVE, WINE, GRAY
+    dashes = "-", "--", "-.", ":"
     return {"color": colors[index % len(colors)], "linestyle": dashes[index % len(dashes)]}
+
+
+def interval_style(color: str, cap: str) -> dict[str, Any]:
+    """Return the style of an interval with a cap at each end.
+
+    The caps are longer than the mark of the mean, so that an interval shorter than it is seen, too.
+    cap: "|" for an interval along x, "_" along y.
+    """
+    return {"color": color, "linewidth": 1.8, "marker": cap, "markersize": 7}
 
 
 def label_colors(label_map: np.ndarray, frame: np.ndarray) -> np.ndarray:
@@ -256,7 +270,7 @@ def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
 def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
     """Write folder/name.webp if the figure contains images, else folder/name.svg.
 
-    The data note is at the foot of the figure and in the file's metadata.
+    The data note is at the foot of the figure, no wider than it, and in the file's metadata.
     """
     # a tight box would move legends at the figure's edge onto the note, so their places are fixed
     figure.draw_without_rendering()
@@ -266,10 +280,11 @@ def save_figure(figure: plt.Figure, folder: Path, name: str, note: str) -> None:
         legend.borderaxespad = 0
         legend.set_loc("lower left")
         legend.set_bbox_to_anchor((box.x0, box.y0), transform=figure.transFigure)
+    box = figure.get_tightbbox()  # inches
     figure.text(
-        0.5,
+        (box.x0 + box.x1) / 2 / figure.get_figwidth(),
         -0.08 / figure.get_figheight(),
-        note,
+        fill(note, int(NOTE_LETTERS * box.width)),
         fontsize=6,
         color="#777777",
         ha="center",
