@@ -119,6 +119,17 @@ def figure_4_05(
     return style.pictures(frame, pictures, keypoints, label_maps=[prediction])
 
 
+def figure_overview(
+    frame: np.ndarray, all_keypoints: np.ndarray, mask: np.ndarray, kept_keypoints: np.ndarray
+) -> plt.Figure:
+    """Draw all keypoints of a frame beside those on its mask; keypoints are (n, 2) pixels."""
+    all_title = f"all {len(all_keypoints)} keypoints"
+    kept_title = f"the {len(kept_keypoints)} keypoints on the mask (light)"
+    dimmed = np.where(mask > 0, frame, frame // 3)
+    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
+    return style.pictures(frame, {all_title: frame, kept_title: dimmed}, keypoints, columns=2)
+
+
 MARKERS = "os^Dv"  # of lines, beside their colours and dashes
 # around a keypoint of the frame before
 RING: dict[str, Any] = {"s": 34, "facecolors": "none", "edgecolors": PINK, "linewidths": 1.1}

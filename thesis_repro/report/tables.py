@@ -250,7 +250,12 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
     history = read(settings.build / "model" / "history.csv")
     if len(history):
         best = history.loc[history["val_loss"].idxmin()]
-        numbers["figure_4_01"] = {"epochs": len(history), "best": best.to_dict()}
+        last = history.iloc[-1]
+        numbers["figure_4_01"] = {
+            "epochs": len(history),
+            "best": best.to_dict(),
+            "last": last.to_dict(),
+        }
     chosen = read(settings.figures / "table_4_1.csv")
     if "mean keypoints" in chosen:
         numbers["figure_4_07"] = {"keypoints": chosen["mean keypoints"].clip(lower=1)}
