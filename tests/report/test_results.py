@@ -384,6 +384,6 @@ def test_names_stay_names_in_texts_and_tables(tmp_path):
     in_file[HOSTILE.index("=1+1")] = "'=1+1"
     assert list(table["sequence"]) == list(table["masks"]) == in_file
     runs = runs_of(HOSTILE[:5], lambda *_: 1.0, widths=(5,), repetitions=1)
-    found = texts.html(texts.findings(runs, compare.comparisons(runs), HOSTILE[5]))
+    found = texts.html(texts.findings(runs, compare.comparisons(runs), HOSTILE[5], False))
     assert all(f" {name} (100 frames)" in found for name in shown[:5])
     assert f"Data: {shown[5]}." in found

@@ -71,11 +71,11 @@ def table_of_change(
         mean = rows.groupby("sequence")[metric].mean()
         table[f"{metric.upper()}, {method} (m)"] = mean.map(_three_digits)
         table[f"lost runs, {method}"] = _lost_of(rows)
-    lost = {"change (%)": _is_lost(best), SINGLE: _is_lost(first_best)}
+    judged = {"change (%)": best, SINGLE: first_best}
     summary = {}
     for name, changes in columns.items():
         table[name] = changes.reindex(table.index)
-        summary[name] = _summary(changes, lost.get(name))
+        summary[name] = _summary(changes, judged.get(name))
     if len(studies.columns):
         summary[NULL] = _summary_of_studies(studies)
     else:
@@ -98,30 +98,25 @@ def _lost_of(runs: pd.DataFrame) -> pd.Series:
     return pd.Series(lost, dtype=str)
 
 
-def _is_lost(runs: pd.DataFrame) -> pd.Series:
-    """Return for each sequence whether one of its runs is lost."""
-    return runs.groupby("sequence")["lost"].any()
-
-
 CI = f"mean, {compare.LEVEL} % CI over sequences"
 
 
-def _summary(changes: pd.Series, is_lost: pd.Series | None = None) -> dict[str, float]:
+def _summary(changes: pd.Series, runs: pd.DataFrame | None = None) -> dict[str, float]:
     """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%).
 
-    is_lost: by sequence; a lost sequence has not improved.
+    runs: those with masks behind the changes; None if only the changes are known.
     """
     low, high = compare.mean_interval(changes)
-    improved = changes < 0
-    if is_lost is not None:
-        improved &= ~is_lost.reindex(changes.index).astype(bool)
+    improved = (changes < 0).sum()
+    if runs is not None:
+        improved = thesis_tables.improved(changes, runs)
     return {
         "sum (the thesis's aggregate)": changes.sum(min_count=1),
         "mean": changes.mean(),
         f"{CI}, from": low,
         f"{CI}, to": high,
         "median": changes.median(),
-        "sequences improved": improved.sum(),
+        "sequences improved": improved,
     }
 
 

@@ -93,9 +93,14 @@ def changes_if_masks_did_nothing(baseline: pd.DataFrame, widths: int, metric: st
     return pd.DataFrame(columns)
 
 
-def lost_runs(runs: pd.DataFrame) -> pd.Series:
-    """Return the number of lost runs (see `metrics.step_errors`), by sequence."""
-    return runs.groupby("sequence")["lost"].sum()
+def improved(changes: pd.Series, runs: pd.DataFrame) -> int:
+    """Return the number of sequences with a negative change (%) and no lost run.
+
+    changes: by sequence, of the runs. A lost run (see `metrics.step_errors`) may have a low error
+    by chance.
+    """
+    is_lost = runs.groupby("sequence")["lost"].any()
+    return int(((changes < 0) & ~is_lost.reindex(changes.index).astype(bool)).sum())
 
 
 def chosen_widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
