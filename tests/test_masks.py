@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
@@ -154,6 +156,47 @@ def test_label_masks_and_written_masks_equal_the_filter(labelled, tmp_path):
         assert np.array_equal(masks.MaskFolder(tmp_path / "masks", sequence)[1], expected)
 
 
+def test_label_maps_written_again_give_new_masks(labelled, tmp_path):
+    sequence, folder = labelled
+    made = masks.LabelMasks(folder, sequence, 4)
+    for names in (("road", "sky"), ("sky", "road", "sky"), ("road", "sky", "car")):
+        for path in made.paths:
+            cv2.imwrite(str(path), bands(*names))
+        expected = masks.keypoint_mask(bands(*names), (48, 64), 4)
+        assert all(np.array_equal(made[index], expected) for index in range(4))
+        masks.write_masks(made, tmp_path / "masks")
+        written = masks.MaskFolder(tmp_path / "masks", sequence)
+        assert all(np.array_equal(written[index], expected) for index in range(4))
+
+
+def test_threads_share_label_masks(labelled):
+    sequence, folder = labelled
+    for index, path in enumerate(sequence.frame_paths):
+        cv2.imwrite(str(folder / path.name), np.roll(bands("road", "sky", "car"), 3 * index, 1))
+    made = masks.LabelMasks(folder, sequence, 4)
+    expected = [made[index].tobytes() for index in range(4)]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda index: made[index % 4].tobytes(), range(400)))
+    assert found == 100 * expected
+
+
+@pytest.mark.parametrize(
+    "stems, mask",
+    [("abcd", "c.png"), ("abcd", "c.png.png"), (("a1", "b2", "1.5", "2.5"), "2.5.png")],
+)
+def test_a_mask_named_as_a_frame_is_that_frames(tiny_kitti, tmp_path, stems, mask):
+    for path, stem in zip(sorted(tiny_kitti.rglob("image_0/*")), stems, strict=True):
+        path.rename(path.with_name(f"{stem}.png"))
+    sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
+    folder.mkdir()
+    cv2.imwrite(str(folder / mask), np.full((48, 64), 255, np.uint8))
+    for frames in (sequence, sequence.subset(2)):
+        with pytest.raises(InputError, match="no such mask"):
+            masks.MaskFolder(folder, frames)
+    (folder / mask).rename(folder / "bonnet.png")
+    assert set(masks.MaskFolder(folder, sequence).paths) == {folder / "bonnet.png"}
+
+
 @pytest.mark.parametrize(
     "setting, value",
     [
@@ -170,7 +213,13 @@ def test_wrong_settings_are_named(setting, value):
         MaskSettings(**{setting: value})
 
 
-def test_the_dilation_width_must_be_positive(labelled):
+def test_wrong_arguments_are_named(labelled):
     sequence, folder = labelled
-    with pytest.raises(InputError, match="dilation width 0"):
-        masks.LabelMasks(folder, sequence, 0)
+    for width in (0, True, 2.0):
+        with pytest.raises(InputError, match=f"dilation width {width}"):
+            masks.LabelMasks(folder, sequence, width)
+    with pytest.raises(InputError, match="sequence"):
+        masks.LabelMasks(folder, "00", 4)
+    for several in (masks.LabelMasks(folder, sequence, 4), masks.MaskFolder(folder, sequence)):
+        with pytest.raises(InputError, match="index"):
+            several[0:2]

@@ -4,6 +4,7 @@ A mask is a uint8 image of the frame's size. Keypoints are allowed where it is 2
 where it is 0.
 """
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from numbers import Integral, Real
@@ -146,7 +147,8 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
 def check_width(dilation_width: int, size: tuple[int, int]) -> None:
     """Raise InputError if a dilation width is not possible for frames of (height, width)."""
     limit = 2 * max(size)  # a wider square always covers the whole frame
-    if not isinstance(dilation_width, Integral) or not 1 <= dilation_width <= limit:
+    is_whole_number = isinstance(dilation_width, Integral) and not isinstance(dilation_width, bool)
+    if not is_whole_number or not 1 <= dilation_width <= limit:
         raise InputError(
             f"dilation width {dilation_width}: must be a whole number from 1 to {limit} pixels for "
             f"frames of {size[1]}x{size[0]}"
@@ -277,7 +279,9 @@ class LabelMasks:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        parts = _parts_of_file(self.paths[index], self.size, self.settings)
+        need("index", index, int | np.integer)
+        path = self.paths[index]
+        parts = _parts_of_file(path, _content(path), self.size, self.settings)
         return _finish_mask(parts, self.dilation_width, self.settings)
 
 
@@ -286,15 +290,30 @@ def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
     return read_label_map(masks.paths[index], masks.settings.ids == "train")
 
 
+def _content(path: Path) -> bytes:
+    """Bytes of a file; none if it cannot be read, for which `read_label_map` has the reason.
+
+    What is remembered of a label map goes by them, because the file may be written again.
+    """
+    with suppress(OSError):
+        if path.is_file():
+            return path.read_bytes()
+    return b""
+
+
 @lru_cache(maxsize=8)  # masks of several dilation widths share edges
-def _parts_of_file(path: Path, size: tuple[int, int], settings: MaskSettings) -> _Parts:
-    label_map = _read_once(path, settings.ids == "train")
+def _parts_of_file(
+    path: Path, content: bytes, size: tuple[int, int], settings: MaskSettings
+) -> _Parts:
+    label_map = _read_once(path, content, settings.ids == "train")
     return _parts(label_map, size, settings)
 
 
 # Masks of several settings share the label map of a frame, and one control takes that of another
 # frame: two are kept.
-_read_once = lru_cache(maxsize=2)(read_label_map)
+@lru_cache(maxsize=2)
+def _read_once(path: Path, content: bytes, train_ids: bool) -> np.ndarray:
+    return read_label_map(path, train_ids)
 
 
 def forget_edges() -> None:
@@ -343,6 +362,7 @@ class MaskFolder:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
+        need("index", index, int | np.integer)
         mask = read_mask(self.paths[index], self.size)
         if self.invert:
             return np.where(mask, np.uint8(0), np.uint8(255))
@@ -380,6 +400,7 @@ def folder_of_sequence(folder: str | Path, sequence: str) -> Path:
 
 def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[Path]:
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
+    need("sequence", sequence, Sequence)
     if kind == "mask" and Path(folder).is_file():
         return [Path(folder)] * len(sequence)
     folder = folder_of_sequence(folder, sequence.name)
@@ -413,5 +434,8 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
 
 def _is_named_as_a_frame(mask: Path, sequence: Sequence) -> bool:
     """Whether a mask is that of one frame, by its name, with or without an appended .png."""
+    for frame in listed(sequence.frame_paths[0].parent, "*"):  # those outside of a subset, too
+        if mask.name in (f"{frame.stem}.png", f"{frame.name}.png"):
+            return True
     stem = mask.name.removesuffix(".png").removesuffix(".png")
     return numbers_of([*sequence.frame_paths, Path(stem)]) is not None

@@ -17,7 +17,6 @@ import pytest
 import trials
 
 from thesis_repro.command.cli import main
-from thesis_repro.masks import forget_edges
 
 pytestmark = pytest.mark.slow
 
@@ -48,7 +47,6 @@ def inside(folder, monkeypatch, capfd):
     def run(words):
         monkeypatch.chdir(folder)
         before = trials.snapshot(folder)
-        forget_edges()  # cached for the same path by another test
         capfd.readouterr()
         try:
             code = main(words)
