@@ -1,6 +1,9 @@
 """The odometry against PySLAM's runs, its rules for bad frames, and its settings."""
 
+import copy
+import pickle
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import cv2
 import numpy as np
@@ -246,13 +249,15 @@ def test_black_and_blown_out_frames_are_bridged(drive):
     assert result.frames["updated"][[2, 3, 4, 6]].all()
 
 
-def test_implausible_motions_are_flagged_and_kept(drive, monkeypatch):
+@pytest.mark.parametrize("estimator", ["thesis", "inliers", "refined"])
+def test_implausible_motions_are_flagged_and_kept(drive, monkeypatch, estimator):
+    settings = replace(THESIS, estimator=estimator)
     noise = np.random.RandomState(0).normal(0, 2, drive.frame(0).shape)
     still = Changed(drive, {5: np.clip(drive.frame(4) + noise, 0, 255).astype(np.uint8)})
-    assert flags(odometry.run(still))[5].endswith("no parallax")
-    plain = odometry.run(drive)
+    assert flags(odometry.run(still, settings))[5].endswith("no parallax")
+    plain = odometry.run(drive, settings)
     monkeypatch.setattr(odometry.odometry, "MAX_TURN", 0.05)
-    flagged = odometry.run(drive)
+    flagged = odometry.run(drive, settings)
     assert plain.flagged.empty and set(flags(flagged).values()) == {"too large a turn"}
     np.testing.assert_array_equal(flagged.poses, plain.poses)
 
@@ -364,6 +369,61 @@ def test_another_detector_follows_the_drive(drive):
     result = odometry.run(few, replace(THESIS, detector="orb"))
     assert metrics.rmse(result.poses, few.poses) < 0.1
     assert np.abs(result.poses - odometry.run(few).poses).max() > 1e-9
+
+
+# What the caller does with the arrays does not matter
+
+SETTINGS = {
+    "thesis": THESIS,
+    "tracked on": replace(THESIS, redetect_below=10),
+    "fallback": replace(THESIS, fallback=True),
+    "refined": replace(THESIS, estimator="refined"),
+}
+
+
+def arrays_of(step):
+    motion = step.motion.rotation, step.motion.translation, step.motion.inliers
+    arrays = step.pose, step.keypoints, step.previous, step.current, *motion
+    return [array for array in arrays if array is not None]
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_a_step_does_not_depend_on_arrays_of_the_caller(drive, settings):
+    intrinsics, buffer = drive.intrinsics.copy(), np.empty_like(drive.frame(0))
+    plain, disturbed = Odometry(drive.intrinsics, settings), Odometry(intrinsics, settings)
+    intrinsics[:] = 0
+    for index in range(6):
+        frame, scale, mask = drive.frame(index), 0.4 * (index > 0), Stripes(40)[index]
+        buffer[:] = frame
+        step, other = plain.step(frame, scale, mask), disturbed.step(buffer, scale, mask)
+        np.testing.assert_array_equal(other.pose, step.pose)
+        for array in (buffer, *arrays_of(other)):
+            array[:] = 0
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda odometry: pickle.loads(pickle.dumps(odometry))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_a_copy_goes_on_with_the_same_bits(drive, copied):
+    first = Odometry(drive.intrinsics, replace(SMALL, estimator="refined", fallback=True))
+    masks = Stripes(40)
+    for index in range(3):
+        first.step(drive.frame(index), 0.4, masks[index])
+    second = copied(first)
+    for index in range(3, 6):
+        poses = [each.step(drive.frame(index), 0.4, masks[index]).pose for each in (first, second)]
+        np.testing.assert_array_equal(*poses)
+
+
+def test_results_and_steps_equal_only_themselves(drive):
+    few = Changed(drive, frames=2)
+    first, second = odometry.run(few, SMALL), odometry.run(few, SMALL)
+    assert first == first != second and len({first, second}) == 2
+    follower = Odometry(drive.intrinsics, SMALL)
+    steps = [follower.step(drive.frame(index), 0.4) for index in range(3)]
+    assert steps.index(steps[2]) == 2 and len({step.motion for step in steps[1:]}) == 2
 
 
 # Many runs in one pass
@@ -509,9 +569,28 @@ def test_wrong_frames_and_masks_are_named(drive):
         (frame / 255, 0.4),
         (frame, float("nan")),
         (frame, None),
+        (frame, Fraction(-1, 2)),
         (None, 0.4),  # of cv2.imread, for a missing file
         (frame, 0.4, frame.tolist()),
     ):
         with pytest.raises(InputError, match="frame 1"):
             follower.step(*arguments)
-    assert follower.step(frame, 0.4).updated  # the state is unchanged
+    assert follower.step(frame, Fraction(2, 5)).updated  # the state is unchanged
+
+
+@pytest.mark.parametrize("sequence", ["00", None])
+def test_wrong_sequences_are_named(sequence):
+    with pytest.raises(InputError, match="sequence"):
+        odometry.run(sequence)
+
+
+@pytest.mark.parametrize(
+    "masks", [lambda index: None, iter(()), [None] * 9], ids=["function", "iterator", "short"]
+)
+def test_wrong_masks_are_named_before_a_frame_is_read(drive, masks):
+    unread = Changed(drive)
+    with pytest.raises(InputError, match="masks: "):
+        odometry.run(unread, masks=masks)
+    with pytest.raises(InputError, match="masks: "):
+        odometry.run_many(unread, {"": (THESIS, masks)})
+    assert unread.read == []

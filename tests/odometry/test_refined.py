@@ -10,7 +10,7 @@ from street import Street
 
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import THESIS, Odometry, metrics, pose
+from thesis_repro.odometry import THESIS, Odometry, Step, metrics, pose
 from thesis_repro.odometry.odometry import ALL_KEYPOINTS
 from thesis_repro.odometry.refined import fit as refine
 from thesis_repro.odometry.refined import motion_prior
@@ -226,6 +226,22 @@ def test_a_camera_that_only_turns_or_zooms_is_flagged(estimator, axis, degrees, 
     follower.step(drive.frame(0))
     step = follower.step(moved, 0.5)
     assert step.updated and {"no parallax", "zoom"} & set(step.flags) == {flag}
+
+
+@pytest.mark.parametrize("estimator", ["thesis", "refined"])
+def test_a_turn_that_no_car_can_make_is_flagged_again_and_again(estimator):
+    """The second such step is consistent with the first one."""
+    camera = Street(1).intrinsics
+    follower = Odometry(camera, replace(THESIS, estimator=estimator))
+    current, previous = (
+        points * np.diag(camera)[:2] + camera[:2, 2] for points in seen(street(), turn(24), AHEAD)
+    )
+    for frame in (1, 2):
+        step = Step(frame, scale=1.0, points=len(current), previous=previous, current=current)
+        follower.estimate(step)
+        follower.compose(step)
+        assert "too large a turn" in step.flags
+        assert degrees_apart(turn(24 * frame), follower.pose[:3, :3]) < 0.1
 
 
 @pytest.mark.real

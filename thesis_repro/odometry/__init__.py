@@ -30,8 +30,6 @@ means that the pose does not change:
 | inliers move as if all were equally far,  | "zoom": the pose moves, ahead or back              |
 | as under a zoom                           |                                                    |
 
-"too large a turn" is not looked for with estimator="refined".
-
 With settings.fallback and masks, the flag "all keypoints used" marks steps estimated from all
 keypoints. The masked keypoints did not determine the motion, or it differed too much from the
 previous step's. With estimator="refined" there are two more flags, and the pose is always moved

@@ -11,7 +11,7 @@ from thesis_repro.odometry.pose import Motion
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Essential:
     """An essential matrix and the normalised correspondences (N, 2) from which it was estimated."""
 

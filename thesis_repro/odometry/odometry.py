@@ -1,6 +1,7 @@
 """The odometry, frame by frame: keypoints, the motion between two frames, and the new pose."""
 
 import time
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from numbers import Real
@@ -26,11 +27,12 @@ ALL_KEYPOINTS, STATIONARY = "all keypoints used", "stationary"
 MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
 
 
-@dataclass
+@dataclass(eq=False)
 class Step:
     """Results for one frame.
 
     Its N correspondences are `previous` and `current`, (N, 2) pixels; `inliers` is (N,).
+    Later steps do not depend on its arrays.
     """
 
     frame: int
@@ -110,7 +112,7 @@ class Odometry:
         and for a start that is no pose.
         """
         need("settings", settings, OdometrySettings)
-        self.intrinsics = np.asarray(intrinsics, np.float64)
+        self.intrinsics = np.array(intrinsics, np.float64)
         self.settings = settings
         self.pose = np.eye(4) if start is None else np.array(start, np.float64)
         if not is_camera_matrix(self.intrinsics):
@@ -124,7 +126,7 @@ class Odometry:
         self.prior = (
             MotionPrior.straight_ahead()
         )  # used by the refined estimator and the fallback only
-        self.keypoints: Any = shared or keypoints  # both have `detect` and `track`
+        self.shared = shared
         self.count = 0
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
         self.points = keypoints.NO_POINTS
@@ -150,8 +152,11 @@ class Odometry:
             if mask.dtype == bool:
                 mask = mask.view(np.uint8)
         need(f"frame {self.count}: scale", np.asarray(scale)[()], Real)
+        scale = float(scale)
         self._check(frame, scale, mask)
-        step = Step(frame=self.count, scale=float(scale))
+        if self.shared is None:  # shared keypoints know a frame by its identity
+            frame = frame.copy()  # the caller may read the next frame into the same array
+        step = Step(frame=self.count, scale=scale)
         self.count += 1
         if self.previous is not None:
             step.scale += self.gap
@@ -166,7 +171,7 @@ class Odometry:
         points = step.current
         if len(points) < self.settings.redetect_below or not len(points):
             started = time.perf_counter()
-            detected = self.keypoints.detect(frame, self.settings, mask)
+            detected = self._tracker.detect(frame, self.settings, mask)
             step.seconds["detect"] = time.perf_counter() - started
             step.detected = len(detected)
             if len(detected):
@@ -174,15 +179,20 @@ class Odometry:
             else:
                 step.flags.append("no keypoints")
         self.previous = frame
-        self.points = step.keypoints = points
+        self.points, step.keypoints = points.copy(), points
         return step
+
+    @property
+    def _tracker(self) -> Any:
+        """What detects and tracks: the shared keypoints or the module, with the same functions."""
+        return self.shared or keypoints
 
     def _track(self, step: Step, frame: np.ndarray) -> None:
         """Track the points of the previous frame into this one: the step's correspondences."""
         started = time.perf_counter()
         if self.previous is not None and len(self.points):
             step.points = len(self.points)
-            tracked, was_tracked = self.keypoints.track(
+            tracked, was_tracked = self._tracker.track(
                 self.previous, frame, self.points, self.settings.window, self.settings.levels
             )
             step.previous = self.points.compress(was_tracked, axis=0)
@@ -227,7 +237,8 @@ class Odometry:
                 self._move(step)
             else:
                 step.flags.append(flag)
-        step.pose = self.pose
+        step.pose = self.pose.copy()
+        self.prior = deepcopy(self.prior)  # step.motion has the arrays of the original
         return step
 
     def _flag_if_kept(self, step: Step) -> str | None:
@@ -245,8 +256,10 @@ class Odometry:
         """Move the pose, and flag a motion that is doubtful."""
         if self.settings.estimator == "refined":
             self._check_consistency(step)
-        else:
-            self._check_turn(step)
+        elif self.settings.fallback:
+            motion = step.motion
+            self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
+        self._check_turn(step)
         self._check_parallax(step)
         rotation = self.pose[:3, :3]
         moved = np.eye(4)
@@ -304,13 +317,10 @@ class Odometry:
         step.seconds["pose"] += time.perf_counter() - started
 
     def _check_turn(self, step: Step) -> None:
-        """Flag a step that turns more than a car can, and remember its motion for the fallback."""
-        motion = step.motion
-        cosine = (np.trace(motion.rotation) - 1) / 2
+        """Flag a step that turns more than a car can."""
+        cosine = (np.trace(step.motion.rotation) - 1) / 2
         if cosine < np.cos(np.radians(MAX_TURN)):
             step.flags.append("too large a turn")
-        if self.settings.fallback and motion.translation is not None:
-            self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
 
     def _check_parallax(self, step: Step) -> None:
         """Flag a step without parallax.

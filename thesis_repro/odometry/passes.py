@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Mapping, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
@@ -42,6 +42,7 @@ DTYPES = {
 NUMBER_COLUMNS = [*(column for column in FRAME_COLUMNS if column != "flag"), "mask_seconds"]
 
 
+@runtime_checkable
 class Masks(Protocol):
     """An object whose item i is the mask of frame i, (height, width) uint8.
 
@@ -51,12 +52,12 @@ class Masks(Protocol):
     def __getitem__(self, index: int, /) -> np.ndarray: ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
     """Result of one run.
 
     poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing values
-    are blank.
+    are blank. A result equals only itself; compare poses with np.array_equal.
     """
 
     poses: np.ndarray
@@ -117,11 +118,9 @@ def run(
     """Run the odometry over a kitti.Sequence. Returns a Result.
 
     masks: see Masks. description: text of the progress bar; None for no bar.
-    Raises InputError if a frame cannot be read, if a mask and its frame differ in size, and if
-    there are fewer masks than frames.
+    Raises InputError if a frame cannot be read, if a mask and its frame differ in size, if there
+    are fewer masks than frames, and for another kind of sequence, settings or masks.
     """
-    if isinstance(masks, Sized) and len(masks) < len(sequence):
-        raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
     results_by_name = _run_pass(sequence, {"": (settings, masks)}, None, description, None)
     return results_by_name[""]
 
@@ -173,8 +172,17 @@ def _run_pass(
     checkpoint: Path | None,
 ) -> dict[str, Result]:
     """Make runs in one pass. shared: None if the times of a single run are wanted."""
+    if not hasattr(sequence, "frame"):
+        raise InputError(
+            f"sequence: must be a thesis_repro.Sequence, not {type(sequence).__name__}"
+        )
     members = {}
     for name, (settings, masks) in runs.items():
+        is_short = isinstance(masks, Sized) and len(masks) < len(sequence)
+        if is_short or not isinstance(masks, Masks | None):
+            raise InputError(
+                f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks"
+            )
         odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), shared)
         numbers = np.full((len(sequence), len(NUMBER_COLUMNS)), np.nan)
         members[name] = _Run(odometry, masks, numbers)

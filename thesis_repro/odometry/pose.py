@@ -23,7 +23,7 @@ MIN_CORRESPONDENCES = 5
 FLOW_ROUNDS = 2  # they leave 0.1 pixels of a turn by 5 degrees; one leaves 10
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Motion:
     """Motion of the camera between two frames.
 

@@ -41,7 +41,7 @@ _gesv: Any = types.ExternalFunction(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RefinedMotion(Motion):
     """A fitted motion with its uncertainty."""
 
