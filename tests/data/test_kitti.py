@@ -30,6 +30,9 @@ def test_reads_a_sequence(tiny_kitti):
     short = sequence.subset(2)
     assert len(short) == len(short.poses) == len(short.times) == 2
     assert len(sequence.subset(99)) == len(sequence.subset(None)) == 4
+    for count in (0, -5, 2.5, "3"):
+        with pytest.raises(InputError, match=f"frames {count!r}"):
+            sequence.subset(count)
 
 
 def test_tum_files_are_read_by_evo(tmp_path):

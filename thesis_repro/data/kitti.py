@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from copy import copy
 from functools import cached_property
 from itertools import islice, pairwise
+from numbers import Integral
 from pathlib import Path
 from statistics import median_low
 
@@ -278,7 +279,12 @@ class Sequence:
             yield self.frame(index)
 
     def subset(self, count: int | None) -> "Sequence":
-        """Copy of the sequence with its first `count` frames; None for all frames."""
+        """Copy of the sequence with its first `count` frames; None for all frames.
+
+        Raises InputError for another count than a whole number from 1 on.
+        """
+        if count is not None and not (isinstance(count, Integral) and count > 0):
+            raise InputError(f"frames {count!r}: must be a whole number, 1 or more; None takes all")
         short = copy(self)
         short.frame_paths, short.times = self.frame_paths[:count], self.times[:count]
         if self.has_truth:
