@@ -128,10 +128,23 @@ def test_folders_of_sequences_get_a_mean(files, capsys):
     assert [row["sequence"] for row in rows] == ["07", "08", "mean of 2"]
     values = [metrics.rmse(winding(seed=seed)[:120], winding()[:120]) for seed in (1, 2)]
     assert [row["rmse_m"] for row in rows] == pytest.approx([*values, np.mean(values)])
+    assert rows[-1]["note"] == ""
     assert main([*command, "--sequence", "08"]) == 0
     assert [row["sequence"] for row in json.loads(capsys.readouterr().out)] == ["08"]
     (files / "kitti/poses").rename(files / "elsewhere")
     assert main(command) == 1 and "ours" in capsys.readouterr().err
+
+
+def test_a_mean_over_fewer_sequences_says_so(files, capsys):
+    for name, frames in (("07", 160), ("08", 20)):  # 19 m are too short for t_rel
+        write_kitti_poses(files / f"kitti/poses/{name}.txt", winding()[:frames])
+        write_kitti_poses(files / f"ours/{name}.txt", winding(seed=1)[:frames])
+    command = ["evaluate", "--kitti", str(files / "kitti"), str(files / "ours")]
+    assert main([*command, "--json"]) == 0
+    long, short, mean = json.loads(capsys.readouterr().out)
+    assert short["t_rel_percent"] is None and mean["t_rel_percent"] == long["t_rel_percent"]
+    assert mean["note"] == "mean of only 1 of 2: t_rel_percent, r_rel_deg_per_100m"
+    assert main(command) == 0 and mean["note"] in capsys.readouterr().out
 
 
 def moved(poses, change):

@@ -180,7 +180,7 @@ def _or_none(value: Any) -> Any:
 def means(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Yield a row with the means of each trajectory that has several sequences.
 
-    rows: of `evaluate`.
+    rows: of `evaluate`. Some sequences do not have all errors; the row's note counts them.
     """
     by_trajectory = pd.DataFrame(rows).groupby("trajectory", sort=False)
     sequences = by_trajectory["sequence"].agg(", ".join)
@@ -192,14 +192,28 @@ def means(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         if differ:
             averaged = sequences[name]
         counts = ["poses", "frames", "segments"]
-        mean = errors.drop(columns=counts, errors="ignore").mean(numeric_only=True)
+        values = errors.drop(columns=counts, errors="ignore")
+        mean = values.mean(numeric_only=True)
         yield {
             "trajectory": name,
             "sequence": f"mean of {averaged}",
             "poses": int(errors["poses"].sum()),
             **mean.to_dict(),
-            "note": "",
+            "note": _note_of_fewer(values[mean.index].count(), len(errors)),
         }
+
+
+def _note_of_fewer(counts: pd.Series, sequences: int) -> str:
+    """Return what to say about errors that some of the averaged sequences do not have.
+
+    counts: number of values by error.
+    """
+    fewer = counts[counts.index.isin(COLUMNS) & (counts < sequences)]
+    names_by_count = fewer.index.groupby(fewer)
+    return "; ".join(
+        f"mean of only {count} of {sequences}: {', '.join(names)}"
+        for count, names in names_by_count.items()
+    )
 
 
 def aligned(
