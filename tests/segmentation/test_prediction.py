@@ -104,6 +104,9 @@ def test_workers_write_the_label_maps_of_one_process_and_only_missing_ones(
     assert prediction.spread_label_maps(*arguments) == 2
     assert [path for path in dates if path.stat().st_mtime_ns != dates[path]] == [removed]
 
+    untrained(2).save(tmp_path / "model.keras")  # trained again, while the workers live
+    assert prediction.spread_label_maps(*arguments) == len(frames) + 5
+
 
 @pytest.mark.parametrize(
     "answer",

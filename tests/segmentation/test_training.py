@@ -239,6 +239,13 @@ def test_sets_that_cannot_be_trained_on_are_refused(images, labels):
         training.Batches([(images, labels)], 4)
 
 
+@pytest.mark.parametrize("counts", [(18,), (9, 8), (6, 6, 6)])
+def test_an_augmenter_needs_two_sets_of_one_length(counts):
+    sets = [(SETS[0][:1].repeat(count, 0), SETS[1][:1].repeat(count, 0)) for count in counts]
+    with pytest.raises(InputError, match="augmenter"):
+        training.Batches(sets, 4, seed=0, augmenter=augmentation.training_augmenter(SIZE))
+
+
 def test_early_stopping_keeps_the_best_and_stays_stopped(tmp_path):
     # a validation set that contradicts the training set gets worse as training goes on
     sets = (*SETS[:3], np.where(SETS[3] == 7, 11, 7).astype(np.uint8))

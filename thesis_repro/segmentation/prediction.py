@@ -181,8 +181,10 @@ def spread_label_maps(
     return missing
 
 
-# a worker predicts many parts with one model
-_load_once = lru_cache(maxsize=1)(training.load_model)
+@lru_cache(maxsize=1)  # a worker predicts many parts with one model
+def _load_once(model_file: Path, weights: str) -> Any:
+    """Load a model. weights: their digest, because the file may be written again."""
+    return training.load_model(model_file)
 
 
 def _write_part(
@@ -194,7 +196,7 @@ def _write_part(
     """
     try:
         results.check_worker(folder, record)
-        model = _load_once(model_file)
+        model = _load_once(model_file, record["model"])
         results.check_worker(folder, record, model=training.weights_digest(model), **_arithmetic())
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # the other parts continue, and the caller reports the reason

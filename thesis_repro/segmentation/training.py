@@ -99,8 +99,8 @@ class Batches:
 
         augmenter: if given, every epoch augments the first set again and uses the result instead of
         the second set.
-        Raises InputError for an empty set, images and label maps that do not match, and unknown
-        label ids.
+        Raises InputError for an empty set, images and label maps that do not match, unknown label
+        ids, and an augmenter without two sets of one length.
         """
         for images, labels in sets:
             if len(images) == 0 or images.ndim != 4 or images.shape[:3] != labels.shape:
@@ -113,6 +113,12 @@ class Batches:
                 raise InputError(
                     f"label id {highest} is above {N_CLASSES - 1}; label maps must hold Cityscapes ids"
                 )
+        lengths = [len(images) for images, _ in sets]
+        if augmenter and (len(lengths) != 2 or lengths[0] != lengths[1]):
+            raise InputError(
+                f"augmenter: with sets of {lengths} images; give two sets of one length, whose second "
+                "one it replaces"
+            )
         self.sets, self.batch_size, self.seed, self.augmenter = sets, batch_size, seed, augmenter
         self.epoch = 0
         self._places = [
