@@ -116,6 +116,21 @@ def test_progress_is_written_to_the_named_file(tmp_path, monkeypatch):
     assert "counting" in (tmp_path / "log").read_text()
 
 
+def test_progress_closes_the_named_file(tmp_path, monkeypatch):
+    opened = []
+
+    def noted(*arguments, **options):
+        opened.append(open(*arguments, **options))  # noqa: SIM115  the bar closes it
+        return opened[-1]
+
+    monkeypatch.setenv("THESIS_REPRO_PROGRESS", str(tmp_path / "log"))
+    monkeypatch.setattr(files, "open", noted, raising=False)
+    with files.progress(None, "held", 3):
+        list(files.progress(range(3), "ended"))
+        next(iter(files.progress(range(3), "stopped")))
+    assert [file.closed for file in opened] == [True] * 3
+
+
 # Pairs of images and label maps
 
 

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TextIO
 
 import cv2
 import numpy as np
@@ -290,14 +290,15 @@ def progress(
     it to its terminal for the bars inside notebooks. Without a terminal, the bar is replaced by a
     line every 20 seconds.
     """
-    stream = sys.stderr
+    own_file = None
     with suppress(KeyError, OSError):
-        # the bar needs it open, and the process closes it at its end
-        stream = open(os.environ["THESIS_REPRO_PROGRESS"], "a", buffering=1)  # noqa: SIM115
+        # the bar closes it
+        own_file = open(os.environ["THESIS_REPRO_PROGRESS"], "a", buffering=1)  # noqa: SIM115
+    stream = own_file or sys.stderr
     options: dict[str, Any] = {"file": _Lines(stream), "mininterval": 20, "ascii": True}
     if stream.isatty():
         options = {"file": stream, "mininterval": 0.2, "dynamic_ncols": True, "leave": False}
-    return tqdm(
+    bar = _Bar(
         iterable,
         desc=description,
         total=total,
@@ -307,6 +308,20 @@ def progress(
         smoothing=0,  # the average over the whole time predicts better than the last steps
         **options,
     )
+    bar.own_file = own_file
+    return bar
+
+
+class _Bar(tqdm):
+    """A bar that closes the file which was opened for it."""
+
+    own_file: TextIO | None = None
+
+    def close(self) -> None:
+        """Clear or leave the bar."""
+        super().close()
+        if self.own_file:
+            self.own_file.close()
 
 
 class _Lines(ObjectWrapper):
