@@ -393,7 +393,7 @@ def test_numbers_of_the_run_and_of_the_thesis(run):
         "Here: 4.0 to 6.7 times fewer" in text and "gives 2.0 to 4.1 times fewer than 2000" in text
     )
     assert (
-        "Here: 2 epochs, the best was 1; last epoch: train loss 0.70, F1 0.30, IoU 0.10; validation loss 0.90, F1 0.20"
+        "Here: 2 epochs, the best was 1; last epoch: train loss 0.70, F1 0.30, IoU 0.20; validation loss 0.90, F1 0.20"
         in text
     )
     assert "5 to 10 % of the time saved." in text and "Here: -10 to 20 % of the time saved" in text
