@@ -67,6 +67,7 @@ def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
         "sequences": ", ".join(sorted(rows["sequence"].unique())),
         "over": over,
         **ratios,
+        "lost runs": compare.lost(rows),
     }
 
 
@@ -101,6 +102,7 @@ def _of_embedded_world():
             "sequences": f"{row['sequences']} drives",
             "over": ALL_KEYPOINTS,
             **{label: row[label] for label in compare.JUDGING_METRICS.values() if label in row},
+            "lost runs": row["lost runs"],
         }
         for name, (mean_iou, where, row) in sources.items()
     ]
