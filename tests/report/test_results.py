@@ -102,6 +102,11 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
     text = texts.findings(runs, compare.comparisons(runs), "real", False, shuffled=shuffled)
     assert f"{null['mean']:+.1f} %" in text
+    assert "with the matched points shuffled, the mean" in text
+    is_once = (runs["repetition"] == 0) | (runs["dilation_width"] != 5)  # width 5 is run once
+    once = runs[is_once]
+    text = texts.findings(once, compare.comparisons(once), "real", False, shuffled=shuffled)
+    assert "with the matched points shuffled, the mean" not in text
     assert "procedure" not in texts.findings(runs, compare.comparisons(runs), "real", False)
 
 
