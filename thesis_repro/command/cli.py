@@ -335,7 +335,7 @@ def _print_oddities(sequence: Any, mask_sets: Iterable) -> list[str]:
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             line, mask_warnings = oddities.of_masks(masks, sequence)
-            console.log.info(line)
+            console.log.info(one_line(line))
             warnings += mask_warnings
     return warnings
 
@@ -348,7 +348,7 @@ def _warn(lines: Iterable[str]) -> list[str]:
         places.setdefault(fault, []).append(place)
     merged = [f"{', '.join(names)}: {fault}" for fault, names in places.items()]
     for line in merged:
-        console.log.warning(line)
+        console.log.warning(one_line(line))
     return merged
 
 
@@ -468,7 +468,7 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
         text = texts.render(template, record=record, **values).rstrip()
     print(text)
     for name, path in _output_files(options).items():
-        console.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
+        console.log.info(one_line(f"{path}: {OUTPUT_FILES[name][0]}"))
 
 
 def _replace_closed_streams() -> None:
