@@ -263,6 +263,7 @@ def test_links_are_relative_and_exist_and_no_folder_of_the_machine_is_named(run)
         # the name of MathML's vocabulary is no address that is loaded
         text = text.replace("http://www.w3.org/1998/Math/MathML", "")
         assert not re.search(r"https?:|url\(|@import|file:|\$\$", text)
+        assert "<mi></mi>" not in text  # a formula whose letters stand outside of their tags
         assert str(ROOT) not in text and str(run.settings.figures.parent) not in text
 
 

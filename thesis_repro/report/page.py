@@ -85,10 +85,10 @@ def notebook_html(path: Path, page: Path) -> str:
     for cell in notebook.cells:
         if cell.cell_type == "markdown":  # browsers show MathML without scripts
             cell.source = re.sub(r"\$\$(.+?)\$\$", mathml, cell.source, flags=re.DOTALL)
-    # nbconvert's complete pages load scripts from the network, but the basic template does not
+    # nbconvert's complete pages load scripts from the network, but the basic template does not;
+    # without embed_images, which would take MathML apart; pictures of outputs are embedded anyway
     exporter = HTMLExporter(
         template_name="basic",
-        embed_images=True,
         exclude_input_prompt=True,
         exclude_output_prompt=True,
         exclude_anchor_links=True,
