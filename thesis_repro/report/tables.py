@@ -123,13 +123,13 @@ def _summary(changes: pd.Series, runs: pd.DataFrame | None = None) -> dict[str, 
 def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
     """Return the last rows for simulated studies (%), one row a study: means over the studies."""
     means = studies.mean(axis=1)
-    tail = (100 - compare.LEVEL) / 200
+    low, high = thesis_tables.middle(means)
     middle = f"mean, middle {compare.LEVEL} % of {len(studies)} simulated studies"
     return {
         "sum (the thesis's aggregate)": studies.sum(axis=1).mean(),
         "mean": means.mean(),
-        f"{middle}, from": means.quantile(tail),
-        f"{middle}, to": means.quantile(1 - tail),
+        f"{middle}, from": low,
+        f"{middle}, to": high,
         "median": studies.median(axis=1).mean(),
         "sequences improved": (studies < 0).sum(axis=1).mean(),
     }

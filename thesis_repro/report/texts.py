@@ -187,7 +187,6 @@ def _thesis_procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[s
     # the embedded world repeats only one width, and one width is no choice
     widths_run = masked.groupby("repetition")["dilation_width"].nunique()
     repetitions = sorted(widths_run.index[widths_run == widths])
-    tail = (100 - compare.LEVEL) / 200
     rows = []
     for metric in ("rmse", "mae"):
         by_repetition = [
@@ -198,6 +197,7 @@ def _thesis_procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[s
         best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
         studies = thesis_tables.changes_if_masks_did_nothing(shuffled, widths, metric)
         null_means = studies.mean(axis=1)
+        null_low, null_high = thesis_tables.middle(null_means)
         row = {
             "name": compare.METRICS[metric],
             "widths": widths,
@@ -211,8 +211,8 @@ def _thesis_procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[s
             "repetitions": len(means),
             "studies": len(studies),
             "null_mean": null_means.mean(),
-            "null_low": null_means.quantile(tail),
-            "null_high": null_means.quantile(1 - tail),
+            "null_low": null_low,
+            "null_high": null_high,
             "null_improved": (studies < 0).sum(axis=1).mean(),
         }
         rows.append(row)

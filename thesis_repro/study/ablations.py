@@ -24,10 +24,8 @@ from thesis_repro.odometry.pose import normalise
 from thesis_repro.running import results
 from thesis_repro.running.files import progress
 from thesis_repro.study import workers
-from thesis_repro.study.compare import LEVEL
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import measures
-from thesis_repro.study.thesis_tables import STUDIES, percent_change
 
 Run = tuple[OdometrySettings, Masks | None]
 Runs = dict[tuple[str, str, int], Run]  # by method, estimator, repetition
@@ -190,61 +188,6 @@ def _mean_number(sequence: Sequence, frame_masks: Masks) -> int:
         points = keypoints.detect(sequence.frame(index), THESIS, frame_masks[index])
         numbers.append(len(points))
     return round(np.mean(numbers))
-
-
-# Results of the thesis's procedure if masks did nothing (Section 4.2, Tables 4.2 and 4.3)
-
-SEQUENCES, WIDTHS = 11, 15  # of the thesis
-
-
-def null_distribution(
-    runs: pd.DataFrame, reported: pd.Series, widths: int = WIDTHS
-) -> pd.DataFrame:
-    """Simulate what the thesis's procedure reports if masks do nothing.
-
-    Returns one row each for mean, median and sum of the changes (%).
-    The thesis runs all keypoints once and masks of 15 widths once each, takes the best width of
-    each sequence and averages Equation 4.1. If masks did nothing, these 16 runs would differ only
-    in the order of the matched points. So the procedure is applied STUDIES times to 16 errors for
-    each sequence, drawn with replacement from measured errors.
-
-    runs: all keypoints under one estimator, several repetitions of each sequence, columns sequence
-    and rmse.
-    reported: the changes (%) that a study reports, by sequence. Columns: expected (mean of the
-    simulated studies), low, high (their middle LEVEL percent), share_as_low (percent of them with
-    the reported number or a lower one). The best of 15 drawn errors is never better than the best
-    measured error.
-    """
-    random = np.random.default_rng(0)
-    logarithms = random.choice(deviations(runs), (STUDIES, SEQUENCES, widths + 1))
-    best = np.exp(logarithms[..., 1:].min(axis=-1))
-    changes = percent_change(best, np.exp(logarithms[..., 0]))
-    tail = (100 - LEVEL) / 2
-    rows = {}
-    for name, summarize in (("mean", np.mean), ("median", np.median), ("sum", np.sum)):
-        values = summarize(changes, axis=1)
-        as_low = values <= summarize(reported.to_numpy())
-        rows[name] = {
-            "expected": values.mean(),
-            "low": np.percentile(values, tail),
-            "high": np.percentile(values, 100 - tail),
-            "share_as_low": 100 * as_low.mean(),
-        }
-    return pd.DataFrame(rows).T
-
-
-def deviations(runs: pd.DataFrame) -> np.ndarray:
-    """Return the logarithms of all errors minus the mean logarithm of their sequence.
-
-    They are scaled by sqrt(n / (n - 1)), since the mean comes from the same n repetitions. runs:
-    sequence, rmse.
-    """
-    logarithms = np.log(runs["rmse"])
-    by_sequence = logarithms.groupby(runs["sequence"])
-    count = by_sequence.transform("size")
-    deviation = logarithms - by_sequence.transform("mean")
-    widened = deviation * np.sqrt(count / (count - 1))
-    return widened[count > 1].to_numpy()
 
 
 # Keypoints and boundaries one by one

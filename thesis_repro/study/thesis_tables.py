@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from thesis_repro.study.compare import LEVEL
+
 STUDIES = 4000  # simulated ones
 
 
@@ -91,6 +93,12 @@ def changes_if_masks_did_nothing(baseline: pd.DataFrame, widths: int, metric: st
         best = of_widths[np.arange(STUDIES), best_column]
         columns[name] = percent_change(errors[best], errors[benchmark])
     return pd.DataFrame(columns)
+
+
+def middle(values: pd.Series) -> tuple[float, float]:
+    """Return the ends of the middle LEVEL percent of a number of simulated studies."""
+    tail = (100 - LEVEL) / 200
+    return values.quantile(tail), values.quantile(1 - tail)
 
 
 def improved(changes: pd.Series, runs: pd.DataFrame) -> int:
