@@ -138,11 +138,11 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
                 if index >= CHECKPOINT + 1 and index < FRAMES - 3
             ]
 
-        wait_for(lambda: list(there.rglob("*.csv")) and victims())
+        wait_for(lambda: list(there.rglob("[!.]*.csv")) and victims())
         killed.extend(victims()[:1])
         os.kill(killed[0], signal.SIGKILL)
         processes[killed[0]].wait()
-        finished.update({path: path.stat().st_mtime_ns for path in there.rglob("*.csv")})
+        finished.update({path: path.stat().st_mtime_ns for path in there.rglob("[!.]*.csv")})
 
     killer = threading.Thread(target=kill)
     killer.start()
