@@ -77,11 +77,9 @@ def _search(columns: np.ndarray, threshold: float, probability: float) -> _Solut
     """
     count = columns.shape[1]
     limit = np.float32(threshold * threshold)
-    # Correspondences in single precision; the last row says how much an error of the matrix may
-    # matter to each.
-    x, y, u, v = np.abs(columns)
+    extents = np.abs(columns).max(axis=1)
     with np.errstate(over="ignore"):
-        rough = np.vstack([columns, (1 + x + y) * (1 + u + v)]).astype(np.float32)
+        rough = columns.astype(np.float32)
 
     def solve_exactly(candidate: _Candidate) -> _Candidate:
         solution = _opencv_solution(columns, candidate.sample, threshold, probability, limit)
@@ -95,7 +93,7 @@ def _search(columns: np.ndarray, threshold: float, probability: float) -> _Solut
         if best.sample is not None:
             enough = _samples_needed(probability, (count - best.most) / count)
         state, drawn, sample, fewest, most = _next_better(
-            columns, rough, float(limit), np.uint64(state), drawn, enough, best.fewest
+            columns, rough, extents, float(limit), np.uint64(state), drawn, enough, best.fewest
         )
         if fewest > best.most:
             best = _Candidate(sample, fewest, most)  # surely better
@@ -207,9 +205,10 @@ def draw(state, columns, sample, five):
 
 
 @fast
-def _next_better(columns, rough, limit, state, drawn, samples, best):
+def _next_better(columns, rough, extents, limit, state, drawn, samples, best):
     """Draw samples until one may have more than `best` inliers, or `samples` are drawn.
 
+    rough: the columns in single precision. extents: largest absolute values of the four columns.
     Returns the generator's state, the number of samples drawn, the sample's five indices, and
     bounds of the number of inliers of its best solution (0, 0 if no sample may be better).
     """
@@ -224,7 +223,7 @@ def _next_better(columns, rough, limit, state, drawn, samples, best):
             return state, drawn, sample, 0, count
         low, high = 0, 0
         for k in range(len(solutions)):
-            if not _may_beat(solutions[k], margins[k], rough, limit, max(best, low)):
+            if not _may_beat(solutions[k], margins[k], rough, extents, limit, max(best, low)):
                 continue
             fewest, most = _bounds(solutions[k], margins[k], columns, limit, max(best, low))
             low = max(low, fewest)
@@ -235,32 +234,27 @@ def _next_better(columns, rough, limit, state, drawn, samples, best):
 
 
 @inner
-def _may_beat(e, margin, rough, limit, best):
+def _may_beat(e, margin, rough, extents, limit, best):
     """False if surely no matrix within the margin of e has more than `best` inliers.
 
-    This test runs in single precision.
+    This test runs in single precision. It compares `algebraic` alone with the largest value that
+    an inlier anywhere within the extents can have. That decides nearly always, because most
+    solutions are far off.
     """
     count = rough.shape[1]
     allowed = count - best  # outliers
-    root = np.sqrt(limit)
-    # `doubt` bounds how far the margin (see _bounds_of_block) and nine roundings of 2^-24 may
-    # change `algebraic` and `root` times the root of the sum of squares. `wide` allows for the
-    # rounding of their squares.
-    doubt = np.float32(4.001 * margin + 1e-6 * (1 + root))
-    wide = np.float32(1.00001 * limit)
+    largest = np.float32(1.00001 * _largest_of_inliers(e, margin, extents, limit))
     matrix = epipolar.entries(e.astype(np.float32))
     outliers = 0
     for start in range(0, count, SCORING_BLOCK):
         stop = min(start + SCORING_BLOCK, count)
         outliers += _surely_out(
             matrix,
-            doubt,
-            wide,
+            largest,
             rough[0, start:stop],
             rough[1, start:stop],
             rough[2, start:stop],
             rough[3, start:stop],
-            rough[4, start:stop],
         )
         if outliers >= allowed:
             return False
@@ -268,14 +262,27 @@ def _may_beat(e, margin, rough, limit, best):
 
 
 @inner
-def _surely_out(matrix, doubt, limit, x, y, u, v, reach):
-    """Number of correspondences that are outliers in spite of all rounding."""
+def _largest_of_inliers(e, margin, extents, limit):
+    """Bound of |algebraic| of an inlier, as computed from e in single precision.
+
+    extents: largest |x|, |y|, |u| and |v|.
+    """
+    x, y, u, v = extents[0], extents[1], extents[2], extents[3]
+    _, l0, l1, m0, m1 = epipolar.sampson_terms(epipolar.entries(np.abs(e)), x, y, u, v)
+    root = np.sqrt(limit)
+    # nine roundings of 2^-24
+    rounding = 1e-6 * (1 + root) * (1 + x + y) * (1 + u + v)
+    doubt = _change(margin, root, x, y, u, v) + rounding
+    return root * np.sqrt(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) + doubt
+
+
+@inner
+def _surely_out(matrix, largest, x, y, u, v):
+    """Number of correspondences whose |algebraic| is larger than that of any inlier."""
     outliers = np.int32(0)  # of the same width as the distances, so that the loop is vectorised
     for k in range(len(x)):
-        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
-        least = max(abs(algebraic) - doubt * reach[k], np.float32(0))
-        square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
-        outliers = np.int32(outliers + np.int32(least * least > limit * square))
+        algebraic, _, _, _, _ = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
+        outliers = np.int32(outliers + np.int32(abs(algebraic) > largest))
     return outliers
 
 
@@ -313,13 +320,22 @@ def _bounds_of_block(e, margin, x, y, u, v, limit):
     low, high = 0, 0
     for k in range(len(x)):
         algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
-        square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
-        excess = algebraic * algebraic - limit * square
-        # |algebraic| and the root of the other term each change by less than `change` within the
-        # margin.
-        change = 2 * margin * (1 + abs(x[k]) + abs(y[k])) * (1 + abs(u[k]) + abs(v[k]))
-        size = abs(algebraic) + root * (abs(l0) + abs(l1) + abs(m0) + abs(m1)) + change
-        doubt = 2 * change * size + 1e-6 * size * size
-        low += excess < -doubt
-        high += excess <= doubt
+        # |algebraic| of an inlier is at most this
+        largest = root * np.sqrt(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
+        doubt = _change(margin, root, x[k], y[k], u[k], v[k]) + 1e-6 * (abs(algebraic) + largest)
+        low += abs(algebraic) < largest - doubt
+        high += abs(algebraic) <= largest + doubt
     return low, high
+
+
+@inner
+def _change(margin, root, x, y, u, v):
+    """How much |algebraic| minus `largest` (_bounds_of_block) may change within the margin.
+
+    By Cauchy and Schwarz: a matrix of norm `margin` changes (u, v, 1) E (x, y, 1)^T by at most the
+    margin times the lengths of both vectors, and each epipolar line by at most the margin times
+    the length of its vector.
+    """
+    current = 1 + x * x + y * y
+    previous = 1 + u * u + v * v
+    return margin * (np.sqrt(current * previous) + root * np.sqrt(current + previous))

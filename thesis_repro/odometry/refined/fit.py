@@ -388,8 +388,7 @@ def _normal_equations(r, t, current, previous, scale):
     matrices = _essential_and_derivatives(r, t)
     essential = epipolar.entries(matrices[0])
     cost = 0.0
-    hessian = np.zeros((5, 5))
-    gradient = np.zeros(5)
+    sums = np.zeros((6, 6))
     # Points are handled in blocks, one quantity after the other, so that these loops are
     # vectorised. The sums go point by point, so the bits are those of one loop over all points.
     size = POINTS_PER_BLOCK
@@ -401,7 +400,7 @@ def _normal_equations(r, t, current, previous, scale):
         np.empty(size),
         np.empty(size),
     )
-    jacobian = np.empty((5, size))
+    rows = np.empty((size, 6))  # derivatives of the residual, then the residual
     for start in range(0, len(current), size):
         count = min(size, len(current) - start)
         for i in range(count):
@@ -419,21 +418,34 @@ def _normal_equations(r, t, current, previous, scale):
             rarity[i] = 1 + ratio * ratio
             weight[i] = 1 / rarity[i]
         for k in range(5):
-            derivative, column = epipolar.entries(matrices[1 + k]), jacobian[k]
+            derivative = epipolar.entries(matrices[1 + k])
             for i in range(count):
                 change, d0, d1, c0, c1 = epipolar.sampson_terms(derivative, x[i], y[i], u[i], v[i])
                 # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2
                 # + m1^2
                 slope = l0[i] * d0 + l1[i] * d1 + m0[i] * c0 + m1[i] * c1
-                column[i] = (change - residual[i] * inverse[i] * slope) * inverse[i]
+                rows[i, k] = (change - residual[i] * inverse[i] * slope) * inverse[i]
         for i in range(count):
             cost += np.log(rarity[i])
-            for k in range(5):
-                gradient[k] += weight[i] * residual[i] * jacobian[k, i]
-                for j in range(k + 1):
-                    hessian[k, j] += weight[i] * jacobian[k, i] * jacobian[j, i]
+            rows[i, 5] = residual[i]
+            _add_products(sums, rows[i], weight[i])
+    hessian = sums[:5, :5].copy()
     _mirror(hessian)
-    return cost, hessian, gradient
+    return cost, hessian, sums[5, :5].copy()
+
+
+@inner
+def _add_products(sums, row, weight):
+    """Add weight * row[k] * row[j] to the lower triangle of the sums (6, 6).
+
+    All numbers are read before a sum is written. So the compiler knows that writing a sum does not
+    change them, and does not read them again.
+    """
+    numbers = row[0], row[1], row[2], row[3], row[4], row[5]
+    for k in range(6):
+        weighted = weight * numbers[k]
+        for j in range(k + 1):
+            sums[k, j] += weighted * numbers[j]
 
 
 @inner
