@@ -42,6 +42,8 @@ class Step:
     detected: int | None = None  # number of new keypoints; None if the detector did not run
     previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
+    # current and previous in normalised image coordinates, once they were asked for
+    normalised: tuple[np.ndarray, np.ndarray] | None = None
     # tracked into the next frame
     keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     motion: Any = Motion()  # a RefinedMotion if it was refined
@@ -199,10 +201,18 @@ class Odometry:
             )
             step.previous = self.points.compress(was_tracked, axis=0)
             step.current = tracked.compress(was_tracked, axis=0)
+            self._normalised(step)  # copies of the step, in other runs, share it
         elif self.previous is not None or step.frame > 0:
             step.points = 0
             step.flags.append("no points")
         step.seconds["track"] = time.perf_counter() - started
+
+    def _normalised(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
+        """The step's correspondences (current, previous) in normalised coordinates."""
+        if step.normalised is None:
+            current = pose.normalise(step.current, self.intrinsics)
+            step.normalised = current, pose.normalise(step.previous, self.intrinsics)
+        return step.normalised
 
     def estimate(self, step: Step, essential: Essential | None = None) -> Essential | None:
         """Estimate the motion from the step's correspondences. Returns the essential matrix.
@@ -213,7 +223,7 @@ class Odometry:
         if not step.points:
             return None
         if essential is None:
-            essential = _essential(step, self.settings, self.intrinsics)
+            essential = _essential(step, self._normalised(step), self.settings)
         step.seconds["essential"] = essential.seconds
         if essential.matrix is None:
             step.motion = Motion(problem=essential.problem)
@@ -276,12 +286,10 @@ class Odometry:
         if motion.rotation is None or _by_chance(motion.inliers):
             return True
         if not isinstance(motion, RefinedMotion):
-            current, previous = self._normalised(step)
             refined = with_uncertainty(
                 motion.rotation,
                 motion.translation,
-                current,
-                previous,
+                *self._normalised(step),
                 motion.inliers,
                 self.settings.threshold,
             )
@@ -299,20 +307,15 @@ class Odometry:
         step.points = len(points)
         step.previous = points[was_tracked]
         step.current = current[was_tracked]
+        step.normalised = None
         step.flags.append(ALL_KEYPOINTS)
         self.estimate(step)
-
-    def _normalised(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
-        """The step's correspondences (current, previous) in normalised coordinates."""
-        current = pose.normalise(step.current, self.intrinsics)
-        return current, pose.normalise(step.previous, self.intrinsics)
 
     def _check_consistency(self, step: Step) -> None:
         """Compare the motion with the previous step's, and replace or flag it."""
         started = time.perf_counter()
-        current, previous = self._normalised(step)
         step.motion, self.prior, flag = check_consistency(
-            step.motion, current, previous, step.scale, self.settings.threshold, self.prior
+            step.motion, *self._normalised(step), step.scale, self.settings.threshold, self.prior
         )
         if flag:
             step.flags.append(flag)
@@ -329,12 +332,9 @@ class Odometry:
 
         Its points do not tell in which direction it went, or whether it was a zoom.
         """
-        current, previous = self._normalised(step)
-        distances, zoom = pose.rotation_and_zoom(
-            current.compress(step.inliers, axis=0), previous.compress(step.inliers, axis=0)
-        )
         largest = MAX_TRACKING_ERROR / self.intrinsics[0, 0]
-        if (distances < largest).mean() >= 0.95:
+        share, zoom = pose.rotation_and_zoom(*self._normalised(step), step.inliers, largest)
+        if share >= 0.95:
             step.flags.append("zoom" if abs(zoom - 1) > MIN_ZOOM else "no parallax")
 
     def _check(self, frame: np.ndarray, scale: float, mask: np.ndarray | None) -> None:
@@ -364,15 +364,16 @@ class Odometry:
             )
 
 
-def _essential(step: Step, settings: OdometrySettings, intrinsics: np.ndarray) -> Essential:
+def _essential(
+    step: Step, normalised: tuple[np.ndarray, np.ndarray], settings: OdometrySettings
+) -> Essential:
     """Essential matrix of a step's correspondences, which are shuffled if the settings say so."""
     started = time.perf_counter()
     order: np.ndarray | slice = slice(None)
     if settings.shuffle_seed is not None:
         random = np.random.default_rng((settings.shuffle_seed, step.frame))
         order = random.permutation(len(step.current))
-    current = pose.normalise(step.current, intrinsics)[order]
-    previous = pose.normalise(step.previous, intrinsics)[order]
+    current, previous = (points[order] for points in normalised)
     matrix, inliers, problem = pose.essential_matrix(current, previous, settings.threshold)
     seconds = time.perf_counter() - started
     return Essential(current, previous, order, matrix, inliers, problem, seconds)
@@ -404,6 +405,7 @@ def warm_up(refined: bool) -> None:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
     pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
     pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
+    pose.rotation_and_zoom(points, points, np.ones(8, bool), 1.0)
     if refined:
         ahead = np.array([0.0, 0.0, 1.0])
         fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)
