@@ -1,11 +1,11 @@
 """The odometry, frame by frame: keypoints, the motion between two frames, and the new pose."""
 
 import time
-from copy import deepcopy
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,8 +50,8 @@ class Step:
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres
     updated: bool = False  # whether this step moved the pose
     flags: list[str] = field(default_factory=list)
-    # previous and current, if a fallback is possible
-    images: tuple[np.ndarray, np.ndarray] | None = None
+    # if a fallback is possible, finds the matches of all keypoints; copies of the step share them
+    all_matches: Callable[[], "_Matches"] | None = None
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
@@ -170,7 +170,8 @@ class Odometry:
             return step
         self.gap = 0.0
         if self.settings.fallback and mask is not None and self.previous is not None:
-            step.images = self.previous, frame
+            find = partial(_matches_without_mask, self.previous, frame, self.settings)
+            step.all_matches = cache(find)
         self._track(step, frame)
         points = step.current
         if len(points) < self.settings.redetect_below or not len(points):
@@ -240,9 +241,9 @@ class Odometry:
         The rules are in the table in odometry/__init__.py.
         """
         is_long = step.scale > self.settings.scale_gate
-        if step.images is not None and is_long and self._in_doubt(step):
-            self._use_all_keypoints(step, *step.images)
-        step.images = None
+        if step.all_matches is not None and is_long and self._in_doubt(step):
+            self._use_all_keypoints(step, step.all_matches())
+        step.all_matches = None  # it holds two frames
         if step.points:
             flag = self._flag_if_kept(step)
             if flag is None:
@@ -250,7 +251,7 @@ class Odometry:
             else:
                 step.flags.append(flag)
         step.pose = self.pose.copy()
-        self.prior = deepcopy(self.prior)  # step.motion has the arrays of the original
+        self.prior = self.prior.copy()  # step.motion has the arrays of the original
         return step
 
     def _flag_if_kept(self, step: Step) -> str | None:
@@ -296,17 +297,11 @@ class Odometry:
             motion = replace(refined, translation=motion.translation)
         return not is_consistent(motion, step.scale, self.prior)
 
-    def _use_all_keypoints(self, step: Step, previous_frame: np.ndarray, frame: np.ndarray) -> None:
+    def _use_all_keypoints(self, step: Step, matches: "_Matches") -> None:
         """Estimate the step anew, without a mask."""
-        points = keypoints.detect(previous_frame, self.settings)
-        if not len(points):
+        if not matches.points:
             return
-        current, was_tracked = keypoints.track(
-            previous_frame, frame, points, self.settings.window, self.settings.levels
-        )
-        step.points = len(points)
-        step.previous = points[was_tracked]
-        step.current = current[was_tracked]
+        step.points, step.previous, step.current = matches
         step.normalised = None
         step.flags.append(ALL_KEYPOINTS)
         self.estimate(step)
@@ -362,6 +357,27 @@ class Odometry:
                 f"frame {self.count}: the mask holds {len(np.unique(mask))} different values; a mask has "
                 "0 and 255 (keypoint_mask makes masks from label maps)"
             )
+
+
+class _Matches(NamedTuple):
+    """Correspondences of two frames, (N, 2) pixels, found for a number of points."""
+
+    points: int
+    previous: np.ndarray
+    current: np.ndarray
+
+
+def _matches_without_mask(
+    previous_frame: np.ndarray, frame: np.ndarray, settings: OdometrySettings
+) -> _Matches:
+    """Correspondences of all keypoints of the previous frame."""
+    points = keypoints.detect(previous_frame, settings)
+    if not len(points):
+        return _Matches(0, points, points)
+    tracked, was_tracked = keypoints.track(
+        previous_frame, frame, points, settings.window, settings.levels
+    )
+    return _Matches(len(points), points[was_tracked], tracked[was_tracked])
 
 
 def _essential(
