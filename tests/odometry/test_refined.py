@@ -10,7 +10,7 @@ from street import Street
 
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import THESIS, Odometry, Step, metrics, pose
+from thesis_repro.odometry import THESIS, Odometry, Step, keypoints, metrics, pose
 from thesis_repro.odometry.odometry import ALL_KEYPOINTS
 from thesis_repro.odometry.refined import fit as refine
 from thesis_repro.odometry.refined import motion_prior
@@ -307,3 +307,16 @@ def test_the_fallback_uses_all_keypoints_if_masks_leave_too_few(small_world, est
     assert replaced == {"few": len(drive) - 1, "last": 1, "without": 0, "no mask": 0}
     equal = {name: np.array_equal(result.poses, every) for name, result in results.items()}
     assert equal == {"few": True, "last": True, "without": False, "no mask": True}
+
+
+def test_fallbacks_of_one_step_track_all_keypoints_once(monkeypatch):
+    drive = Street(2)
+    few = np.zeros((2, *drive.size), np.uint8)
+    few[:, :, :4] = 255  # too few keypoints for any motion
+    settings = replace(THESIS, fallback=True)
+    runs = {f"{seed}": (replace(settings, shuffle_seed=seed), few) for seed in (1, 2, 3)}
+    tracked, track = [], keypoints.track
+    monkeypatch.setattr(keypoints, "track", lambda *given: tracked.append(1) or track(*given))
+    results = odometry.run_many(drive, runs)
+    assert all(result.flagged[ALL_KEYPOINTS] == 1 for result in results.values())
+    assert len(tracked) == 2  # with the mask, and without it

@@ -1,11 +1,11 @@
 """The odometry, frame by frame: keypoints, the motion between two frames, and the new pose."""
 
 import time
-from copy import deepcopy
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,14 +42,16 @@ class Step:
     detected: int | None = None  # number of new keypoints; None if the detector did not run
     previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
+    # current and previous in normalised image coordinates, once they were asked for
+    normalised: tuple[np.ndarray, np.ndarray] | None = None
     # tracked into the next frame
     keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
     motion: Any = Motion()  # a RefinedMotion if it was refined
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres
     updated: bool = False  # whether this step moved the pose
     flags: list[str] = field(default_factory=list)
-    # previous and current, if a fallback is possible
-    images: tuple[np.ndarray, np.ndarray] | None = None
+    # if a fallback is possible, finds the matches of all keypoints; copies of the step share them
+    all_matches: Callable[[], "_Matches"] | None = None
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
 
     @property
@@ -168,7 +170,8 @@ class Odometry:
             return step
         self.gap = 0.0
         if self.settings.fallback and mask is not None and self.previous is not None:
-            step.images = self.previous, frame
+            find = partial(_matches_without_mask, self.previous, frame, self.settings)
+            step.all_matches = cache(find)
         self._track(step, frame)
         points = step.current
         if len(points) < self.settings.redetect_below or not len(points):
@@ -199,10 +202,18 @@ class Odometry:
             )
             step.previous = self.points.compress(was_tracked, axis=0)
             step.current = tracked.compress(was_tracked, axis=0)
+            self._normalised(step)  # copies of the step, in other runs, share it
         elif self.previous is not None or step.frame > 0:
             step.points = 0
             step.flags.append("no points")
         step.seconds["track"] = time.perf_counter() - started
+
+    def _normalised(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
+        """The step's correspondences (current, previous) in normalised coordinates."""
+        if step.normalised is None:
+            current = pose.normalise(step.current, self.intrinsics)
+            step.normalised = current, pose.normalise(step.previous, self.intrinsics)
+        return step.normalised
 
     def estimate(self, step: Step, essential: Essential | None = None) -> Essential | None:
         """Estimate the motion from the step's correspondences. Returns the essential matrix.
@@ -213,7 +224,7 @@ class Odometry:
         if not step.points:
             return None
         if essential is None:
-            essential = _essential(step, self.settings, self.intrinsics)
+            essential = _essential(step, self._normalised(step), self.settings)
         step.seconds["essential"] = essential.seconds
         if essential.matrix is None:
             step.motion = Motion(problem=essential.problem)
@@ -230,9 +241,9 @@ class Odometry:
         The rules are in the table in odometry/__init__.py.
         """
         is_long = step.scale > self.settings.scale_gate
-        if step.images is not None and is_long and self._in_doubt(step):
-            self._use_all_keypoints(step, *step.images)
-        step.images = None
+        if step.all_matches is not None and is_long and self._in_doubt(step):
+            self._use_all_keypoints(step, step.all_matches())
+        step.all_matches = None  # it holds two frames
         if step.points:
             flag = self._flag_if_kept(step)
             if flag is None:
@@ -240,7 +251,7 @@ class Odometry:
             else:
                 step.flags.append(flag)
         step.pose = self.pose.copy()
-        self.prior = deepcopy(self.prior)  # step.motion has the arrays of the original
+        self.prior = self.prior.copy()  # step.motion has the arrays of the original
         return step
 
     def _flag_if_kept(self, step: Step) -> str | None:
@@ -276,43 +287,30 @@ class Odometry:
         if motion.rotation is None or _by_chance(motion.inliers):
             return True
         if not isinstance(motion, RefinedMotion):
-            current, previous = self._normalised(step)
             refined = with_uncertainty(
                 motion.rotation,
                 motion.translation,
-                current,
-                previous,
+                *self._normalised(step),
                 motion.inliers,
                 self.settings.threshold,
             )
             motion = replace(refined, translation=motion.translation)
         return not is_consistent(motion, step.scale, self.prior)
 
-    def _use_all_keypoints(self, step: Step, previous_frame: np.ndarray, frame: np.ndarray) -> None:
+    def _use_all_keypoints(self, step: Step, matches: "_Matches") -> None:
         """Estimate the step anew, without a mask."""
-        points = keypoints.detect(previous_frame, self.settings)
-        if not len(points):
+        if not matches.points:
             return
-        current, was_tracked = keypoints.track(
-            previous_frame, frame, points, self.settings.window, self.settings.levels
-        )
-        step.points = len(points)
-        step.previous = points[was_tracked]
-        step.current = current[was_tracked]
+        step.points, step.previous, step.current = matches
+        step.normalised = None
         step.flags.append(ALL_KEYPOINTS)
         self.estimate(step)
-
-    def _normalised(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
-        """The step's correspondences (current, previous) in normalised coordinates."""
-        current = pose.normalise(step.current, self.intrinsics)
-        return current, pose.normalise(step.previous, self.intrinsics)
 
     def _check_consistency(self, step: Step) -> None:
         """Compare the motion with the previous step's, and replace or flag it."""
         started = time.perf_counter()
-        current, previous = self._normalised(step)
         step.motion, self.prior, flag = check_consistency(
-            step.motion, current, previous, step.scale, self.settings.threshold, self.prior
+            step.motion, *self._normalised(step), step.scale, self.settings.threshold, self.prior
         )
         if flag:
             step.flags.append(flag)
@@ -329,12 +327,9 @@ class Odometry:
 
         Its points do not tell in which direction it went, or whether it was a zoom.
         """
-        current, previous = self._normalised(step)
-        distances, zoom = pose.rotation_and_zoom(
-            current.compress(step.inliers, axis=0), previous.compress(step.inliers, axis=0)
-        )
         largest = MAX_TRACKING_ERROR / self.intrinsics[0, 0]
-        if (distances < largest).mean() >= 0.95:
+        share, zoom = pose.rotation_and_zoom(*self._normalised(step), step.inliers, largest)
+        if share >= 0.95:
             step.flags.append("zoom" if abs(zoom - 1) > MIN_ZOOM else "no parallax")
 
     def _check(self, frame: np.ndarray, scale: float, mask: np.ndarray | None) -> None:
@@ -364,15 +359,37 @@ class Odometry:
             )
 
 
-def _essential(step: Step, settings: OdometrySettings, intrinsics: np.ndarray) -> Essential:
+class _Matches(NamedTuple):
+    """Correspondences of two frames, (N, 2) pixels, found for a number of points."""
+
+    points: int
+    previous: np.ndarray
+    current: np.ndarray
+
+
+def _matches_without_mask(
+    previous_frame: np.ndarray, frame: np.ndarray, settings: OdometrySettings
+) -> _Matches:
+    """Correspondences of all keypoints of the previous frame."""
+    points = keypoints.detect(previous_frame, settings)
+    if not len(points):
+        return _Matches(0, points, points)
+    tracked, was_tracked = keypoints.track(
+        previous_frame, frame, points, settings.window, settings.levels
+    )
+    return _Matches(len(points), points[was_tracked], tracked[was_tracked])
+
+
+def _essential(
+    step: Step, normalised: tuple[np.ndarray, np.ndarray], settings: OdometrySettings
+) -> Essential:
     """Essential matrix of a step's correspondences, which are shuffled if the settings say so."""
     started = time.perf_counter()
     order: np.ndarray | slice = slice(None)
     if settings.shuffle_seed is not None:
         random = np.random.default_rng((settings.shuffle_seed, step.frame))
         order = random.permutation(len(step.current))
-    current = pose.normalise(step.current, intrinsics)[order]
-    previous = pose.normalise(step.previous, intrinsics)[order]
+    current, previous = (points[order] for points in normalised)
     matrix, inliers, problem = pose.essential_matrix(current, previous, settings.threshold)
     seconds = time.perf_counter() - started
     return Essential(current, previous, order, matrix, inliers, problem, seconds)
@@ -404,6 +421,7 @@ def warm_up(refined: bool) -> None:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
     pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
     pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
+    pose.rotation_and_zoom(points, points, np.ones(8, bool), 1.0)
     if refined:
         ahead = np.array([0.0, 0.0, 1.0])
         fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)

@@ -21,6 +21,7 @@ MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farthe
 LIMIT_MARGIN = 1e-7
 MIN_CORRESPONDENCES = 5
 FLOW_ROUNDS = 2  # they leave 0.1 pixels of a turn by 5 degrees; one leaves 10
+FLOW_DAMPING = 1e-10  # keeps equations solvable; with points all over a frame it changes nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,36 +69,78 @@ def essential_matrix(
     return matrix, inliers.ravel() > 0, ""
 
 
-def rotation_and_zoom(current: np.ndarray, previous: np.ndarray) -> tuple[np.ndarray, float]:
-    """How far the points are from the motion of a camera that only turned or zoomed.
+@fast
+def rotation_and_zoom(current, previous, inliers, near):
+    """How well the motion of a camera that only turned or zoomed explains the points.
 
-    current, previous: normalised correspondences (N, 2). Returns (distances, zoom). A rotation and
-    a zoom of a camera that stays in its place would move the previous points somewhere. distances
-    (N,) are those of the current points from there, and 1.01 is a zoom that shows everything one
-    per cent closer.
+    current, previous: normalised correspondences (N, 2). inliers: N booleans. Returns (share,
+    zoom). A rotation and a zoom of a camera that stays in its place would move the previous points
+    somewhere. share is that of the inliers whose current point is nearer to there than `near`.
+    1.01 is a zoom that shows everything one per cent closer.
 
     Rotation and zoom are fitted by least squares. Each round linearises the motion (flow) that they
     cause (Longuet-Higgins and Prazdny, 1980).
     """
-    moved, zoom = previous, 1.0
+    moved = previous.copy()
+    zoom = 1.0
     for _ in range(FLOW_ROUNDS):
-        x, y = moved.T
-        # columns: change of x, then of y, by the three rotations and by the zoom
-        flow = np.vstack(
-            [
-                np.column_stack([-x * y, 1 + x * x, -y, x]),
-                np.column_stack([-1 - y * y, x * y, x, y]),
-            ]
-        )
-        shift = (current - moved).T.ravel()
-        # The normal equations are 4x4, so they are solved in no time. `lstsq` also solves them if
-        # too few points leave them singular, where `solve` would fail.
-        change, *_ = np.linalg.lstsq(flow.T @ flow, flow.T @ shift)
-        rotation, _ = cv2.Rodrigues(change[:3])
-        turned = cv2.convertPointsToHomogeneous(moved)[:, 0] @ rotation.T
-        moved = (1 + change[3]) * turned[:, :2] / turned[:, 2:]
-        zoom *= 1 + change[3]
-    return np.linalg.norm(current - moved, axis=1), zoom
+        turn_x, turn_y, turn_z, growth = _flow(current, moved, inliers)
+        for k in range(len(moved)):
+            moved[k, 0], moved[k, 1] = _turned(moved[k, 0], moved[k, 1], turn_x, turn_y, turn_z)
+            moved[k, 0] *= 1 + growth
+            moved[k, 1] *= 1 + growth
+        zoom *= 1 + growth
+    count, close = 0, 0
+    for k in range(len(moved)):
+        dx = current[k, 0] - moved[k, 0]
+        dy = current[k, 1] - moved[k, 1]
+        count += inliers[k]
+        close += inliers[k] and dx * dx + dy * dy < near * near
+    return close / count, zoom
+
+
+@inner
+def _flow(current, moved, inliers):
+    """Three rotations and a zoom that move the inliers of `moved` to `current`, linearised."""
+    across = np.empty(4)  # change of x by the three rotations and by the zoom
+    down = np.empty(4)  # change of y
+    products = np.zeros((4, 4))
+    right = np.zeros(4)
+    for k in range(len(moved)):
+        if not inliers[k]:
+            continue
+        x, y = moved[k, 0], moved[k, 1]
+        dx, dy = current[k, 0] - x, current[k, 1] - y
+        across[0], across[1], across[2], across[3] = -x * y, 1 + x * x, -y, x
+        down[0], down[1], down[2], down[3] = -1 - y * y, x * y, x, y
+        for i in range(4):
+            right[i] += across[i] * dx + down[i] * dy
+            for j in range(i + 1):
+                products[i, j] += across[i] * across[j] + down[i] * down[j]
+    for i in range(4):  # points that do not determine all four leave the rest at about zero
+        products[i, i] += FLOW_DAMPING
+    _cholesky(products)
+    return _solve(products, right[0], right[1], right[2], right[3])
+
+
+@inner
+def _turned(x, y, turn_x, turn_y, turn_z):
+    """Image (x, y) of a point after a rotation by a vector (Rodrigues' formula)."""
+    angle = np.sqrt(turn_x * turn_x + turn_y * turn_y + turn_z * turn_z)
+    sine, cosine = 1.0, 0.5
+    if angle > 1e-6:
+        sine = np.sin(angle) / angle
+        cosine = (1 - np.cos(angle)) / (angle * angle)
+    # turn x point, and turn x (turn x point)
+    first_x, first_y, first_z = turn_y - turn_z * y, turn_z * x - turn_x, turn_x * y - turn_y * x
+    second_x = turn_y * first_z - turn_z * first_y
+    second_y = turn_z * first_x - turn_x * first_z
+    second_z = turn_x * first_y - turn_y * first_x
+    depth = 1 + sine * first_z + cosine * second_z
+    return (
+        (x + sine * first_x + cosine * second_x) / depth,
+        (y + sine * first_y + cosine * second_y) / depth,
+    )
 
 
 def recover_pose(
@@ -215,27 +258,12 @@ def _least_eigenvector(b):
 
     Returns whether the iteration converged, and the four coordinates of the vector.
     """
-    for j in range(4):  # Cholesky
-        for k in range(j):
-            b[j, j] -= b[j, k] * b[j, k]
-        if b[j, j] < 1e-15:
-            return False, 0.0, 0.0, 0.0, 1.0
-        b[j, j] = np.sqrt(b[j, j])
-        for i in range(j + 1, 4):
-            for k in range(j):
-                b[i, j] -= b[i, k] * b[j, k]
-            b[i, j] /= b[j, j]
+    if not _cholesky(b):
+        return False, 0.0, 0.0, 0.0, 1.0
     x0, x1, x2, x3 = 0.5, 0.5, 0.5, 0.5
     change = 1.0
     for _ in range(30):
-        y0 = x0 / b[0, 0]
-        y1 = (x1 - b[1, 0] * y0) / b[1, 1]
-        y2 = (x2 - b[2, 0] * y0 - b[2, 1] * y1) / b[2, 2]
-        y3 = (x3 - b[3, 0] * y0 - b[3, 1] * y1 - b[3, 2] * y2) / b[3, 3]
-        y3 = y3 / b[3, 3]
-        y2 = (y2 - b[3, 2] * y3) / b[2, 2]
-        y1 = (y1 - b[2, 1] * y2 - b[3, 1] * y3) / b[1, 1]
-        y0 = (y0 - b[1, 0] * y1 - b[2, 0] * y2 - b[3, 0] * y3) / b[0, 0]
+        y0, y1, y2, y3 = _solve(b, x0, x1, x2, x3)
         norm = 1 / np.sqrt(y0 * y0 + y1 * y1 + y2 * y2 + y3 * y3)
         y0, y1, y2, y3 = y0 * norm, y1 * norm, y2 * norm, y3 * norm
         change = abs(y0 - x0) + abs(y1 - x1) + abs(y2 - x2) + abs(y3 - x3)
@@ -243,3 +271,36 @@ def _least_eigenvector(b):
         if change < 1e-11:
             return True, x0, x1, x2, x3
     return False, x0, x1, x2, x3
+
+
+@inner
+def _cholesky(b):
+    """Replace the lower triangle of b (4, 4) by its Cholesky factor.
+
+    Returns whether b is positive definite.
+    """
+    for j in range(4):
+        for k in range(j):
+            b[j, j] -= b[j, k] * b[j, k]
+        if b[j, j] < 1e-15:
+            return False
+        b[j, j] = np.sqrt(b[j, j])
+        for i in range(j + 1, 4):
+            for k in range(j):
+                b[i, j] -= b[i, k] * b[j, k]
+            b[i, j] /= b[j, j]
+    return True
+
+
+@inner
+def _solve(b, x0, x1, x2, x3):
+    """Solution of the four equations whose Cholesky factor is b and whose right side is x."""
+    y0 = x0 / b[0, 0]
+    y1 = (x1 - b[1, 0] * y0) / b[1, 1]
+    y2 = (x2 - b[2, 0] * y0 - b[2, 1] * y1) / b[2, 2]
+    y3 = (x3 - b[3, 0] * y0 - b[3, 1] * y1 - b[3, 2] * y2) / b[3, 3]
+    y3 = y3 / b[3, 3]
+    y2 = (y2 - b[3, 2] * y3) / b[2, 2]
+    y1 = (y1 - b[2, 1] * y2 - b[3, 1] * y3) / b[1, 1]
+    y0 = (y0 - b[1, 0] * y1 - b[2, 0] * y2 - b[3, 0] * y3) / b[0, 0]
+    return y0, y1, y2, y3

@@ -7,6 +7,7 @@ stopped or failed resumes from its checkpoints.
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,18 +103,15 @@ def run_jobs(
         path = result_file(folder, job)
         if not path.is_file():
             continue
-        # an empty flag stays a text, an empty number becomes NaN
-        numbers = {"detected": "", "tracked": ""}
-        frames = pd.read_csv(path, keep_default_na=False, na_values=numbers)
         sequence = opened[job.sequence]
-        if frames["detected"].isna().all():  # the path is a point, whatever the method
+        numbers = _measures_of_file(path, path.stat().st_mtime_ns, sequence)
+        if numbers is None:
             failures[job] = Failure(
                 f"{sequence.folder}: no frame has any structure (all are black, white or of one "
                 "gray); check how they were written"
             )
             continue
-        errors = measures(frames, sequence.poses)
-        rows[job] = {"sequence": job.sequence, "run": job.name, **asdict(job), **errors}
+        rows[job] = {"sequence": job.sequence, "run": job.name, **asdict(job), **numbers}
     warnings = _report(failures)
     if not rows:
         first = next(iter(failures.values()))
@@ -126,6 +124,20 @@ def run_jobs(
         failed=len(jobs) - len(rows),
         warnings=warnings,
     )
+
+
+@cache  # a study calls `run_jobs` again, with more jobs
+def _measures_of_file(path: Path, changed: int, sequence: Sequence) -> dict[str, Any] | None:
+    """Return the `measures` of a result file, or None if no frame has any structure.
+
+    changed: when the file was changed, ns.
+    """
+    # an empty flag stays a text, an empty number becomes NaN
+    numbers = {"detected": "", "tracked": ""}
+    frames = pd.read_csv(path, keep_default_na=False, na_values=numbers)
+    if frames["detected"].isna().all():  # the path is a point, whatever the method
+        return None
+    return measures(frames, sequence.poses)
 
 
 def keypoint_controls(

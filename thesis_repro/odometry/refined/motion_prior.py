@@ -42,6 +42,10 @@ class MotionPrior(NamedTuple):
         """Expected motion before the first step."""
         return cls(np.eye(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
+    def copy(self) -> "MotionPrior":
+        """Copy with arrays of its own."""
+        return MotionPrior(self.rotation.copy(), self.translation.copy(), self.scale)
+
     def expected_rotation(self, scale: float) -> np.ndarray:
         """Expected rotation (3x3) of a step of `scale` metres on the same curve."""
         if not self.scale:
