@@ -16,6 +16,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import LabelMasks, write_masks
 from thesis_repro.report import study as report
+from thesis_repro.report import tables
 from thesis_repro.study import compare, runner
 from thesis_repro.study.sources import Source
 from thesis_repro.study.study import Study
@@ -159,13 +160,9 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
         "--kitti",
         small_world / "kitti",
         "--labels",
-        small_labels,
+        f"net={small_labels}",
         "--masks",
-        masks,
-        "--name",
-        "net",
-        "--name",
-        "by-hand",
+        f"by-hand={masks}",
         "--widths",
         5,
         7,
@@ -212,8 +209,10 @@ def test_results_of_another_length_are_kept(done, study):
         ("", "--labels"),
         ("--labels nowhere", "nowhere: "),
         ("--labels {labels} --labels {labels}", "small_labels"),
-        ("--labels {labels} --name a --name b", "--name b: 2 names for 1"),
-        ("--labels {labels} --name a/b", "--name a/b: "),
+        ("--labels a={labels} --masks A={masks}", "'A'"),
+        ("--labels a*b={labels}", "--labels a*b="),
+        ("--labels ={labels}", "--labels ="),
+        ("--labels a/b={labels}", "a/b="),
         ("--masks {masks} --widths 5", "--widths: "),
         ("--masks {masks} --symmetric", "--labels"),
         ("--masks {labels}", "320x320"),
@@ -250,6 +249,32 @@ def test_bad_input_is_one_line_before_anything_runs(
         and "\n" not in error
         and not (tmp_path / "out").exists()
     )
+
+
+def test_each_source_has_the_name_before_its_folder(
+    small_world, small_labels, masks, tmp_path, monkeypatch
+):
+    shutil.copytree(small_labels, tmp_path / "lr=0.1")
+    monkeypatch.chdir(tmp_path)
+    sources = ["--masks", f"by hand={masks}", "--labels", f"my net={small_labels}"]
+    sources += ["--labels", "lr=0.1"]  # a folder that has no name
+    command = ["study", "--kitti", str(small_world / "kitti"), "--sequences", "00", *sources]
+    command += ["--widths", "5", "--repetitions", "1", "--frames", "5", "--output", "out"]
+    assert main(command) == 0
+    runs = tables.read(tmp_path / "out" / "runs.csv")
+    masked = runs[runs["method"] == "masked"].set_index("source")
+    widths = masked["dilation_width"].fillna(0)
+    assert widths.to_dict() == {"by hand": 0, "my net": 5, "lr-0-1": 5}
+    names = pd.read_csv(tmp_path / "out" / "summary.csv")["masks"]
+    assert set(names) == set(widths.index)
+    assert "my net" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_the_old_option_for_names_shows_the_new_form(capsys):
+    with pytest.raises(SystemExit) as end:
+        main("study --kitti kitti --labels mine --name net --output out".split())
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.count("\n") == 1 and "--labels net=" in error
 
 
 def test_a_sequence_named_like_a_column_is_refused(tiny_kitti):
