@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -50,7 +51,11 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     runs = runs.assign(sequence=runs["sequence"].map(one_line))
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", texts.findings(runs, table, note, embedded))
-    figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}
+    unknown = study.of_unknown_polarity()
+    figures = {
+        "comparison": comparison.figure_comparison(table),
+        "sources": figure_sources(study, unknown),
+    }
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf")
@@ -78,6 +83,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         [("text", "findings"), *names],
         study=study,
         warnings=warnings,
+        of_unknown_polarity=unknown,
         embedded=embedded,
         kinds=KINDS,
         estimators=ESTIMATORS,
@@ -105,11 +111,12 @@ def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
             write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
 
-def figure_sources(study: Study) -> Figure:
+def figure_sources(study: Study, of_unknown_polarity: Collection[str] = ()) -> Figure:
     """Draw the middle frame of the first readable sequence, one row a source.
 
     A row shows the source's label map, its mask and the kept keypoints. The plain frame replaces a
-    label map that is missing.
+    label map that is missing. of_unknown_polarity: names of sources whose masks may be inverted;
+    the keypoints that their inverted masks keep are drawn in place of a label map.
     """
     for sequence, sequence_masks in study.shown_masks():
         index = len(sequence) // 2
@@ -130,6 +137,10 @@ def figure_sources(study: Study) -> Figure:
                 label_maps.append(label_map)
                 colors = style.label_colors(label_map, frame)
                 style.show_image(first, colors, f"{source.name}: label map")
+            elif source.name in of_unknown_polarity:
+                points = keypoints.detect(frame, THESIS, cv2.bitwise_not(mask))
+                first.set_title(f"{source.name}, inverted: {len(points)} keypoints")
+                first.scatter(*points.T, **style.KEYPOINT)
             points = keypoints.detect(frame, THESIS, mask)
             style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
             third.set_title(f"{source.name}: {len(points)} keypoints")
