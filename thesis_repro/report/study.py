@@ -3,11 +3,9 @@
 Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
 
-import re
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +16,7 @@ from thesis_repro.data.trajectories import read_poses, write_kitti_poses, write_
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
-from thesis_repro.report import comparison, page, style, tables, texts, trajectories
+from thesis_repro.report import comparison, latex, page, style, tables, texts, trajectories
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, controls, runner
@@ -27,6 +25,8 @@ from thesis_repro.study.sources import KINDS, Source
 from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
+# columns that tell the rows of tables apart
+LATEX_LABELS = ("masks", "sequence", "estimator", "keypoints", "over", "width (pixels)")
 
 
 @style.applied()
@@ -64,18 +64,12 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         "comparison": comparison.table_comparison(table),
         "widths": comparison.table_widths(runs),
         "errors": tables.table_errors(runs),
-        "runs": runs.round(6),
     }
     for name, rows in numbers.items():
-        layout: dict[str, Any] = {"longtable": True}
-        if name == "summary":  # narrow enough for a portrait page; long texts are broken
-            layout = {"column_format": f"lr{(rows.shape[1] - 2) * 'p{17mm}'}"}
-        latex = rows.to_latex(
-            index=False, escape=True, na_rep="", float_format="{:g}".format, **layout
-        )
-        # after the end of a row, these would be its options
-        latex = re.sub(r"^(?=[\[*])", "{}", latex, flags=re.MULTILINE)
-        write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
+        if name == "summary":  # one column a source fits into a column of text
+            rows = rows.set_index("masks").T.rename_axis("masks").reset_index()
+        write_text(folder / f"{name}.tex", f"% {note}\n{latex.latex(rows, LATEX_LABELS)}")
+    numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX
     names = style.save_all(figures, numbers, folder, note)
     widths = sorted(runs["dilation_width"].dropna().astype(int).unique())
     text = page.build_study(
