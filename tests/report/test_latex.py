@@ -10,7 +10,7 @@ from thesis_repro.report import latex
 NAMES = [
     "my segmentation network",
     "RMSE MAE",
-    "WWWWWWWWWWWWWWWW",
+    "RESNETBACKBONE",
     "net_2%",
     "Masks*",
     "[best] {of} ~all^<3>",
