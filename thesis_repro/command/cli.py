@@ -320,7 +320,11 @@ def _sequence(options: Any) -> Any:
     from thesis_repro.data.kitti import Sequence
 
     sequence = Sequence(
-        options.kitti, options.sequence, options.camera, getattr(options, "speed", None)
+        options.kitti,
+        options.sequence,
+        options.camera,
+        getattr(options, "speed", None),
+        getattr(options, "fps", None),
     )
     return sequence.subset(options.frames)
 

@@ -238,6 +238,9 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
         ),
+        "--fps": dict(
+            type=float, metavar="N", help="frames a second, if there is no times.txt (10)"
+        ),
         "--masks": dict(
             type=Path,
             metavar="DIR",
