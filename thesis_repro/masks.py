@@ -365,15 +365,16 @@ class MaskFolder:
         need("index", index, int | np.integer)
         mask = read_mask(self.paths[index], self.size)
         if self.invert:
-            return np.where(mask, np.uint8(0), np.uint8(255))
+            return cv2.bitwise_not(mask)
         return mask
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
     """Read a mask for frames of (height, width).
 
-    It is uint8, 0 where keypoints are forbidden and one other value elsewhere. Raises InputError if
-    the size differs or there are more than two values, as in a label map.
+    It is uint8, 0 where keypoints are forbidden and 255 elsewhere; a file may have another value in
+    place of 255, such as 1. Raises InputError if the size differs or there are more than two
+    values, as in a label map.
     """
     mask = read_gray(path)
     check_size(Path(path), mask.shape, size, "its frame")
@@ -382,7 +383,7 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
             f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps go "
             "with --labels)"
         )
-    return mask
+    return np.where(mask, np.uint8(255), np.uint8(0))
 
 
 def folder_of_sequence(folder: str | Path, sequence: str) -> Path:

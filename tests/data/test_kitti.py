@@ -121,8 +121,27 @@ def test_without_ground_truth_steps_are_assumed(tiny_kitti):
             kitti.Sequence(tiny_kitti, "00", speed=speed)
     (tiny_kitti / "sequences/00/times.txt").unlink()
     assert np.allclose(kitti.Sequence(tiny_kitti, "00").times, [0, 0.1, 0.2, 0.3])
-    with pytest.raises(InputError, match="times.txt"):
+    with pytest.raises(InputError, match=r"times.txt.*--fps"):
         kitti.Sequence(tiny_kitti, "00", speed=5)
+
+
+def test_frames_a_second_replace_a_missing_file_of_times(tiny_kitti):
+    with pytest.raises(InputError, match="times.txt"):
+        kitti.Sequence(tiny_kitti, "00", fps=25)
+    (tiny_kitti / "sequences/00/times.txt").unlink()
+    (tiny_kitti / "poses/00.txt").unlink()
+    sequence = kitti.Sequence(tiny_kitti, "00", speed=5, fps=25)
+    np.testing.assert_allclose(sequence.times, [0, 0.04, 0.08, 0.12])
+    np.testing.assert_allclose(odometry.scales(sequence), [0, 0.2, 0.2, 0.2])
+    for fps in (0, -1, np.nan, np.inf):
+        with pytest.raises(InputError, match="fps"):
+            kitti.Sequence(tiny_kitti, "00", fps=fps)
+
+
+def test_the_error_of_a_missing_calibration_shows_its_form(tiny_kitti):
+    (tiny_kitti / "sequences/00/calib.txt").unlink()
+    with pytest.raises(InputError, match=r"calib.txt.*P0: f 0 u 0 0 f v 0 0 0 1 0"):
+        kitti.Sequence(tiny_kitti, "00")
 
 
 def test_a_folder_of_frames_needs_no_layout(tiny_kitti, tmp_path):

@@ -287,20 +287,26 @@ def test_the_page_in_git_does_not_depend_on_the_machine_or_day(run):
     assert len(files) > 80 and missing == []
     assert {link[1:] for link in links if link.startswith("#")} <= shown.ids
     # the numbers of the answer on real frames are seen before anything is unfolded
-    places = [
-        before.index(text)
-        for text in (
-            'id="real-frames"',
-            "<table>",
-            'id="answer"',
-            'id="findings"',
-            'id="chapter-4-on-real-frames"',
-            'id="real-table-comparison"',
-            'id="chapter-4"',
-            'id="table-comparison"',
-        )
-    ]
+    places = [0]
+    for text in (
+        'id="real-frames"',
+        "<table>",
+        'id="answer"',
+        'id="this-run"',
+        '<details id="demonstration">',
+        'id="findings"',
+        'id="figure-comparison"',
+        "</details>",
+        'id="chapter-4-on-real-frames"',
+        'id="real-table-comparison"',
+        'id="chapter-4"',
+        'id="table-comparison"',
+    ):
+        places.append(before.index(text, places[-1] if text == "</details>" else 0))
     assert places == sorted(places)
+    # the answer on real frames, with its number, is the first text of the page
+    ratio = re.search(r"(\d\.\d\d) times", (ROOT / "docs" / "answer.md").read_text())[1]
+    assert ratio in before.partition("</h1>")[2].partition("</p>")[0]
     assert str(Path("my build", "embedded-demo", "notebooks")) in shown.text
 
 
@@ -399,3 +405,16 @@ def test_numbers_of_the_run_and_of_the_thesis(run):
     )
     assert "5 to 10 % of the time saved." in text and "Here: -10 to 20 % of the time saved" in text
     assert "15,337,571 parameters" in text
+
+
+def test_the_count_of_improved_sequences_is_whole():
+    rows = {"sequence": ["mean", tables.IMPROVED], "a": [-1.25, 9.0], "b": [2.5, 9.64]}
+    text = tables.html(pd.DataFrame(rows).convert_dtypes())
+    assert re.findall("<td>(.*?)</td>", text) == [
+        "mean",
+        "-1.25",
+        "2.50",
+        tables.IMPROVED,
+        "9",
+        "9.64",
+    ]

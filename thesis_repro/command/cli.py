@@ -206,7 +206,7 @@ def study(options: Any) -> int:
         raise InputError(
             "no masks: name a folder of label maps with --labels, or of masks with --masks"
         )
-    kinds = {kind for kind, _ in options.sources}
+    kinds = {kind for kind, _, _ in options.sources}
     has_labels = "labels" in kinds
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
@@ -222,9 +222,7 @@ def study(options: Any) -> int:
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
-        sources.named(
-            options.sources, options.name, _mask_settings(options, has_labels), options.invert
-        ),
+        sources.named(options.sources, _mask_settings(options, has_labels), options.invert),
         tuple(sorted(widths)),
         options.controls,
         tuple(dict.fromkeys(options.estimator)),
@@ -322,7 +320,11 @@ def _sequence(options: Any) -> Any:
     from thesis_repro.data.kitti import Sequence
 
     sequence = Sequence(
-        options.kitti, options.sequence, options.camera, getattr(options, "speed", None)
+        options.kitti,
+        options.sequence,
+        options.camera,
+        getattr(options, "speed", None),
+        getattr(options, "fps", None),
     )
     return sequence.subset(options.frames)
 

@@ -1,6 +1,7 @@
 """The options of the command line. cli.py has the commands."""
 
 import argparse
+import shlex
 import textwrap
 from collections.abc import Callable
 from functools import partial
@@ -155,9 +156,30 @@ def _source(kind: str, content: str) -> dict[str, Any]:
     return dict(
         dest="sources",
         action="append",
-        metavar="DIR",
-        type=lambda text: (kind, _path(text)),
-        help=f"folder with a subfolder NN for each sequence ({content}); can be repeated",
+        metavar="[NAME=]DIR",
+        type=lambda text: (kind, *_name_and_folder(text)),
+        help=f"folder with a subfolder NN for each sequence ({content}), and a name for it (the folder's); "
+        "can be repeated",
+    )
+
+
+def _name_and_folder(text: str) -> tuple[str | None, Path]:
+    """Return the name and the folder of NAME=FOLDER; no name for a folder alone.
+
+    A path may have "=" in it: it is no name if it holds "/", or if there is a folder of that path.
+    """
+    name, equals, folder = text.partition("=")
+    if not equals or "/" in name or Path(text).is_dir():
+        return None, _path(text)
+    # a shell replaces "~" only at the start of a word
+    return name, _path(folder).expanduser()
+
+
+def _refuse_name(text: str) -> NoReturn:
+    """Raise InputError for the option --name, which had to stand in the order of the folders."""
+    raise InputError(
+        f"a name stands before its folder now: --labels {shlex.quote(text)}=FOLDER, "
+        f"or --masks {shlex.quote(text)}=FOLDER"
     )
 
 
@@ -216,6 +238,9 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
         ),
+        "--fps": dict(
+            type=float, metavar="N", help="frames a second, if there is no times.txt (10)"
+        ),
         "--masks": dict(
             type=Path,
             metavar="DIR",
@@ -260,12 +285,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         **_shared("--output"),
         "--labels": _source("labels", "label maps, any size"),
         "--masks": _source("masks", "masks, 255 keeps keypoints, 0 ignores them"),
-        "--name": dict(
-            action="append",
-            default=[],
-            metavar="NAME",
-            help="name of a --labels or --masks folder (its name)",
-        ),
+        "--name": dict(type=_setting(_refuse_name), help=argparse.SUPPRESS),
         "--widths": dict(
             **WIDTHS,
             help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",

@@ -42,6 +42,7 @@ TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embe
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
 MAX_MISSING_NAMED = 10_000  # frames
 MAX_SPEED = 10_000  # metres a second
+MAX_FPS = 10_000  # frames a second
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
@@ -182,6 +183,7 @@ class Sequence:
         name: str | Path,
         camera: str | None = None,
         speed: float | None = None,
+        fps: float | None = None,
     ) -> None:
         """Find, read and check the files of a sequence, except its frames.
 
@@ -190,7 +192,8 @@ class Sequence:
         drive, or holds calib.txt, the frames (in image_0 or in the folder itself) and optionally
         times.txt and poses.txt.
         camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence
-        without ground truth; the default is one metre a frame.
+        without ground truth; the default is one metre a frame. fps: frames a second, for a
+        sequence without times.txt.
         """
         need("sequence", name, str | Path)
         self.root, self.folder, self.poses_path = locate(root, name)
@@ -204,16 +207,18 @@ class Sequence:
         self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
         # a broken link or a folder is reported when it is read
         self.has_times = os.path.lexists(times_path)
-        self.times = FRAME_TIME * np.arange(len(self))
-        if self.has_times:
-            self.times = times_of(times_path)
-            check_count(times_path, len(self.times), self.frame_paths)
+        self.times = self._read_times(times_path, fps)
         self.has_truth = os.path.lexists(self.poses_path)
         if self.has_truth:
             self._poses = truth_of(self.poses_path)
             check_count(self.poses_path, len(self._poses), self.frame_paths)
         if speed is not None:
-            self._check_speed(speed, times_path)
+            if not self.has_times and fps is None:
+                raise InputError(
+                    f"{times_path}: no such file; a speed needs the times of the frames, or their "
+                    "number a second (--fps)"
+                )
+            self._check_speed(speed)
 
     def _refuse_no_frames(self, frame_folder: Path) -> None:
         if images_of(self.folder) == self.folder and (self.folder / "image_1").is_dir():
@@ -223,13 +228,24 @@ class Sequence:
             )
         raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
 
-    def _check_speed(self, speed: float, times_path: Path) -> None:
+    def _read_times(self, path: Path, fps: float | None) -> np.ndarray:
+        if self.has_times:
+            if fps is not None:
+                raise InputError(f"fps {fps:g}: leave it out; {path} has the times of the frames")
+            times = times_of(path)
+            check_count(path, len(times), self.frame_paths)
+            return times
+        if fps is None:
+            return FRAME_TIME * np.arange(len(self))
+        if not 0 < fps <= MAX_FPS:
+            raise InputError(f"fps {fps:g}: must be above 0 and at most {MAX_FPS} frames a second")
+        return np.arange(len(self)) / fps
+
+    def _check_speed(self, speed: float) -> None:
         if self.has_truth:
             raise InputError(
                 f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
             )
-        if not self.has_times:
-            raise InputError(f"{times_path}: no such file; a speed needs the times of the frames")
         if not 0 < speed <= MAX_SPEED:
             raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s")
 
@@ -462,19 +478,18 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
         key = f"P{camera[-1]}"
     elif camera in kitti_raw.IMAGE_FOLDERS:
         key = f"P_rect_{camera[-2:]}"
+    form = f"must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
         lines = [line for line in text.splitlines() if line.startswith(f"{key}:")]
         matrix = np.array(lines[0].split()[1:], np.float64)
         matrix = matrix.reshape(3, 4)[:, :3]
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        raise InputError(f"{path}: cannot be read: {error.strerror}; it {form}") from None
     except (ValueError, IndexError):
         matrix = np.zeros((3, 3))
     if not is_camera_matrix(matrix):
-        raise InputError(
-            f"{path}: must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
-        )
+        raise InputError(f"{path}: {form}")
     return matrix
 
 

@@ -3,12 +3,11 @@
 Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
 
-import re
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -17,7 +16,7 @@ from thesis_repro.data.trajectories import read_poses, write_kitti_poses, write_
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
-from thesis_repro.report import comparison, page, style, tables, texts, trajectories
+from thesis_repro.report import comparison, latex, page, style, tables, texts, trajectories
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, controls, runner
@@ -26,6 +25,8 @@ from thesis_repro.study.sources import KINDS, Source
 from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
+# columns that tell the rows of tables apart
+LATEX_LABELS = ("masks", "sequence", "estimator", "keypoints", "over", "width (pixels)")
 
 
 @style.applied()
@@ -50,7 +51,11 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     runs = runs.assign(sequence=runs["sequence"].map(one_line))
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", texts.findings(runs, table, note, embedded))
-    figures = {"comparison": comparison.figure_comparison(table), "sources": figure_sources(study)}
+    unknown = study.of_unknown_polarity()
+    figures = {
+        "comparison": comparison.figure_comparison(table),
+        "sources": figure_sources(study, unknown),
+    }
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf")
@@ -59,18 +64,12 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         "comparison": comparison.table_comparison(table),
         "widths": comparison.table_widths(runs),
         "errors": tables.table_errors(runs),
-        "runs": runs.round(6),
     }
     for name, rows in numbers.items():
-        layout: dict[str, Any] = {"longtable": True}
-        if name == "summary":  # narrow enough for a portrait page; long texts are broken
-            layout = {"column_format": f"lr{(rows.shape[1] - 2) * 'p{17mm}'}"}
-        latex = rows.to_latex(
-            index=False, escape=True, na_rep="", float_format="{:g}".format, **layout
-        )
-        # after the end of a row, these would be its options
-        latex = re.sub(r"^(?=[\[*])", "{}", latex, flags=re.MULTILINE)
-        write_text(folder / f"{name}.tex", f"% {note}\n{latex}")
+        if name == "summary":  # one column a source fits into a column of text
+            rows = rows.set_index("masks").T.rename_axis("masks").reset_index()
+        write_text(folder / f"{name}.tex", f"% {note}\n{latex.latex(rows, LATEX_LABELS)}")
+    numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX
     names = style.save_all(figures, numbers, folder, note)
     widths = sorted(runs["dilation_width"].dropna().astype(int).unique())
     text = page.build_study(
@@ -78,6 +77,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         [("text", "findings"), *names],
         study=study,
         warnings=warnings,
+        of_unknown_polarity=unknown,
         embedded=embedded,
         kinds=KINDS,
         estimators=ESTIMATORS,
@@ -105,11 +105,12 @@ def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
             write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
 
-def figure_sources(study: Study) -> Figure:
+def figure_sources(study: Study, of_unknown_polarity: Collection[str] = ()) -> Figure:
     """Draw the middle frame of the first readable sequence, one row a source.
 
     A row shows the source's label map, its mask and the kept keypoints. The plain frame replaces a
-    label map that is missing.
+    label map that is missing. of_unknown_polarity: names of sources whose masks may be inverted;
+    the keypoints that their inverted masks keep are drawn in place of a label map.
     """
     for sequence, sequence_masks in study.shown_masks():
         index = len(sequence) // 2
@@ -130,6 +131,10 @@ def figure_sources(study: Study) -> Figure:
                 label_maps.append(label_map)
                 colors = style.label_colors(label_map, frame)
                 style.show_image(first, colors, f"{source.name}: label map")
+            elif source.name in of_unknown_polarity:
+                points = keypoints.detect(frame, THESIS, cv2.bitwise_not(mask))
+                first.set_title(f"{source.name}, inverted: {len(points)} keypoints")
+                first.scatter(*points.T, **style.KEYPOINT)
             points = keypoints.detect(frame, THESIS, mask)
             style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
             third.set_title(f"{source.name}: {len(points)} keypoints")

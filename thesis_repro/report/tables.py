@@ -88,6 +88,7 @@ def table_of_change(
     return table.rename_axis("sequence").reset_index()
 
 
+IMPROVED = "sequences improved"  # a row of counts, and of a mean of counts
 SINGLE = "change (%), one run each"
 NULL = "change (%), one run each, if masks did nothing"
 
@@ -116,7 +117,7 @@ def _summary(changes: pd.Series, runs: pd.DataFrame | None = None) -> dict[str, 
         f"{CI}, from": low,
         f"{CI}, to": high,
         "median": changes.median(),
-        "sequences improved": improved,
+        IMPROVED: improved,
     }
 
 
@@ -131,7 +132,7 @@ def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
         f"{middle}, from": low,
         f"{middle}, to": high,
         "median": studies.median(axis=1).mean(),
-        "sequences improved": (studies < 0).sum(axis=1).mean(),
+        IMPROVED: (studies < 0).sum(axis=1).mean(),
     }
 
 
@@ -201,11 +202,12 @@ def html(table: pd.DataFrame) -> Markup:
     """Return a table as HTML with escaped texts.
 
     The numbers of a column have the same number of digits. Where most numbers of a row are whole,
-    these are counts and stay whole.
+    and in the row IMPROVED, whole numbers are counts and stay whole.
     """
     floats = table.select_dtypes("Float64").astype(float)
     is_whole = floats.eq(floats.round())
     has_counts = is_whole.sum(axis=1) > floats.notna().sum(axis=1) / 2
+    has_counts |= table.iloc[:, 0].astype(str).eq(IMPROVED)
     shown = {}
     numeric = 0
     for name, cells in table.items():

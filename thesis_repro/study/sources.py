@@ -3,7 +3,6 @@
 import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from typing import TypeAlias
 
@@ -87,37 +86,29 @@ def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
 
 
 def named(
-    folders: Iterable[tuple[str, Path]],
-    names: Iterable[str],
+    folders: Iterable[tuple[str, str | None, Path]],
     settings: MaskSettings,
     invert: bool = False,
 ) -> tuple[Source, ...]:
-    """Return sources from (kind, folder) pairs and their names, in order.
+    """Return sources from (kind, name, folder). Without a name, that of the folder is used.
 
-    The default name is that of the folder.
     settings: for all masks from label maps. invert: for all ready-made masks.
-    Raises InputError for a name that cannot be a folder's name, for equal names, and for more names
-    than folders.
+    Raises InputError for a name that cannot be a folder's name, and for equal names.
     """
-    folders, names = list(folders), list(names)
     sources: list[Source] = []
-    if len(names) > len(folders):
-        raise InputError(
-            f"--name {names[len(folders)]}: {len(names)} names for {len(folders)} folders of masks; give "
-            "one --name for each --labels or --masks, in their order"
-        )
-    for (kind, folder), given_name in zip_longest(folders, names):
-        if given_name is not None and not re.fullmatch(r"[\w+-]+", given_name):
+    for kind, given_name, folder in folders:
+        if given_name is not None and not re.fullmatch(r"[\w+-]+( [\w+-]+)*", given_name):
             raise InputError(
-                f"--name {given_name}: a name may have letters, digits, '_', '+' and '-'"
+                f"--{kind} {given_name}={folder}: a name has letters, digits, '_', '+', '-' and single "
+                "spaces between them"
             )
         folder_name = re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-")
         name = given_name or folder_name or "masks"
         # some file systems ignore case
         if name.lower() in [source.name.lower() for source in sources]:
             raise InputError(
-                f"--name: two folders of masks would be called {name!r}; give each a different --name, in "
-                "the order of --labels and --masks"
+                f"--{kind} {folder}: two folders of masks would be called {name!r}; give one another name, "
+                f"--{kind} NAME={folder}"
             )
         sources.append(Source(folder.absolute(), kind, name, settings, invert and kind == "masks"))
     return tuple(sources)

@@ -1,15 +1,17 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro.checks import oddities
+from thesis_repro.checks import oddities, polarity
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
+from thesis_repro.masks import MaskFolder
 from thesis_repro.running import results
 from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
@@ -89,6 +91,23 @@ class Study:
         return [
             (sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
             for sequence in self.opened
+        ]
+
+    def of_unknown_polarity(self) -> list[str]:
+        """Return the names of the sources whose ready-made masks may be inverted, or look so.
+
+        Their shape says on no sequence that they are right, or on one that they are inverted.
+        """
+        shapes: dict[str, set[str]] = {}
+        for _, sequence_masks in self.shown_masks():
+            for source, masks in zip(self.sources, sequence_masks, strict=True):
+                if isinstance(masks, MaskFolder):
+                    with suppress(InputError):  # the runs report a file that cannot be read
+                        shapes.setdefault(source.name, set()).add(oddities.polarity_of(masks))
+        return [
+            name
+            for name, found in shapes.items()
+            if polarity.RIGHT not in found or found & polarity.INVERTED.keys()
         ]
 
     def shown_jobs(self, name: str) -> list[jobs.Job]:
