@@ -150,7 +150,7 @@ def check_width(dilation_width: int, size: tuple[int, int]) -> None:
     is_whole_number = isinstance(dilation_width, Integral) and not isinstance(dilation_width, bool)
     if not is_whole_number or not 1 <= dilation_width <= limit:
         raise InputError(
-            f"dilation width {dilation_width}: must be a whole number from 1 to {limit} pixels for "
+            f"dilation width {dilation_width!r}: must be a whole number from 1 to {limit} pixels for "
             f"frames of {size[1]}x{size[0]}"
         )
 

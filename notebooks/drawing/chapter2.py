@@ -63,6 +63,16 @@ def figure_2_02(
     return figure
 
 
+def window_of_most_contrast(image: np.ndarray, side: int) -> tuple[slice, slice]:
+    """Return the square window of an image (size, size) in which its values vary most.
+
+    It is not at the edge of the image, where a convolution adds zeros to it.
+    """
+    places = range(1, len(image) - side, side // 4)
+    windows = [np.s_[row : row + side, left : left + side] for row in places for left in places]
+    return max(windows, key=lambda window: image[window].std())
+
+
 def _mark(
     figure: plt.Figure, panel: plt.Axes, pixel: tuple[int, int], side: int, unit: str
 ) -> None:

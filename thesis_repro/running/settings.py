@@ -333,14 +333,12 @@ def _changed_sizes(profile: str, sizes: Profile) -> dict[str, str]:
     return texts
 
 
-def number(name: str, text: str | int, limits: tuple[int, int, int] | None = None) -> int:
+def number(name: str, text: str) -> int:
     """Return the whole number in the text of setting `name`.
 
-    Raises InputError if its limits (default: LIMITS[name]) do not allow it. Notebooks check the
-    numbers of their knobs with it.
+    Raises InputError if its LIMITS do not allow it.
     """
-    least, most, step = limits or LIMITS[name]
-    text = str(text)
+    least, most, step = LIMITS[name]
     if re.fullmatch("[0-9]{1,19}", text):
         value = int(text)
         if least <= value <= most and value % step == 0:

@@ -56,9 +56,27 @@ def fused_loss(loss: Any) -> Callable:
         value, gradient = value_and_gradient(true, predicted)
         return value, lambda upstream: (None, upstream * gradient)
 
-    # the library's losses and Keras' own
-    compiled.__name__ = getattr(loss, "__name__", None) or loss.name
+    compiled.__name__ = loss_name(loss)
     return compiled
+
+
+def named_loss(loss: Any) -> Callable:
+    """Return the same loss as a function that Keras can write into a file, by `loss_name`.
+
+    Keras writes its own losses and plain functions, but no lambda, partial or other callable.
+    """
+
+    def by_name(true: tf.Tensor, predicted: tf.Tensor) -> tf.Tensor:
+        return loss(true, predicted)
+
+    by_name.__name__ = loss_name(loss)
+    return by_name
+
+
+def loss_name(loss: Any) -> str:
+    """Return the name of a loss: one of the library's, one of Keras' own, or any callable."""
+    name = getattr(loss, "__name__", None) or getattr(loss, "name", None) or type(loss).__name__
+    return name.strip("<>")  # of a lambda
 
 
 def metrics() -> list:

@@ -385,27 +385,30 @@ def _failure_of(error: Exception) -> Failure:
 def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
     """Return what a table of runs has from a run's frames: errors, keypoints, flagged frames.
 
-    frames: the table of `odometry.Result`.
-    true: poses (n, 4, 4). The errors are those of `metrics.errors` and `metrics.step_errors`; t_rel
-    (percent) and r_rel (degrees per 100 m) are those of `metrics.kitti_errors`. A lost run has its
-    RMSE in place of the aligned ATE: the alignment absorbs a wrong turn near the start of the path,
-    so that a lost run would look better than any other.
+    frames: the table of `odometry.Result`. true: poses (n, 4, 4). The errors are `path_errors`.
     """
-    poses = poses_of(frames)
+    return {
+        "frames": len(frames),
+        **path_errors(poses_of(frames), true),
+        "mean_keypoints": frames["detected"].mean(),
+        "flagged": int(is_flagged(frames).sum()),
+    }
+
+
+def path_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Return the errors of a path; poses, true: (n, 4, 4).
+
+    They are those of `metrics.errors` and `metrics.step_errors`; t_rel (percent) and r_rel (degrees
+    per 100 m) are those of `metrics.kitti_errors`. A lost run has its RMSE in place of the aligned
+    ATE: the alignment absorbs a wrong turn near the start of the path, so that a lost run would
+    look better than any other.
+    """
     errors = metrics.errors(poses, true)
     step_errors = metrics.step_errors(poses, true)
     if step_errors["lost"]:
         errors["se3"] = errors["rmse"]
     kitti = metrics.kitti_errors(poses, true)
-    return {
-        "frames": len(frames),
-        **errors,
-        **step_errors,
-        "t_rel": kitti["t_rel"],
-        "r_rel": kitti["r_rel"],
-        "mean_keypoints": frames["detected"].mean(),
-        "flagged": int(is_flagged(frames).sum()),
-    }
+    return {**errors, **step_errors, "t_rel": kitti["t_rel"], "r_rel": kitti["r_rel"]}
 
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
