@@ -164,7 +164,8 @@ def _streets(sequences):
 def main():
     """Write the evidence with the settings of the environment."""
     settings = read_settings()
-    others = named([("labels", Path(path)) for path in sys.argv[1:]], [], masks.MaskSettings())
+    folders = [("labels", None, Path(path)) for path in sys.argv[1:]]
+    others = named(folders, masks.MaskSettings())
     folder = settings.build / "evidence"
     with results.claimed(folder), console.logged(folder, "tables, plots and findings") as run:
         write(settings, FOLDER, others)
