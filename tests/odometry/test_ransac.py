@@ -1,6 +1,7 @@
 """RANSAC returns the same bits as cv2.findEssentialMat."""
 
 import cv2
+import numba
 import numpy as np
 import pytest
 
@@ -148,6 +149,42 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
             )
             shares.append((distances / margins).min())
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
+
+
+@numba.njit(error_model="numpy")
+def bounds(e, margin, columns, limit):
+    return ransac._bounds(e, margin, columns, limit, -1)
+
+
+@numba.njit(error_model="numpy")
+def may_beat(e, margin, columns, limit, best):
+    extents = np.array([np.abs(columns[k]).max() for k in range(4)])
+    return ransac._may_beat(e, margin, columns.astype(np.float32), extents, limit, best)
+
+
+def test_bounds_hold_for_the_worst_matrices_within_the_margin():
+    """The matrices are moved by the margin in the direction that changes one point most."""
+    margin, limit = 3e-5, np.float32(THESIS.threshold**2)
+    random = np.random.default_rng(4)
+    current, previous = scene(random, 400)
+    matrix, _ = ransac.find_essential_matrix(current, previous, THESIS.threshold, pose.PROBABILITY)
+    e = matrix.ravel() / np.linalg.norm(matrix)
+    columns = np.vstack([current.T, previous.T])
+    low, high = bounds(e, margin, columns, limit)
+    assert 100 < low < high < 350
+    sure = 0
+    for k in range(columns.shape[1]):
+        direction = np.outer([*previous[k], 1], [*current[k], 1]).ravel()
+        direction *= margin / np.linalg.norm(direction)
+        masks = ransac._inlier_masks(np.stack([e - direction, e + direction]), columns, limit)
+        for inliers in masks.sum(axis=1):
+            assert low <= inliers <= high
+            assert may_beat(e, margin, columns, limit, inliers - 1)
+        fewest, most = bounds(e, margin, columns[:, k : k + 1].copy(), limit)
+        assert fewest <= masks[:, k].min() and masks[:, k].max() <= most
+        sure += fewest == most
+    assert sure == 400 - (high - low)
+    assert not may_beat(e, margin, columns, limit, 399)
 
 
 @pytest.mark.real

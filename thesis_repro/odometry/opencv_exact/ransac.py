@@ -31,6 +31,7 @@ MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole searc
 OPENCV_SEED = 2**64 - 1  # of its RANSAC's random number generator
 # correspondences scored between two checks whether the best can still be beaten
 SCORING_BLOCK = 128
+SMALLEST = np.finfo(float).tiny  # normal number
 
 
 class _Solution(NamedTuple):
@@ -152,12 +153,11 @@ def _samples_needed(probability: float, outliers: float) -> int:
 
     outliers: their share of the correspondences.
     """
-    tiny = np.finfo(float).tiny
     missed = 1.0 - math.pow(1.0 - outliers, SAMPLE_SIZE)  # probability that a sample has an outlier
-    if missed < tiny:
+    if missed < SMALLEST:
         return 0
     log_missed = math.log(missed)
-    log_failure = math.log(max(1.0 - probability, tiny))
+    log_failure = math.log(max(1.0 - probability, SMALLEST))
     if log_missed >= 0 or -log_failure >= MAX_SAMPLES * -log_missed:
         return MAX_SAMPLES
     return round(log_failure / log_missed)

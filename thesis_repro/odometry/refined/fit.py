@@ -427,6 +427,7 @@ def _normal_equations(r, t, current, previous, scale):
                 rows[i, k] = (change - residual[i] * inverse[i] * slope) * inverse[i]
         for i in range(count):
             cost += np.log(rarity[i])
+        for i in range(count):
             rows[i, 5] = residual[i]
             _add_products(sums, rows[i], weight[i])
     hessian = sums[:5, :5].copy()
