@@ -173,6 +173,7 @@ odometry --kitti kitti --sequence 77 -> sequences/77
 odometry --kitti kitti --sequence ../00 -> '../00'
 {MASKS[:-3]}labels -> --output labels
 {STUDY} --widths 900 -> 900
+{ODOMETRY} --fps 25 -> times.txt
 check-data -> --kitti
 check-data --kitti nowhere -> nowhere
 synthesize mine --profile smoke -> mine
@@ -193,6 +194,7 @@ MISUSED = [
     ("study --widths 5-1", "--widths"),
     (f"{LABELLED} --masks masks", "--masks"),
     (f"{STUDY} --jobs 0", "--jobs"),
+    (f"{STUDY} --name net", "--labels net="),
     (f"{STUDY} --dask inproc://1", "--dask"),
 ]
 

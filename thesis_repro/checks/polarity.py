@@ -2,7 +2,10 @@
 
 255 keeps keypoints by convention, but many tools write masks of what has to be left out. Coverage,
 values and contrast tell nothing: a mask without vehicles may cover little or much, and a mask of
-the road is as sound as one without it. Two kinds of shape are known:
+the road is as sound as one without it. Nor do steps that fail: of 180 steps on real streets, 8 had
+a flag with masks that keep only vehicles, 2 with right boundaries, none with inverted ones.
+
+Two kinds of shape are known:
 
 - boundaries are strips that run through most of the frame, with areas between them;
 - things, such as vehicles, are areas that fill little of the frame, and neither reach its upper
