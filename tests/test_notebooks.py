@@ -336,6 +336,10 @@ style.with_sliders = watched
 """
 MOVED = """
 for draw, sliders in SHOWN:
+    for slider in sliders.values():
+        if hasattr(slider, "step"):  # a browser rounds a value that no step reaches
+            steps = (slider.value - slider.min) / slider.step
+            assert abs(steps - round(steps)) < 1e-9, slider
     figure = draw(**{name: slider.value for name, slider in sliders.items()})
     texts = [text for axes in figure.axes for text in (axes.title, *axes.texts)]
     print("SLIDER", "; ".join(text.get_text() for text in texts))

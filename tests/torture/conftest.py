@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from trials import thesis
 
+ROOT = Path(__file__).parents[2]
 # the training of tests/segmentation/test_training.py as a command
 TRAINING = f"""
 import sys
-sys.path.insert(0, {str(Path(__file__).parents[1] / "segmentation")!r})
+sys.path[:0] = {[str(ROOT / "tests/segmentation"), str(ROOT / "tools")]!r}
 from thesis_repro.running import console, results
 from thesis_repro.segmentation import training
 import test_training

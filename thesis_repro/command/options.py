@@ -106,7 +106,7 @@ SHARED: dict[str, dict[str, Any]] = {
     ),
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
-WIDTHS = dict(type=_setting(read_widths), nargs="+", action="extend", metavar="W")
+WIDTHS = dict(type=_setting(read_widths), nargs="+", action="extend", metavar="W,W")
 MASK_OPTIONS: dict[str, dict[str, Any]] = {
     "--boundaries": dict(
         metavar="canny|exact",

@@ -112,8 +112,8 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each source: the answer of a study (`compare.primary_comparison`).
 
     The columns are the mean number of keypoints that the masks leave and that of all, the ratio of
-    each judging metric, the verdict, and the control without segmentation that has the lowest
-    ratio of the first judging metric.
+    each judging metric, the verdict, and the control that does not use the classes in the frame and
+    has the lowest ratio of the first judging metric.
     """
     judged = compare.primary_comparison(table)
     estimator = compare.judging_estimator(judged)

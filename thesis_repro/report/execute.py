@@ -1,9 +1,10 @@
 """Execution of notebooks by `make figures`: progress bars, one line on failure, a log file.
 
-Usage: python -m thesis_repro.report.execute NOTEBOOK OUTPUT. The log file stands beside the output.
+Usage: python -m thesis_repro.report.execute NOTEBOOK EXECUTED. The log file stands beside EXECUTED.
 The user's settings of Jupyter and IPython are not read. One of them lets failing cells pass.
 """
 
+import argparse
 import logging
 import os
 import signal
@@ -124,7 +125,13 @@ def _reason(error: Exception) -> str:
 
 def main() -> None:
     """Execute a notebook, and write it with its outputs."""
-    source, output = map(Path, sys.argv[1:])
+    parser = argparse.ArgumentParser(
+        "python -m thesis_repro.report.execute", description=main.__doc__
+    )
+    parser.add_argument("notebook", type=Path)
+    parser.add_argument("executed", type=Path, help="where the notebook with its outputs goes")
+    options = parser.parse_args()
+    source, output = options.notebook, options.executed
     resources = {"metadata": {"name": source.stem, "path": str(source.parent)}}
     with TemporaryDirectory() as ipython_folder:
         execution = Execution(output.with_suffix(".log"), ipython_folder)

@@ -23,7 +23,7 @@ ESCAPED |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
 # \hspace: LaTeX does not hyphenate the first word of a cell
 HEAD = rf"""\providecommand{{\leftcell}}{{\raggedright\hspace{{0pt}}}}
 \providecommand{{\rightcell}}{{\raggedleft\hspace{{0pt}}}}
-{{\scriptsize\setlength{{\tabcolsep}}{{{GAP / 2:g}pt}}"""
+\par{{\scriptsize\setlength{{\tabcolsep}}{{{GAP / 2:g}pt}}"""
 
 
 def latex(table: pd.DataFrame, labels: Collection[str]) -> str:

@@ -66,7 +66,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         "errors": tables.table_errors(runs),
     }
     for name, rows in numbers.items():
-        if name == "summary":  # one column a source fits into a column of text
+        if name == "summary" and len(rows):  # one column a source fits into a column of text
             rows = rows.set_index("masks").T.rename_axis("masks").reset_index()
         write_text(folder / f"{name}.tex", f"% {note}\n{latex.latex(rows, LATEX_LABELS)}")
     numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX

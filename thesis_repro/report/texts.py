@@ -245,12 +245,12 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
     runs = compare.of_source(runs, source)
     masked = compare.of_method(runs, "masked")
     widths = masked["dilation_width"].nunique()
-    same_best = None
+    same_best, repeated = None, 0
     if widths > 1:
         stability = thesis_tables.stability(masked, compare.of_method(runs, "baseline"))
         mean = stability["same_best"].mean()
         if not pd.isna(mean):
-            same_best = float(mean)
+            same_best, repeated = float(mean), int(stability["same_best"].count())
     judged = compare.primary_comparison(table, source)
     over_all = (table["source"] == source) & (table["reference"] == "baseline") & table["tested"]
     of_masks = table[over_all & (table["method"] == "masked")]
@@ -269,4 +269,5 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
         "controls": verdicts.to_dict(),
         "widths": widths,
         "same_best": same_best,
+        "repeated": repeated,
     }

@@ -171,10 +171,10 @@ def rank_test(logarithms: np.ndarray) -> float:
     """Return the p-value of Wilcoxon's signed-rank test (exact, two-sided), 0 to 1.
 
     It tests whether the logarithms (n,) of ratios lie around 0. A sequence without any difference
-    is left out. NaN if none is left.
+    is left out. NaN if fewer than MIN_SEQUENCES are left: their p-value is never below 0.05.
     """
     different = logarithms[logarithms != 0]
-    if not len(different):
+    if len(different) < MIN_SEQUENCES:
         return np.nan
     return float(wilcoxon(different, method="exact").pvalue)
 

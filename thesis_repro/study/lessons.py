@@ -171,7 +171,7 @@ def finish(
     edited: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> None:
-    """End a notebook: write its record and say what was edited.
+    """End a notebook: write its record, and say which edits its files come from.
 
     used: the records of the notebooks whose files it read, as `begin` returns them. edited: what
     was edited in this notebook.
@@ -183,7 +183,8 @@ def finish(
     made_from = {name: record.made for name, record in used.items()}
     record = Record(made, made_from, edits, dict(settings or {}))
     files.write_text(build / RECORDS[notebook], json.dumps(asdict(record), indent=1))
-    print("edited so far:", name_of(edits))
+    shown = name_of(edits) if edits else "none"
+    print(f"edits behind the files of {notebook}: {shown}")
 
 
 def of_odometry(build: Path) -> Record:
