@@ -8,7 +8,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, pose
-from thesis_repro.odometry.opencv_exact import ransac, rounding
+from thesis_repro.odometry.opencv_exact import five_point, ransac, rounding
 
 
 def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBABILITY):
@@ -133,22 +133,46 @@ def test_opencv_does_the_whole_search_if_the_bounds_were_wrong(monkeypatch):
 )
 def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, most_unsure):
     random, shares, unsure = np.random.default_rng(3), [], 0
-    for _ in range(300):
-        current, previous = scene(random, 5, outliers=0.0, **options)
-        sure, solutions, margins = rounding.solve(np.hstack([current, previous]))
-        if not sure:
-            unsure += 1
-            continue
-        stack, _ = opencv(current, previous, 1e-3)
-        matrices = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
-        assert len(matrices) == len(solutions)
-        for matrix in matrices:
-            distances = np.minimum(
-                np.linalg.norm(solutions - matrix, axis=1),
-                np.linalg.norm(solutions + matrix, axis=1),
-            )
-            shares.append((distances / margins).min())
+    solutions = rounding.no_solutions()
+    for _ in range(19):
+        samples = [scene(random, 5, outliers=0.0, **options) for _ in range(five_point.LANES)]
+        rounding.solve(np.array([np.hstack(sample) for sample in samples]), solutions)
+        for lane, sample in enumerate(samples):
+            count = solutions.counts[lane]
+            margins = solutions.margins[lane, :count]
+            if not solutions.sure[lane] or (margins >= rounding.WELL_CONDITIONED).any():
+                unsure += 1
+            if not solutions.sure[lane]:
+                assert not count
+                continue
+            stack, _ = opencv(*sample, 1e-3)
+            matrices = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
+            assert len(matrices) == count
+            ours = solutions.matrices[lane, :count]
+            for matrix in matrices:
+                distances = np.minimum(
+                    np.linalg.norm(ours - matrix, axis=1), np.linalg.norm(ours + matrix, axis=1)
+                )
+                shares.append((distances / margins).min())
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
+
+
+def test_a_sample_has_the_same_solutions_in_every_lane_and_company():
+    random, lanes = np.random.default_rng(5), five_point.LANES
+    fives = np.array([np.hstack(scene(random, 5, outliers=0.0)) for _ in range(lanes)])
+    fives[3, 1] = fives[3, 0]  # not solvable
+    together = rounding.no_solutions()
+    rounding.solve(fives, together)
+    assert not together.sure[3] and together.sure.sum() >= lanes - 2
+    for shift in range(1, lanes):
+        moved = rounding.no_solutions()
+        rounding.solve(np.roll(fives, shift, axis=0), moved)
+        np.testing.assert_array_equal(np.roll(together.counts, shift), moved.counts)
+        for lane in range(lanes):
+            kept = moved.counts[(lane + shift) % lanes]
+            np.testing.assert_array_equal(
+                together.matrices[lane, :kept], moved.matrices[(lane + shift) % lanes, :kept]
+            )
 
 
 @numba.njit(error_model="numpy")

@@ -38,12 +38,12 @@ def fast(function: Callable, **options: Any) -> Callable:
     return dispatcher
 
 
-def inner(function: Callable) -> Callable:
+def inner(function: Callable, **options: Any) -> Callable:
     """Compile a function for calls from compiled functions only.
 
     It is inlined there, and Python cannot call it. This saves compile time and run time.
     """
-    return fast(function, forceinline=True, no_cpython_wrapper=True)
+    return fast(function, forceinline=True, no_cpython_wrapper=True, **options)
 
 
 # The cache

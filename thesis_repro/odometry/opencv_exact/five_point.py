@@ -16,12 +16,16 @@ pose.recover_pose.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from thesis_repro.running.compiled import fast, inner
+from thesis_repro.running.compiled import inner
 
 SAMPLE_SIZE = 5
+# Samples whose polynomials are solved side by side, one in each lane. Fewer than 16 are not
+# vectorised; with more, more samples are solved in vain when a search ends.
+LANES = 16
 MIN_INDEPENDENCE = 1e-8  # of five epipolar constraints; with less, no solution is trusted
 
 
@@ -95,15 +99,15 @@ TO_QUADRATIC, TO_CUBIC = _products()
 
 
 @inner
-def null_space(five):
+def null_space(five, rows):
     """Step 1: basis X, Y, Z, W of the matrices that meet five epipolar constraints.
 
-    Returns the independence of the constraints (0 to 1) and the basis (4, 9; matrices row by row).
-    A constraint is (u, v, 1) E (x, y, 1)^T = 0. An independence below MIN_INDEPENDENCE is returned
+    Returns the independence of the constraints (0 to 1). Writes the constraints to the first five
+    rows (9, 9), made orthonormal, and the basis to the others, each a matrix row by row. A
+    constraint is (u, v, 1) E (x, y, 1)^T = 0. An independence below MIN_INDEPENDENCE is returned
     as 0. Nister uses a QR factorisation. This is Gram-Schmidt, run twice against rounding. It gives
     OpenCV's basis: in another basis, rounding would change the solutions by other amounts.
     """
-    rows = np.empty((9, 9))
     independence = 1.0
     for k in range(9):
         if k < SAMPLE_SIZE:
@@ -113,8 +117,8 @@ def null_space(five):
                 rows[k, i] = SIGNS[k - SAMPLE_SIZE, i]
         independence = min(independence, _orthonormalise(rows, k))
         if not independence > MIN_INDEPENDENCE:
-            return 0.0, rows[SAMPLE_SIZE:]
-    return independence, rows[SAMPLE_SIZE:]
+            return 0.0
+    return independence
 
 
 @inner
@@ -153,20 +157,20 @@ def _orthonormalise(rows, k):
 
 
 @inner
-def constraints(basis):
-    """Step 2: ten cubic equations (10, 20) in x, y, z for E = x X + y Y + z Z + W.
+def constraints(basis, equations, squares, minors):
+    """Step 2: write ten cubic equations (10, 20) in x, y, z for E = x X + y Y + z Z + W.
 
     Rows 0 to 8, the trace constraint: E E^T E - trace(E E^T) E / 2 = 0. Row 9, the determinant
-    constraint: det E = 0.
+    constraint: det E = 0. squares (9, 10), minors (3, 10): space.
     """
-    squares = _squares(basis)
-    minors = _minors(basis)
+    _write_squares(basis, squares)
+    _write_minors(basis, minors)
     for p in range(10):
         half = 0.5 * (squares[0, p] + squares[4, p] + squares[8, p])
         for i in range(3):
             # E E^T - trace(E E^T) / 2, which times E is the trace constraint
             squares[4 * i, p] -= half
-    equations = np.zeros((10, 20))
+    equations[:] = 0.0
     for p in range(10):
         for q in range(4):
             place = TO_CUBIC[p, q]
@@ -175,13 +179,12 @@ def constraints(basis):
                 for j in range(3):
                     for k in range(3):
                         equations[3 * i + j, place] += squares[3 * i + k, p] * basis[q, 3 * k + j]
-    return equations
 
 
 @inner
-def _squares(basis):
-    """Entries (9) of E E^T, quadratic in x, y, z (10)."""
-    squares = np.zeros((9, 10))
+def _write_squares(basis, squares):
+    """Write the entries (9) of E E^T, quadratic in x, y, z (10)."""
+    squares[:] = 0.0
     for i in range(3):
         for j in range(i + 1):
             for k in range(3):
@@ -192,13 +195,12 @@ def _squares(basis):
         for j in range(i):
             for p in range(10):
                 squares[3 * j + i, p] = squares[3 * i + j, p]
-    return squares
 
 
 @inner
-def _minors(basis):
-    """Minors (3) of the first row of E, quadratic in x, y, z (10)."""
-    minors = np.zeros((3, 10))
+def _write_minors(basis, minors):
+    """Write the minors (3) of the first row of E, quadratic in x, y, z (10)."""
+    minors[:] = 0.0
     for i in range(3):
         # columns of the minor's entries in E's second and third row
         left = (i + 1) % 3
@@ -209,7 +211,6 @@ def _minors(basis):
                     basis[p, 3 + left] * basis[q, 6 + right]
                     - basis[p, 3 + right] * basis[q, 6 + left]
                 )
-    return minors
 
 
 @inner
@@ -278,13 +279,12 @@ def row_values(c, z):
 
 
 @inner
-def determinant(b):
-    """Step 4: coefficients (11, highest power first) of det B(z).
+def determinant(b, polynomial, minor):
+    """Step 4: write the coefficients (11, highest power first) of det B(z).
 
-    The determinant is expanded along the last column.
+    The determinant is expanded along the last column. minor (7): space.
     """
-    polynomial = np.zeros(11)
-    minor = np.empty(7)
+    polynomial[:] = 0.0
     for i in range(3):
         first = (i + 1) % 3
         second = (i + 2) % 3
@@ -296,54 +296,100 @@ def determinant(b):
         for p in range(7):
             for q in range(5):
                 polynomial[p + q] += minor[p] * b[i, 8 + q]
-    return polynomial
 
 
-@fast
-def real_roots(polynomial: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Step 5: solve a polynomial of degree ten (11, highest power first).
+class RealRoots(NamedTuple):
+    """Real roots and extrema of LANES polynomials, one in each lane."""
 
-    Returns (solved, real roots, places of the extrema). At most one root lies between two
-    neighbouring extrema. The extrema are the roots of the derivative, so all derivatives are
-    solved, the lowest degree first and less precisely. The caller must look at the extrema: where
-    the polynomial is nearly 0 there, it has a double root or none.
+    solved: np.ndarray  # (LANES,) booleans
+    counts: np.ndarray  # (LANES,), numbers of roots
+    roots: np.ndarray  # (10, LANES)
+    extremum_counts: np.ndarray  # (LANES,)
+    extrema: np.ndarray  # (10, LANES), places
+    heights: np.ndarray  # (10, LANES), values at the extrema
+
+
+@inner
+def real_roots(polynomials):
+    """Step 5: solve LANES polynomials of degree ten (LANES, 11; highest power first).
+
+    At most one root lies between two neighbouring extrema. The extrema are the roots of the
+    derivative, so all derivatives are solved, the lowest degree first and less precisely. The
+    caller must look at the extrema: where the polynomial is nearly 0 there, it has a double root or
+    none.
+
+    One polynomial alone keeps the processor waiting: each step of Newton's method needs the one
+    before. So the polynomials are solved side by side, and the loops over the lanes are vectorised.
     """
-    edges, roots, bends = np.empty(12), np.empty(11), np.empty(12)
-    bound = _root_bound(polynomial)
-    if bound < 0:
-        return False, roots[:0], edges[:0]
-    derivatives = _derivatives(polynomial)
-    count, intervals = 0, 0
+    solved, bounds, derivatives = _prepare(polynomials)
+    brackets = np.empty((4, 10, LANES))  # start, left end, right end, and whether it rises (1 or 0)
+    counts, new_counts = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
+    roots, extrema = np.empty((10, LANES)), np.empty((10, LANES))
+    # of the next polynomial and of its second derivative, at its extrema
+    heights, bends = np.empty((10, LANES)), np.empty((10, LANES))
+    first_heights, last_heights = np.empty(LANES), np.empty(LANES)  # at the bounds
+    state, flags = np.empty((4, LANES)), np.empty((2, LANES), np.int64)
     for degree in range(1, 11):
-        derivative, slopes = derivatives[degree], derivatives[degree - 1]
+        polynomial, slopes = derivatives[degree], derivatives[degree - 1]
+        _values(polynomial, -bounds, first_heights)
+        _values(polynomial, bounds, last_heights)
+        most = 0
+        for lane in range(LANES):
+            new_counts[lane] = _write_brackets(
+                lane,
+                counts[lane],
+                bounds[lane],
+                roots,
+                heights,
+                bends,
+                first_heights[lane],
+                last_heights[lane],
+                brackets,
+            )
+            most = max(most, new_counts[lane])
+        counts, new_counts = new_counts, counts
+        roots, extrema = extrema, roots
         precision = 1e-14 if degree > 8 else 1e-6
-        # the intervals lie between the bounds and the roots of the previous degree
-        edges[0] = -bound
-        edges[count + 1] = bound
-        for k in range(count):
-            edges[k + 1] = roots[k]
-        intervals = count + 1
-        count = 0
-        left = value(derivative, degree, -bound)
-        for k in range(intervals):
-            right = value(derivative, degree, edges[k + 1])
-            if (left < 0) != (right < 0):
-                start = _start(edges, bends, k, intervals, left, right)
-                roots[count] = _root_between(
-                    derivative,
-                    slopes,
-                    degree,
-                    edges[k],
-                    edges[k + 1],
-                    left < 0,
-                    start,
-                    precision,
-                )
-                count += 1
-            left = right
-        for k in range(count):
-            bends[k + 1] = value(slopes, degree - 1, roots[k])
-    return True, roots[:count], edges[1:intervals]
+        for k in range(most):
+            for lane in range(LANES):
+                left, right = brackets[1, k, lane], brackets[2, k, lane]
+                state[0, lane], state[1, lane] = brackets[0, k, lane], left
+                state[2, lane], state[3, lane] = right, right - left
+                flags[0, lane], flags[1, lane] = brackets[3, k, lane] > 0, k < counts[lane]
+            for _ in range(100):
+                if not _newton_step(polynomial, slopes, state, flags, precision):
+                    break
+            for lane in range(LANES):
+                roots[k, lane] = state[0, lane]
+            _values(slopes, roots[k], bends[k])
+            if degree < 10:
+                _values(derivatives[degree + 1], roots[k], heights[k])
+    return RealRoots(solved, counts, roots, new_counts, extrema, heights)
+
+
+@inner
+def _prepare(polynomials):
+    """Which polynomials can be solved, bounds of their roots, and all their derivatives.
+
+    derivatives: (11, 11, LANES). Row d is the one of degree d, its lowest power first; row 10 is
+    the polynomial itself. One that cannot be solved is replaced by the constant 1.
+    """
+    solved, bounds = np.zeros(LANES, np.bool_), np.ones(LANES)
+    derivatives = np.zeros((11, 11, LANES))
+    for lane in range(LANES):
+        bound = _root_bound(polynomials[lane])
+        derivatives[10, 0, lane] = 1.0
+        if bound >= 0:
+            solved[lane] = True
+            bounds[lane] = bound
+            for power in range(11):
+                derivatives[10, power, lane] = polynomials[lane, 10 - power]
+    for degree in range(10, 0, -1):
+        for power in range(1, degree + 1):
+            for lane in range(LANES):
+                coefficient = derivatives[degree, power, lane]
+                derivatives[degree - 1, power - 1, lane] = coefficient * power
+    return solved, bounds, derivatives
 
 
 @inner
@@ -360,79 +406,92 @@ def _root_bound(polynomial):
 
 
 @inner
-def _derivatives(polynomial):
-    """All derivatives (11, 11): row d is the one of degree d, and row 10 the polynomial itself."""
-    derivatives = np.empty((11, 11))
-    for k in range(11):
-        derivatives[10, k] = polynomial[k]
-    for degree in range(10, 0, -1):
-        for k in range(degree):
-            derivatives[degree - 1, k] = derivatives[degree, k] * (degree - k)
-    return derivatives
+def _write_brackets(
+    lane, extrema, bound, places, heights, bends, first_height, last_height, brackets
+):
+    """Write the intervals between a lane's extrema that have a root, and where to start in each.
+
+    Returns their number. extrema: number of extrema. places, heights, bends: of the extrema, their
+    values and second derivatives, (10, LANES).
+    """
+    count = 0
+    left, left_height = -bound, first_height
+    for k in range(extrema + 1):
+        right, right_height = bound, last_height
+        if k < extrema:
+            right, right_height = places[k, lane], heights[k, lane]
+        if (left_height < 0) != (right_height < 0):
+            if 0 < k < extrema:  # root of the cubic with the same two extrema
+                turn = math.asin((left_height + right_height) / (left_height - right_height))
+                start = left + (0.5 - math.sin(turn / 3)) * (right - left)
+            # beyond the last extremum: root of the parabola with the same bend there
+            elif k > 0:
+                start = left + math.sqrt(abs(2 * left_height / bends[k - 1, lane]))
+            elif extrema > 0:
+                start = right - math.sqrt(abs(2 * right_height / bends[0, lane]))
+            else:
+                start = 0.5 * (left + right)
+            if not left < start < right:
+                start = 0.5 * (left + right)
+            brackets[0, count, lane] = start
+            brackets[1, count, lane], brackets[2, count, lane] = left, right
+            brackets[3, count, lane] = left_height < 0
+            count += 1
+        left, left_height = right, right_height
+    return count
 
 
 @inner
-def _start(edges, bends, k, intervals, left, right):
-    """Where the search for the root of interval k starts.
+def value(polynomial, z, lane):
+    """Value at z of one of several polynomials (11, LANES; lowest power first).
 
-    left, right: values at the ends of the interval. bends: second derivatives at the edges.
+    Even and odd powers are summed apart, so the processor runs both sums at once. The sums are
+    written out, because the compiler does not vectorise a loop over lanes with a loop inside.
     """
-    if 0 < k < intervals - 1:  # root of the cubic with the same two extrema
-        part = 0.5 - math.sin(math.asin((left + right) / (left - right)) / 3)
-        return edges[k] + part * (edges[k + 1] - edges[k])
-    # beyond the last extremum: root of the parabola with the same bend there
-    if k > 0:
-        return edges[k] + math.sqrt(abs(2 * left / bends[k]))
-    if intervals > 1:
-        return edges[1] - math.sqrt(abs(2 * right / bends[1]))
-    return 0.5 * (edges[k] + edges[k + 1])
-
-
-@inner
-def value(polynomial, degree, z):
-    """Value of a polynomial at z.
-
-    Even and odd powers are summed apart, so the processor runs both sums at once.
-    """
-    if not degree:
-        return polynomial[0]
     square = z * z
-    first, second = polynomial[0], polynomial[1]
-    for k in range(2, degree, 2):
-        first = first * square + polynomial[k]
-        second = second * square + polynomial[k + 1]
-    if degree % 2:
-        return first * z + second
-    return first * square + polynomial[degree] + second * z
+    even = polynomial[10, lane] * square + polynomial[8, lane]
+    even = (even * square + polynomial[6, lane]) * square + polynomial[4, lane]
+    even = (even * square + polynomial[2, lane]) * square + polynomial[0, lane]
+    odd = polynomial[9, lane] * square + polynomial[7, lane]
+    odd = (odd * square + polynomial[5, lane]) * square + polynomial[3, lane]
+    odd = odd * square + polynomial[1, lane]
+    return even + odd * z
 
 
 @inner
-def _root_between(polynomial, slopes, degree, left, right, rising, start, precision):
-    """Root in an interval by Newton's method.
+def _values(polynomial, places, values):
+    """Write the values (LANES) of polynomials (11, LANES) at a place of each."""
+    for lane in range(LANES):
+        values[lane] = value(polynomial, places[lane], lane)
+
+
+@inner
+def _newton_step(polynomial, slopes, state, flags, precision):
+    """Make one step of Newton's method in each lane. Returns the number of lanes that go on.
 
     Bisection replaces a step that leaves the interval or converges slowly.
+    state (4, LANES): place, ends of the interval, size of the last step. flags (2, LANES): whether
+    the polynomial rises at the root, whether the lane goes on; the others keep their places.
     """
-    z = 0.5 * (left + right)
-    if left < start < right:
-        z = start
-    before = right - left
-    for _ in range(100):
-        height = value(polynomial, degree, z)
-        slope = value(slopes, degree - 1, z)
-        if (height < 0) == rising:
-            left = z
-        else:
-            right = z
-        step = np.inf
-        if slope != 0:
-            step = height / slope
-        if not (left <= z - step <= right) or abs(step) > 0.5 * before:
-            step = z - 0.5 * (left + right)
-        before = abs(step)
-        z -= step
-        if before <= precision * abs(z) + 1e-300:
-            break
-    return z
+    going_on = 0
+    for lane in range(LANES):
+        z = state[0, lane]
+        height = value(polynomial, z, lane)
+        step = height / value(slopes, z, lane)
+        is_left = (height < 0) == (flags[0, lane] != 0)
+        left = z if is_left else state[1, lane]
+        right = state[2, lane] if is_left else z
+        is_inside = (left <= z - step) & (z - step <= right)
+        is_shorter = abs(step) <= 0.5 * state[3, lane]
+        step = step if is_inside & is_shorter else z - 0.5 * (left + right)
+        moved = z - step
+        goes_on = flags[1, lane]
+        state[0, lane] = moved if goes_on else z
+        state[1, lane], state[2, lane], state[3, lane] = left, right, abs(step)
+        goes_on = 0 if abs(step) <= precision * abs(moved) + 1e-300 else goes_on
+        flags[1, lane] = goes_on
+        going_on += goes_on
+    return going_on
 
 
 @inner

@@ -4,8 +4,8 @@ OpenCV spends nearly all of its time in the five-point solver. It finds all ten 
 polynomial by an iteration that goes on long after the roots have converged. But RANSAC keeps only
 one of all solutions. So this search solves few samples with OpenCV:
 
-1. Draw samples of five correspondences with OpenCV's random number generator.
-2. Solve each sample quickly with `rounding.solve`. The last digits differ from OpenCV's, but the
+1. Draw samples of five correspondences with OpenCV's random number generator, LANES at a time.
+2. Solve them quickly with `rounding.solve`. The last digits differ from OpenCV's, but the
    difference is within a margin. The margin gives bounds of OpenCV's number of inliers. A test in
    single precision rules out most solutions.
 3. Let OpenCV solve a sample if the bounds do not decide whether it beats the best one so far. Let
@@ -16,14 +16,15 @@ The margin is a generous estimate, not a proof. The tests compare the results wi
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
-from thesis_repro.odometry.opencv_exact.rounding import solve
+from thesis_repro.odometry.opencv_exact.five_point import LANES, SAMPLE_SIZE
+from thesis_repro.odometry.opencv_exact.rounding import Solutions, no_solutions, solve
 from thesis_repro.running.compiled import fast, inner
 
 MAX_SAMPLES = 1000
@@ -43,12 +44,20 @@ class _Solution(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A sample of five, and what is known about the number of inliers of its best solution."""
+    """A sample of five, and bounds of the number of inliers of OpenCV's best solution for it."""
 
-    sample: np.ndarray | None  # five indices; None before the first sample
+    sample: np.ndarray  # five indices
     fewest: int
     most: int
-    solution: _Solution | None = None  # once OpenCV has computed it; then fewest = most
+
+
+class _Block(NamedTuple):
+    """LANES samples that were drawn and solved together."""
+
+    state: np.ndarray  # (1,) uint64, of the random number generator after them
+    samples: np.ndarray  # (LANES, 5)
+    fives: np.ndarray  # (LANES, 5, 4), their correspondences
+    solutions: Solutions
 
 
 def find_essential_matrix(
@@ -76,43 +85,46 @@ def _search(columns: np.ndarray, threshold: float, probability: float) -> _Solut
 
     columns: correspondences (4, N), rows x, y, u, v. None: no sample won, or the bounds were wrong.
     """
-    count = columns.shape[1]
     limit = np.float32(threshold * threshold)
     extents = np.abs(columns).max(axis=1)
     with np.errstate(over="ignore"):
         rough = columns.astype(np.float32)
-
-    def solve_exactly(candidate: _Candidate) -> _Candidate:
-        solution = _opencv_solution(columns, candidate.sample, threshold, probability, limit)
-        return _Candidate(candidate.sample, solution.inliers, solution.inliers, solution)
-
-    state, drawn = OPENCV_SEED, 0
+    block = first_block()
+    drawn = 0
     # as in OpenCV, a sample counts only if its own five correspondences are inliers
-    best = _Candidate(None, SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
+    best = _Candidate(np.zeros(SAMPLE_SIZE, np.int64), SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
+    solution = None  # of the best sample, once OpenCV has computed it
     while True:
-        enough = MAX_SAMPLES
-        if best.sample is not None:
-            enough = _samples_needed(probability, (count - best.most) / count)
-        state, drawn, sample, fewest, most = _next_better(
-            columns, rough, extents, float(limit), np.uint64(state), drawn, enough, best.fewest
+        drawn, is_new, best, challenger = _next_doubtful(
+            columns, rough, extents, float(limit), probability, block, drawn, best
         )
-        if fewest > best.most:
-            best = _Candidate(sample, fewest, most)  # surely better
-            continue
-        is_over = most == 0  # none of the remaining samples may be better
-        if is_over and (best.sample is None or best.solution is not None):
-            return best.solution
+        if is_new:
+            solution = None
+        is_over = challenger.most == 0
+        if is_over and (best.most < SAMPLE_SIZE or solution is not None):
+            return solution
         # Now the exact number of inliers of the best sample matters: it decides whether the search
-        # ends, or whether the new sample is better.
+        # ends, or whether the challenger is better.
         if is_over or best.fewest < best.most:
-            solved = solve_exactly(best)
-            if not best.fewest <= solved.fewest <= best.most:
+            solution = _opencv_solution(columns, best.sample, threshold, probability, limit)
+            if not best.fewest <= solution.inliers <= best.most:
                 return None
-            best = solved
-        if most > best.fewest:
-            challenger = solve_exactly(_Candidate(sample, fewest, most))
-            if challenger.fewest > best.fewest:
-                best = challenger
+            best = _Candidate(best.sample, solution.inliers, solution.inliers)
+        if challenger.most > best.fewest:
+            other = _opencv_solution(columns, challenger.sample, threshold, probability, limit)
+            if other.inliers > best.fewest:
+                best = _Candidate(challenger.sample, other.inliers, other.inliers)
+                solution = other
+
+
+def first_block() -> _Block:
+    """Space for the samples of a search, with OpenCV's generator at its start."""
+    return _Block(
+        np.array([OPENCV_SEED], np.uint64),
+        np.empty((LANES, SAMPLE_SIZE), np.int64),
+        np.empty((LANES, SAMPLE_SIZE, 4)),
+        no_solutions(),
+    )
 
 
 def _opencv(
@@ -131,7 +143,7 @@ def _opencv(
 
 def _opencv_solution(
     columns: np.ndarray,
-    sample: np.ndarray | None,
+    sample: np.ndarray,
     threshold: float,
     probability: float,
     limit: np.float32,
@@ -148,12 +160,14 @@ def _opencv_solution(
     return _Solution(int(inliers[best]), matrix, masks[best].reshape(-1, 1))
 
 
-def _samples_needed(probability: float, outliers: float) -> int:
+@inner
+def _samples_needed(probability, outliers):
     """Number of samples among which one is free of outliers with the given probability.
 
     outliers: their share of the correspondences.
     """
-    missed = 1.0 - math.pow(1.0 - outliers, SAMPLE_SIZE)  # probability that a sample has an outlier
+    # probability that a sample has an outlier
+    missed = 1.0 - math.pow(1.0 - outliers, float(SAMPLE_SIZE))
     if missed < SMALLEST:
         return 0
     log_missed = math.log(missed)
@@ -182,55 +196,78 @@ def _inlier_masks(matrices, columns, limit):
 
 
 @fast
-def draw(state, columns, sample, five):
-    """Draw a sample as OpenCV does.
-
-    Writes the sample's five indices to `sample` and its rows to `five` (5, 4). Returns the
-    generator's new state.
-    """
-    count = columns.shape[1]
-    taken = 0
-    while taken < SAMPLE_SIZE:
-        state = (state & np.uint64(0xFFFFFFFF)) * np.uint64(4164903690) + (state >> np.uint64(32))
-        index = np.int64((state & np.uint64(0xFFFFFFFF)) % np.uint64(count))
-        new = True
-        for k in range(taken):
-            new = new and sample[k] != index
-        if new:
-            sample[taken] = index
-            for j in range(4):
-                five[taken, j] = columns[j, index]
-            taken += 1
-    return state
+def draw(columns, block):
+    """Draw the next LANES samples as OpenCV does."""
+    count = np.uint64(columns.shape[1])
+    low_bits = np.uint64(0xFFFFFFFF)
+    state = block.state[0]
+    for lane in range(LANES):
+        sample = block.samples[lane]
+        taken = 0
+        while taken < SAMPLE_SIZE:
+            state = (state & low_bits) * np.uint64(4164903690) + (state >> np.uint64(32))
+            index = np.int64((state & low_bits) % count)
+            new = True
+            for k in range(taken):
+                new = new and sample[k] != index
+            if new:
+                sample[taken] = index
+                for j in range(4):
+                    block.fives[lane, taken, j] = columns[j, index]
+                taken += 1
+    block.state[0] = state
 
 
 @fast
-def _next_better(columns, rough, extents, limit, state, drawn, samples, best):
-    """Draw samples until one may have more than `best` inliers, or `samples` are drawn.
+def _next_doubtful(columns, rough, extents, limit, probability, block, drawn, best):
+    """Draw samples until one may or may not be better than the best one, or the search is over.
 
     rough: the columns in single precision. extents: largest absolute values of the four columns.
-    Returns the generator's state, the number of samples drawn, the sample's five indices, and
-    bounds of the number of inliers of its best solution (0, 0 if no sample may be better).
+    drawn: number of samples so far, of which the last ones are in `block`.
+    Returns the number of samples, whether the best one is another one, the best one, and the one in
+    doubt (no inliers if the search is over).
     """
     count = columns.shape[1]
-    sample = np.empty(SAMPLE_SIZE, np.int64)
-    five = np.empty((SAMPLE_SIZE, 4))
-    while drawn < samples:
+    sample, fewest, most = best
+    is_new = False
+    needed = MAX_SAMPLES
+    if most >= SAMPLE_SIZE:
+        needed = _samples_needed(probability, (count - most) / count)
+    while drawn < needed:
+        lane = drawn % LANES
+        if lane == 0:
+            draw(columns, block)
+            solve(block.fives, block.solutions)
         drawn += 1
-        state = draw(state, columns, sample, five)
-        sure, solutions, margins = solve(five)
-        if not sure:
-            return state, drawn, sample, 0, count
-        low, high = 0, 0
-        for k in range(len(solutions)):
-            if not _may_beat(solutions[k], margins[k], rough, extents, limit, max(best, low)):
-                continue
-            fewest, most = _bounds(solutions[k], margins[k], columns, limit, max(best, low))
+        low, high = _inliers_of_sample(
+            columns, rough, extents, limit, block.solutions, lane, fewest
+        )
+        if low > most:  # surely better
+            sample, fewest, most = block.samples[lane].copy(), low, high
+            is_new = True
+            needed = _samples_needed(probability, (count - most) / count)
+        elif high > fewest:
+            challenger = _Candidate(block.samples[lane].copy(), low, high)
+            return drawn, is_new, _Candidate(sample, fewest, most), challenger
+    return drawn, is_new, _Candidate(sample, fewest, most), _Candidate(sample, 0, 0)
+
+
+@inner
+def _inliers_of_sample(columns, rough, extents, limit, solutions, lane, best):
+    """Bounds of the number of inliers of a sample's best solution.
+
+    (0, 0) if it never has more than `best`.
+    """
+    if not solutions.sure[lane]:
+        return 0, columns.shape[1]
+    low, high = 0, 0
+    for k in range(solutions.counts[lane]):
+        matrix, margin = solutions.matrices[lane, k], solutions.margins[lane, k]
+        if _may_beat(matrix, margin, rough, extents, limit, max(best, low)):
+            fewest, most = _bounds(matrix, margin, columns, limit, max(best, low))
             low = max(low, fewest)
             high = max(high, most)
-        if high > best:
-            return state, drawn, sample, low, high
-    return state, drawn, sample, 0, 0
+    return low, high
 
 
 @inner
@@ -244,7 +281,10 @@ def _may_beat(e, margin, rough, extents, limit, best):
     count = rough.shape[1]
     allowed = count - best  # outliers
     largest = np.float32(1.00001 * _largest_of_inliers(e, margin, extents, limit))
-    matrix = epipolar.entries(e.astype(np.float32))
+    e0, e1, e2 = np.float32(e[0]), np.float32(e[1]), np.float32(e[2])
+    e3, e4, e5 = np.float32(e[3]), np.float32(e[4]), np.float32(e[5])
+    e6, e7, e8 = np.float32(e[6]), np.float32(e[7]), np.float32(e[8])
+    matrix = e0, e1, e2, e3, e4, e5, e6, e7, e8
     outliers = 0
     for start in range(0, count, SCORING_BLOCK):
         stop = min(start + SCORING_BLOCK, count)
@@ -268,7 +308,8 @@ def _largest_of_inliers(e, margin, extents, limit):
     extents: largest |x|, |y|, |u| and |v|.
     """
     x, y, u, v = extents[0], extents[1], extents[2], extents[3]
-    _, l0, l1, m0, m1 = epipolar.sampson_terms(epipolar.entries(np.abs(e)), x, y, u, v)
+    l0, l1 = abs(e[0]) * x + abs(e[1]) * y + abs(e[2]), abs(e[3]) * x + abs(e[4]) * y + abs(e[5])
+    m0, m1 = abs(e[0]) * u + abs(e[3]) * v + abs(e[6]), abs(e[1]) * u + abs(e[4]) * v + abs(e[7])
     root = np.sqrt(limit)
     # nine roundings of 2^-24
     rounding = 1e-6 * (1 + root) * (1 + x + y) * (1 + u + v)
@@ -276,12 +317,20 @@ def _largest_of_inliers(e, margin, extents, limit):
     return root * np.sqrt(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) + doubt
 
 
-@inner
+@partial(inner, fastmath={"contract"})
 def _surely_out(matrix, largest, x, y, u, v):
-    """Number of correspondences whose |algebraic| is larger than that of any inlier."""
+    """Number of correspondences whose |algebraic| is larger than that of any inlier.
+
+    A product and a sum may become one operation, rounded once. No result depends on these roundings
+    (see `largest`), and two thirds of the operations are enough.
+    """
+    e0, e1, e2, e3, e4, e5, e6, e7, e8 = matrix
     outliers = np.int32(0)  # of the same width as the distances, so that the loop is vectorised
     for k in range(len(x)):
-        algebraic, _, _, _, _ = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
+        l0 = e0 * x[k] + (e1 * y[k] + e2)
+        l1 = e3 * x[k] + (e4 * y[k] + e5)
+        l2 = e6 * x[k] + (e7 * y[k] + e8)
+        algebraic = u[k] * l0 + (v[k] * l1 + l2)
         outliers = np.int32(outliers + np.int32(abs(algebraic) > largest))
     return outliers
 

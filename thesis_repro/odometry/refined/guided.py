@@ -9,9 +9,9 @@ angles.
 import numpy as np
 
 from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
-from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, OPENCV_SEED, draw
-from thesis_repro.odometry.opencv_exact.rounding import solve
+from thesis_repro.odometry.opencv_exact.five_point import LANES
+from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, draw, first_block
+from thesis_repro.odometry.opencv_exact.rounding import WELL_CONDITIONED, solve
 from thesis_repro.running.compiled import fast, inner
 
 
@@ -28,23 +28,27 @@ def ransac_with_prior(
 
     None if no motion is near it.
 
+    A sample with a solution that rounding may change much is left out.
     current, previous: normalised correspondences (N, 2), N >= 5. rotation, translation: the
     expected motion.
     max_rotation, max_heading: largest differences in degrees of the rotation and of the
     translation's direction, whose sign is ignored.
     """
     columns = np.ascontiguousarray(np.hstack([current, previous]).T)
-    state = OPENCV_SEED
-    sample = np.empty(SAMPLE_SIZE, np.int64)
-    five = np.empty((SAMPLE_SIZE, 4))
-    solutions = []
+    block = first_block()
+    kept_matrices = []
     # in Python: `solve` within another compiled function would be compiled once more
-    for _ in range(MAX_SAMPLES):
-        state = draw(np.uint64(state), columns, sample, five)
-        _, matrices, _ = solve(five)  # no matrices if it is not sure
-        solutions.append(matrices)
+    for start in range(0, MAX_SAMPLES, LANES):
+        draw(columns, block)
+        solve(block.fives, block.solutions)
+        _, counts, matrices, margins = block.solutions
+        is_solution = np.arange(matrices.shape[1]) < counts[:, None]
+        is_bad = ((margins >= WELL_CONDITIONED) & is_solution).any(axis=1)
+        is_solution[is_bad] = False
+        is_solution[MAX_SAMPLES - start :] = False
+        kept_matrices.append(matrices[is_solution])
     most, best_rotation, best_translation = _best(
-        np.concatenate(solutions),
+        np.concatenate(kept_matrices),
         columns,
         threshold * threshold,
         np.ascontiguousarray(rotation),
