@@ -136,7 +136,7 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
     solutions = rounding.no_solutions()
     for _ in range(19):
         samples = [scene(random, 5, outliers=0.0, **options) for _ in range(five_point.LANES)]
-        rounding.solve(np.array([np.hstack(sample) for sample in samples]), solutions)
+        rounding.solve(np.stack([np.hstack(sample) for sample in samples], axis=-1), solutions)
         for lane, sample in enumerate(samples):
             count = solutions.counts[lane]
             margins = solutions.margins[lane, :count]
@@ -159,14 +159,15 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
 
 def test_a_sample_has_the_same_solutions_in_every_lane_and_company():
     random, lanes = np.random.default_rng(5), five_point.LANES
-    fives = np.array([np.hstack(scene(random, 5, outliers=0.0)) for _ in range(lanes)])
-    fives[3, 1] = fives[3, 0]  # not solvable
+    samples = [np.hstack(scene(random, 5, outliers=0.0)) for _ in range(lanes)]
+    fives = np.stack(samples, axis=-1)
+    fives[1, :, 3] = fives[0, :, 3]  # not solvable
     together = rounding.no_solutions()
     rounding.solve(fives, together)
     assert not together.sure[3] and together.sure.sum() >= lanes - 2
     for shift in range(1, lanes):
         moved = rounding.no_solutions()
-        rounding.solve(np.roll(fives, shift, axis=0), moved)
+        rounding.solve(np.roll(fives, shift, axis=-1), moved)
         np.testing.assert_array_equal(np.roll(together.counts, shift), moved.counts)
         for lane in range(lanes):
             kept = moved.counts[(lane + shift) % lanes]

@@ -11,6 +11,10 @@ in x, y, z;
 5. `real_roots`: the real roots of det B(z) = 0 (a complex root gives no motion);
 6. `essential`: x, y and E for one root.
 
+A single sample keeps the processor waiting, because most operations need the one before. So LANES
+samples are solved side by side. Their arrays end with an axis of lanes, and the compiler vectorises
+the loops over it: those with nothing but numbers, or loops of constant length, inside.
+
 `rounding.solve` runs these steps. Nister's last step, rotation and translation from E, is
 pose.recover_pose.
 """
@@ -23,8 +27,8 @@ import numpy as np
 from thesis_repro.running.compiled import inner
 
 SAMPLE_SIZE = 5
-# Samples whose polynomials are solved side by side, one in each lane. Fewer than 16 are not
-# vectorised; with more, more samples are solved in vain when a search ends.
+# Samples solved side by side, one in each lane. Loops over fewer than 16 are not vectorised; with
+# more, more samples are solved in vain when a search ends.
 LANES = 16
 MIN_INDEPENDENCE = 1e-8  # of five epipolar constraints; with less, no solution is trusted
 
@@ -99,203 +103,255 @@ TO_QUADRATIC, TO_CUBIC = _products()
 
 
 @inner
-def null_space(five, rows):
+def null_space(fives, rows, independences):
     """Step 1: basis X, Y, Z, W of the matrices that meet five epipolar constraints.
 
-    Returns the independence of the constraints (0 to 1). Writes the constraints to the first five
-    rows (9, 9), made orthonormal, and the basis to the others, each a matrix row by row. A
-    constraint is (u, v, 1) E (x, y, 1)^T = 0. An independence below MIN_INDEPENDENCE is returned
-    as 0. Nister uses a QR factorisation. This is Gram-Schmidt, run twice against rounding. It gives
+    fives: (5, 4, LANES), correspondences x, y, u, v. A constraint is (u, v, 1) E (x, y, 1)^T = 0.
+    Writes the constraints to the first five rows (9, 9, LANES), made orthonormal, and the basis to
+    the others, each a matrix row by row. Writes the constraints' independences (LANES; 0 to 1).
+    Nister uses a QR factorisation. This is Gram-Schmidt, run twice against rounding. It gives
     OpenCV's basis: in another basis, rounding would change the solutions by other amounts.
     """
-    independence = 1.0
+    row, norms = np.empty((9, LANES)), np.empty(LANES)
+    for lane in range(LANES):
+        independences[lane] = 1.0
     for k in range(9):
         if k < SAMPLE_SIZE:
-            _write_constraint(five[k], rows[k])
+            _write_constraint(fives[k], row)
         else:
             for i in range(9):
-                rows[k, i] = SIGNS[k - SAMPLE_SIZE, i]
-        independence = min(independence, _orthonormalise(rows, k))
-        if not independence > MIN_INDEPENDENCE:
-            return 0.0
-    return independence
+                for lane in range(LANES):
+                    row[i, lane] = SIGNS[k - SAMPLE_SIZE, i]
+        _write_norms(row, norms)
+        for _ in range(2):
+            for j in range(k):
+                _make_normal(row, rows[j])
+        _write_unit_row(row, norms, rows[k], independences)
 
 
 @inner
-def _write_constraint(correspondence, row):
-    """Write the factors (9) of E's entries in one correspondence's epipolar constraint."""
-    x, y = correspondence[0], correspondence[1]
-    u, v = correspondence[2], correspondence[3]
-    row[0], row[1], row[2] = x * u, y * u, u
-    row[3], row[4], row[5] = x * v, y * v, v
-    row[6], row[7], row[8] = x, y, 1.0
+def _write_constraint(five, row):
+    """Write the factors (9, LANES) of E's entries in one epipolar constraint."""
+    for lane in range(LANES):
+        x, y, u, v = five[0, lane], five[1, lane], five[2, lane], five[3, lane]
+        row[0, lane], row[1, lane], row[2, lane] = x * u, y * u, u
+        row[3, lane], row[4, lane], row[5, lane] = x * v, y * v, v
+        row[6, lane], row[7, lane], row[8, lane] = x, y, 1.0
 
 
 @inner
-def _orthonormalise(rows, k):
-    """Make row k normal to the rows before it, with unit norm.
+def _write_norms(row, norms):
+    for lane in range(LANES):
+        total = 0.0
+        for i in range(9):
+            total += row[i, lane] * row[i, lane]
+        norms[lane] = np.sqrt(total)
 
-    Returns the share of its norm that was left before it was divided by it.
+
+@inner
+def _make_normal(row, other):
+    """Make a row normal to another one of unit norm."""
+    for lane in range(LANES):
+        along = 0.0
+        for i in range(9):
+            along += row[i, lane] * other[i, lane]
+        for i in range(9):
+            row[i, lane] -= along * other[i, lane]
+
+
+@inner
+def _write_unit_row(row, norms, unit_row, independences):
+    """Write a row with unit norm, and lower the independence to the share left of its norm."""
+    for lane in range(LANES):
+        total = 0.0
+        for i in range(9):
+            total += row[i, lane] * row[i, lane]
+        norm = np.sqrt(total)
+        for i in range(9):
+            unit_row[i, lane] = row[i, lane] / norm
+        share = norm / norms[lane]
+        independences[lane] = share if share < independences[lane] else independences[lane]
+
+
+@inner
+def constraints(basis, equations):
+    """Step 2: ten cubic equations in x, y, z for E = x X + y Y + z Z + W.
+
+    equations: (10, 20, LANES), given as zeros. Rows 0 to 8 become the trace constraint: E E^T E -
+    trace(E E^T) E / 2 = 0. Row 9 becomes the determinant constraint: det E = 0.
     """
-    before = 0.0
-    for i in range(9):
-        before += rows[k, i] * rows[k, i]
-    for _ in range(2):
-        for j in range(k):
-            along = 0.0
-            for i in range(9):
-                along += rows[k, i] * rows[j, i]
-            for i in range(9):
-                rows[k, i] -= along * rows[j, i]
-    norm = 0.0
-    for i in range(9):
-        norm += rows[k, i] * rows[k, i]
-    norm = np.sqrt(norm)
-    for i in range(9):
-        rows[k, i] /= norm
-    return norm / np.sqrt(before)
-
-
-@inner
-def constraints(basis, equations, squares, minors):
-    """Step 2: write ten cubic equations (10, 20) in x, y, z for E = x X + y Y + z Z + W.
-
-    Rows 0 to 8, the trace constraint: E E^T E - trace(E E^T) E / 2 = 0. Row 9, the determinant
-    constraint: det E = 0. squares (9, 10), minors (3, 10): space.
-    """
-    _write_squares(basis, squares)
-    _write_minors(basis, minors)
-    for p in range(10):
-        half = 0.5 * (squares[0, p] + squares[4, p] + squares[8, p])
-        for i in range(3):
-            # E E^T - trace(E E^T) / 2, which times E is the trace constraint
-            squares[4 * i, p] -= half
-    equations[:] = 0.0
-    for p in range(10):
-        for q in range(4):
-            place = TO_CUBIC[p, q]
-            for i in range(3):
-                equations[9, place] += minors[i, p] * basis[q, i]
-                for j in range(3):
-                    for k in range(3):
-                        equations[3 * i + j, place] += squares[3 * i + k, p] * basis[q, 3 * k + j]
-
-
-@inner
-def _write_squares(basis, squares):
-    """Write the entries (9) of E E^T, quadratic in x, y, z (10)."""
-    squares[:] = 0.0
-    for i in range(3):
-        for j in range(i + 1):
-            for k in range(3):
-                for p in range(4):
-                    for q in range(4):
-                        product = basis[p, 3 * i + k] * basis[q, 3 * j + k]
-                        squares[3 * i + j, TO_QUADRATIC[p, q]] += product
-        for j in range(i):
-            for p in range(10):
-                squares[3 * j + i, p] = squares[3 * i + j, p]
-
-
-@inner
-def _write_minors(basis, minors):
-    """Write the minors (3) of the first row of E, quadratic in x, y, z (10)."""
-    minors[:] = 0.0
-    for i in range(3):
-        # columns of the minor's entries in E's second and third row
-        left = (i + 1) % 3
-        right = (i + 2) % 3
+    squares = np.zeros((10, 9, LANES))  # entries of E E^T, quadratic in x, y, z
+    minors = np.zeros((10, 3, LANES))  # of the first row of E, quadratic in x, y, z
+    for k in range(3):
         for p in range(4):
             for q in range(4):
-                minors[i, TO_QUADRATIC[p, q]] += (
-                    basis[p, 3 + left] * basis[q, 6 + right]
-                    - basis[p, 3 + right] * basis[q, 6 + left]
-                )
+                _add_squares(basis[p], basis[q], k, squares[TO_QUADRATIC[p, q]])
+    for p in range(4):
+        for q in range(4):
+            _add_minors(basis[p], basis[q], minors[TO_QUADRATIC[p, q]])
+    for p in range(10):
+        _finish_squares(squares[p])
+    for p in range(10):
+        for q in range(4):
+            _add_products(squares[p], minors[p], basis[q], equations[:, TO_CUBIC[p, q]])
+
+
+@inner
+def _add_squares(a, b, k, squares):
+    """Add the products of the k-th columns of matrices a and b (9, LANES): the lower triangle."""
+    for lane in range(LANES):
+        squares[0, lane] += a[k, lane] * b[k, lane]
+        squares[3, lane] += a[3 + k, lane] * b[k, lane]
+        squares[4, lane] += a[3 + k, lane] * b[3 + k, lane]
+        squares[6, lane] += a[6 + k, lane] * b[k, lane]
+        squares[7, lane] += a[6 + k, lane] * b[3 + k, lane]
+        squares[8, lane] += a[6 + k, lane] * b[6 + k, lane]
+
+
+@inner
+def _finish_squares(squares):
+    """Fill the upper triangle, and make of E E^T what gives the trace constraint.
+
+    That is E E^T - trace(E E^T) / 2, which times E is the constraint.
+    """
+    for lane in range(LANES):
+        squares[1, lane] = squares[3, lane]
+        squares[2, lane] = squares[6, lane]
+        squares[5, lane] = squares[7, lane]
+        half = 0.5 * (squares[0, lane] + squares[4, lane] + squares[8, lane])
+        squares[0, lane] -= half
+        squares[4, lane] -= half
+        squares[8, lane] -= half
+
+
+@inner
+def _add_minors(a, b, minors):
+    """Add the minors (3) of the second row of a and the third row of b."""
+    for lane in range(LANES):
+        minors[0, lane] += a[4, lane] * b[8, lane] - a[5, lane] * b[7, lane]
+        minors[1, lane] += a[5, lane] * b[6, lane] - a[3, lane] * b[8, lane]
+        minors[2, lane] += a[3, lane] * b[7, lane] - a[4, lane] * b[6, lane]
+
+
+@inner
+def _add_products(squares, minors, matrix, equations):
+    """Add the products with a matrix of the basis to one place of the equations (10, LANES)."""
+    for lane in range(LANES):
+        for i in range(3):
+            equations[9, lane] += minors[i, lane] * matrix[i, lane]
+            for j in range(3):
+                total = equations[3 * i + j, lane]
+                for k in range(3):
+                    total += squares[3 * i + k, lane] * matrix[3 * k + j, lane]
+                equations[3 * i + j, lane] = total
 
 
 @inner
 def eliminate(a, b):
-    """Step 3: write B(z) to b (3, 13; given as zeros).
+    """Step 3: write B(z) to b (3, 13, LANES; given as zeros).
 
-    Returns False if the equations a (10, 20) are singular. They are eliminated in place. A row of
-    B(z) is one eliminated row minus z times the next one, so that only x, y and 1 are left. It
-    holds their factors: polynomials in z of degree 3, 3 and 4, each with its highest power first.
+    The equations a (10, 20, LANES) are eliminated in place. Singular ones leave infinite numbers or
+    NaN. A row of B(z) is one eliminated row minus z times the next one, so that only x, y and 1 are
+    left. It holds their factors: polynomials in z of degree 3, 3 and 4, each with its highest power
+    first.
     """
-    # Gauss-Jordan elimination
-    if not _make_triangular(a):
-        return False
+    _make_triangular(a)
     _substitute_back(a)
     for i in range(3):
         # the columns of x z^2 to x, y z^2 to y, z^3 to 1
         for start, stop, place in ((10, 13, 0), (13, 16, 4), (16, 20, 8)):
             for j in range(start, stop):
-                b[i, place + j - start + 1] += a[4 + 2 * i, j]
-                b[i, place + j - start] -= a[5 + 2 * i, j]
-    return True
+                for lane in range(LANES):
+                    b[i, place + j - start + 1, lane] += a[4 + 2 * i, j, lane]
+                    b[i, place + j - start, lane] -= a[5 + 2 * i, j, lane]
 
 
 @inner
 def _make_triangular(a):
-    """Clear a (10, 20) below its diagonal, with partial pivoting.
-
-    Returns False if a is singular.
-    """
+    """Gauss-Jordan elimination with partial pivoting. Nothing uses what is left of the diagonal."""
+    factors = np.empty(LANES)
     for k in range(10):
-        pivot = k
+        _swap_pivot(a, k)
         for i in range(k + 1, 10):
-            if abs(a[i, k]) > abs(a[pivot, k]):
-                pivot = i
-        if a[pivot, k] == 0:
-            return False
-        if pivot != k:
-            for j in range(k, 20):
-                a[k, j], a[pivot, j] = a[pivot, j], a[k, j]
-        for i in range(k + 1, 10):
-            factor = a[i, k] / a[k, k]
-            for j in range(k + 1, 20):
-                a[i, j] -= factor * a[k, j]
-    return True
+            for lane in range(LANES):
+                factors[lane] = a[i, k, lane] / a[k, k, lane]
+            _subtract(a[i, :10], a[k, :10], factors)
+            _subtract(a[i, 10:], a[k, 10:], factors)
 
 
 @inner
 def _substitute_back(a):
-    """Solve the triangular equations a (10, 20) for the last six unknowns: B(z) needs no others."""
+    """Solve the triangular equations for the last six unknowns: B(z) needs no others."""
+    factors = np.empty(LANES)
     for k in range(9, 3, -1):
         for i in range(k + 1, 10):
-            for j in range(10, 20):
-                a[k, j] -= a[k, i] * a[i, j]
+            for lane in range(LANES):
+                factors[lane] = a[k, i, lane]
+            _subtract(a[k, 10:], a[i, 10:], factors)
+        _divide(a[k], k)
+
+
+@inner
+def _swap_pivot(a, k):
+    """Swap row k of each lane with the one that has the largest number in column k."""
+    for lane in range(LANES):
+        pivot = k
+        for i in range(k + 1, 10):
+            if abs(a[i, k, lane]) > abs(a[pivot, k, lane]):
+                pivot = i
+        if pivot != k:
+            for j in range(k, 20):
+                a[k, j, lane], a[pivot, j, lane] = a[pivot, j, lane], a[k, j, lane]
+
+
+@inner
+def _subtract(row, top, factors):
+    """Subtract a multiple of half a row from half a row, (10, LANES)."""
+    for lane in range(LANES):
+        factor = factors[lane]
+        for j in range(10):
+            row[j, lane] -= factor * top[j, lane]
+
+
+@inner
+def _divide(row, k):
+    for lane in range(LANES):
+        diagonal = row[k, lane]
         for j in range(10, 20):
-            a[k, j] /= a[k, k]
+            row[j, lane] /= diagonal
 
 
 @inner
-def row_values(c, z):
-    """Values at z of the three polynomials in one row c (13) of B(z)."""
-    return (
-        ((c[0] * z + c[1]) * z + c[2]) * z + c[3],
-        ((c[4] * z + c[5]) * z + c[6]) * z + c[7],
-        (((c[8] * z + c[9]) * z + c[10]) * z + c[11]) * z + c[12],
-    )
+def determinant(b, polynomials):
+    """Step 4: write the coefficients (11, LANES; lowest power first; given as zeros) of det B(z).
 
-
-@inner
-def determinant(b, polynomial, minor):
-    """Step 4: write the coefficients (11, highest power first) of det B(z).
-
-    The determinant is expanded along the last column. minor (7): space.
+    The determinant is expanded along the last column.
     """
-    polynomial[:] = 0.0
+    minor = np.empty((7, LANES))
     for i in range(3):
-        first = (i + 1) % 3
-        second = (i + 2) % 3
         for p in range(7):
-            minor[p] = 0.0
+            for lane in range(LANES):
+                minor[p, lane] = 0.0
+        _add_minor(b[(i + 1) % 3], b[(i + 2) % 3], minor)
+        _add_expansion(minor, b[i], polynomials)
+
+
+@inner
+def _add_minor(first, second, minor):
+    for lane in range(LANES):
         for p in range(4):
             for q in range(4):
-                minor[p + q] += b[first, p] * b[second, 4 + q] - b[second, p] * b[first, 4 + q]
+                minor[p + q, lane] += (
+                    first[p, lane] * second[4 + q, lane] - second[p, lane] * first[4 + q, lane]
+                )
+
+
+@inner
+def _add_expansion(minor, row, polynomials):
+    for lane in range(LANES):
         for p in range(7):
             for q in range(5):
-                polynomial[p + q] += minor[p] * b[i, 8 + q]
+                polynomials[10 - p - q, lane] += minor[p, lane] * row[8 + q, lane]
 
 
 class RealRoots(NamedTuple):
@@ -311,15 +367,12 @@ class RealRoots(NamedTuple):
 
 @inner
 def real_roots(polynomials):
-    """Step 5: solve LANES polynomials of degree ten (LANES, 11; highest power first).
+    """Step 5: solve LANES polynomials of degree ten (11, LANES; lowest power first).
 
     At most one root lies between two neighbouring extrema. The extrema are the roots of the
     derivative, so all derivatives are solved, the lowest degree first and less precisely. The
     caller must look at the extrema: where the polynomial is nearly 0 there, it has a double root or
     none.
-
-    One polynomial alone keeps the processor waiting: each step of Newton's method needs the one
-    before. So the polynomials are solved side by side, and the loops over the lanes are vectorised.
     """
     solved, bounds, derivatives = _prepare(polynomials)
     brackets = np.empty((4, 10, LANES))  # start, left end, right end, and whether it rises (1 or 0)
@@ -328,7 +381,7 @@ def real_roots(polynomials):
     # of the next polynomial and of its second derivative, at its extrema
     heights, bends = np.empty((10, LANES)), np.empty((10, LANES))
     first_heights, last_heights = np.empty(LANES), np.empty(LANES)  # at the bounds
-    state, flags = np.empty((4, LANES)), np.empty((2, LANES), np.int64)
+    search = np.zeros((28, LANES))
     for degree in range(1, 11):
         polynomial, slopes = derivatives[degree], derivatives[degree - 1]
         _values(polynomial, -bounds, first_heights)
@@ -350,17 +403,17 @@ def real_roots(polynomials):
         counts, new_counts = new_counts, counts
         roots, extrema = extrema, roots
         precision = 1e-14 if degree > 8 else 1e-6
-        for k in range(most):
+        for power in range(11):
             for lane in range(LANES):
-                left, right = brackets[1, k, lane], brackets[2, k, lane]
-                state[0, lane], state[1, lane] = brackets[0, k, lane], left
-                state[2, lane], state[3, lane] = right, right - left
-                flags[0, lane], flags[1, lane] = brackets[3, k, lane] > 0, k < counts[lane]
+                search[power, lane] = polynomial[power, lane]
+                search[11 + power, lane] = slopes[power, lane]
+        for k in range(most):
+            _start_search(search, brackets[:, k], k, counts)
             for _ in range(100):
-                if not _newton_step(polynomial, slopes, state, flags, precision):
+                if not _newton_step(search, precision):
                     break
             for lane in range(LANES):
-                roots[k, lane] = state[0, lane]
+                roots[k, lane] = search[22, lane]
             _values(slopes, roots[k], bends[k])
             if degree < 10:
                 _values(derivatives[degree + 1], roots[k], heights[k])
@@ -377,13 +430,13 @@ def _prepare(polynomials):
     solved, bounds = np.zeros(LANES, np.bool_), np.ones(LANES)
     derivatives = np.zeros((11, 11, LANES))
     for lane in range(LANES):
-        bound = _root_bound(polynomials[lane])
+        bound = _root_bound(polynomials, lane)
         derivatives[10, 0, lane] = 1.0
         if bound >= 0:
             solved[lane] = True
             bounds[lane] = bound
             for power in range(11):
-                derivatives[10, power, lane] = polynomials[lane, 10 - power]
+                derivatives[10, power, lane] = polynomials[power, lane]
     for degree in range(10, 0, -1):
         for power in range(1, degree + 1):
             for lane in range(LANES):
@@ -393,14 +446,16 @@ def _prepare(polynomials):
 
 
 @inner
-def _root_bound(polynomial):
+def _root_bound(polynomials, lane):
     """Bound of the absolute values of all roots; -1 if the leading coefficient is too small."""
     bound = 0.0
+    leading = abs(polynomials[10, lane])
     for k in range(1, 11):
-        if not abs(polynomial[k]) < 1e15 * abs(polynomial[0]):
+        size = abs(polynomials[10 - k, lane])
+        if not size < 1e15 * leading:
             return -1.0
-        bound = max(bound, 2 * (abs(polynomial[k]) / abs(polynomial[0])) ** (1.0 / k))
-    if abs(polynomial[0]) < 1e-12:  # OpenCV drops a leading coefficient of 2e-16
+        bound = max(bound, 2 * (size / leading) ** (1.0 / k))
+    if leading < 1e-12:  # OpenCV drops a leading coefficient of 2e-16
         return -1.0
     return bound
 
@@ -466,32 +521,57 @@ def _values(polynomial, places, values):
 
 
 @inner
-def _newton_step(polynomial, slopes, state, flags, precision):
+def _start_search(search, brackets, k, counts):
+    """Prepare the search for root k of each lane, see `_newton_step`."""
+    for lane in range(LANES):
+        left, right = brackets[1, lane], brackets[2, lane]
+        search[22, lane], search[23, lane], search[24, lane] = brackets[0, lane], left, right
+        search[25, lane], search[26, lane] = right - left, brackets[3, lane]
+        search[27, lane] = 1.0 if k < counts[lane] else 0.0
+
+
+@inner
+def _newton_step(search, precision):
     """Make one step of Newton's method in each lane. Returns the number of lanes that go on.
 
     Bisection replaces a step that leaves the interval or converges slowly.
-    state (4, LANES): place, ends of the interval, size of the last step. flags (2, LANES): whether
-    the polynomial rises at the root, whether the lane goes on; the others keep their places.
+    search (28, LANES): coefficients of the polynomial (11) and of its derivative (11), the place,
+    both ends of the interval, the size of the last step, whether the polynomial rises at the root,
+    whether the lane goes on. The others keep their places.
+
+    They are in one array of less than 4096 bytes. The processor takes addresses that differ by a
+    multiple of that for the same one, and waits. With several arrays, that happened in some runs
+    and doubled the time.
     """
     going_on = 0
     for lane in range(LANES):
-        z = state[0, lane]
-        height = value(polynomial, z, lane)
-        step = height / value(slopes, z, lane)
-        is_left = (height < 0) == (flags[0, lane] != 0)
-        left = z if is_left else state[1, lane]
-        right = state[2, lane] if is_left else z
+        z = search[22, lane]
+        height = value(search, z, lane)
+        step = height / value(search[11:], z, lane)
+        is_left = (height < 0) == (search[26, lane] > 0)
+        left = z if is_left else search[23, lane]
+        right = search[24, lane] if is_left else z
         is_inside = (left <= z - step) & (z - step <= right)
-        is_shorter = abs(step) <= 0.5 * state[3, lane]
+        is_shorter = abs(step) <= 0.5 * search[25, lane]
         step = step if is_inside & is_shorter else z - 0.5 * (left + right)
         moved = z - step
-        goes_on = flags[1, lane]
-        state[0, lane] = moved if goes_on else z
-        state[1, lane], state[2, lane], state[3, lane] = left, right, abs(step)
-        goes_on = 0 if abs(step) <= precision * abs(moved) + 1e-300 else goes_on
-        flags[1, lane] = goes_on
-        going_on += goes_on
+        goes_on = search[27, lane]
+        search[22, lane] = moved if goes_on > 0 else z
+        search[23, lane], search[24, lane], search[25, lane] = left, right, abs(step)
+        goes_on = 0.0 if abs(step) <= precision * abs(moved) + 1e-300 else goes_on
+        search[27, lane] = goes_on
+        going_on += 1 if goes_on > 0 else 0
     return going_on
+
+
+@inner
+def row_values(c, z):
+    """Values at z of the three polynomials in one row c (13) of B(z)."""
+    return (
+        ((c[0] * z + c[1]) * z + c[2]) * z + c[3],
+        ((c[4] * z + c[5]) * z + c[6]) * z + c[7],
+        (((c[8] * z + c[9]) * z + c[10]) * z + c[11]) * z + c[12],
+    )
 
 
 @inner

@@ -56,7 +56,7 @@ class _Block(NamedTuple):
 
     state: np.ndarray  # (1,) uint64, of the random number generator after them
     samples: np.ndarray  # (LANES, 5)
-    fives: np.ndarray  # (LANES, 5, 4), their correspondences
+    fives: np.ndarray  # (5, 4, LANES), their correspondences
     solutions: Solutions
 
 
@@ -122,7 +122,7 @@ def first_block() -> _Block:
     return _Block(
         np.array([OPENCV_SEED], np.uint64),
         np.empty((LANES, SAMPLE_SIZE), np.int64),
-        np.empty((LANES, SAMPLE_SIZE, 4)),
+        np.empty((SAMPLE_SIZE, 4, LANES)),
         no_solutions(),
     )
 
@@ -213,7 +213,7 @@ def draw(columns, block):
             if new:
                 sample[taken] = index
                 for j in range(4):
-                    block.fives[lane, taken, j] = columns[j, index]
+                    block.fives[taken, j, lane] = columns[j, index]
                 taken += 1
     block.state[0] = state
 

@@ -10,7 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from thesis_repro.odometry.opencv_exact import five_point
-from thesis_repro.odometry.opencv_exact.five_point import LANES, SAMPLE_SIZE
+from thesis_repro.odometry.opencv_exact.five_point import (
+    LANES,
+    MIN_INDEPENDENCE,
+    SAMPLE_SIZE,
+)
 from thesis_repro.running.compiled import fast, inner
 
 ROUNDING = 2.0**-52  # of a number of size 1
@@ -50,153 +54,193 @@ def no_solutions() -> Solutions:
 
 
 class _Steps(NamedTuple):
-    """What the steps before the roots leave of each of LANES samples."""
+    """What the steps before the roots leave of LANES samples."""
 
     independences: np.ndarray  # (LANES,)
-    rows: np.ndarray  # (LANES, 9, 9); the last four are the basis
-    b: np.ndarray  # (LANES, 3, 13), B(z)
-    errors: np.ndarray  # (LANES, 6), see `_write_elimination_errors`
-    polynomials: np.ndarray  # (LANES, 11), det B(z); 0 if a step failed
+    rows: np.ndarray  # (9, 9, LANES); the last four are the basis
+    b: np.ndarray  # (3, 13, LANES), B(z)
+    b_sizes: np.ndarray  # absolute values of b
+    errors: np.ndarray  # (6, LANES), see `_write_elimination_errors`
+    polynomials: np.ndarray  # (11, LANES), det B(z), lowest power first
 
 
 @fast
 def solve(fives, solutions):
     """Solve LANES samples of five correspondences, and write their Solutions.
 
-    fives: (LANES, 5, 4), rows x, y in the current frame, u, v in the previous frame.
+    fives: (5, 4, LANES), rows x, y in the current frame, u, v in the previous frame.
     """
     steps = _first_steps(fives)
     roots = five_point.real_roots(steps.polynomials)  # step 5
-    b_sizes = np.empty((3, 13))
-    work = np.empty((4, 3, 3))
+    work, errors = np.empty((4, 3, 3, LANES)), np.empty(LANES)
+    sure, counts = solutions.sure, solutions.counts
     for lane in range(LANES):
-        for i in range(3):
-            for j in range(13):
-                b_sizes[i, j] = abs(steps.b[lane, i, j])
-        sure = roots.solved[lane] and _are_simple(lane, roots, steps, b_sizes, work)
-        count = roots.counts[lane] if sure else 0
-        for k in range(count):
-            margin = _write_solution(
-                lane, roots.roots[k, lane], steps, b_sizes, work, solutions.matrices[lane, k]
-            )
-            solutions.margins[lane, k] = margin
-            sure &= margin < np.inf
-        solutions.sure[lane] = sure
-        solutions.counts[lane] = count if sure else 0
+        # not solved if the equations were singular: the polynomial is not finite
+        sure[lane] = roots.solved[lane] and steps.independences[lane] > MIN_INDEPENDENCE
+    for k in range(roots.extremum_counts.max()):
+        _write_determinant_errors(steps, roots.extrema[k], work, errors)
+        for lane in range(LANES):
+            # a value as small as rounding: a double root or none
+            is_simple = abs(roots.heights[k, lane]) > SAFETY_FACTOR * ROUNDING * errors[lane]
+            sure[lane] &= is_simple or k >= roots.extremum_counts[lane]
+    for k in range(roots.counts.max()):
+        _write_determinant_errors(steps, roots.roots[k], work, errors)
+        for lane in range(LANES):
+            if sure[lane] and k < roots.counts[lane]:
+                root, error = roots.roots[k, lane], errors[lane]
+                matrix = solutions.matrices[lane, k]
+                margin = _write_solution(steps, lane, root, error, work, matrix)
+                solutions.margins[lane, k] = margin
+                sure[lane] &= margin < np.inf
+    for lane in range(LANES):
+        counts[lane] = roots.counts[lane] if sure[lane] else 0
 
 
 @inner
 def _first_steps(fives):
     """Steps 1 to 4."""
-    steps = _Steps(
-        np.zeros(LANES),
-        np.empty((LANES, 9, 9)),
-        np.zeros((LANES, 3, 13)),
-        np.empty((LANES, 6)),
-        np.zeros((LANES, 11)),
-    )
-    # space that all samples use in turn, because getting it anew takes as long as a step
-    equations, squares, minors = np.empty((10, 20)), np.empty((9, 10)), np.empty((3, 10))
-    minor, inverse, sums = np.empty(7), np.empty((6, 6)), np.empty(6)
-    for lane in range(LANES):
-        rows = steps.rows[lane]
-        steps.independences[lane] = five_point.null_space(fives[lane], rows)
-        if steps.independences[lane] == 0:
-            continue
-        five_point.constraints(rows[SAMPLE_SIZE:], equations, squares, minors)
-        if five_point.eliminate(equations, steps.b[lane]):
-            _write_elimination_errors(equations, inverse, sums, steps.errors[lane])
-            five_point.determinant(steps.b[lane], steps.polynomials[lane], minor)
-    return steps
+    independences, rows = np.empty(LANES), np.empty((9, 9, LANES))
+    equations, b = np.zeros((10, 20, LANES)), np.zeros((3, 13, LANES))
+    errors, polynomials = np.empty((6, LANES)), np.zeros((11, LANES))
+    b_sizes = np.empty((3, 13, LANES))
+    five_point.null_space(fives, rows, independences)
+    five_point.constraints(rows[SAMPLE_SIZE:], equations)
+    five_point.eliminate(equations, b)
+    _write_elimination_errors(equations, errors)
+    five_point.determinant(b, polynomials)
+    for i in range(3):
+        for j in range(13):
+            for lane in range(LANES):
+                b_sizes[i, j, lane] = abs(b[i, j, lane])
+    return _Steps(independences, rows, b, b_sizes, errors, polynomials)
 
 
 @inner
-def _are_simple(lane, roots, steps, b_sizes, work):
-    """Whether all roots are surely simple.
+def _write_solution(steps, lane, root, error, work, matrix):
+    """Write the essential matrix (9) of a root. Returns its margin.
 
-    Where det B(z) is as small as rounding at an extremum, it has a double root or none.
+    error: of det B(z), see `_write_determinant_errors`.
     """
-    for k in range(roots.extremum_counts[lane]):
-        error = _determinant_error(
-            steps.b[lane], b_sizes, steps.errors[lane], roots.extrema[k, lane], work
-        )
-        if not abs(roots.heights[k, lane]) > SAFETY_FACTOR * ROUNDING * error:
-            return False
-    return True
-
-
-@inner
-def _write_solution(lane, root, steps, b_sizes, work, matrix):
-    """Write the essential matrix (9) of a root. Returns its margin."""
-    b = steps.b[lane]
-    error = _determinant_error(b, b_sizes, steps.errors[lane], root, work)
-    best = _best_row(work[3])
-    five_point.essential(work[3, best], steps.rows[lane, SAMPLE_SIZE:], root, matrix)  # step 6
-    change = _solution_error(b, best, root, error, steps.polynomials[lane], work)
+    cofactors = work[3, :, :, lane]
+    best = _best_row(cofactors)
+    basis = steps.rows[SAMPLE_SIZE:, :, lane]
+    five_point.essential(cofactors[best], basis, root, matrix)  # step 6
+    change = _solution_error(steps, lane, best, root, error, work)
     margin = MIN_MARGIN + SAFETY_FACTOR * ROUNDING * (1 / steps.independences[lane] + change)
     return margin if margin < WELL_CONDITIONED else SAFETY_FACTOR * margin
 
 
 @inner
-def _write_elimination_errors(a, inverse, sums, total):
-    """Write the rounding errors (6) of the six rows that B(z) is made from, OpenCV's way included.
+def _write_elimination_errors(a, errors):
+    """Write the rounding errors of the six rows that B(z) is made from, OpenCV's way included.
 
-    They are in units of ROUNDING. a (10, 20): result of the elimination, with the triangle U of the
-    last six unknowns. inverse (6, 6), sums (6): space. An error of one unit in the equations
-    becomes |U^-1| times the size of the result. OpenCV inverts and multiplies, which adds
-    |U^-1| |U| |U^-1|.
+    They are in units of ROUNDING, (6, LANES). a (10, 20, LANES): result of the elimination, with
+    the triangle U of the last six unknowns. An error of one unit in the equations becomes |U^-1|
+    times the size of the result. OpenCV inverts and multiplies, which adds |U^-1| |U| |U^-1|.
     """
-    largest = 1.0
-    for k in range(4, 10):
-        for j in range(10, 20):
-            largest = max(largest, abs(a[k, j]))
-    inverse[:] = 0.0
-    sums[:] = 0.0
-    total[:] = 0.0
-    for i in range(5, -1, -1):
-        inverse[i, i] = 1 / a[4 + i, 4 + i]
-        for j in range(i + 1, 6):
-            for k in range(i + 1, j + 1):
-                inverse[i, j] -= a[4 + i, 4 + k] * inverse[k, j]
-            inverse[i, j] /= a[4 + i, 4 + i]
-        for j in range(i, 6):
-            sums[i] += abs(inverse[i, j])
-    for j in range(6):
-        error = largest
-        for k in range(j, 6):
-            error += abs(a[4 + j, 4 + k]) * sums[k]
-        for i in range(j + 1):
-            total[i] += abs(inverse[i, j]) * error
+    inverse, sums = np.empty((6, 6)), np.empty(6)
+    for lane in range(LANES):
+        triangle = a[4:, 4:, lane]
+        _invert(triangle, inverse, sums)
+        largest = 1.0
+        for i in range(6):
+            errors[i, lane] = 0.0
+            for j in range(6, 16):
+                largest = max(largest, abs(triangle[i, j]))
+        for j in range(6):
+            error = largest
+            for k in range(j, 6):
+                error += abs(triangle[j, k]) * sums[k]
+            for i in range(j + 1):
+                errors[i, lane] += abs(inverse[i, j]) * error
 
 
 @inner
-def _determinant_error(b, b_sizes, errors, z, work):
-    """Rounding error of det B(z), in units of ROUNDING.
+def _invert(triangle, inverse, sums):
+    """Write the inverse of an upper triangle (6, 6), and the sums of the sizes in its rows."""
+    for i in range(5, -1, -1):
+        inverse[i, i] = 1 / triangle[i, i]
+        sums[i] = abs(inverse[i, i])
+        for j in range(i + 1, 6):
+            inverse[i, j] = 0.0
+            for k in range(i + 1, j + 1):
+                inverse[i, j] -= triangle[i, k] * inverse[k, j]
+            inverse[i, j] /= triangle[i, i]
+            sums[i] += abs(inverse[i, j])
 
-    It is Wilkinson's bound: the sum of the sizes of all terms. Also writes to work (4, 3, 3): B(z),
-    the sizes of its terms, its errors in units of ROUNDING, its cofactors.
+
+@inner
+def _write_determinant_errors(steps, places, work, errors):
+    """Write the rounding errors (LANES) of det B(z) at a place of each lane, in units of ROUNDING.
+
+    They are Wilkinson's bound: the sum of the sizes of all terms. Also writes to work (4, 3, 3,
+    LANES): B(z), the sizes of its terms, its errors in units of ROUNDING, its cofactors.
     """
     values, sizes, wrong, cofactors = work[0], work[1], work[2], work[3]
-    size = abs(z)
-    powers = 1 + size + size * size
     for i in range(3):
-        values[i, 0], values[i, 1], values[i, 2] = five_point.row_values(b[i], z)
-        sizes[i, 0], sizes[i, 1], sizes[i, 2] = five_point.row_values(b_sizes[i], size)
-        error = errors[2 * i] + size * errors[2 * i + 1]
-        wrong[i, 0] = error * powers + sizes[i, 0]
-        wrong[i, 1] = error * powers + sizes[i, 1]
-        wrong[i, 2] = error * (1 + size * powers) + sizes[i, 2]
-    error = 0.0
+        _write_row(steps.b[i], places, values[i])
+        _write_sizes(
+            steps.b_sizes[i],
+            steps.errors[2 * i],
+            steps.errors[2 * i + 1],
+            places,
+            sizes[i],
+            wrong[i],
+        )
+    for lane in range(LANES):
+        errors[lane] = 0.0
     for i in range(3):
         p = (i + 1) % 3
         q = (i + 2) % 3
+        _write_cofactors(values[p], values[q], cofactors[i])
+        _add_errors(cofactors[i], wrong[i], sizes[i], sizes[p], sizes[q], errors)
+
+
+@inner
+def _write_row(b_row, places, values):
+    """Write one row of B(z), (3, LANES)."""
+    for lane in range(LANES):
+        first, second, third = five_point.row_values(b_row[:, lane], places[lane])
+        values[0, lane], values[1, lane], values[2, lane] = first, second, third
+
+
+@inner
+def _write_sizes(b_sizes, error, next_error, places, sizes, wrong):
+    """Write the sizes of the terms in one row of B(z), and its errors, (3, LANES).
+
+    error, next_error: of the two eliminated rows that it is made from.
+    """
+    for lane in range(LANES):
+        size = abs(places[lane])
+        powers = 1 + size + size * size
+        first, second, third = five_point.row_values(b_sizes[:, lane], size)
+        sizes[0, lane], sizes[1, lane], sizes[2, lane] = first, second, third
+        both = error[lane] + size * next_error[lane]
+        wrong[0, lane] = both * powers + first
+        wrong[1, lane] = both * powers + second
+        wrong[2, lane] = both * (1 + size * powers) + third
+
+
+@inner
+def _write_cofactors(first, second, cofactors):
+    """Write the cofactors of one row from the two other rows, each (3, LANES)."""
+    for lane in range(LANES):
         for j in range(3):
             m = (j + 1) % 3
             n = (j + 2) % 3
-            cofactors[i, j] = values[p, m] * values[q, n] - values[p, n] * values[q, m]
-            error += DETERMINANT_SHARE * abs(cofactors[i, j]) * wrong[i, j]
-        error += sizes[i, 0] * (sizes[p, 1] * sizes[q, 2] + sizes[p, 2] * sizes[q, 1])
-    return error
+            left, right = first[m, lane] * second[n, lane], first[n, lane] * second[m, lane]
+            cofactors[j, lane] = left - right
+
+
+@inner
+def _add_errors(cofactors, wrong, sizes, first, second, errors):
+    """Add one row's part of the errors. first, second: sizes in the two other rows."""
+    for lane in range(LANES):
+        error = errors[lane]
+        for j in range(3):
+            error += DETERMINANT_SHARE * abs(cofactors[j, lane]) * wrong[j, lane]
+        terms = first[1, lane] * second[2, lane] + first[2, lane] * second[1, lane]
+        errors[lane] = error + sizes[0, lane] * terms
 
 
 @inner
@@ -220,7 +264,7 @@ def _best_row(cofactors):
 
 
 @inner
-def _solution_error(b, best, z, error, polynomial, work):
+def _solution_error(steps, lane, best, z, error, work):
     """First-order rounding error of the essential matrix of a root z, in units of ROUNDING.
 
     The matrix has unit norm. In the basis the matrix is (x, y, w z, w), where (x, y, w) is normal
@@ -228,7 +272,8 @@ def _solution_error(b, best, z, error, polynomial, work):
     B(z). An error of B(z) changes it by the error over B(z)'s second singular value, which is the
     norm of the cofactors over the norm of B(z).
     """
-    values, wrong, cofactors = work[0], work[2], work[3]
+    values, wrong, cofactors = work[0, :, :, lane], work[2, :, :, lane], work[3, :, :, lane]
+    b = steps.b[:, :, lane]
     cofactor_norm = 0.0
     norm = 0.0
     for i in range(3):
@@ -257,10 +302,10 @@ def _solution_error(b, best, z, error, polynomial, work):
     for i in range(3):
         tilt += (abs(x) * wrong[i, 0] + abs(y) * wrong[i, 1] + abs(w) * wrong[i, 2]) ** 2
     tilt *= norm / cofactor_norm * (1 + z * z)
-    height, slope = polynomial[0], 0.0
-    for k in range(1, 11):
+    height, slope = steps.polynomials[10, lane], 0.0
+    for power in range(9, -1, -1):
         slope = slope * z + height
-        height = height * z + polynomial[k]
+        height = height * z + steps.polynomials[power, lane]
     return (error / abs(slope) * np.sqrt(speed) + np.sqrt(tilt)) / np.sqrt(square)
 
 
