@@ -33,7 +33,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
-from scipy.stats import wilcoxon
 
 from thesis_repro.odometry.metrics import RELATIVE_LENGTH
 from thesis_repro.study.controls import MASK_CONTROLS
@@ -173,6 +172,8 @@ def rank_test(logarithms: np.ndarray) -> float:
     It tests whether the logarithms (n,) of ratios lie around 0. A sequence without any difference
     is left out. NaN if fewer than MIN_SEQUENCES are left: their p-value is never below 0.05.
     """
+    from scipy.stats import wilcoxon  # imported here because it takes half a second
+
     different = logarithms[logarithms != 0]
     if len(different) < MIN_SEQUENCES:
         return np.nan
