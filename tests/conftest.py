@@ -3,7 +3,11 @@
 import fcntl
 import os
 import signal
+import sys
 from contextlib import contextmanager
+
+# as in thesis_repro/report/execute.py: a second for each process of a test run
+sys.modules.setdefault("rfc3987_syntax", None)
 
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
@@ -13,6 +17,17 @@ import numpy as np
 import pytest
 import trials
 
+# the files that take longest, longest first
+LONGEST = (
+    "test_executed.py",
+    "test_edits.py",
+    "test_install.py",
+    "test_training.py",
+    "test_dask.py",
+    "test_prediction.py",
+    "test_odometry.py",
+    "test_study.py",
+)
 # fixtures that take seconds
 SLOW_FIXTURES = {
     "small_world",
@@ -29,8 +44,9 @@ def pytest_collection_modifyitems(items):
         marked = item.get_closest_marker("notebooks") or item.get_closest_marker("torture")
         if marked or SLOW_FIXTURES & set(item.fixturenames):
             item.add_marker(pytest.mark.slow)
-    # the longest tests begin first, so that other processes have work until they end
-    items.sort(key=lambda item: item.path.name != "test_notebooks.py")
+    # the longest files begin first, so that all processes have work until the end
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.name, len(places)))
 
 
 def _real_data(*parts):

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import os
 import sys
 import warnings
 
@@ -51,31 +52,61 @@ def _visible_texts(figure):
     ]
 
 
-def watch(shell, path):
-    """Append the faults of every figure that the notebook of an IPython shell saves to a file.
+def between_steps(slider):
+    """Say so if no step of a slider reaches its value, which a browser would round."""
+    if not hasattr(slider, "step"):
+        return None
+    steps = (slider.value - slider.min) / slider.step
+    if abs(steps - round(steps)) < 1e-9:
+        return None
+    return f"{slider} is between its steps"
 
-    Also the number of figures that a cell has made but not shown.
+
+class Watch:
+    """What is seen of the notebook of an IPython shell, written into a folder.
+
+    faults.txt has the faults of every figure that the notebook saves, and the number of figures
+    that a cell has made but not shown. sliders-NUMBER.txt has the texts of each figure with
+    sliders, drawn again after the last cell. The variable WATCHED has the number of the notebook.
     """
 
-    def wrap_save_figure(_):
+    def __init__(self, shell, folder):
+        self.folder, self.with_sliders = folder, []
+        for function in (self.wrap_functions_of_style, self.report_hidden, self.draw_again):
+            shell.events.register("post_run_cell", function)
+
+    def report(self, *lines, name="faults"):
+        with open(f"{self.folder}/{name}.txt", "a", encoding="utf-8") as file:
+            file.writelines(f"{line}\n" for line in lines)
+
+    def wrap_functions_of_style(self, _):
         style = sys.modules.get("thesis_repro.report.style")
         if style is None or hasattr(style.save_figure, "__wrapped__"):
             return
-        save_figure = style.save_figure
+        save_figure, show_sliders = style.save_figure, style.with_sliders
 
         @functools.wraps(save_figure)
         def checked(figure, folder, name, note):
-            with open(path, "a", encoding="utf-8") as file:
-                file.writelines(f"{name}: {fault}\n" for fault in ["saved", *problems(figure)])
+            self.report(*(f"{name}: {fault}" for fault in ["saved", *problems(figure)]))
             save_figure(figure, folder, name, note)
 
-        style.save_figure = checked
+        def remembered(draw, **sliders):
+            self.with_sliders.append((draw, sliders))
+            show_sliders(draw, **sliders)
 
-    def report_hidden(_):
+        style.save_figure, style.with_sliders = checked, remembered
+
+    def report_hidden(self, _):
         pyplot = sys.modules.get("matplotlib.pyplot")
         if pyplot and pyplot.get_fignums():
-            with open(path, "a", encoding="utf-8") as file:
-                file.write(f"{len(pyplot.get_fignums())} figures are not shown\n")
+            self.report(f"{len(pyplot.get_fignums())} figures are not shown")
 
-    shell.events.register("post_run_cell", wrap_save_figure)
-    shell.events.register("post_run_cell", report_hidden)
+    def draw_again(self, result):
+        if not result.info.raw_cell.startswith("PUT_BACK = "):  # the last cell
+            return
+        name = f"sliders-{os.environ['WATCHED']}"
+        for draw, sliders in self.with_sliders:
+            self.report(*filter(None, map(between_steps, sliders.values())), name=name)
+            figure = draw(**{key: slider.value for key, slider in sliders.items()})
+            texts = [text for axes in figure.axes for text in (axes.title, *axes.texts)]
+            self.report("; ".join(text.get_text() for text in texts), name=name)

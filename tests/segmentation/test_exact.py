@@ -177,10 +177,12 @@ def steps(model):
 
 
 @pytest.mark.parametrize(
-    "network", [lambda: build_unet((128, 128, 1), 35, 8), prediction.load_shipped]
+    "network, first",
+    # nothing in the package trains the shipped model
+    [(lambda: build_unet((128, 128, 1), 35, 8), 0), (prediction.load_shipped, 1)],
 )
-def test_the_networks_use_exact_operations_only(network):
-    for step in steps(network()):
+def test_the_networks_use_exact_operations_only(network, first):
+    for step in [*steps(network())][first:]:
         names = operations(step)
         assert names["DivNoNan"] and names["Sqrt"]  # the batch normalisation is among them
         assert inexact(names) == set()

@@ -229,6 +229,14 @@ def test_quality_agrees_with_keras_and_with_a_plain_count():
 
 
 @pytest.mark.real
+def test_the_shipped_model_is_as_good_on_a_tenth_of_camvid_as_recorded(camvid_real):
+    pairs = cityscapes.pairs(camvid_real, "val")[::10]
+    measured = quality.quality(prediction.load_shipped(), *cityscapes.load(pairs, 320))
+    assert (measured.accuracy, measured.mean_iou) == pytest.approx((0.8905, 0.5982), abs=5e-4)
+
+
+@pytest.mark.real
+@pytest.mark.torture
 def test_the_shipped_model_is_as_good_on_camvid_as_its_card_says(camvid_real):
     images, labels = cityscapes.load(cityscapes.pairs(camvid_real, "val"), 320)
     measured = quality.quality(prediction.load_shipped(), images, labels)

@@ -53,12 +53,13 @@ def start(folder, *arguments):
         )
 
 
-@pytest.fixture
-def scheduler(tmp_path):
-    """Address of a scheduler without workers."""
-    file = tmp_path / "scheduler.json"
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """Address of a scheduler; it has no workers but those of `workers`."""
+    folder = tmp_path_factory.mktemp("scheduler")
+    file = folder / "scheduler.json"
     process = start(
-        tmp_path,
+        folder,
         "scheduler",
         "--host",
         "127.0.0.1",
@@ -120,6 +121,15 @@ def reads(log):
     ]
 
 
+def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
+    monkeypatch.setattr("thesis_repro.study.workers.TIMEOUT", 1)
+    # without workers, none, no address
+    for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
+        with pytest.raises(InputError, match=address) as error, open_pool(1, address):
+            pass
+        assert "\n" not in str(error.value)
+
+
 def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, scheduler, tmp_path):
     opened = [Sequence(small_world / "kitti", name) for name in ("00", "01")]
     jobs = first_jobs(opened, {"thesis": (5, 15)}, repetitions=2)
@@ -166,15 +176,6 @@ def test_runs_of_a_killed_worker_resume(small_world, small_labels, workers, sche
     again = {frame for frame, count in times.items() if count > passes}
     assert again and again <= {(name, index) for index in range(CHECKPOINT, stopped + 1)}
     assert set(times.values()) == {passes, passes + 1} and len(times) == 2 * FRAMES
-
-
-def test_an_unusable_scheduler_is_one_line(scheduler, monkeypatch):
-    monkeypatch.setattr("thesis_repro.study.workers.TIMEOUT", 1)
-    # without workers, none, no address
-    for address in (scheduler, "tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
-        with pytest.raises(InputError, match=address) as error, open_pool(1, address):
-            pass
-        assert "\n" not in str(error.value)
 
 
 def test_a_worker_with_other_folders_or_other_code_is_reported(

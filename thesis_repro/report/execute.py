@@ -15,6 +15,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+# jsonschema, which nbformat imports, would build a grammar of internationalised addresses. That
+# takes more than a second at each start, and nothing in a notebook is checked by it.
+sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]
+
+# isort: split
 import nbformat
 from jupyter_client import AsyncKernelManager
 from jupyter_client.kernelspec import KernelSpecManager

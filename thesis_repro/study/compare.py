@@ -33,7 +33,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
-from scipy.stats import wilcoxon
 
 from thesis_repro.odometry.metrics import RELATIVE_LENGTH
 from thesis_repro.study.controls import MASK_CONTROLS
@@ -173,6 +172,8 @@ def rank_test(logarithms: np.ndarray) -> float:
     It tests whether the logarithms (n,) of ratios lie around 0. A sequence without any difference
     is left out. NaN if fewer than MIN_SEQUENCES are left: their p-value is never below 0.05.
     """
+    from scipy.stats import wilcoxon  # imported here because it takes half a second
+
     different = logarithms[logarithms != 0]
     if len(different) < MIN_SEQUENCES:
         return np.nan
@@ -195,8 +196,12 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
 
     metric: the column of the error. Sequences without a positive error in both tables are left out.
     """
-    difference = _mean_logarithms(rows, metric) - _mean_logarithms(reference, metric)
-    return np.exp(difference.dropna())
+    return _ratios(_mean_logarithms(rows, metric), _mean_logarithms(reference, metric))
+
+
+def _ratios(logarithms: pd.Series, of_reference: pd.Series) -> pd.Series:
+    """Return `ratios` of the mean logarithms of two tables."""
+    return np.exp((logarithms - of_reference).dropna())
 
 
 def _mean_logarithms(runs: pd.DataFrame, metric: str) -> pd.Series:
@@ -233,12 +238,13 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
     rows = []
     for estimator in ESTIMATORS:
-        variants = _variants(runs[runs["estimator"] == estimator])
+        variants = _variants(runs[runs["estimator"] == estimator], metrics)
         for variant, reference in product(variants, variants):
             if not _is_compared(variant, reference):
                 continue
             for metric in metrics:
-                by_sequence = ratios(variant.runs, reference.runs, metric)
+                logarithms, of_reference = variant.logarithms, reference.logarithms
+                by_sequence = _ratios(logarithms[metric], of_reference[metric])
                 if by_sequence.empty:
                     continue
                 row = {
@@ -248,8 +254,8 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
                     "estimator": estimator,
                     "metric": metric,
                     "far_off": far_off(by_sequence),
-                    "lost": lost(variant.runs),
-                    "reference_lost": lost(reference.runs),
+                    "lost": variant.lost,
+                    "reference_lost": reference.lost,
                     **geometric_mean(by_sequence),
                     **by_sequence,
                 }
@@ -268,10 +274,11 @@ class _Variant(NamedTuple):
     source: str
     method: str
     columns: dict[str, Any]  # of `comparisons`, about this variant
-    runs: pd.DataFrame
+    logarithms: dict[str, pd.Series]  # by metric: mean logarithm of the errors, by sequence
+    lost: str  # see `lost`
 
 
-def _variants(runs: pd.DataFrame) -> list[_Variant]:
+def _variants(runs: pd.DataFrame, metrics: list[str]) -> list[_Variant]:
     """Split the runs by method, source and width."""
     variants = []
     for method in METHODS:
@@ -287,7 +294,9 @@ def _variants(runs: pd.DataFrame) -> list[_Variant]:
                 "keypoints": rows.groupby("sequence")["mean_keypoints"].mean().mean(),
                 "tested": bool(tested),
             }
-            variants.append(_Variant(source, method, columns, rows))
+            # once for all comparisons with this variant
+            logarithms = {metric: _mean_logarithms(rows, metric) for metric in metrics}
+            variants.append(_Variant(source, method, columns, logarithms, lost(rows)))
     return variants
 
 

@@ -1,0 +1,40 @@
+"""`make figures` on the smallest profile."""
+
+import os
+import re
+import subprocess
+
+from thesis_repro.running.settings import ROOT
+
+FIGURES = [
+    *(f"figure_2_{n:02d}" for n in range(1, 13)),
+    *(f"figure_3_{n:02d}" for n in range(1, 7)),
+    *(f"figure_4_{n:02d}" for n in range(1, 18)),
+    "figure_a_01",
+]
+EXECUTED = re.compile(r"report\.execute notebooks/(\d\d)_")  # in the output of make
+
+
+def make_figures(tmp_path, *options, root=ROOT):
+    # MAKEFLAGS would pass the options of an outer make on to this one
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("MAKE", "MFLAGS", "THESIS_REPRO_"))
+    }
+    return subprocess.run(
+        [
+            "make",
+            "figures",
+            "PROFILE=smoke",
+            f"BUILD={tmp_path / 'build'}",
+            f"FIGURES={tmp_path / 'figures'}",
+            "-o",
+            ".venv/ready",
+            *options,
+        ],
+        cwd=root,
+        env=environment | {"PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+    )
