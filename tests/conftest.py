@@ -3,11 +3,7 @@
 import fcntl
 import os
 import signal
-import sys
 from contextlib import contextmanager
-
-# as in thesis_repro/report/execute.py: a second for each process of a test run
-sys.modules.setdefault("rfc3987_syntax", None)
 
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 

@@ -15,9 +15,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-# jsonschema, which nbformat imports, would build a grammar of internationalised addresses. That
-# takes more than a second at each start, and nothing in a notebook is checked by it.
-sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]
+if __name__ == "__main__":
+    # jsonschema, which nbformat imports, would build a grammar of internationalised addresses. That
+    # takes more than a second at each start, and nothing in a notebook is checked by it.
+    sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
 
 # isort: split
 import nbformat
