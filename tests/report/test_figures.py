@@ -4,6 +4,7 @@ Also the axes that figures share, and the video of the odometry.
 """
 
 import re
+from xml.etree import ElementTree
 
 import cv2
 import matplotlib.pyplot as plt
@@ -319,3 +320,23 @@ def test_figures_carry_no_date(tmp_path, ending):
     written = (tmp_path / f"a.{ending}").read_bytes()
     assert b"CreationDate" not in written and b"dc:date" not in written
     assert written == (tmp_path / f"b.{ending}").read_bytes()
+
+
+def test_the_last_bits_of_coordinates_do_not_change_a_file(tmp_path):
+    """Other vector instructions add numbers in another order."""
+    for name, nudge in (("a", 0.0), ("b", 1e-13)):
+        figure = plt.figure()
+        axes = figure.add_axes((0.1 + nudge, 0.1, 0.5 - nudge, 0.5))
+        axes.plot([0, 1 / 3, 1 + nudge], [nudge, 2 / 3, 1], "o-", label="0.1234567 -0 #a123456789b")
+        axes.fill_between([0, 1], [0, 1 - nudge], hatch="/")
+        axes.legend()
+        style.write_figure(figure, tmp_path / f"{name}.svg")
+        plt.close(figure)
+    svg = (tmp_path / "a.svg").read_text(encoding="utf-8")
+    assert svg == (tmp_path / "b.svg").read_text(encoding="utf-8")
+    assert "0.1234567 -0 #a123456789b" in svg
+    links = set(re.findall(r"(?:url\(#|href=\"#)([^)\"]+)", svg))
+    assert links and links <= set(re.findall(r'id="([^"]+)"', svg))
+    root = ElementTree.fromstring(svg)  # still well-formed
+    width = float(root.get("width").removesuffix("pt"))
+    assert 200 < width < 500

@@ -3,6 +3,7 @@
 Figures are written as SVG or WebP, tables as CSV and Markdown.
 """
 
+import re
 from base64 import b64encode
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -309,6 +310,36 @@ def write_figure(figure: plt.Figure, path: str | Path, **options: Any) -> None:
         options["metadata"] = {DATES[ending]: None} | options.get("metadata", {})
     with atomic(path) as temporary:
         figure.savefig(temporary, bbox_inches="tight", pad_inches=0.04, **options)
+        if ending == ".svg":
+            svg = temporary.read_text(encoding="utf-8")
+            temporary.write_text(same_on_all_processors(svg), encoding="utf-8")
+
+
+def same_on_all_processors(svg: str) -> str:
+    """Return the text of an SVG file without what the last bits of its coordinates change.
+
+    Sums of numbers end in other bits with wider vector instructions. So coordinates have three
+    decimals in place of six. Matplotlib names clip paths by a digest of their coordinates; they are
+    numbered here.
+    """
+    numbers: dict[str, int] = {}
+    for name in re.findall(r'id="([a-z][0-9a-f]{10})"', svg):
+        numbers.setdefault(name, len(numbers) + 1)
+
+    def in_tag(tag: re.Match) -> str:
+        rounded = re.sub(r"(?<![\w.#-])(-?\d+\.\d{4,}|-0(?![\w.]))", _rounded, tag[0])
+        return re.sub(
+            r"""(id="|url\(#|href="#)([a-z][0-9a-f]{10})\b""",
+            lambda link: f"{link[1]}shared{numbers[link[2]]}",
+            rounded,
+        )
+
+    return re.sub(r"<[^>]*>", in_tag, svg)  # not the texts between the tags
+
+
+def _rounded(number: re.Match) -> str:
+    text = f"{float(number[0]):.3f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
 
 
 def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
