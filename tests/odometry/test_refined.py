@@ -69,21 +69,17 @@ def test_the_sign_survives_a_slow_step():
         assert motion.translation @ AHEAD > 0.999
         assert motion.pose_inliers > 150
     # no two rays meet at so large an angle
-    assert refine.cheirality_votes(turn(0.2), AHEAD, current, previous, 1.0) == (0, 0)
+    points = refine.columns(current, previous)
+    assert refine.cheirality_votes(turn(0.2), AHEAD, points, 1.0) == (0, 0)
 
 
 def test_normal_equations_are_sums_over_single_points():
-    points = np.random.default_rng(0).uniform(-0.6, 0.6, (2 * refine.POINTS_PER_BLOCK + 7, 4))
-    rotation, ahead, scale = (
-        Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(),
-        np.array([0.0, 0.6, 0.8]),
-        0.1,
-    )
-    current, previous = points[:, :2].copy(), points[:, 2:].copy()
-    totals = refine._normal_equations(rotation, ahead, current, previous, scale)
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (4, 2 * refine.POINTS_PER_BLOCK + 7))
+    motion = Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(), np.array([0.0, 0.6, 0.8])
+    totals = refine._normal_equations(*motion, points, 0.1, True)
     parts = [
-        refine._normal_equations(rotation, ahead, current[k : k + 1], previous[k : k + 1], scale)
-        for k in range(len(points))
+        refine._normal_equations(*motion, np.ascontiguousarray(point), 0.1, True)
+        for point in np.split(points, points.shape[1], axis=1)
     ]
     for total, terms in zip(totals, zip(*parts, strict=True), strict=True):
         np.testing.assert_allclose(total, sum(terms), rtol=1e-12, atol=1e-12)
