@@ -13,7 +13,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, Step, keypoints, metrics, pose
 from thesis_repro.odometry.odometry import ALL_KEYPOINTS
 from thesis_repro.odometry.refined import fit as refine
-from thesis_repro.odometry.refined import motion_prior
+from thesis_repro.odometry.refined import motion_prior, normal_equations
 from thesis_repro.odometry.refined.motion_prior import AMBIGUOUS, NOT_DETERMINED, MotionPrior
 
 AHEAD = np.array([0.0, 0.0, 1.0])
@@ -74,11 +74,13 @@ def test_the_sign_survives_a_slow_step():
 
 
 def test_normal_equations_are_sums_over_single_points():
-    points = np.random.default_rng(0).uniform(-0.6, 0.6, (4, 2 * refine.POINTS_PER_BLOCK + 7))
+    points = np.random.default_rng(0).uniform(
+        -0.6, 0.6, (4, 2 * normal_equations.POINTS_PER_BLOCK + 7)
+    )
     motion = Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(), np.array([0.0, 0.6, 0.8])
-    totals = refine._normal_equations(*motion, points, 0.1, True)
+    totals = normal_equations.normal_equations(*motion, points, 0.1, True)
     parts = [
-        refine._normal_equations(*motion, np.ascontiguousarray(point), 0.1, True)
+        normal_equations.normal_equations(*motion, np.ascontiguousarray(point), 0.1, True)
         for point in np.split(points, points.shape[1], axis=1)
     ]
     for total, terms in zip(totals, zip(*parts, strict=True), strict=True):

@@ -12,13 +12,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import binding
 from numba import types
-from numba.core import cgutils
-from numba.extending import get_cython_function_address, intrinsic
+from numba.extending import get_cython_function_address
 
 from thesis_repro.odometry.opencv_exact import epipolar
 from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
+from thesis_repro.odometry.refined import matrices
+from thesis_repro.odometry.refined.normal_equations import normal_equations
 from thesis_repro.running.compiled import fast, inner
 
 MAX_ITERATIONS = 10
@@ -28,19 +29,11 @@ RESTART_SCALES = (4, 1)  # scales of the second start, in thresholds
 # of the largest angle between the headings of one motion
 SAME_MOTION_COSINE = np.cos(np.radians(15.0))
 LOWER_COST = 0.99  # of the first start's cost: a smaller difference may be rounding
-POINTS_PER_BLOCK = 64
-# Rows of a block, one quantity each. NUMBERS: five derivatives of the residual, then the residual.
-# WEIGHTED: the same, times the weight.
-X, Y, U, V, L0, L1, M0, M1, INVERSE, RARITY, WEIGHT, PRODUCT, NUMBERS = range(13)
-RESIDUAL = NUMBERS + 5
-WEIGHTED = NUMBERS + 6
-ROWS = WEIGHTED + 6
 # LAPACK's gesv, which solves linear equations, as SciPy brings it. np.linalg.solve calls it, too,
 # but takes seconds to compile.
 binding.add_symbol(
     "gesv_of_scipy", get_cython_function_address("scipy.linalg.cython_lapack", "dgesv")
 )
-_intrinsic: Any = intrinsic  # mypy does not know that callers leave out the first argument
 _INTEGER, _NUMBERS = types.CPointer(types.int32), types.CPointer(types.float64)
 _gesv: Any = types.ExternalFunction(
     "gesv_of_scipy",
@@ -144,8 +137,8 @@ def refine(
     for scale in RESTART_SCALES:
         second = _minimise(*second, points, scale * threshold)
     second = _rounds(*second, points, _support(*second, points, threshold), threshold)
-    first_cost, _, _ = _normal_equations(*first, points, threshold / 2, False)
-    second_cost, _, _ = _normal_equations(*second, points, threshold / 2, False)
+    first_cost, _, _ = normal_equations(*first, points, threshold / 2, False)
+    second_cost, _, _ = normal_equations(*second, points, threshold / 2, False)
     rotation, heading = first
     is_same_motion = abs(second[1] @ heading) > SAME_MOTION_COSINE
     if is_same_motion and second_cost < LOWER_COST * first_cost:
@@ -164,7 +157,7 @@ def _deviations(
     The covariance is the inverse of the Gauss-Newton matrix times scale^2, the variance of the
     residuals.
     """
-    _, hessian, _ = _normal_equations(rotation, translation, points, scale, True)
+    _, hessian, _ = normal_equations(rotation, translation, points, scale, True)
     values, vectors = np.linalg.eigh(hessian)
     if points.shape[1] < MIN_CORRESPONDENCES or not values[0] > 1e-12 * values[-1]:
         return np.inf, np.inf, np.inf
@@ -194,7 +187,7 @@ def near(r, t, current, previous, limit):
 @inner
 def _near(r, t, points, limit):
     """As `near`, of points (4, N)."""
-    essential = _product(_skew(t), _row_by_row(r))
+    essential = matrices.product(matrices.skew(t), matrices.row_by_row(r))
     mask = np.empty(points.shape[1], np.bool_)
     for k in range(len(mask)):
         x, y, u, v = points[0, k], points[1, k], points[2, k], points[3, k]
@@ -238,7 +231,7 @@ def _minimise(r, t, points, scale):
     """Levenberg-Marquardt iteration: each step solves (H + damping diag H) change = -gradient."""
     damping = 1e-4
     integers = np.empty(8, np.int32)
-    cost, hessian, gradient = _normal_equations(r, t, points, scale, True)
+    cost, hessian, gradient = normal_equations(r, t, points, scale, True)
     for k in range(MAX_ITERATIONS):
         damped = hessian.copy()
         for j in range(5):
@@ -247,7 +240,7 @@ def _minimise(r, t, points, scale):
         _solve(damped, change, integers)
         r_new, t_new = _moved(r, t, change)
         is_last = k == MAX_ITERATIONS - 1
-        cost_new, hessian_new, gradient_new = _normal_equations(
+        cost_new, hessian_new, gradient_new = normal_equations(
             r_new, t_new, points, scale, not is_last
         )
         if cost_new < cost:
@@ -311,79 +304,6 @@ def cheirality_votes(rotation, t, points, parallax):
     return forward, backward
 
 
-# Matrices are tuples here, row by row: single numbers stay in registers.
-
-
-@_intrinsic
-def _multiply_add(typing_context, a, b, c):
-    """Compute a * b + c, rounded once."""
-
-    def generate(context, builder, signature, arguments):
-        return builder.fma(*arguments)
-
-    return types.float64(types.float64, types.float64, types.float64), generate
-
-
-@inner
-def _row_times_matrix(a0, a1, a2, b):
-    """Product of a row and a 3x3 matrix.
-
-    It has the bits of np.dot, which starts from 0.0 and fuses as well, where the processor can.
-    """
-    return (
-        _multiply_add(a2, b[6], _multiply_add(a1, b[3], _multiply_add(a0, b[0], 0.0))),
-        _multiply_add(a2, b[7], _multiply_add(a1, b[4], _multiply_add(a0, b[1], 0.0))),
-        _multiply_add(a2, b[8], _multiply_add(a1, b[5], _multiply_add(a0, b[2], 0.0))),
-    )
-
-
-@inner
-def _product(a, b):
-    """Product of two 3x3 matrices."""
-    p0, p1, p2 = _row_times_matrix(a[0], a[1], a[2], b)
-    p3, p4, p5 = _row_times_matrix(a[3], a[4], a[5], b)
-    p6, p7, p8 = _row_times_matrix(a[6], a[7], a[8], b)
-    return p0, p1, p2, p3, p4, p5, p6, p7, p8
-
-
-@inner
-def _row_by_row(m):
-    """An array (3, 3) as a tuple."""
-    return m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2]
-
-
-@inner
-def _skew(v):
-    """Matrix [v]x of the cross product with v (Equation 2.5)."""
-    return 0.0, -v[2], v[1], v[2], 0.0, -v[0], -v[1], v[0], 0.0
-
-
-@inner
-def _normalised(v0, v1, v2):
-    """Unit vector (3) in the direction of (v0, v1, v2)."""
-    norm = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-    return v0 / norm, v1 / norm, v2 / norm
-
-
-@inner
-def _tangents(t):
-    """Two unit vectors that are perpendicular to the unit vector t and to each other."""
-    # cross product with the axis that t is farthest from
-    if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):
-        x, y, z = 0.0, t[2], -t[1]
-    elif abs(t[1]) <= abs(t[2]):
-        x, y, z = -t[2], 0.0, t[0]
-    else:
-        x, y, z = t[1], -t[0], 0.0
-    first = _normalised(x, y, z)
-    second = (
-        t[1] * first[2] - t[2] * first[1],
-        t[2] * first[0] - t[0] * first[2],
-        t[0] * first[1] - t[1] * first[0],
-    )
-    return first, second
-
-
 @inner
 def _moved(r, t, change):
     """Motion after a change (5) of its parameters.
@@ -391,8 +311,8 @@ def _moved(r, t, change):
     The rotation becomes exp([turn]x) R (Rodrigues' formula). t moves along its tangents.
     """
     angle = np.sqrt(change[0] * change[0] + change[1] * change[1] + change[2] * change[2])
-    cross = _skew(change)
-    square = _product(cross, cross)
+    cross = matrices.skew(change)
+    square = matrices.product(cross, cross)
     sine, cosine = 1.0, 0.0
     if angle > 1e-12:
         sine = np.sin(angle) / angle
@@ -402,158 +322,15 @@ def _moved(r, t, change):
         for j in range(3):
             k = 3 * i + j
             rodrigues[i, j] = (i == j) + sine * cross[k] + cosine * square[k]
-    first, second = _tangents(t)
+    first, second = matrices.tangents(t)
     heading = np.empty(3)
-    heading[0], heading[1], heading[2] = _normalised(
+    heading[0], heading[1], heading[2] = matrices.normalised(
         t[0] + change[3] * first[0] + change[4] * second[0],
         t[1] + change[3] * first[1] + change[4] * second[1],
         t[2] + change[3] * first[2] + change[4] * second[2],
     )
     rotation = np.empty((3, 3))
-    _write(rotation.ravel(), _product(_row_by_row(rodrigues), _row_by_row(r)))
+    matrices.write(
+        rotation.ravel(), matrices.product(matrices.row_by_row(rodrigues), matrices.row_by_row(r))
+    )
     return rotation, heading
-
-
-@inner
-def _write(array, entries):
-    """Write the entries of a matrix to an array (9)."""
-    for k in range(9):
-        array[k] = entries[k]
-
-
-@inner
-def _essential_and_derivatives(r, t):
-    """E = [t]x R and its five derivatives (6, 9), row by row.
-
-    Three derivatives are [t]x [unit]x R, by the rotation. Two are [tangent]x R, by the direction.
-    """
-    matrices = np.empty((6, 9))
-    rotation = _row_by_row(r)
-    cross = _skew(t)
-    first, second = _tangents(t)
-    _write(matrices[0], _product(cross, rotation))
-    _write(matrices[1], _product(cross, _product(_skew((1.0, 0.0, 0.0)), rotation)))
-    _write(matrices[2], _product(cross, _product(_skew((0.0, 1.0, 0.0)), rotation)))
-    _write(matrices[3], _product(cross, _product(_skew((0.0, 0.0, 1.0)), rotation)))
-    _write(matrices[4], _product(_skew(first), rotation))
-    _write(matrices[5], _product(_skew(second), rotation))
-    return matrices
-
-
-@fast
-def _normal_equations(r, t, points, scale, with_derivatives):
-    """Cauchy cost of the Sampson distances, its Gauss-Newton matrix (5, 5) and its gradient (5).
-
-    With residual s and weight w = 1 / (1 + (s / scale)^2): the sums of log(1 + (s / scale)^2), of w
-    J^T J and of w s J. Without derivatives, only the cost is computed.
-    """
-    matrices = _essential_and_derivatives(r, t)
-    essential = epipolar.entries(matrices[0])
-    cost = 0.0
-    sums = np.zeros((6, 8))
-    # Points are handled in blocks, one quantity after the other, so that these loops are
-    # vectorised. The sums go point by point, so the bits are those of one loop over all points.
-    # All quantities are rows of one array: the compiler sees that they do not overlap.
-    size = POINTS_PER_BLOCK
-    rows = np.empty((ROWS, size))
-    for start in range(0, points.shape[1], size):
-        count = min(size, points.shape[1] - start)
-        for i in range(count):
-            rows[X, i], rows[Y, i] = points[0, start + i], points[1, start + i]
-            rows[U, i], rows[V, i] = points[2, start + i], points[3, start + i]
-        for i in range(count):
-            algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(
-                essential, rows[X, i], rows[Y, i], rows[U, i], rows[V, i]
-            )
-            square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
-            # a point at an epipole has no residual
-            inverse = 1 / np.sqrt(square) if square >= 1e-18 else 0.0
-            residual = algebraic * inverse  # signed Sampson distance
-            ratio = residual / scale
-            rows[L0, i], rows[L1, i], rows[M0, i], rows[M1, i] = l0, l1, m0, m1
-            rows[INVERSE, i], rows[RESIDUAL, i] = inverse, residual
-            rows[RARITY, i] = 1 + ratio * ratio
-        for i in range(count):
-            cost += np.log(rows[RARITY, i])
-        if not with_derivatives:
-            continue
-        for i in range(count):
-            rows[WEIGHT, i] = 1 / rows[RARITY, i]
-            rows[WEIGHTED + 5, i] = rows[WEIGHT, i] * rows[RESIDUAL, i]
-            rows[PRODUCT, i] = rows[RESIDUAL, i] * rows[INVERSE, i]
-        for k in range(5):
-            derivative = epipolar.entries(matrices[1 + k])
-            for i in range(count):
-                change, d0, d1, c0, c1 = epipolar.sampson_terms(
-                    derivative, rows[X, i], rows[Y, i], rows[U, i], rows[V, i]
-                )
-                # (a / sqrt(q))' = a' / sqrt(q) - a q' / (2 q sqrt(q)), where q = l0^2 + l1^2 + m0^2
-                # + m1^2
-                slope = rows[L0, i] * d0 + rows[L1, i] * d1 + rows[M0, i] * c0 + rows[M1, i] * c1
-                number = (change - rows[PRODUCT, i] * slope) * rows[INVERSE, i]
-                rows[NUMBERS + k, i] = number
-                rows[WEIGHTED + k, i] = rows[WEIGHT, i] * number
-        _add_products(sums, rows, count)
-    hessian = sums[:5, :5].copy()
-    _mirror(hessian)
-    return cost, hessian, sums[5, :5].copy()
-
-
-@_intrinsic
-def _add_products(typing_context, sums, rows, count):
-    """Add rows[WEIGHTED + k, i] * rows[NUMBERS + j, i] to sums[k, j], point by point (i), j <= k.
-
-    sums: (6, 8). rows: (ROWS, POINTS_PER_BLOCK). count: number of points.
-
-    The compiler would add one sum after the other. Here the sums of a row are one vector, which
-    stays in a register: four sums (j < 4) and, in the last two rows, two more. A vector also holds
-    sums with j > k, which nobody reads.
-    """
-    double, index = ir.DoubleType(), ir.IntType(32)
-    four, two = ir.VectorType(double, 4), ir.VectorType(double, 2)
-
-    def generate(context, builder, signature, arguments):
-        sums, rows = (
-            context.make_array(kind)(context, builder, array).data
-            for kind, array in zip(signature.args[:2], arguments[:2], strict=True)
-        )
-
-        def place(array, offset):
-            return builder.gep(array, [context.get_constant(types.intp, offset)])
-
-        def vector(kind, values):
-            result = ir.Constant(kind, ir.Undefined)
-            for k, value in enumerate(values):
-                result = builder.insert_element(result, value, ir.Constant(index, k))
-            return result
-
-        def column(first, i):
-            places = [place(rows, POINTS_PER_BLOCK * (first + k)) for k in range(6)]
-            return [builder.load(builder.gep(start, [i])) for start in places]
-
-        parts = [(k, 0, four) for k in range(6)] + [(k, 4, two) for k in (4, 5)]
-        totals = []
-        for k, first, kind in parts:
-            source = builder.bitcast(place(sums, 8 * k + first), kind.as_pointer())
-            total = cgutils.alloca_once_value(builder, builder.load(source, align=8))
-            totals.append((source, total))
-        with cgutils.for_range(builder, arguments[2]) as loop:
-            factors = column(WEIGHTED, loop.index)
-            row = column(NUMBERS, loop.index)
-            vectors = {0: vector(four, row[:4]), 4: vector(two, row[4:])}
-            for (k, first, kind), (_, total) in zip(parts, totals, strict=True):
-                factor = vector(kind, [factors[k]] * kind.count)
-                product = builder.fmul(factor, vectors[first])
-                builder.store(builder.fadd(builder.load(total), product), total)
-        for target, total in totals:
-            builder.store(builder.load(total), target, align=8)
-
-    return types.void(sums, rows, count), generate
-
-
-@inner
-def _mirror(matrix):
-    """Copy the lower triangle of a matrix (5, 5) to the upper one."""
-    for k in range(5):
-        for j in range(k):
-            matrix[j, k] = matrix[k, j]
