@@ -8,7 +8,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, pose
-from thesis_repro.odometry.opencv_exact import five_point, ransac, rounding
+from thesis_repro.odometry.opencv_exact import ransac, real_roots, rounding
 
 
 def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBABILITY):
@@ -135,7 +135,7 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
     random, shares, unsure = np.random.default_rng(3), [], 0
     solutions = rounding.no_solutions()
     for _ in range(19):
-        samples = [scene(random, 5, outliers=0.0, **options) for _ in range(five_point.LANES)]
+        samples = [scene(random, 5, outliers=0.0, **options) for _ in range(real_roots.LANES)]
         rounding.solve(np.stack([np.hstack(sample) for sample in samples], axis=-1), solutions)
         for lane, sample in enumerate(samples):
             count = solutions.counts[lane]
@@ -158,7 +158,7 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
 
 
 def test_a_sample_has_the_same_solutions_in_every_lane_and_company():
-    random, lanes = np.random.default_rng(5), five_point.LANES
+    random, lanes = np.random.default_rng(5), real_roots.LANES
     samples = [np.hstack(scene(random, 5, outliers=0.0)) for _ in range(lanes)]
     fives = np.stack(samples, axis=-1)
     fives[1, :, 3] = fives[0, :, 3]  # not solvable

@@ -23,7 +23,8 @@ import cv2
 import numpy as np
 
 from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.opencv_exact.five_point import LANES, SAMPLE_SIZE
+from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
+from thesis_repro.odometry.opencv_exact.real_roots import LANES
 from thesis_repro.odometry.opencv_exact.rounding import Solutions, no_solutions, solve
 from thesis_repro.running.compiled import fast, inner
 

@@ -10,11 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from thesis_repro.odometry.opencv_exact import five_point
-from thesis_repro.odometry.opencv_exact.five_point import (
-    LANES,
-    MIN_INDEPENDENCE,
-    SAMPLE_SIZE,
-)
+from thesis_repro.odometry.opencv_exact.five_point import MIN_INDEPENDENCE, SAMPLE_SIZE
+from thesis_repro.odometry.opencv_exact.real_roots import LANES, real_roots
 from thesis_repro.running.compiled import fast, inner
 
 ROUNDING = 2.0**-52  # of a number of size 1
@@ -71,7 +68,7 @@ def solve(fives, solutions):
     fives: (5, 4, LANES), rows x, y in the current frame, u, v in the previous frame.
     """
     steps = _first_steps(fives)
-    roots = five_point.real_roots(steps.polynomials)  # step 5
+    roots = real_roots(steps.polynomials)  # step 5
     work, errors = np.empty((4, 3, 3, LANES)), np.empty(LANES)
     sure, counts = solutions.sure, solutions.counts
     for lane in range(LANES):

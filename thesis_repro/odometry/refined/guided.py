@@ -9,8 +9,8 @@ angles.
 import numpy as np
 
 from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.opencv_exact.five_point import LANES
 from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, draw, first_block
+from thesis_repro.odometry.opencv_exact.real_roots import LANES
 from thesis_repro.odometry.opencv_exact.rounding import WELL_CONDITIONED, solve
 from thesis_repro.running.compiled import fast, inner
 
