@@ -132,7 +132,7 @@ def test_opencv_does_the_whole_search_if_the_bounds_were_wrong(monkeypatch):
     ids=["ahead", "flat", "hardly moving", "turning only"],
 )
 def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, most_unsure):
-    random, shares, unsure = np.random.default_rng(3), [], 0
+    random, shares, unsure, ill_conditioned = np.random.default_rng(3), [], 0, 0
     solutions = rounding.no_solutions()
     for _ in range(19):
         samples = [scene(random, 5, outliers=0.0, **options) for _ in range(real_roots.LANES)]
@@ -149,12 +149,14 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
             matrices = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
             assert len(matrices) == count
             ours = solutions.matrices[lane, :count]
+            ill_conditioned += (margins >= rounding.WELL_CONDITIONED).sum()
             for matrix in matrices:
                 distances = np.minimum(
                     np.linalg.norm(ours - matrix, axis=1), np.linalg.norm(ours + matrix, axis=1)
                 )
                 shares.append((distances / margins).min())
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
+    assert ill_conditioned > 0  # these are among the shares
 
 
 def test_a_sample_has_the_same_solutions_in_every_lane_and_company():

@@ -107,7 +107,8 @@ def null_space(fives, rows, independences):
     Nister uses a QR factorisation. This is Gram-Schmidt, run twice against rounding. It gives
     OpenCV's basis: in another basis, rounding would change the solutions by other amounts.
     """
-    row, norms = np.empty((9, LANES)), np.empty(LANES)
+    row = np.empty((9, LANES))
+    norms, norms_left = np.empty(LANES), np.empty(LANES)
     for lane in range(LANES):
         independences[lane] = 1.0
     for k in range(9):
@@ -121,7 +122,11 @@ def null_space(fives, rows, independences):
         for _ in range(2):
             for j in range(k):
                 _make_normal(row, rows[j])
-        _write_unit_row(row, norms, rows[k], independences)
+        _write_norms(row, norms_left)
+        _write_unit_row(row, norms_left, rows[k])
+        for lane in range(LANES):
+            share = norms_left[lane] / norms[lane]
+            independences[lane] = share if share < independences[lane] else independences[lane]
 
 
 @inner
@@ -155,17 +160,10 @@ def _make_normal(row, other):
 
 
 @inner
-def _write_unit_row(row, norms, unit_row, independences):
-    """Write a row with unit norm, and lower the independence to the share left of its norm."""
+def _write_unit_row(row, norms, unit_row):
     for lane in range(LANES):
-        total = 0.0
         for i in range(9):
-            total += row[i, lane] * row[i, lane]
-        norm = np.sqrt(total)
-        for i in range(9):
-            unit_row[i, lane] = row[i, lane] / norm
-        share = norm / norms[lane]
-        independences[lane] = share if share < independences[lane] else independences[lane]
+            unit_row[i, lane] = row[i, lane] / norms[lane]
 
 
 @inner

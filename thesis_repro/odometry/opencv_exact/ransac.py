@@ -322,8 +322,8 @@ def _largest_of_inliers(e, margin, extents, limit):
 def _surely_out(matrix, largest, x, y, u, v):
     """Number of correspondences whose |algebraic| is larger than that of any inlier.
 
-    A product and a sum may become one operation, rounded once. No result depends on these roundings
-    (see `largest`), and two thirds of the operations are enough.
+    A product and a sum may become one operation, rounded once, which is faster. `largest` has room
+    for either rounding, so no result depends on it.
     """
     e0, e1, e2, e3, e4, e5, e6, e7, e8 = matrix
     outliers = np.int32(0)  # of the same width as the distances, so that the loop is vectorised

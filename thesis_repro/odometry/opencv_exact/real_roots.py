@@ -169,8 +169,7 @@ def _write_brackets(
 def value(polynomial, z, lane):
     """Value at z of one of several polynomials (11, LANES; lowest power first).
 
-    Even and odd powers are summed apart, so the processor runs both sums at once. The sums are
-    written out, because the compiler does not vectorise a loop over lanes with a loop inside.
+    Even and odd powers are summed apart, so the processor runs both sums at once.
     """
     square = z * z
     even = polynomial[10, lane] * square + polynomial[8, lane]
