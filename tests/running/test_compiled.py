@@ -10,7 +10,7 @@ import pytest
 from nbclient import NotebookClient
 
 from thesis_repro import errors
-from thesis_repro.running import compiled, folders
+from thesis_repro.running import compiled, folders, messages
 
 CALL = "from thesis_repro.odometry.outer import f; print(f(1.0))"
 OUTER = (
