@@ -34,8 +34,9 @@ class Matches:
 class Motion:
     """Motion of the camera between two frames.
 
-    It takes coordinates of the current camera to coordinates of the previous camera. rotation is
-    None if the motion is not known; `flag` says why, or what is doubtful about a known motion.
+    As in PySLAM, it takes coordinates of the current camera to coordinates of the previous camera,
+    so it moves a camera-to-world pose without an inverse. rotation is None if it is not known.
+    flag: what is doubtful about the motion.
     """
 
     rotation: np.ndarray | None = None  # 3x3
