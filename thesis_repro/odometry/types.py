@@ -27,7 +27,7 @@ class Matches:
     previous: np.ndarray
     threshold: float
     inliers: np.ndarray | None = None
-    order: np.ndarray | slice = slice(None)
+    order: np.ndarray | slice = field(default_factory=lambda: slice(None))
 
 
 @dataclass(frozen=True, eq=False)
