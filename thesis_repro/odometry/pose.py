@@ -9,7 +9,8 @@ moved by them without an inverse.
 
 import numpy as np
 
-from opencv_exact import find_essential_matrix
+from opencv_exact import find_essential_matrix, recover_pose  # noqa: F401
+from thesis_repro.odometry.types import Motion  # noqa: F401
 
 PROBABILITY = 0.999  # of RANSAC
 MIN_CORRESPONDENCES = 5
