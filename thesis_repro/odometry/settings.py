@@ -16,8 +16,17 @@ CHOICES = {
     "mask_mode": ("detect", "filter"),
     "estimator": tuple(estimators.ESTIMATORS),
 }
-# settings that decide which keypoints are found
-DETECTION = ("detector", "max_keypoints", "min_distance", "mask_mode", "quality", "block_size")
+# Settings that do not change which keypoints are found in a frame. Runs that differ in nothing else
+# share keypoints, so a new setting belongs here only if it acts later.
+AFTER_DETECTION = {
+    "redetect_below",
+    "window",
+    "levels",
+    "threshold",
+    "shuffle_seed",
+    "estimator",
+    "scale_gate",
+}
 # {name: (least, most)}
 LIMITS = {
     "max_keypoints": (0, 2**31 - 1),
@@ -75,7 +84,7 @@ class OdometrySettings:
 
     def of_detection(self) -> tuple:
         """Return the settings that decide which keypoints are found."""
-        return tuple(getattr(self, name) for name in DETECTION)
+        return tuple(value for name, value in vars(self).items() if name not in AFTER_DETECTION)
 
     def order(self, frame: int, matches: int) -> np.ndarray | slice:
         """Return the order in which RANSAC takes matches, (N,) indices; a slice: as they are."""
