@@ -178,6 +178,42 @@ def test_a_mask_in_the_detector_fills_the_limit_and_a_filter_does_not(drive):
     assert len(inside) == 500 and 100 < len(filtered) < 400
 
 
+def nearest_neighbours(points):
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    return np.sort(distances, axis=1)[:, 1]
+
+
+def test_spread_keypoints_are_as_many_and_farther_apart(drive):
+    frame, few = drive.frame(0), replace(THESIS, max_keypoints=100)
+    everything = keypoints.detect(frame, replace(THESIS, max_keypoints=0))
+    corners = keypoints.detect(frame, replace(THESIS, max_keypoints=0, min_distance=0))
+    spread = keypoints.detect(frame, replace(few, choice="spread"))
+    assert len(spread) == len(everything[:100]) == 100
+    assert {*map(tuple, spread)} <= {*map(tuple, corners)}
+    assert nearest_neighbours(spread).min() > 2 * nearest_neighbours(everything[:100]).min()
+    # the strongest one is always taken, and as many as there are if those are fewer
+    np.testing.assert_array_equal(spread[0], everything[0])
+    all_spread = keypoints.detect(frame, replace(THESIS, max_keypoints=10**6, choice="spread"))
+    np.testing.assert_array_equal(all_spread, everything)
+
+
+def test_a_filled_mask_leaves_no_field_empty(drive):
+    frame, mask = drive.frame(0), np.zeros(drive.size, np.uint8)
+    mask[:, :240] = 255
+    plain = keypoints.detect(frame, THESIS, mask)
+    filled = keypoints.detect(frame, replace(THESIS, fill=3), mask)
+    np.testing.assert_array_equal(filled[: len(plain)], plain)
+    everything = keypoints.detect(frame, replace(THESIS, max_keypoints=0))
+    for row in range(5):
+        for column in range(16):
+            counts = [
+                (points // (30, 32) == (column, row)).all(axis=1).sum()
+                for points in (plain, filled, everything)
+            ]
+            assert counts[1] == max(counts[0], min(3, counts[2])), (row, column, counts)
+    assert nearest_neighbours(filled).min() >= 3
+
+
 # Bad frames are flagged, and the run goes on
 
 
@@ -496,6 +532,7 @@ def test_runs_share_no_keypoints_if_a_setting_differs_that_may_matter(
         ("detector", "fast"),
         ("max_keypoints", -1),
         ("threshold", 0.0),
+        ("choice", "best"),
     ],
 )
 def test_wrong_settings_are_named(setting, value):

@@ -2,6 +2,7 @@
 
 import math
 import numbers
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from importlib import import_module
 from typing import Any
@@ -13,6 +14,7 @@ from thesis_repro.odometry import estimators
 
 CHOICES = {
     "detector": ("shi-tomasi", "orb"),
+    "choice": ("strongest", "spread"),
     "mask_mode": ("detect", "filter"),
     "estimator": tuple(estimators.ESTIMATORS),
 }
@@ -30,6 +32,7 @@ AFTER_DETECTION = {
 # {name: (least, most)}
 LIMITS = {
     "max_keypoints": (0, 2**31 - 1),
+    "fill": (0, 1000),
     "min_distance": (0, 10_000),
     "redetect_below": (0, 2**31 - 1),
     "quality": (0, 1),
@@ -52,6 +55,10 @@ class OdometrySettings:
     relative to the strongest one; side of the square over which gradients are summed, pixels.
     window, levels: side of the tracker's window, pixels, and the number of times it halves the
     frame.
+    choice: the "strongest" max_keypoints, as in the thesis, or as many "spread" ones: the strongest
+    that are as far apart as their number allows (keypoints.spread).
+    fill: with a mask, number of keypoints in each of 16 x 5 fields of the frame that is filled up
+    from outside the mask (keypoints.filled). 0: none, as in the thesis.
     mask_mode: "detect" gives the mask to the detector, which returns up to max_keypoints inside it;
     "filter" drops keypoints outside the mask.
     redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all
@@ -70,6 +77,8 @@ class OdometrySettings:
 
     detector: str = "shi-tomasi"
     max_keypoints: int = 2000
+    choice: str = "strongest"
+    fill: int = 0
     min_distance: float = 3
     mask_mode: str = "detect"
     redetect_below: int = 2000
@@ -92,12 +101,14 @@ class OdometrySettings:
             return slice(None)
         return np.random.default_rng((self.shuffle_seed, frame)).permutation(matches)
 
-    def detect_function(self) -> Any:
-        """Return what finds keypoints: OpenCV's call, or keypoints.detect for other choices."""
-        module = "thesis_repro.odometry.odometry"
+    def detect_function(self) -> Callable:
+        """Return what finds keypoints: OpenCV's call, or `keypoints.detect` for other choices."""
+        if self.choice == "spread" or self.fill:
+            sharing = import_module("thesis_repro.odometry.sharing")
+            return sharing.SharedCalls().detect  # computes the strength of corners once a frame
         if self.detector == "orb" or self.mask_mode == "filter":
-            module = "thesis_repro.odometry.keypoints"
-        return import_module(module).detect
+            return import_module("thesis_repro.odometry.keypoints").detect
+        return import_module("thesis_repro.odometry.odometry").detect
 
     def new_estimator(self, calls: Any) -> Any:
         """Return a new object of the estimator. calls: see odometry.Calls."""
@@ -111,6 +122,8 @@ class OdometrySettings:
                     f"odometry setting {name}: {value!r} is unknown; "
                     f"choose one of {', '.join(choices)}"
                 )
+        if self.choice == "spread" and not self.max_keypoints:
+            raise InputError('odometry setting choice: "spread" needs max_keypoints of 1 or more')
         for field in fields(self):
             if field.name in LIMITS:
                 _check_number(field.name, getattr(self, field.name), field.type)
