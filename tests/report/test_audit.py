@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 
 import thesis_repro as tr
+from thesis import ablations, timing
 from thesis_repro.data import cityscapes
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import metrics
@@ -25,7 +26,7 @@ from thesis_repro.running import results
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import augmentation, quality
 from thesis_repro.segmentation.training import sm
-from thesis_repro.study import ablations, compare, thesis_tables, timing
+from thesis_repro.study import compare, thesis_tables
 
 
 def test_rows_are_numbered_and_every_measurement_has_a_row():
