@@ -19,7 +19,7 @@ from thesis_repro.odometry.refined.fit import RefinedMotion, fit, with_uncertain
 from thesis_repro.odometry.refined.guided import ransac_with_prior
 from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency, is_consistent
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.running import console
+from thesis_repro.running import messages
 
 TIMED_PARTS = ("detect", "track", "essential", "pose")
 ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
@@ -138,7 +138,7 @@ class Odometry:
 
     def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
         """Take the next frame: `observe`, `estimate` and `compose`."""
-        with console.held_signals():
+        with messages.held_signals():
             step = self.observe(frame, scale, mask)
             self.estimate(step)
             return self.compose(step)

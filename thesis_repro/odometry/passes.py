@@ -24,7 +24,7 @@ from thesis_repro.odometry.odometry import (
 )
 from thesis_repro.odometry.refined.motion_prior import MotionPrior
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.running import console, results
+from thesis_repro.running import messages, results
 from thesis_repro.running.files import progress
 
 CHECKPOINT = 300  # frames
@@ -195,8 +195,8 @@ def _run_pass(
     if description is not None:
         indices = progress(indices, description, total=len(sequence), initial=done)
     for index in indices:
-        console.check_stop()
-        with console.held_signals():
+        messages.check_stop()
+        with messages.held_signals():
             frame = sequence.frame(index)
             if shared is not None:
                 starts = [(leader.odometry.previous, leader.odometry.points) for leader in leaders]
