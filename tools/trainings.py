@@ -21,7 +21,7 @@ from thesis_repro.data import cityscapes, kitti
 from thesis_repro.report.trainings import TABLE
 from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import read_settings
-from thesis_repro.segmentation import memory, prediction, quality, training
+from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 from thesis_repro.study import compare, domain_gap, jobs, runner, thesis_tables, workers
 from thesis_repro.study.sources import Source
@@ -51,7 +51,6 @@ def train(settings, seed):
     model.compile(
         keras.optimizers.Adam(sizes.learning_rate), training.fused_loss(training.total_loss())
     )
-    model.optimizer.build(model.trainable_variables)
     folder = results.stage(
         settings.build / f"trainings/model_{seed}",
         **training.made_from(model, batches, validation),
@@ -60,14 +59,13 @@ def train(settings, seed):
     best = keras.callbacks.ModelCheckpoint(
         folder / training.MODEL, monitor="val_loss", save_best_only=True
     )
-    resumable = training.ResumableTraining(folder, model, batches, [stop, best])
+    resumable = training.ResumableTraining(folder, batches, [stop, best])
     model.fit(
         batches.dataset(),
         validation_data=validation.dataset(),
         epochs=sizes.epochs,
         shuffle=False,
         verbose=0,
-        initial_epoch=resumable.first_epoch(sizes.epochs),
         callbacks=[stop, best, resumable],
     )
     return folder / training.MODEL
@@ -76,7 +74,6 @@ def train(settings, seed):
 def label_maps(settings, seed):
     """Train and predict; return the source of masks, and {network, mean_iou} of the training."""
     tf.config.threading.set_intra_op_parallelism_threads(settings.sizes.threads)
-    memory.keep_freed()
     model = training.load_model(train(settings, seed))
     folder = settings.build / f"trainings/labels_{seed}"
     sequences = opened(settings)
