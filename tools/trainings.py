@@ -20,7 +20,6 @@ import pandas as pd
 import tensorflow as tf
 
 from thesis_repro.data import cityscapes, kitti
-from thesis_repro.report.trainings import TABLE
 from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import ROOT, read_settings
 from thesis_repro.segmentation import memory, prediction, quality, training
@@ -32,6 +31,7 @@ sys.path.append(str(ROOT / "notebooks"))
 
 # isort: split
 from thesis import domain_gap
+from thesis.trainings import TABLE
 
 SEEDS = range(10)  # the first one is the default run's
 METRICS = (*compare.JUDGING_METRICS, "rmse")
