@@ -130,25 +130,6 @@ def test_the_iou_figure_shows_areas_and_their_ratio():
     assert all(number in shown for number in ("200 / 300", "0.67", "200 pixels", "300 pixels"))
 
 
-def test_the_colours_of_the_iou_figure_are_those_of_its_legend():
-    label_map, prediction = (np.full((20, 20), ID["road"], np.uint8) for _ in range(2))
-    label_map[:10], prediction[5:15] = ID["car"], ID["car"]
-    figure = chapter3.figure_3_03(label_map, label_map, prediction, LABELS[ID["car"]])
-    of_label_map, of_prediction, of_both = (
-        np.array(patch.get_facecolor()[:3]) * 255 for patch in figure.legends[0].get_patches()
-    )
-    first, second, third = (axes.images[0].get_array() for axes in figure.axes)
-    for picture, row, color in (
-        (first, 0, of_label_map),
-        (first, 7, of_label_map),
-        (second, 7, of_prediction),
-        (third, 0, of_label_map),
-        (third, 7, of_both),
-        (third, 12, of_prediction),
-    ):
-        assert np.abs(picture[row, 0] - color).max() < 1
-
-
 @pytest.mark.slow
 def test_the_unet_figure_shows_the_sizes_of_the_model():
     from thesis_repro.segmentation.unet import build_unet
@@ -209,21 +190,6 @@ def test_saved_figures_have_repeatable_bytes_and_a_note(tmp_path):
         "picture.svg",
         "plot.svg",
     ]
-
-
-def test_a_long_note_widens_no_figure(tmp_path):
-    widths = []
-    for note in ("short", "00 (200 frames), " * 30):
-        style.save_figure(chapter2.figure_2_08(turning(), "title"), tmp_path, "plot", note)
-        head = (tmp_path / "plot.svg").read_text(encoding="utf-8")[:1000]
-        widths.append(float(re.search(r'width="([\d.]+)pt"', head)[1]))
-    assert widths[1] == pytest.approx(widths[0], abs=1)
-
-
-def test_lines_of_a_figure_differ():
-    styles = [tuple(style.line_style(index).values()) for index in range(44)]
-    assert len(set(styles)) == 44
-    assert len({color for color, _ in styles[:11]}) == 11
 
 
 @pytest.mark.parametrize(
@@ -310,16 +276,6 @@ def test_the_map_shows_the_ground_truth_if_there_is_one(drive):
     del drive.poses
     without = list(video.pictures(drive))[-1][160:]
     assert painted(without, BLUE).sum() > 20 and (without != last).any()
-
-
-@pytest.mark.parametrize("ending", ["svg", "pdf", "png"])
-def test_figures_carry_no_date(tmp_path, ending):
-    with style.applied():
-        for name in ("a", "b"):
-            style.write_figure(style.new_figure()[0], tmp_path / f"{name}.{ending}")
-    written = (tmp_path / f"a.{ending}").read_bytes()
-    assert b"CreationDate" not in written and b"dc:date" not in written
-    assert written == (tmp_path / f"b.{ending}").read_bytes()
 
 
 def test_the_last_bits_of_coordinates_do_not_change_a_file(tmp_path):

@@ -133,42 +133,6 @@ class ImageEdges(OtherFrame):
 
 
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-OF_MASKS = {
-    "other-frame": OtherFrame,
-    "mirrored": Mirrored,
-    "random-lines": RandomLines,
-    "image-edges": ImageEdges,
-}
-# as SLAM systems use a segmentation, see masks.KEEP
-LITERATURE = ("static", "inverse", "static-boundaries")
-OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
-# "fallback" is a setting of the odometry, with the same masks
-MASK_CONTROLS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)
-
-
-def masks_of_method(
-    method: str, source: Source, sequence: Sequence, dilation_width: int | None
-) -> ControlMasks:
-    """Return the masks of a sequence for a method: "masked" or one of MASK_CONTROLS.
-
-    source: of the masks that a control is compared with. dilation_width: pixels, for masks from
-    label maps.
-    """
-    if method in OF_MASKS:
-        return OF_MASKS[method](source, sequence, dilation_width)
-    if method in ("masked", "fallback"):
-        return source.masks(sequence, dilation_width)
-    folder, settings = source.folder, source.settings
-    if method == "true-labels":
-        folder = true_labels(sequence.root, sequence.name)
-        settings = replace(settings, ids="labels")
-    elif method == "corrected":
-        settings = replace(CORRECTED, ids=settings.ids)
-    elif method in LITERATURE:
-        settings = replace(settings, keep=method)
-    else:
-        settings = replace(settings, boundaries="exact")
-    return replace(source, folder=folder, settings=settings).masks(sequence, dilation_width)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:
