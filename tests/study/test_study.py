@@ -135,26 +135,6 @@ def test_latex_of_a_study_fits_the_columns_of_an_article(done, study, columns, w
     assert_fits(texts, columns, tmp_path)
 
 
-def test_masks_that_may_be_inverted_are_drawn_both_ways(study, masks, tmp_path):
-    lower = np.zeros(Sequence(study.kitti, "00").size, np.uint8)
-    lower[lower.shape[0] // 2 :] = 1  # not 255
-    (tmp_path / "half").mkdir()
-    cv2.imwrite(str(tmp_path / "half" / "all.png"), lower)
-    sources = (Source(masks, "masks", "ours"), Source(tmp_path / "half", "masks", "half"))
-    both = replace(study, sequences=("00",), sources=sources)
-    assert both.of_unknown_polarity() == ["half"]
-    panels = report.figure_sources(both, ["half"]).axes
-    drawn = {panel.get_title().partition(" keypoints")[0]: panel for panel in panels}
-    shown = drawn["half: mask"].images[-1].get_array()
-    assert (shown.min(), shown.max()) == (0, 255)
-    half = [panel for title, panel in drawn.items() if title.startswith("half")]
-    upper, lower = (panel.collections[0].get_offsets()[:, 1] for panel in half if panel.collections)
-    assert len(upper) and len(lower) and upper.max() < lower.min()
-    ours = [panel for title, panel in drawn.items() if title.startswith("ours")]
-    # the project's own masks are right
-    assert len(ours) == 3 and sum(len(panel.collections) for panel in ours) == 1
-
-
 def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
     done, study, small_labels, tmp_path, monkeypatch
 ):

@@ -50,14 +50,14 @@ def check_data(options: Any) -> int:
 
     Says what they hold, what is damaged, and what can be run.
     """
-    from thesis_repro.checks import check
+    from thesis_repro import checks
 
     roots = options.kitti, options.cityscapes, options.kitti_semantic
     if not any(roots):
         raise InputError(
             "no folder to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic"
         )
-    is_complete = check.report(*roots, options.deep)
+    is_complete = checks.report(*roots)
     return int(not is_complete)
 
 
@@ -116,7 +116,7 @@ def masks(options: Any) -> None:
         for width in sorted(set().union(*options.dilation or [(1,)]))
     ]
     _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
-    _warn(_print_oddities(sequence, mask_sets))
+    _warn(_check_masks(sequence, mask_sets))
     for label_masks in mask_sets:
         width = label_masks.dilation_width
         folder = options.folder
@@ -130,8 +130,7 @@ def masks(options: Any) -> None:
 def odometry(options: Any) -> None:
     """Run the visual odometry on one sequence; print its errors, number of keypoints and time."""
     _load_evo()
-    from thesis_repro import odometry
-    from thesis_repro.checks import oddities
+    from thesis_repro import checks, odometry
     from thesis_repro.data import kitti
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
@@ -157,15 +156,13 @@ def odometry(options: Any) -> None:
         sequence.folder,
         sequence.frame_paths[0].parent,
     )
-    _warn(_print_oddities(sequence, mask_sets))
+    _warn(_check_masks(sequence, mask_sets))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
         write_kitti_poses(options.output, result.poses)
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
-    if sequence.has_truth:
-        _warn(oddities.of_path(sequence.name, result.poses, sequence.poses))
-    _warn(oddities.of_steps(sequence.name, result.failed, len(sequence)))
+    _warn(checks.of_run(sequence.name, len(sequence), result.failed))
     record = run_record(result, sequence)
     if options.video:
         from thesis_repro.report import video
@@ -238,10 +235,10 @@ def study(options: Any) -> int:
     with console.logged(folder, options.command_line) as run, results.claimed(folder):
         warnings = []
         for sequence, masks in planned.shown_masks():
-            warnings += _print_oddities(sequence, masks)
+            warnings += _check_masks(sequence, masks)
         warnings = _warn(warnings)
         outcome = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += outcome.warnings + _warn(planned.path_oddities(outcome.table, folder))
+        warnings += outcome.warnings + _warn(planned.run_warnings(outcome.table))
         page = study.write(planned, outcome.table, folder, warnings)
         failed = ""
         if outcome.failed:
@@ -329,16 +326,15 @@ def _sequence(options: Any) -> Any:
     return sequence.subset(options.frames)
 
 
-def _print_oddities(sequence: Any, mask_sets: Iterable) -> list[str]:
+def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
-    from thesis_repro.checks import oddities
+    from thesis_repro import checks
 
-    warnings = oddities.of_sequence(sequence)
+    warnings = checks.of_sequence(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
-            line, mask_warnings = oddities.of_masks(masks, sequence)
-            console.log.info(one_line(line))
-            warnings += mask_warnings
+            console.log.info(one_line(checks.describe_masks(masks, sequence)))
+            warnings += checks.of_masks(masks, sequence)
     return warnings
 
 

@@ -1,17 +1,15 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
 import os
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
 import pandas as pd
 
-from thesis_repro.checks import oddities, polarity
+from thesis_repro import checks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.masks import MaskFolder
 from thesis_repro.running import results
 from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
@@ -93,23 +91,6 @@ class Study:
             for sequence in self.opened
         ]
 
-    def of_unknown_polarity(self) -> list[str]:
-        """Return the names of the sources whose ready-made masks may be inverted, or look so.
-
-        Their shape says on no sequence that they are right, or on one that they are inverted.
-        """
-        shapes: dict[str, set[str]] = {}
-        for _, sequence_masks in self.shown_masks():
-            for source, masks in zip(self.sources, sequence_masks, strict=True):
-                if isinstance(masks, MaskFolder):
-                    with suppress(InputError):  # the runs report a file that cannot be read
-                        shapes.setdefault(source.name, set()).add(oddities.polarity_of(masks))
-        return [
-            name
-            for name, found in shapes.items()
-            if polarity.RIGHT not in found or found & polarity.INVERTED.keys()
-        ]
-
     def shown_jobs(self, name: str) -> list[jobs.Job]:
         """Return the runs of a sequence whose paths are drawn.
 
@@ -124,19 +105,12 @@ class Study:
             shown.append(jobs.Job(name, "masked", width, estimator=estimator, source=source.name))
         return shown
 
-    def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
-        """Return the warnings of `oddities.of_steps` and `oddities.of_path`.
-
-        They are about one run with all keypoints of each sequence.
-        """
+    def run_warnings(self, runs: pd.DataFrame) -> list[str]:
+        """Return the warnings of `checks.of_run` about the first run of each sequence."""
         unshuffled = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)]
-        baselines = unshuffled.drop_duplicates("sequence")
         warnings = []
-        for run in baselines.itertuples():
-            warnings += oddities.of_steps(run.sequence, run.flagged, run.frames)
-        true = {sequence.name: sequence.poses for sequence in self.opened}
-        for (name, _), poses in runner.run_poses(baselines, folder / RUNS).items():
-            warnings += oddities.of_path(name, poses, true[name])
+        for run in unshuffled.drop_duplicates("sequence").itertuples():
+            warnings += checks.of_run(run.sequence, run.frames, run.flagged)
         return warnings
 
     def first_jobs(self) -> list[jobs.Job]:
