@@ -16,7 +16,7 @@ import numpy as np
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.masks import LabelMasks, MaskFolder, coverage, label_map_of
-from thesis_repro.running import console, files, results
+from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import read_settings
 
 # Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
@@ -244,4 +244,4 @@ def _class_shares(source: LabelMasks) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    console.run_main(lambda: sys.exit(main(Path(sys.argv[1]))))
+    messages.run_main(lambda: sys.exit(main(Path(sys.argv[1]))))
