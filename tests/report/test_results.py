@@ -14,7 +14,8 @@ from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, findings, style, texts
 from thesis_repro.report import tables as report_tables
-from thesis_repro.study import compare, thesis_tables
+from thesis import thesis_tables
+from thesis_repro.study import compare
 from thesis_repro.study.jobs import ESTIMATORS
 
 AHEAD = np.array([[0, 0, z] for z in range(4)])  # true positions, metres
@@ -92,7 +93,7 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     options = {"estimators": ["thesis"], "repetitions": 30, "noise": 0.2}
     shuffled = made_up.runs(ELEVEN, lambda *_: 1.0, baseline, **options)
     table = tables.table_of_change(runs, shuffled, "rmse", "thesis").set_index("sequence")
-    studies = thesis_tables.changes_if_masks_did_nothing(shuffled, 3, "rmse")
+    studies = thesis_tables.null_distribution(shuffled, 3, "rmse")
     null = table["change (%), one run each, if masks did nothing"]
     assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
     assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths

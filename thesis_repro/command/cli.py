@@ -67,7 +67,6 @@ def predict(options: Any) -> None:
     Label maps hold Cityscapes ids as 8-bit PNG, 320x320, named like the frames.
     """
     from thesis_repro.segmentation import quietly
-    from thesis_repro.study import workers
 
     images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
     # the name of a link, not of what it points to, because `study` looks for this name
@@ -89,13 +88,9 @@ def predict(options: Any) -> None:
     model_file = options.model or prediction.SHIPPED
     with messages.logged(options.folder, options.command_line) as run:
         new = 0
-        if options.dask:
-            with workers.open_pool(1, options.dask) as pool:
-                new = prediction.spread_label_maps(pool.run, model_file, sequences)
-        else:
-            model = training.load_model(model_file)
-            for paths, output in sequences:
-                new += prediction.write_label_maps(model, paths, output)
+        model = training.load_model(model_file)
+        for paths, output in sequences:
+            new += prediction.write_label_maps(model, paths, output)
         total = sum(len(paths) for paths, _ in sequences)
         lines = [f"{output}: {len(paths)} label maps" for paths, output in sequences]
         run.end("\n".join(lines), total - new)

@@ -1,23 +1,16 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
-import os
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
-import pandas as pd
-
-from thesis_repro.checks import oddities, polarity
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.masks import MaskFolder
 from thesis_repro.running import results
 from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
-LONGEST_NAME = 200  # bytes of a sequence's name, which results have in the names of their files
 RUNS = "runs"  # folder of the results of the runs
 
 
@@ -64,11 +57,6 @@ class Study:
                 raise InputError(
                     f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
                 )
-            if len(os.fsencode(sequence.name)) > LONGEST_NAME:
-                raise InputError(
-                    f"{sequence.folder}: its name is too long for names of files; make a link to it with "
-                    "a shorter one"
-                )
         widths = list(self.widths)
         if self.tested:
             widths.append(self.tested)
@@ -93,23 +81,6 @@ class Study:
             for sequence in self.opened
         ]
 
-    def of_unknown_polarity(self) -> list[str]:
-        """Return the names of the sources whose ready-made masks may be inverted, or look so.
-
-        Their shape says on no sequence that they are right, or on one that they are inverted.
-        """
-        shapes: dict[str, set[str]] = {}
-        for _, sequence_masks in self.shown_masks():
-            for source, masks in zip(self.sources, sequence_masks, strict=True):
-                if isinstance(masks, MaskFolder):
-                    with suppress(InputError):  # the runs report a file that cannot be read
-                        shapes.setdefault(source.name, set()).add(oddities.polarity_of(masks))
-        return [
-            name
-            for name, found in shapes.items()
-            if polarity.RIGHT not in found or found & polarity.INVERTED.keys()
-        ]
-
     def shown_jobs(self, name: str) -> list[jobs.Job]:
         """Return the runs of a sequence whose paths are drawn.
 
@@ -123,31 +94,6 @@ class Study:
             width = self.shown_width if source.has_label_maps else None
             shown.append(jobs.Job(name, "masked", width, estimator=estimator, source=source.name))
         return shown
-
-    def path_oddities(self, runs: pd.DataFrame, folder: Path) -> list[str]:
-        """Return the warnings of `oddities.of_steps` and `oddities.of_path`.
-
-        They are about one run with all keypoints of each sequence.
-        """
-        unshuffled = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)]
-        baselines = unshuffled.drop_duplicates("sequence")
-        warnings = []
-        for run in baselines.itertuples():
-            warnings += oddities.of_steps(run.sequence, run.flagged, run.frames)
-        true = {sequence.name: sequence.poses for sequence in self.opened}
-        for (name, _), poses in runner.run_poses(baselines, folder / RUNS).items():
-            warnings += oddities.of_path(name, poses, true[name])
-        return warnings
-
-    def first_jobs(self) -> list[jobs.Job]:
-        """Return the jobs that need no other results."""
-        return jobs.first_jobs(
-            self.opened,
-            dict.fromkeys(self.estimators, self.widths),
-            tested=self.tested,
-            sources=self.sources,
-            repetitions=self.repetitions,
-        )
 
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
         """Run the jobs whose results are not in the folder yet, see `runner.run_jobs`.
@@ -164,9 +110,18 @@ class Study:
         )
         with results.claimed(folder):
             results.stage(folder, replace=False, frames=self.frames)
-            first_jobs = self.first_jobs()
+            first_jobs = jobs.first_jobs(
+                self.opened,
+                dict.fromkeys(self.estimators, self.widths),
+                tested=self.tested,
+                sources=self.sources,
+                repetitions=self.repetitions,
+            )
             first = run_jobs(first_jobs)
-            self._check_runs(first.table)
+            if not (first.table["method"] == "masked").any():
+                raise InputError(
+                    "every run with masks failed (see above), so there is nothing to compare"
+                )
             if not self.tested:
                 return first
             more_jobs = runner.keypoint_controls(
@@ -180,10 +135,3 @@ class Study:
             both = run_jobs(first_jobs + more_jobs)
         # the second call counts the runs of the first one as kept
         return replace(both, made=both.made + first.made, kept=both.kept - first.made)
-
-    def _check_runs(self, runs: pd.DataFrame) -> None:
-        """Raise InputError if the runs leave nothing to compare."""
-        if not (runs["method"] == "masked").any():
-            raise InputError(
-                "every run with masks failed (see above), so there is nothing to compare"
-            )
