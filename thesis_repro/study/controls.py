@@ -14,7 +14,7 @@ import numpy as np
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.masks import MaskSettings, dilate
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.keypoints import SharedKeypoints
+from thesis_repro.odometry.odometry import detect
 from thesis_repro.study.sources import FileMasks, Source
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
@@ -142,14 +142,14 @@ def min_distance(sequence: Sequence, number: float) -> float:
     of the sequence, and is never below the distance of the thesis.
     """
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
-    frames = [(sequence.frame(index), SharedKeypoints()) for index in sample]
+    frames = [sequence.frame(index) for index in sample]
 
     def distance(steps: int) -> float:
         return round(THESIS.min_distance + steps * STEP, 6)
 
     def mean_number(steps: int) -> float:
         settings = replace(THESIS, min_distance=distance(steps))
-        numbers = [len(keypoints.detect(frame, settings)) for frame, keypoints in frames]
+        numbers = [len(detect(frame, settings)) for frame in frames]
         return float(np.mean(numbers))
 
     low, high = 0, round(min(sequence.size) / STEP)

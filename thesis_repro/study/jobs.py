@@ -161,7 +161,7 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
     """Return jobs that limit the detector to as many keypoints as the best masks leave.
 
     This is each sequence's mean number of keypoints at its best width (Figure 4.12). best: the
-    table of `thesis_tables.best_widths`.
+    table of `best_width.best_widths`.
     """
     jobs = []
     for name, number in best["mean_keypoints"].items():

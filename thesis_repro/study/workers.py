@@ -6,7 +6,7 @@ whose workers died.)
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, Executor
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -27,17 +27,11 @@ class Pool(NamedTuple):
     executor: Executor
 
     def run(self, function: Callable, calls: Iterable[tuple]) -> Iterator[Any]:
-        """Yield the results of calls, given by their arguments, in the order in which they end.
-
-        Raises InputError if a worker is lost.
-        """
+        """Yield the results of calls, which are tuples of arguments, in their order."""
         futures = [self.executor.submit(function, *call) for call in calls]
-        for future in as_completed(futures):
+        for future in futures:
             messages.check_stop()
-            try:
-                yield future.result()
-            except (BrokenExecutor, CancelledError):
-                raise InputError(LOST) from None
+            yield future.result()
 
 
 @contextmanager
@@ -45,12 +39,14 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """Open a pool on a Dask scheduler or, without one, on processes of this machine.
 
     processes: their number. scheduler: its address, "tcp://host:8786".
-    Raises InputError if the scheduler does not answer or has no workers.
+    Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
     """
     if scheduler_address(scheduler) is None:
         executor = get_reusable_executor(processes, initializer=messages.leave_ctrl_c_to_parent)
         try:
             yield Pool(processes, executor)
+        except BrokenExecutor:
+            raise InputError(LOST) from None
         except BaseException:
             executor.shutdown(kill_workers=True)
             raise
@@ -66,12 +62,13 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
             "'dask scheduler' and give the address that it prints, tcp://host:port"
         ) from None
     with client:
-        if not client.nthreads():
+        size = sum(client.nthreads().values())
+        if not size:
             raise InputError(
                 f"Dask scheduler {scheduler}: has no workers; start some with "
                 f"'dask worker {scheduler} --nthreads 1'"
             )
         try:
-            yield Pool(sum(client.nthreads().values()), client.get_executor(pure=False))
-        except KilledWorker:
+            yield Pool(size, client.get_executor(pure=False))
+        except (KilledWorker, CancelledError):
             raise InputError(LOST) from None
