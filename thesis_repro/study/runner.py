@@ -27,6 +27,18 @@ from thesis_repro.study.methods import METHODS, masks_of_method
 from thesis_repro.study.sources import Source, by_name
 from thesis_repro.study.workers import open_pool
 
+# rooms whose code decides the results
+CODE = (
+    "opencv_exact",
+    "thesis_repro.odometry",
+    "thesis_repro.masks",
+    "thesis_repro.data",
+    "thesis_repro.study.jobs",
+    "thesis_repro.study.methods",
+    "thesis_repro.study.controls",
+    "thesis_repro.study.sources",
+)
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -198,7 +210,7 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": results.digest_of_code("thesis_repro.odometry", "thesis_repro.study.jobs"),
+        "code": results.digest_of_code(*CODE),
         **results.made_with("opencv", "numpy", "numba"),
     }
 

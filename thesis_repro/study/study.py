@@ -7,7 +7,6 @@ from pathlib import Path
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import results
-from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
@@ -39,10 +38,8 @@ class Study:
 
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
-        if not 1 <= self.repetitions <= MOST_REPETITIONS:
-            raise InputError(
-                f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}"
-            )
+        if self.repetitions < 1:
+            raise InputError(f"--repetitions {self.repetitions}: must be 1 or more")
         if self.tested is not None and self.tested < 1:
             raise InputError(
                 f"--controls {self.tested}: must be a dilation width, 1 or more pixels"
