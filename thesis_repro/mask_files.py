@@ -20,7 +20,7 @@ from thesis_repro.masks import (
     forbidden,
 )
 from thesis_repro.running import results
-from thesis_repro.running.files import is_whole, listed, numbers_of, progress, read_gray, write_png
+from thesis_repro.running.files import listed, numbers_of, progress, read_gray, write_png
 
 
 class LabelMasks:
@@ -114,11 +114,11 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             **asdict(masks.settings),
             dilation_width=masks.dilation_width,
             frames=results.digest_of_files(masks.frame_paths),
-            code=results.digest_of_code("thesis_repro.masks"),
+            code=results.digest_of_code("thesis_repro.masks", "thesis_repro.data.cityscapes"),
             **results.made_with("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
-            if not is_whole(folder / path.name):
+            if not (folder / path.name).is_file():
                 write_png(folder / path.name, masks[index])
 
 
