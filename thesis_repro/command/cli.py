@@ -235,11 +235,11 @@ def study(options: Any) -> int:
             warnings += _print_oddities(sequence, masks)
         warnings = _warn(warnings)
         outcome = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += outcome.warnings + _warn(planned.path_oddities(outcome.table, folder))
+        warnings += outcome.warnings
         page = study.write(planned, outcome.table, folder, warnings)
         failed = ""
-        if outcome.failed:
-            failed = f", {outcome.failed:,} failed (see above)"
+        if outcome.failed_jobs:
+            failed = f", {outcome.failed_jobs:,} failed (see above)"
         run.end(f"{len(outcome.table):,} runs{failed}; open {page} in a browser", outcome.kept)
     return int(bool(failed))
 
