@@ -34,7 +34,7 @@ from thesis_repro.running import messages
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
-from thesis_repro.study import controls
+from thesis_repro.study import methods
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.sources import Source
 
@@ -136,12 +136,12 @@ def shared_cost(sequence):
 def mask_cost(sequence, labels):
     """Return CPU milliseconds a mask, for masks made together and one by one.
 
-    The masks are those of all widths and controls.
+    The masks are those of all widths and methods.
     """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        controls.masks_of_method(method, source, sequence, controls.LINE_WIDTH)
-        for method in controls.MASK_CONTROLS
+        methods.masks_of_method(method, source, sequence, methods.LINE_WIDTH)
+        for method in methods.MASK_CONTROLS
         if method != "true-labels"
     ]
     for index in range(len(sequence)):
