@@ -1,9 +1,11 @@
 """KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
+import re
 from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
-from functools import cached_property
+from decimal import Decimal
+from functools import cache, cached_property
 from itertools import pairwise
 from numbers import Integral
 from pathlib import Path
@@ -12,8 +14,15 @@ from statistics import median_low
 import numpy as np
 
 from thesis_repro.data import kitti_raw
-from thesis_repro.data.trajectories import read_poses, read_times, text_of
+from thesis_repro.data.trajectories import (
+    have_times,
+    read_poses,
+    read_poses_at,
+    read_times,
+    text_of,
+)
 from thesis_repro.errors import InputError, need
+from thesis_repro.running import messages
 from thesis_repro.running.files import images, numbers_of, read_gray
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
@@ -38,9 +47,8 @@ KNOWN_SIZES = {
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
+DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
-MAX_SPEED = 10_000  # metres a second
-MAX_FPS = 10_000  # frames a second
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
@@ -108,20 +116,40 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     cameras, inner = IMAGE_FOLDERS, ""
     if kitti_raw.is_drive(folder):
         cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
-    gray, color = (folder / name / inner for name in cameras[:2])
-    frame_folder = folder
+    names: tuple[str, ...] = cameras[:2]
     if camera is not None:
+        names = (camera,)
         if camera not in cameras:
             known = ", ".join(sorted(cameras))
             raise InputError(f"camera {camera!r}: unknown; choose one of {known}")
-        frame_folder = folder / camera / inner
-    elif gray.is_dir():
-        frame_folder = gray
-    elif color.is_dir():
-        frame_folder = color
-    if not frame_folder.is_dir():
-        raise InputError(f"{frame_folder}: no such folder; it must hold the frames")
-    return frame_folder
+    for name in names:
+        if (folder / name / inner).is_dir():
+            return folder / name / inner
+    if camera is not None or not folder.is_dir():
+        raise InputError(f"{folder / (camera or '')}: no such folder; it must hold the frames")
+    return folder
+
+
+def frames_in(folder: Path) -> list[Path]:
+    """Images of a folder in the order of their numbers.
+
+    Names such as 0.15 and 0.2 are ordered by value if they differ in their number of decimals.
+    """
+    paths = images(folder)
+    if not all(DECIMAL.fullmatch(path.stem) for path in paths):
+        return paths
+    if len({len(path.stem.partition(".")[2]) for path in paths}) > 1:
+        paths.sort(key=lambda path: Decimal(path.stem))
+        _say_once(
+            f"{folder}: frames are in the order of their names as decimal numbers, {paths[0].stem} to "
+            f"{paths[-1].stem}; if nanoseconds follow the dot, rename them to nine digits each"
+        )
+    return paths
+
+
+@cache
+def _say_once(line: str) -> None:
+    messages.log.info(line)
 
 
 def camera_of(frame_folder: Path) -> str:
@@ -157,6 +185,7 @@ class Sequence:
         camera: str | None = None,
         speed: float | None = None,
         fps: float | None = None,
+        truth: str | Path | None = None,
     ) -> None:
         """Find, read and check the files of a sequence, except its frames.
 
@@ -166,13 +195,16 @@ class Sequence:
         times.txt and poses.txt.
         camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence
         without ground truth; the default is one metre a frame. fps: frames a second, for a
-        sequence without times.txt.
+        sequence without times.txt. truth: file of the ground truth, in any form that poses.txt may
+        have.
         """
         need("sequence", name, str | Path)
         self.root, self.folder, self.poses_path = locate(root, name)
+        if truth is not None:
+            self.poses_path = Path(truth)
         self.name, self.speed = self.folder.name, speed
         frame_folder = images_of(self.folder, camera)
-        self.frame_paths = images(frame_folder)
+        self.frame_paths = frames_in(frame_folder)
         if not self.frame_paths:
             raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
         check_numbering(self.frame_paths)
@@ -180,10 +212,9 @@ class Sequence:
         self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
         self.has_times = times_path.exists()
         self.times = self._read_times(times_path, fps)
-        self.has_truth = self.poses_path.exists()
+        self.has_truth = truth is not None or self.poses_path.exists()
         if self.has_truth:
-            self._poses = truth_of(self.poses_path)
-            check_count(self.poses_path, len(self._poses), self.frame_paths)
+            self._read_truth(self.poses_path)
         if speed is not None:
             self._check_speed(speed, self.has_times or fps is not None)
 
@@ -191,14 +222,36 @@ class Sequence:
         if self.has_times:
             if fps is not None:
                 raise InputError(f"fps {fps:g}: leave it out; {path} has the times of the frames")
-            times = times_of(path)
+            read = kitti_raw.read_times if path.name == kitti_raw.TIMES else read_times
+            times = read(path)
             check_count(path, len(times), self.frame_paths)
             return times
         if fps is None:
+            _say_once(
+                f"{path}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives "
+                "another number)"
+            )
             return FRAME_TIME * np.arange(len(self))
-        if not 0 < fps <= MAX_FPS:
-            raise InputError(f"fps {fps:g}: must be above 0 and at most {MAX_FPS} frames a second")
+        if not 0 < fps < np.inf:
+            raise InputError(f"fps {fps:g}: must be a number of frames a second, above 0")
         return np.arange(len(self)) / fps
+
+    def _read_truth(self, path: Path) -> None:
+        """Read the ground truth. Frames before and after poses with times are left out."""
+        is_drive = path.match(kitti_raw.OXTS)
+        if is_drive or not have_times(path):
+            self._poses = kitti_raw.read_poses(self.folder) if is_drive else read_poses(path)
+            check_count(path, len(self._poses), self.frame_paths)
+            return
+        indices, self._poses = read_poses_at(path, self.times)
+        first, end = indices[0], indices[-1] + 1
+        if len(indices) < end - first:
+            gap = np.setdiff1d(np.arange(first, end), indices)[0]
+            raise InputError(f"{path}: {self.frame_paths[gap].name} has no pose within 0.01 s")
+        if len(indices) < len(self):
+            _say_once(f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used")
+        self.frame_paths = self.frame_paths[first:end]
+        self.times = self.times[first:end]
 
     def _check_speed(self, speed: float, has_times: bool) -> None:
         if self.has_truth:
@@ -210,8 +263,8 @@ class Sequence:
                 f"speed {speed}: needs the times of the frames (times.txt), or their number a second "
                 "(--fps)"
             )
-        if not 0 < speed <= MAX_SPEED:
-            raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s")
+        if not 0 < speed < np.inf:
+            raise InputError(f"speed {speed}: must be metres a second, above 0")
 
     @property
     def poses(self) -> np.ndarray:
@@ -240,9 +293,8 @@ class Sequence:
 
         Frames and calibration, and the files of times and poses if they exist.
         """
-        paths = list(self.frame_paths)
         texts = *texts_of(self.folder, self.frame_paths[0].parent), self.poses_path
-        paths += filter(Path.is_file, texts)
+        paths = [*self.frame_paths, *filter(Path.is_file, texts)]
         if kitti_raw.is_drive(self.folder):
             paths += kitti_raw.files(self.folder)
         return paths
@@ -261,8 +313,6 @@ class Sequence:
         line = f"sequence {self.name}: {len(self)} frames of {self.size[1]}x{self.size[0]}"
         if not self.has_truth:
             line += "; no ground truth, so step lengths follow from --speed, or are 1 m"
-        if not self.has_times:
-            line += f"; no times, so {1 / FRAME_TIME:g} frames a second"
         return line
 
     def __repr__(self) -> str:
@@ -306,7 +356,8 @@ class Sequence:
 def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]:
     """Root, folder and poses of a sequence.
 
-    The poses are a file, or the OXTS's folder of a raw drive. The arguments are those of Sequence.
+    The poses are root/poses/NN.txt or else poses.txt in the sequence's folder, or the OXTS's folder
+    of a raw drive. The arguments are those of Sequence.
     """
     folder = Path(name).resolve()
     poses = folder / "poses.txt"
@@ -323,26 +374,14 @@ def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]
         folder, poses = folder_of(root) / name, root / "poses" / f"{name}.txt"
     if kitti_raw.is_drive(folder):
         poses = folder / kitti_raw.OXTS
+    elif not poses.exists() and (folder / "poses.txt").exists():
+        poses = folder / "poses.txt"
     return root or folder.parent, folder, poses
 
 
 def name_of(root: str | Path, name: str) -> str:
     """Full name of a sequence, "06" for "6". Its results are stored under this name."""
     return locate(root, name)[1].name
-
-
-def truth_of(path: Path) -> np.ndarray:
-    """Ground truth, (n, 4, 4), from a file of poses, or from the folder of a raw drive's OXTS."""
-    if path.match(kitti_raw.OXTS):
-        return kitti_raw.read_poses(path.parents[1])
-    return read_poses(path)
-
-
-def times_of(path: Path) -> np.ndarray:
-    """Times, (n,), seconds, from a file of seconds, or from a raw drive's file of time stamps."""
-    if path.name == kitti_raw.TIMES:
-        return kitti_raw.read_times(path)
-    return read_times(path)
 
 
 def check_numbering(paths: list[Path]) -> None:
@@ -352,6 +391,8 @@ def check_numbering(paths: list[Path]) -> None:
     accepted, for example every fifth frame, or times.
     """
     numbers = numbers_of(paths) or []
+    if DECIMAL.fullmatch(paths[0].stem):
+        return
     steps = [after - before for before, after in pairwise(numbers)]
     if 0 in steps:
         first = steps.index(0)
