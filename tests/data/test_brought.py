@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thesis_repro.data import kitti, label_ids
+from thesis_repro.data import kitti, label_ids, mask_files
 from thesis_repro.data.cityscapes import COLORS, ID
 from thesis_repro.data.trajectories import read_poses, write_tum
 from thesis_repro.errors import InputError
@@ -168,3 +168,109 @@ def test_a_bad_line_of_a_table_is_named(tmp_path, text):
     (tmp_path / "ids.csv").write_text(text)
     with pytest.raises(InputError, match="ids.csv, line 2: "):
         label_ids.read_table(tmp_path / "ids.csv")
+
+
+CAMERA = "fx 50\nfy 51\ncx 32\ncy 24\nk1 -0.3\nk2 0.1\np1 0.01\np2 -0.02"
+NUMBERS = [float(line.split()[1]) for line in CAMERA.splitlines()]
+ORB_SLAM = "".join(f"Camera.{line.replace(' ', ': ')}\n" for line in CAMERA.splitlines())
+OPENCV = """camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 50., 0., 32., 0., 51., 24., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 4
+   dt: d
+   data: [ -0.3, 0.1, 0.01, -0.02 ]
+"""
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        ("camera.txt", " ".join(map(str, NUMBERS))),
+        ("camera.yaml", f"%YAML:1.0\n---\n{ORB_SLAM}"),
+        ("camera.yaml", f'%YAML:1.0\nCamera.type: "PinHole"\n{ORB_SLAM}'),
+        ("camera.yaml", ORB_SLAM.replace("Camera.", "Camera1.")),
+        ("camera.yml", f"%YAML:1.0\n---\n{OPENCV}"),
+    ],
+)
+def test_distortion_is_taken_out_as_opencv_does(own, name, text):
+    raw = kitti.Sequence(None, own).frame(2)
+    (own / "calib.txt").unlink()
+    (own / name).write_text(text)
+    sequence = kitti.Sequence(None, own, calibration=own / name)
+    assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 51, 24], [0, 0, 1]])
+    expected = cv2.undistort(raw, sequence.intrinsics, np.array(NUMBERS[4:]))
+    assert np.array_equal(sequence.frame(2), expected) and (expected != raw).any()
+    assert own / name in sequence.files
+    mask = np.where(raw > 99, np.uint8(255), np.uint8(0))
+    assert set(np.unique(sequence.undistorted(mask, cv2.INTER_NEAREST))) == {0, 255}
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        ("camera.txt", "50 50 32 24 0.1"),
+        ("camera.txt", "P0: 50 0 32"),
+        ("camera.yaml", "a: [1"),
+        ("camera.yaml", ORB_SLAM.replace("p1", "k3").replace("p2", "k4")),  # a fisheye camera
+    ],
+)
+def test_another_file_is_no_camera(own, name, text):
+    (own / name).write_text(text)
+    with pytest.raises(InputError, match=f"{name}: must hold fx fy cx cy"):
+        kitti.Sequence(None, own, calibration=own / name)
+
+
+def test_frames_of_16_bits_are_scaled_by_their_maximum(own, caplog):
+    caplog.set_level("INFO")
+    expected = [kitti.Sequence(None, own).frame(index) for index in range(4)]
+    for path, frame in zip(sorted(own.glob("*.png")), expected):
+        cv2.imwrite(str(path), frame.astype(np.uint16) * 16)
+    sequence = kitti.Sequence(None, own)
+    white = int(expected[0].max())
+    for index, frame in enumerate(sequence.frames()):
+        exact = np.minimum(expected[index].astype(float) * 255 / white, 255)
+        assert frame.dtype == np.uint8 and np.abs(frame - exact).max() <= 0.5
+    assert sum("16 bits" in line for line in caplog.messages) == 1
+    assert str(16 * white) in caplog.text
+
+
+BINARY = np.zeros((48, 64), np.uint8)
+BINARY[:36, 8:-8] = 255
+
+
+@pytest.mark.parametrize(
+    "name, pixels",
+    [
+        ("a.png", np.dstack([0 * BINARY, 0 * BINARY, 0 * BINARY, BINARY])),
+        ("a.png", np.dstack([BINARY | 255, BINARY | 255, BINARY | 255, BINARY])),
+        ("a.png", np.dstack([0 * BINARY, 0 * BINARY, BINARY])),
+        ("a.png", BINARY.astype(np.uint16) * 257),
+        ("a.png", BINARY // 255),
+        ("a.png", cv2.GaussianBlur(BINARY, (3, 3), 0.5)),
+        ("a.JPG", BINARY),
+    ],
+)
+def test_masks_of_other_tools(tmp_path, name, pixels):
+    data = cv2.imencode(name[1:].lower(), pixels)[1]
+    (tmp_path / name).write_bytes(data.tobytes())
+    path = mask_files.by_name(tmp_path)["a.png"]
+    assert path.name == name and np.array_equal(mask_files.read(path), BINARY)
+
+
+def test_what_is_no_mask_is_named(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, BINARY.shape, np.uint8)
+    for pixels, text in (
+        (np.dstack([noise, noise, noise, BINARY]), "a picture and an alpha channel"),
+        (noise, "gray.*--labels"),
+        (np.repeat([[23, 11, 7, 0]], 48, axis=0).astype(np.uint8), "50% .* gray"),
+    ):
+        cv2.imwrite(str(tmp_path / "a.png"), pixels)
+        with pytest.raises(InputError, match=f"a.png: .*{text}"):
+            mask_files.read(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="a.png: cannot be read"):
+        mask_files.read(tmp_path / "a.png")

@@ -11,9 +11,10 @@ from numbers import Integral
 from pathlib import Path
 from statistics import median_low
 
+import cv2
 import numpy as np
 
-from thesis_repro.data import kitti_raw
+from thesis_repro.data import cameras, kitti_raw
 from thesis_repro.data.trajectories import (
     have_times,
     read_poses,
@@ -186,6 +187,7 @@ class Sequence:
         speed: float | None = None,
         fps: float | None = None,
         truth: str | Path | None = None,
+        calibration: str | Path | None = None,
     ) -> None:
         """Find, read and check the files of a sequence, except its frames.
 
@@ -196,7 +198,8 @@ class Sequence:
         camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence
         without ground truth; the default is one metre a frame. fps: frames a second, for a
         sequence without times.txt. truth: file of the ground truth, in any form that poses.txt may
-        have.
+        have. calibration: file of a camera, see `cameras.read_camera`; its distortion is taken out
+        of the frames.
         """
         need("sequence", name, str | Path)
         self.root, self.folder, self.poses_path = locate(root, name)
@@ -209,7 +212,12 @@ class Sequence:
             raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
         check_numbering(self.frame_paths)
         self.calibration_path, times_path = texts_of(self.folder, frame_folder)
-        self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
+        self.distortion = np.empty(0)
+        if calibration is not None:
+            self.calibration_path = Path(calibration)
+            self.intrinsics, self.distortion = cameras.read_camera(calibration)
+        else:
+            self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
         self.has_times = times_path.exists()
         self.times = self._read_times(times_path, fps)
         self.has_truth = truth is not None or self.poses_path.exists()
@@ -245,9 +253,9 @@ class Sequence:
             return
         indices, self._poses = read_poses_at(path, self.times)
         first, end = indices[0], indices[-1] + 1
-        if len(indices) < end - first:
-            gap = np.setdiff1d(np.arange(first, end), indices)[0]
-            raise InputError(f"{path}: {self.frame_paths[gap].name} has no pose within 0.01 s")
+        gaps = np.setdiff1d(np.arange(first, end), indices)
+        if len(gaps):
+            raise InputError(f"{path}: {self.frame_paths[gaps[0]].name} has no pose within 0.01 s")
         if len(indices) < len(self):
             _say_once(f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used")
         self.frame_paths = self.frame_paths[first:end]
@@ -293,7 +301,8 @@ class Sequence:
 
         Frames and calibration, and the files of times and poses if they exist.
         """
-        texts = *texts_of(self.folder, self.frame_paths[0].parent), self.poses_path
+        _, times_path = texts_of(self.folder, self.frame_paths[0].parent)
+        texts = self.calibration_path, times_path, self.poses_path
         paths = [*self.frame_paths, *filter(Path.is_file, texts)]
         if kitti_raw.is_drive(self.folder):
             paths += kitti_raw.files(self.folder)
@@ -321,7 +330,7 @@ class Sequence:
     @cached_property
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
-        size = read_gray(self.frame_paths[0]).shape
+        size = self._read(self.frame_paths[0]).shape
         check_camera(self.calibration_path, self.intrinsics, self.frame_paths[0], size)
         return size
 
@@ -330,9 +339,36 @@ class Sequence:
 
         Raises InputError if it is unreadable or has another size.
         """
-        image = read_gray(self.frame_paths[index])
+        image = self._read(self.frame_paths[index])
         check_size(self.frame_paths[index], image.shape, self.size)
-        return image
+        return self.undistorted(image)
+
+    def _read(self, path: Path) -> np.ndarray:
+        if self._white is None:
+            return read_gray(path)
+        pixels = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH)
+        if pixels is None:
+            raise InputError(f"{path}: cannot be read; it is not a complete image")
+        return cv2.convertScaleAbs(pixels, alpha=255 / self._white)
+
+    @cached_property
+    def _white(self) -> int | None:
+        """Gray value that becomes 255, in frames of 16 bits: the largest one of the first frame."""
+        pixels = cv2.imread(str(self.frame_paths[0]), cv2.IMREAD_ANYDEPTH)
+        if pixels is None or pixels.dtype == np.uint8:
+            return None
+        white = max(int(pixels.max()), 1)
+        _say_once(f"{self.folder}: frames have 16 bits; {white}, the first one's maximum, is white")
+        return white
+
+    def undistorted(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+        """Image of the frame's size without the camera's distortion, as OpenCV takes it out.
+
+        Frames are so already. For masks and label maps made from files, give cv2.INTER_NEAREST.
+        """
+        if not self.distortion.any():
+            return image
+        return cameras.undistorted(image, self.intrinsics, self.distortion, interpolation)
 
     def frames(self) -> Iterator[np.ndarray]:
         """Yield the frames in order."""
@@ -385,32 +421,20 @@ def name_of(root: str | Path, name: str) -> str:
 
 
 def check_numbering(paths: list[Path]) -> None:
-    """Raise InputError if two frames have the same number, or if a number is missing.
+    """Raise InputError if frames count by one, and one is missing.
 
-    A number can be missing only if frames count by one. Names that do not count by one are
-    accepted, for example every fifth frame, or times.
+    Names that do not count by one are accepted, for example every fifth frame, or times.
     """
     numbers = numbers_of(paths) or []
-    if DECIMAL.fullmatch(paths[0].stem):
-        return
     steps = [after - before for before, after in pairwise(numbers)]
-    if 0 in steps:
-        first = steps.index(0)
-        raise InputError(
-            f"{paths[first + 1]}: has the same number as {paths[first].name}; remove one of them"
-        )
-    if len(steps) < 2 or median_low(steps) != 1:
+    if len(steps) < 2 or median_low(steps) != 1 or DECIMAL.fullmatch(paths[0].stem):
         return
     for number, step, path in zip(numbers, steps, paths):
-        if step != 1:
+        if step > 1:
             letters = path.stem.rstrip("0123456789")
             digits = min(len(path.stem) for path in paths) - len(letters)
             name = f"{letters}{number + 1:0{digits}d}{path.suffix}"
-            count = numbers[-1] - numbers[0] + 1 - len(paths)
-            raise InputError(
-                f"{path.with_name(name)}: this frame is missing ({count} are); the odometry needs all "
-                "frames"
-            )
+            raise InputError(f"{path.with_name(name)}: this frame is missing; all are needed")
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
