@@ -322,7 +322,6 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     Raises InputError if there are no images, or if frames of a sequence are missing.
     """
     from thesis_repro.data import kitti
-    from thesis_repro.running import files
 
     folders = [root]
     if root.is_dir() and not kitti.has_frames(root):
@@ -332,7 +331,7 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
         folders = kitti.folders_with_frames(parent) or [root]
     for folder in folders:
         image_folder = kitti.images_of(folder)
-        paths = files.images(image_folder)
+        paths = kitti.frames_in(image_folder)
         if not paths:
             raise InputError(f"{image_folder}: holds no PNG or JPEG images")
         if image_folder != folder:
