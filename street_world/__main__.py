@@ -1,7 +1,7 @@
 """`python -m street_world` renders the drives of the current settings, as notebook 5 does."""
 
 import street_world
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.settings import read_settings
 
 
@@ -19,4 +19,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

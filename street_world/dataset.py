@@ -17,7 +17,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 
 from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
-from thesis_repro.running import console, results
+from thesis_repro.running import messages, results
 from thesis_repro.running.files import is_whole, progress, write_png, write_text
 
 SEQUENCES = tuple(drives.DRIVES)
@@ -239,7 +239,7 @@ def _write_missing(missing: list[Picture], jobs: int) -> None:
         parallel = Parallel(
             n_jobs=workers,
             return_as="generator_unordered",
-            initializer=console.leave_ctrl_c_to_parent,
+            initializer=messages.leave_ctrl_c_to_parent,
         )
         # Ten at a time, because pictures of one sequence share its street.
         starts = range(1, len(missing), 10)

@@ -30,7 +30,7 @@ import tensorflow as tf
 from thesis_repro import masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
@@ -260,4 +260,4 @@ def main():
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

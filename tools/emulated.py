@@ -21,7 +21,7 @@ from pathlib import Path
 
 from thesis_repro import segmentation
 from thesis_repro.errors import InputError
-from thesis_repro.running import console
+from thesis_repro.running import messages
 
 EMULATOR = "qemu-x86_64"
 DIGEST = re.compile("[0-9a-f]{12}")
@@ -115,4 +115,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

@@ -20,7 +20,7 @@ from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.report import style, texts
-from thesis_repro.running import console, results
+from thesis_repro.running import messages, results
 from thesis_repro.running.files import needed, write_text
 from thesis_repro.running.settings import ROOT, read_settings
 from thesis_repro.study import jobs, runner
@@ -167,10 +167,10 @@ def main():
     folders = [("labels", None, Path(path)) for path in sys.argv[1:]]
     others = named(folders, masks.MaskSettings())
     folder = settings.build / "evidence"
-    with results.claimed(folder), console.logged(folder, "tables, plots and findings") as run:
+    with results.claimed(folder), messages.logged(folder, "tables, plots and findings") as run:
         write(settings, FOLDER, others)
         run.end(f"tables, plots and findings: {FOLDER}")
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

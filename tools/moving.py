@@ -22,7 +22,7 @@ from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.report import style, texts
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.settings import ROOT, cores
 from thesis_repro.study import ablations, compare, jobs, runner
 from thesis_repro.study.sources import Source
@@ -124,4 +124,4 @@ def main():
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

@@ -24,7 +24,7 @@ from keras import ops
 from street_world import dataset as world
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
-from thesis_repro.running import console, files, results
+from thesis_repro.running import files, messages, results
 from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 
@@ -332,4 +332,4 @@ def main(arguments=None):
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

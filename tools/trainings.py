@@ -19,7 +19,7 @@ import tensorflow as tf
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.report.trainings import TABLE
-from thesis_repro.running import console, files, results
+from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import read_settings
 from thesis_repro.segmentation import memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
@@ -175,4 +175,4 @@ def main():
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

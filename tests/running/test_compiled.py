@@ -10,7 +10,7 @@ import pytest
 from nbclient import NotebookClient
 
 from thesis_repro import errors
-from thesis_repro.running import compiled, console, folders
+from thesis_repro.running import compiled, folders, messages
 
 CALL = "from thesis_repro.odometry.outer import f; print(f(1.0))"
 OUTER = (
@@ -58,7 +58,7 @@ def project(tmp_path):
         folder.mkdir(parents=True)
     for folder in (running.parent, running, below.parent, below):
         (folder / "__init__.py").touch()
-    for module in (compiled, console, folders):
+    for module in (compiled, messages, folders):
         shutil.copy(module.__file__, running)
     shutil.copy(errors.__file__, running.parent)
     (below.parent / "outer.py").write_text(OUTER)

@@ -13,7 +13,7 @@ from thesis_repro import masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.segmentation import prediction, training
 from thesis_repro.study import compare, controls, runner, thesis_tables, timing, workers
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
@@ -124,7 +124,7 @@ def test_a_failed_run_is_reported_and_stops_no_other_run(
     shutil.copytree(small_labels, tmp_path / "labels")
     broken = tmp_path / "labels" / "00" / "000003.png"
     broken.write_bytes(broken.read_bytes()[:-20])
-    console.print_messages()
+    messages.print_messages()
     jobs = [
         *first_jobs(opened(small_world)[:1], {"thesis": WIDTHS}),
         Job("00", "true-labels", 10),

@@ -16,14 +16,14 @@ ROOT = Path(__file__).parents[2]
 TRAINING = f"""
 import sys
 sys.path[:0] = {[str(ROOT / "tests/segmentation"), str(ROOT / "tools")]!r}
-from thesis_repro.running import console, results
+from thesis_repro.running import messages, results
 from thesis_repro.segmentation import training
 import test_training
 try:
     folder = results.stage(sys.argv[1], **training.made_from(*test_training.prepared()))
     test_training.train(folder, 3, pause=0.1)
 except Exception as error:
-    sys.exit(console.report_error(error))
+    sys.exit(messages.report_error(error))
 """
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from thesis_repro.checks import oddities
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.running import console, files, results
+from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import Settings, read_settings
 
 
@@ -275,4 +275,4 @@ def _used_files(
 
 
 if __name__ == "__main__":
-    console.run_main(lambda: sys.exit(main(Path(sys.argv[1]))))
+    messages.run_main(lambda: sys.exit(main(Path(sys.argv[1]))))

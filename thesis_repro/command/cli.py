@@ -15,7 +15,7 @@ from typing import Any
 
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
 from thesis_repro.errors import InputError, missing_package, one_line
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.settings import PROFILES, SEED, check_outside
 
 # options that name an output file: its content, and the endings that its name may have (none given:
@@ -36,7 +36,7 @@ def synthesize(options: Any) -> None:
     """Write the embedded world, a rendered street, in the layouts of KITTI and Cityscapes."""
     import street_world
 
-    with console.logged(options.out, options.command_line) as run:
+    with messages.logged(options.out, options.command_line) as run:
         new, total = street_world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
         run.end(
             f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
@@ -87,7 +87,7 @@ def predict(options: Any) -> None:
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
     model_file = options.model or prediction.SHIPPED
-    with console.logged(options.folder, options.command_line) as run:
+    with messages.logged(options.folder, options.command_line) as run:
         new = 0
         if options.dask:
             with workers.open_pool(1, options.dask) as pool:
@@ -235,7 +235,7 @@ def study(options: Any) -> int:
     # this import takes seconds, so the input is checked first
     from thesis_repro.report import study
 
-    with console.logged(folder, options.command_line) as run, results.claimed(folder):
+    with messages.logged(folder, options.command_line) as run, results.claimed(folder):
         warnings = []
         for sequence, masks in planned.shown_masks():
             warnings += _print_oddities(sequence, masks)
@@ -337,7 +337,7 @@ def _print_oddities(sequence: Any, mask_sets: Iterable) -> list[str]:
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             line, mask_warnings = oddities.of_masks(masks, sequence)
-            console.log.info(one_line(line))
+            messages.log.info(one_line(line))
             warnings += mask_warnings
     return warnings
 
@@ -350,7 +350,7 @@ def _warn(lines: Iterable[str]) -> list[str]:
         places.setdefault(fault, []).append(place)
     merged = [f"{', '.join(names)}: {fault}" for fault, names in places.items()]
     for line in merged:
-        console.log.warning(one_line(line))
+        messages.log.warning(one_line(line))
     return merged
 
 
@@ -470,7 +470,7 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
         text = texts.render(template, record=record, **values).rstrip()
     print(text)
     for name, path in _output_files(options).items():
-        console.log.info(one_line(f"{path}: {OUTPUT_FILES[name][0]}"))
+        messages.log.info(one_line(f"{path}: {OUTPUT_FILES[name][0]}"))
 
 
 def _replace_closed_streams() -> None:
@@ -487,18 +487,18 @@ def main(arguments: list[str] | None = None) -> int:
         arguments = sys.argv[1:]
     options = build_parser(COMMANDS).parse_args(arguments)
     options.command_line = shlex.join(["thesis-repro", *arguments])
-    console.print_messages()
+    messages.print_messages()
     try:
         try:
             os.getcwd()
         except FileNotFoundError:
             raise InputError("the working folder was deleted; change to another one") from None
-        with console.stoppable():
-            console.check_environment()
+        with messages.stoppable():
+            messages.check_environment()
             gigabytes = 2
             if options.function is predict:
                 gigabytes = 4
-            console.need_addresses(gigabytes)
+            messages.need_addresses(gigabytes)
             code = options.function(options) or 0
             sys.stdout.flush()
             return code
@@ -506,9 +506,9 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except ImportError as error:
-        return console.report_error(missing_package(error) or error)
+        return messages.report_error(missing_package(error) or error)
     except Exception as error:
-        return console.report_error(error)
+        return messages.report_error(error)
     except KeyboardInterrupt as stop:
         with suppress(OSError):  # the terminal may be gone
             print("stopped; run the same command again to resume", file=sys.stderr)

@@ -28,7 +28,7 @@ from nbclient.exceptions import CellExecutionError, DeadKernelError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import ExecutePreprocessor
 
-from thesis_repro.running import console, results
+from thesis_repro.running import messages, results
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import PREFIX
 
@@ -56,11 +56,11 @@ class Execution(ExecutePreprocessor):
         self, nb: Any, resources: Any = None, km: Any = None
     ) -> tuple[Any, dict[str, Any]]:
         """Execute the notebook `nb`, as nbconvert asks for."""
-        console.print_messages()
+        messages.print_messages()
         # so that the kernel ends with this program, and this program with make: the parent of the
         # shell that runs it
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        console.interrupt_without(os.getppid())
+        messages.interrupt_without(os.getppid())
         name = resources["metadata"]["name"]
         path = self.log_file
         started = time.monotonic()
@@ -69,18 +69,18 @@ class Execution(ExecutePreprocessor):
             path.touch()
             with (
                 results.locked(path),
-                console.logged(path.parent, f"make figures, {name}", has_results=True),
+                messages.logged(path.parent, f"make figures, {name}", has_results=True),
                 open(path, "w", encoding="utf-8") as self._log,
             ):
-                console.log.info(name)
+                messages.log.info(name)
                 try:
                     executed = super().preprocess(nb, resources, km)
-                    console.log.info(f"{name}: done in {time.monotonic() - started:.0f} s")
+                    messages.log.info(f"{name}: done in {time.monotonic() - started:.0f} s")
                     return executed
                 except Exception as error:
                     self._log.write(strip_ansi(traceback.format_exc()))
                     failure = f"{name} failed: {_reason(error)}"
-                    console.log.error(failure)
+                    messages.log.error(failure)
         except KeyboardInterrupt:
             logging.getLogger("asyncio").disabled = True  # would report the interrupted cell
             print(f"{name} was interrupted; the same command resumes it", file=sys.stderr)
@@ -114,7 +114,7 @@ class Execution(ExecutePreprocessor):
             env=environment,
             stdout=self._log,
             stderr=self._log,
-            preexec_fn=console.end_with_parent,
+            preexec_fn=messages.end_with_parent,
             **options,
         )
 
@@ -146,4 +146,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

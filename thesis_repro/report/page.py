@@ -22,7 +22,7 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from thesis_repro.report import captions, tables, texts, trainings
-from thesis_repro.running import console, results
+from thesis_repro.running import messages, results
 from thesis_repro.running.files import listed, write_text
 from thesis_repro.running.settings import ROOT, Settings, read_settings
 
@@ -356,4 +356,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    console.run_main(main)
+    messages.run_main(main)

@@ -21,7 +21,7 @@ from thesis_repro.odometry import (
 )
 from thesis_repro.odometry.passes import Masks
 from thesis_repro.report.style import BASELINE, TRUTH, applied
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.files import atomic, progress
 
 # colours as blue, green, red
@@ -138,7 +138,7 @@ def write_video(
     with atomic(path) as temporary:
         for picture in pictures(sequence, settings, masks):
             if not writer.isOpened():
-                with console.quiet():  # OpenCV looks for the codec's tag, which WebM does not use
+                with messages.quiet():  # OpenCV looks for the codec's tag, which WebM does not use
                     vp8, size = cv2.VideoWriter_fourcc(*"VP80"), picture.shape[1::-1]
                     writer.open(str(temporary), cv2.CAP_FFMPEG, vp8, 1 / frame_time, size)
             writer.write(picture)

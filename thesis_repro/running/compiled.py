@@ -10,7 +10,7 @@ from typing import Any
 import numba
 from numba.extending import is_jitted
 
-from thesis_repro.running import console
+from thesis_repro.running import messages
 
 DIGEST_NAME = "compiled-from"  # a file in each folder of Numba's cache
 _PACKAGE = Path(__file__).parents[1]
@@ -70,7 +70,7 @@ def _check_cache_before_use(dispatcher: Any, room: Path) -> None:
 
     @wraps(load_or_compile)
     def check_and_compile(types: Any) -> Any:
-        with console.held_signals():
+        with messages.held_signals():
             _forget_stale_once(Path(dispatcher.stats.cache_path), room)
             return load_or_compile(types)
 

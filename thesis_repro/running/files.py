@@ -18,7 +18,7 @@ from tqdm import tqdm
 from tqdm.utils import ObjectWrapper
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.folders import holds_results
 
 # matches the names that `temporary_path` returns
@@ -226,7 +226,7 @@ def atomic(path: str | Path) -> Iterator[Path]:
             os.fsync(file.fileno())  # otherwise a crash of the system could leave an empty file
         os.replace(temporary, target)
     except Exception as error:
-        number, name = console.number_of(error), getattr(error, "filename", None)
+        number, name = messages.number_of(error), getattr(error, "filename", None)
         if number is None or name not in (None, str(temporary), temporary):
             raise
         # instead of the temporary name or none

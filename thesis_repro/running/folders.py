@@ -1,12 +1,12 @@
 """What stands in a folder of results beside them: the record of their inputs, digests, and the log.
 
-This module imports only the standard library, as `console` does.
+This module imports only the standard library, as `messages` does.
 """
 
 from pathlib import Path
 
 RECORD = "made-from.json"  # see `results.stage`
-LOG = "log.txt"  # see `console.logged`
+LOG = "log.txt"  # see `messages.logged`
 DIGESTS = "digests.txt"  # of tables, see `results.write_table`
 
 

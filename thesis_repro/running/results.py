@@ -27,7 +27,7 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.files import TEMPORARY, atomic, progress, write_text
 from thesis_repro.running.folders import DIGESTS, LOG, RECORD
 from thesis_repro.running.settings import ROOT
@@ -86,7 +86,7 @@ def _move_aside(folder: Path, changed: str) -> None:
     aside.mkdir()
     for path in paths:
         path.rename(aside / path.name)
-    console.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
+    messages.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
 
 
 def _unused(path: Path) -> Path:
@@ -216,7 +216,7 @@ def has_table(path: str | Path) -> bool:
         return True
     aside = _unused(path)
     path.rename(aside)
-    console.log.warning(f"{path}: was changed; moved to {aside.name}, to be made again")
+    messages.log.warning(f"{path}: was changed; moved to {aside.name}, to be made again")
     return False
 
 
@@ -340,7 +340,7 @@ def _drop_words(tree: ast.Module) -> None:
 def _says_something(function: ast.expr) -> bool:
     if isinstance(function, ast.Name):
         return function.id == "InputError"
-    return isinstance(function, ast.Attribute) and ast.unparse(function).startswith("console.log.")
+    return isinstance(function, ast.Attribute) and ast.unparse(function).startswith("messages.log.")
 
 
 def _is_no_code(statement: ast.stmt) -> bool:

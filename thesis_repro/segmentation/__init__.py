@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import console
+from thesis_repro.running import messages
 
 # Settings that give the same bits on x86 processors with AVX2, together with `exact.same_bits`.
 ARITHMETIC = {
@@ -67,7 +67,7 @@ def quietly() -> Iterator[None]:
     """
     if sys.flags.optimize > 1:
         raise InputError("python -OO: the segmentation's libraries need docstrings; use python -O")
-    with console.quiet():
+    with messages.quiet():
         yield
         if not any(map(os.path.exists, GPUS)):
             sys.modules["tensorflow"].config.list_physical_devices()

@@ -14,7 +14,7 @@ import tensorflow as tf
 from thesis_repro import segmentation
 from thesis_repro.data.cityscapes import read_image
 from thesis_repro.errors import InputError
-from thesis_repro.running import console, files, results
+from thesis_repro.running import files, messages, results
 from thesis_repro.segmentation import memory, training
 
 SIZE = 320  # height and width of written label maps, pixels
@@ -200,7 +200,7 @@ def _write_part(
         results.check_worker(folder, record, model=training.weights_digest(model), **_arithmetic())
         _write_batches(model, batches, lambda count: None)
     except Exception as error:  # the other parts continue, and the caller reports the reason
-        return console.explain(error) or f"{type(error).__name__}: {error}"
+        return messages.explain(error) or f"{type(error).__name__}: {error}"
     return None
 
 

@@ -20,7 +20,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.odometry.passes import is_flagged, poses_of
-from thesis_repro.running import console, results
+from thesis_repro.running import messages, results
 from thesis_repro.running.files import listed, progress
 from thesis_repro.study import compare, controls, workers
 from thesis_repro.study.jobs import (
@@ -182,7 +182,7 @@ def _run_passes(
             frames.append(len(pass_jobs) * len(sequence))
         with progress(None, "odometry", total=sum(frames), unit="frame") as bar:
             for index, pass_failures in pool.run(_run_pass, calls):
-                console.check_stop()
+                messages.check_stop()
                 if isinstance(pass_failures, str):  # the reason why the call was lost
                     pass_failures = dict.fromkeys(passes[index], Failure(pass_failures))
                 failures |= pass_failures
@@ -204,7 +204,7 @@ def _report(failures: Mapping[Job, Failure]) -> list[str]:
         if len(runs) > 3:
             shown += f" and {len(runs) - 3} more"
         lines.append(f"sequence {name}, {shown}: failed: {reason}")
-        console.log.warning(lines[-1])
+        messages.log.warning(lines[-1])
     for failure in failures.values():
         if failure.by_machine:  # a study without these runs could mislead
             raise InputError(failure.reason)
@@ -376,7 +376,7 @@ def _unfinished(jobs: Iterable[Job], folder: Path) -> list[Job]:
 
 
 def _failure_of(error: Exception) -> Failure:
-    reason = console.explain(error)
+    reason = messages.explain(error)
     if reason is None:
         return Failure(f"{type(error).__name__}: {error}")
     return Failure(reason, by_machine=not isinstance(error, InputError))

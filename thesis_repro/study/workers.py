@@ -14,7 +14,7 @@ import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import console
+from thesis_repro.running import messages
 from thesis_repro.running.settings import scheduler_address
 
 TIMEOUT = 8  # seconds that a scheduler has to answer
@@ -70,20 +70,20 @@ def _here(size: int, function: Callable, calls: Calls) -> Results:
         n_jobs=size,
         return_as="generator_unordered",
         initializer=_start_process,
-        initargs=(console.prints_messages(),),
+        initargs=(messages.prints_messages(),),
     )
     numbered = joblib.delayed(_numbered)
     work = (numbered(index, function, call) for index, call in enumerate(calls))
     try:
         yield from parallel(work)
     except TerminatedWorkerError:
-        raise InputError(console.WORKER_KILLED) from None
+        raise InputError(messages.WORKER_KILLED) from None
 
 
 def _start_process(prints_messages: bool) -> None:
-    console.leave_ctrl_c_to_parent()
+    messages.leave_ctrl_c_to_parent()
     if prints_messages:
-        console.print_messages()
+        messages.print_messages()
 
 
 def _numbered(index: int, function: Callable, call: tuple) -> tuple[int, Any]:

@@ -18,7 +18,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.running import compiled, console, files, folders, results
+from thesis_repro.running import compiled, files, folders, messages, results
 
 
 def test_a_stage_keeps_results_of_the_same_inputs(tmp_path):
@@ -122,9 +122,9 @@ def test_changed_code_changes_its_digest(version, changed):
 
 def test_other_messages_do_not_change_the_digest_of_code(version):
     code = (
-        "def g(x):\n    if x:\n        raise InputError(f'{x}: bad')\n    console.log.info('so')\n"
+        "def g(x):\n    if x:\n        raise InputError(f'{x}: bad')\n    messages.log.info('so')\n"
     )
-    same = "def g(x):\n    if x:\n        raise InputError('worse')\n    console.log.info('not')\n"
+    same = "def g(x):\n    if x:\n        raise InputError('worse')\n    messages.log.info('not')\n"
     other = code.replace("if x", "if not x")
     digests = [version(changed={"room/chair": text}) for text in (code, same, other)]
     assert digests[0] == digests[1] != digests[2]
@@ -180,7 +180,7 @@ def test_digests_of_files_change_with_the_bytes_and_are_cached(tmp_path, monkeyp
 def test_results_of_other_inputs_move_aside_with_all_that_was_added(tmp_path, capsys, monkeypatch):
     folder = results.stage(tmp_path / "a", size=3)
     monkeypatch.chdir(folder)
-    console.print_messages()
+    messages.print_messages()
     for size in (3, 4, 5):
         results.stage(".", size=size)  # "." has no name
         files.write_text(folder / "in" / "result", f"result of {size}")
@@ -298,11 +298,11 @@ NOT_CLOSED.__context__ = OSError(errno.ENOSPC, "x", "a.npz")
     ],
 )
 def test_errors_of_the_machine_are_one_line(error, says, capsys):
-    assert console.report_error(error) == 1
+    assert messages.report_error(error) == 1
     line = capsys.readouterr().err
     assert line.startswith("error: ") and says in line and line.count("\n") == 1
     with pytest.raises(ZeroDivisionError):  # unexpected errors are raised
-        console.report_error(ZeroDivisionError("1/0"))
+        messages.report_error(ZeroDivisionError("1/0"))
 
 
 @pytest.mark.parametrize("named", [False, True])
@@ -317,11 +317,11 @@ def test_a_full_disk_names_the_file_and_not_the_temporary_file(tmp_path, named):
 
 def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
     warnings.simplefilter("always")  # pytest restores the filters
-    console.print_messages()
-    with pytest.raises(InputError), console.logged(tmp_path / "out", "thesis-repro study") as run:
+    messages.print_messages()
+    with pytest.raises(InputError), messages.logged(tmp_path / "out", "thesis-repro study") as run:
         results.stage(tmp_path / "out", size=3)
         warnings.warn("odd", stacklevel=1)
-        console.log.warning("sequence 00 failed")
+        messages.log.warning("sequence 00 failed")
         run.end("3 runs")
         raise InputError("bad")
     printed = capsys.readouterr()
@@ -330,7 +330,7 @@ def test_a_log_has_messages_warnings_and_the_error(tmp_path, capsys):
     assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
     assert any("WARNING" in line and "odd" in line for line in lines)
     handlers = logging.getLogger("thesis_repro").handlers
-    assert not any(isinstance(handler, console._LogFile) for handler in handlers)
+    assert not any(isinstance(handler, messages._LogFile) for handler in handlers)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -339,7 +339,7 @@ def test_a_signal_that_compiled_code_loses_stops_at_the_next_frame(tiny_kitti, n
     """Exceptions are lost in callbacks of C, as while Numba compiles."""
     # shells start background jobs with SIGINT ignored, which `stoppable` respects
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    with pytest.raises(KeyboardInterrupt), console.stoppable():
+    with pytest.raises(KeyboardInterrupt), messages.stoppable():
         ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
         with pytest.raises(KeyboardInterrupt):
             odometry.run(Sequence(tiny_kitti, "00"))
@@ -408,8 +408,8 @@ def test_a_run_in_a_thread_leaves_signals_alone(tiny_kitti):
 def test_a_variable_that_a_library_would_fail_with_is_named(monkeypatch, name, good, bad):
     monkeypatch.setenv("MPLBACKEND", "bogus")
     monkeypatch.setenv(name, good)
-    console.check_environment()
+    messages.check_environment()
     assert os.environ["MPLBACKEND"] == "agg"
     monkeypatch.setenv(name, bad)
     with pytest.raises(InputError, match=f"{name}={bad}"):
-        console.check_environment()
+        messages.check_environment()
