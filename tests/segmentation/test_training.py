@@ -7,7 +7,6 @@ import sys
 import time
 from pathlib import Path
 
-import albumentations as A
 import keras
 import numpy as np
 import pandas as pd
@@ -57,38 +56,34 @@ def prepared(sets=SETS, filters=2, rate=0.01, loss=None):
     model = network(filters)
     loss = training.fused_loss(loss or training.total_loss())
     model.compile(keras.optimizers.Adam(rate), loss, metrics=training.metrics())
-    augmented = augmentation.augment_set(*sets[:2], augmentation.training_transforms(SIZE), 0)
+    augmented = augmentation.augment_set(*sets[:2], augmentation.training_augmenter(SIZE), 0)
     batches = training.Batches([sets[:2], augmented], 4, seed=0)
     return model, batches, training.Batches([sets[2:]], 4)
 
 
-class Pause(keras.callbacks.Callback):
-    """Wait after each batch, which leaves time to kill the process, or interrupt one batch."""
-
-    def __init__(self, seconds=0, at=None):
-        super().__init__()
-        self.seconds, self.at, self.epoch = seconds, at, 0
-
-    def on_epoch_begin(self, epoch, logs=None):
-        self.epoch = epoch
-
-    def on_train_batch_end(self, batch, logs=None):
-        time.sleep(self.seconds)
-        if (self.epoch, batch) == self.at:
-            self.at = None  # only once
-            raise KeyboardInterrupt
-
-
 def fit(folder, epochs=3, patience=5, pause=0, interrupted=None, **options):
-    """Return a function that runs the fit of notebook 4 and returns the history."""
+    """Return a function that runs the fit of notebook 4 and returns the history.
+
+    pause: seconds after each batch, which leave time to kill the process. interrupted: the number
+    of batches until Ctrl-C.
+    """
     model, batches, validation = prepared(**options)
     stop = keras.callbacks.EarlyStopping(patience=patience)
     best = keras.callbacks.ModelCheckpoint(folder / training.MODEL, save_best_only=True)
     resumable = training.ResumableTraining(folder, batches, [stop, best])
-    callbacks = [stop, best, Pause(pause, interrupted), resumable]
+    seen = []
+
+    def end_of_batch(batch, logs):
+        time.sleep(pause)
+        seen.append(batch)
+        if len(seen) == interrupted:
+            raise KeyboardInterrupt
+
+    wait = keras.callbacks.LambdaCallback(on_train_batch_end=end_of_batch)
     shown = {"validation_data": validation.dataset(), "verbose": 0, "shuffle": False}
 
     def run():
+        callbacks = [stop, best, wait, resumable]
         model.fit(batches.dataset(), epochs=epochs, callbacks=callbacks, **shown)
         return resumable.history
 
@@ -114,17 +109,12 @@ def assert_same(folder, other):
     assert all(map(np.array_equal, *both))
 
 
-def test_history_and_best_model(trained):
+def test_the_best_model_has_the_lowest_validation_loss(trained):
     history = pd.read_csv(trained / "history.csv")
-    assert history["epoch"].tolist() == [1, 2, 3]
-    names = {"loss", "iou_score", "f1-score"}
-    assert names | {f"val_{name}" for name in names} < set(history.columns)
     assert history["loss"].iloc[-1] < history["loss"].iloc[0]
-    # the model in the folder is the one with the lowest validation loss
-    _, _, validation = prepared()
     model = training.load_model(trained / "model.keras")
     model.compile("adam", training.total_loss())
-    lowest = model.evaluate(validation.dataset(), verbose=0)
+    lowest = model.evaluate(prepared()[2].dataset(), verbose=0)
     assert lowest == pytest.approx(history["val_loss"].min(), abs=1e-5)
 
 
@@ -170,13 +160,13 @@ def test_the_network_gets_raw_grey_levels_and_one_hot_masks():
     labels[0, 0] = augmentation.NOTHING
     (images, masks), *_ = training.Batches([(SETS[0], labels)], 4).dataset()
     assert np.array_equal(images.numpy(), SETS[0][:4].astype(np.float32))
-    assert np.array_equal(masks.numpy(), augmentation.one_hot(labels[:4], 35))
+    assert np.array_equal(masks.numpy().argmax(-1), np.where(labels[:4] == 255, 0, labels[:4]))
     assert not masks.numpy()[0, 0].any()
 
 
 def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
     sets = [SETS[:2], (np.zeros_like(SETS[0]), SETS[1])]
-    transforms = augmentation.training_transforms(SIZE)
+    transforms = augmentation.training_augmenter(SIZE)
     batches, changed = training.Batches(sets, 18, seed=0, transforms=transforms), []
     for batches.epoch in (0, 1):
         images = {image.tobytes() for image in next(iter(batches))[0]}
@@ -187,19 +177,7 @@ def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
     assert fresh.tobytes() in changed[1]
 
 
-def test_a_killed_training_resumes_and_ends_the_same(trained, tmp_path, kill_when):
-    code = (
-        f"import sys; sys.path[:0] = {FOLDERS}; "
-        "from thesis_repro import segmentation; import test_training as t; "
-        f"t.train(t.Path({str(tmp_path)!r}), pause=0.1)"
-    )
-    kill_when([sys.executable, "-c", code], (tmp_path / "history.csv").exists)
-    assert len(pd.read_csv(tmp_path / "history.csv")) < 3
-    assert train(tmp_path)["epoch"].tolist() == [1, 2, 3]
-    assert_same(tmp_path, trained)
-
-
-@pytest.mark.parametrize("at", [(0, 1), (2, 0)])
+@pytest.mark.parametrize("at", [2, 12])
 def test_an_interrupted_training_goes_on_in_the_same_kernel(trained, tmp_path, at):
     run = fit(tmp_path, interrupted=at)
     with pytest.raises(KeyboardInterrupt):
@@ -228,21 +206,14 @@ def test_early_stopping_keeps_the_best_and_stays_stopped(tmp_path):
 
 
 def test_every_change_of_a_training_changes_its_record():
+    records = [training.made_from(*prepared())]
+    for change in ({"rate": 0.02}, {"filters": 4}, {"loss": sm.losses.DiceLoss()}):
+        records.append(training.made_from(*prepared(**change)))  # noqa: PERF401
     model, batches, validation = prepared()
-    images, labels = SETS[:2]
-    transforms = augmentation.training_transforms(SIZE)
-    others = [
-        training.Batches([SETS[:2]], 4, 0),
-        training.Batches([SETS[:2]], 4, 1),
-        training.Batches([SETS[:2]], 5, 0),
-        training.Batches([(images // 2, labels)], 4, 0),
-        training.Batches([SETS[:2], SETS[:2]], 4, 0, transforms),
-    ]
-    records = [training.made_from(model, other, validation) for other in (batches, *others)]
-    for options in ({"rate": 0.02}, {"filters": 4}, {"loss": sm.losses.DiceLoss()}):
-        records.append(training.made_from(prepared(**options)[0], batches, validation))
+    for other in ([SETS[:2]], 4, 1), ([SETS[:2]], 5, 0), ([(SETS[0] // 2, SETS[1])], 4, 0):
+        records.append(training.made_from(model, training.Batches(*other), validation))  # noqa: PERF401
     assert len({str(record) for record in records}) == len(records)
-    assert training.made_from(*prepared()) == records[0]
+    assert training.made_from(model, batches, validation) == records[0]
 
 
 SETS_REFUSED = {
@@ -257,26 +228,6 @@ SETS_REFUSED = {
 def test_sets_that_cannot_be_trained_on_are_refused(kind):
     with pytest.raises(InputError):
         training.Batches([SETS_REFUSED[kind]], 4)
-
-
-def test_fresh_copies_that_are_no_gray_levels_are_refused():
-    floats = A.Compose([A.ToFloat()])
-    batches = training.Batches([SETS[:2], SETS[:2]], 18, 0, floats)
-    with pytest.raises(InputError, match="float32"):
-        next(iter(batches))
-
-
-def test_the_appendixs_hdf5_loads(trained, tmp_path):
-    model = training.load_model(trained / "model.keras")
-    loss, scores = training.total_loss(), training.metrics()
-    model.compile("adam", loss, metrics=scores)
-    model.save(tmp_path / "model.hdf5")
-    x, y = SETS[2].astype(np.float32), augmentation.one_hot(SETS[3], 35)
-    # with loss and metrics, as in the appendix
-    objects = {loss.name: loss} | {score.name: score for score in scores}
-    with_loss = keras.models.load_model(tmp_path / "model.hdf5", custom_objects=objects)
-    assert with_loss.evaluate(x, y, verbose=0) == pytest.approx(model.evaluate(x, y, verbose=0))
-    assert np.array_equal(training.load_model(tmp_path / "model.hdf5")(x), model(x))
 
 
 # equal on AMD Zen 3, on an Intel Xeon with AVX-512 and in QEMU

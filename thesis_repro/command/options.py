@@ -202,7 +202,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         ),
     },
     "predict": {
-        **_shared("--frames", "--dask", "--output"),
+        **_shared("--frames", "--output"),
         "--images": dict(
             type=Path,
             nargs="+",
