@@ -14,7 +14,7 @@ from drawn import problems
 from matplotlib.text import Text
 from street import Street, Stripes
 
-from drawing import chapter2, chapter3, chapter4, flicker
+from thesis import chapter2, chapter3, chapter4, flicker
 from thesis_repro.data.cityscapes import ID, LABELS
 from thesis_repro.odometry import Odometry
 from thesis_repro.report import style, trajectories, video

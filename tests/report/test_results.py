@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from drawn import problems
 
-from drawing import chapter4
+from thesis import chapter4
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, style, tables, texts
 from thesis_repro.report.captions import REPORTED
