@@ -141,11 +141,11 @@ endif
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # A change of the page does not rerun the notebooks.
-SOURCES := $(shell find thesis_repro street_world notebooks/thesis -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html.j2' \
+SOURCES := $(shell find thesis_repro street_world notebooks/thesis -type f -not -path '*/__pycache__/*' -not -path '*/page.*' -not -name '*.html.j2' \
              -not -name 'page.css' -not -name 'captions.json')
 
 figures: $(EXECUTED)
-	@$(BIN)/python -m thesis_repro.report.page
+	@PYTHONPATH=$(CURDIR):$(CURDIR)/notebooks $(BIN)/python -m thesis.page
 	@$(BIN)/python -m thesis_repro.running.settings figures
 	@for notebook in $(EXECUTED); do [ -e $$notebook ] || exit 1; done
 

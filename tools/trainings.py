@@ -9,6 +9,8 @@ its weights, the quality of its label maps, the ratios of errors with their inte
 of Table 4.2. A stopped run resumes.
 """
 
+import sys
+
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
 # isort: split
@@ -18,13 +20,18 @@ import pandas as pd
 import tensorflow as tf
 
 from thesis_repro.data import cityscapes, kitti
-from thesis_repro.report.trainings import TABLE
 from thesis_repro.running import files, messages, results
-from thesis_repro.running.settings import read_settings
+from thesis_repro.running.settings import ROOT, read_settings
 from thesis_repro.segmentation import memory, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.study import compare, domain_gap, jobs, runner, thesis_tables, workers
+from thesis_repro.study import compare, jobs, runner, thesis_tables, workers
 from thesis_repro.study.sources import Source
+
+sys.path.append(str(ROOT / "notebooks"))
+
+# isort: split
+from thesis import domain_gap
+from thesis.trainings import TABLE
 
 SEEDS = range(10)  # the first one is the default run's
 METRICS = (*compare.JUDGING_METRICS, "rmse")

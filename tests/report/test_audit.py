@@ -17,15 +17,16 @@ import pandas as pd
 import pytest
 
 import thesis_repro as tr
+from thesis import ablations, audit, gap, timing, trainings
 from thesis_repro.data import cityscapes
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import metrics
-from thesis_repro.report import audit, gap, style, trainings
+from thesis_repro.report import style
 from thesis_repro.running import results
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import augmentation, quality
 from thesis_repro.segmentation.training import sm
-from thesis_repro.study import ablations, compare, thesis_tables, timing
+from thesis_repro.study import compare, thesis_tables
 
 
 def test_rows_are_numbered_and_every_measurement_has_a_row():

@@ -17,7 +17,7 @@ from street import Street, Stripes
 from thesis import chapter2, chapter3, chapter4, flicker
 from thesis_repro.data.cityscapes import ID, LABELS
 from thesis_repro.odometry import Odometry
-from thesis_repro.report import style, trajectories, video
+from thesis_repro.report import paths, style, video
 
 
 def texts(figure):
@@ -98,10 +98,10 @@ DRAWN = {
     "4.8 without keypoints": lambda: chapter4.figure_4_08(
         flicker.follow_window([FRAME] * 2, [BLANK] * 2, 5), "00"
     ),
-    "paths": lambda: trajectories.figure(
+    "paths": lambda: paths.figure(
         {"masked": turning(), "$all$": 2 * turning()}, turning(), "sequence 00"
     ),
-    "paths without truth": lambda: trajectories.figure({"masked": turning()}, None, "sequence 11"),
+    "paths without truth": lambda: paths.figure({"masked": turning()}, None, "sequence 11"),
 }
 
 

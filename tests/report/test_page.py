@@ -17,7 +17,9 @@ import nbformat
 import pandas as pd
 import pytest
 
-from thesis_repro.report import captions, page, tables
+from thesis import captions, page
+from thesis_repro.report import page as report_page
+from thesis_repro.report import tables
 from thesis_repro.running.settings import ROOT, read_settings
 
 SVG = '<svg height="100pt" width="200pt" xmlns="http://www.w3.org/2000/svg"><path d="M0 0"/></svg>'
@@ -75,7 +77,9 @@ def run(tmp_path):
     )
     settings.figures.mkdir()
     for artefact in ARTEFACTS:
-        for ending in page.ENDINGS[artefact["kind"]][: 1 if artefact["kind"] == "figure" else None]:
+        for ending in report_page.ENDINGS[artefact["kind"]][
+            : 1 if artefact["kind"] == "figure" else None
+        ]:
             text = {".svg": SVG, ".csv": CSV}.get(ending, "What it shows")
             (settings.figures / f"{artefact['name']}{ending}").write_text(text)
     executed = settings.build / "notebooks" / "08_results.ipynb"
@@ -99,7 +103,7 @@ def run(tmp_path):
 
 
 def read(run):
-    page.update(run.settings)
+    page.update(run.settings, run.settings.figures)
     return Reader(run.page.read_text())
 
 
@@ -178,12 +182,12 @@ def faults_in_a_browser(folder, scratch):
 def test_a_browser_shows_the_page_of_the_repository_without_faults(tmp_path):
     figures = tmp_path / "figures"
     shutil.copytree(ROOT / "figures", figures)
-    (figures / page.PAGE).write_text(page.build(replace(read_settings({}), build=tmp_path)))
+    (figures / report_page.PAGE).write_text(page.build(replace(read_settings({}), build=tmp_path)))
     assert faults_in_a_browser(figures, tmp_path / "scratch") == []
     folded = (
         '<p style="height: 0">Folded <img src="none.svg"></p><p>over <a href="#nowhere">it</a></p>'
     )
-    (figures / page.PAGE).write_text(
+    (figures / report_page.PAGE).write_text(
         f'<details>{folded}</details><div style="width: 900px">wide</div>'
         '<p><img src="figure_4_05.webp" width="100"></p>'
     )
@@ -322,7 +326,7 @@ def test_markup_in_names_and_texts_is_escaped(run, tmp_path):
         f"# {attack}\n\n[a](javascript:alert(1)) <script>alert(1)</script>"
     )
     run.executed.rename(run.executed.with_name(f"09{attack}.ipynb".replace("/", "")))
-    page.update(settings)
+    page.update(settings, settings.figures)
     text = run.page.read_text()
     shown = Reader(text)
     assert not {"script", "onerror"} & {
@@ -370,16 +374,16 @@ def test_counts_are_whole_and_the_digits_of_a_column_are_equal():
 
 def test_an_update_renders_changed_notebooks_only(run):
     html = run.executed.with_suffix(".html")
-    page.update(run.settings)
+    page.update(run.settings, run.settings.figures)
     first = html.stat().st_mtime_ns
     (run.settings.figures / "figure_4_06.svg").unlink()
     (run.settings.figures / "table_4_1.csv").write_text("sequence,frames\n00,77\n")
-    page.update(run.settings)
+    page.update(run.settings, run.settings.figures)
     assert "40 of 41" in run.page.read_text() and ">77<" in run.page.read_text()
     assert html.stat().st_mtime_ns == first
     run.executed.write_text(run.executed.read_text().replace("a number: 42", "a number: 43"))
     os.utime(run.executed, ns=(first + 10**9,) * 2)
-    page.update(run.settings)
+    page.update(run.settings, run.settings.figures)
     assert "a number: 43" in html.read_text()
 
 

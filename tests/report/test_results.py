@@ -9,10 +9,11 @@ import pandas as pd
 import pytest
 from drawn import problems
 
-from thesis import chapter4
+from thesis import chapter4, tables
+from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
-from thesis_repro.report import comparison, style, tables, texts
-from thesis_repro.report.captions import REPORTED
+from thesis_repro.report import comparison, findings, style, texts
+from thesis_repro.report import tables as report_tables
 from thesis_repro.study import compare, thesis_tables
 from thesis_repro.study.jobs import ESTIMATORS
 
@@ -100,14 +101,18 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     null = table["change (%), one run each, if masks did nothing"]
     assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
     assert null["mean"] < -5 and null["sequences improved"] > 6  # the best of three widths
-    text = texts.findings(runs, compare.comparisons(runs), "real", False, shuffled=shuffled)
+    text = findings.text(
+        runs, compare.comparisons(runs), "real", False, procedure=tables.procedure(runs, shuffled)
+    )
     assert f"{null['mean']:+.1f} %" in text
     assert "with the matched points shuffled, the mean" in text
     is_once = (runs["repetition"] == 0) | (runs["dilation_width"] != 5)  # width 5 is run once
     once = runs[is_once]
-    text = texts.findings(once, compare.comparisons(once), "real", False, shuffled=shuffled)
+    text = findings.text(
+        once, compare.comparisons(once), "real", False, procedure=tables.procedure(once, shuffled)
+    )
     assert "with the matched points shuffled, the mean" not in text
-    assert "procedure" not in texts.findings(runs, compare.comparisons(runs), "real", False)
+    assert "procedure" not in findings.text(runs, compare.comparisons(runs), "real", False)
 
 
 def test_a_lost_run_is_counted_and_never_improves():
@@ -125,7 +130,7 @@ def test_a_lost_run_is_counted_and_never_improves():
         of_masks["lost runs"] == "1 of 33" and of_masks["lost runs of the reference"] == "0 of 33"
     )
     assert comparison.table_widths(runs).set_index("sequence").loc["lost runs"].iloc[4] == "1 of 33"
-    errors = tables.table_errors(runs)
+    errors = report_tables.table_errors(runs)
     assert errors["lost runs"].value_counts()["1 of 3"] == 6  # three widths, two estimators
 
 
@@ -182,7 +187,7 @@ def test_findings_follow_the_verdict(errors, names, verdict, sources):
     table = compare.comparisons(runs)
     for source in sources:
         assert compare.overall(compare.primary_comparison(table, source)["verdict"]) == verdict
-    text = texts.findings(runs, table, "KITTI folder embedded, made up", False)
+    text = findings.text(runs, table, "KITTI folder embedded, made up", False)
     assert "no evidence" not in text
     assert text.count("Masks help here") == (verdict == compare.LOWER) * len(sources)
     assert text.count("do worse than all") == (verdict == compare.HIGHER) * len(sources)
@@ -201,7 +206,7 @@ def test_findings_name_only_what_was_run():
         runs[runs["method"] == "baseline"],
         runs.assign(se3=np.nan),
     ):
-        text = texts.findings(part, compare.comparisons(part), "made up", True)
+        text = findings.text(part, compare.comparisons(part), "made up", True)
         assert "no evidence" in text
         assert ("refined" in text) == (part["estimator"] == "refined").any()
         assert compare.METRICS["se3"] not in text or part["se3"].notna().any()
@@ -384,11 +389,11 @@ def test_names_stay_names_in_texts_and_tables(tmp_path):
     assert read.count("<td") == 3 * len(HOSTILE) and f"<p>{shown[0]}</p>" in read
     assert all(read.count(f">{name}</td>") == 2 for name in shown)
     # a spreadsheet must not calculate with it, and the page shows it as it is in the file
-    table = tables.read(tmp_path / "table.csv")
+    table = report_tables.read(tmp_path / "table.csv")
     in_file = [name.encode(errors="backslashreplace").decode() for name in HOSTILE]
     in_file[HOSTILE.index("=1+1")] = "'=1+1"
     assert list(table["sequence"]) == list(table["masks"]) == in_file
     runs = runs_of(HOSTILE[:5], lambda *_: 1.0, widths=(5,), repetitions=1)
-    found = texts.html(texts.findings(runs, compare.comparisons(runs), HOSTILE[5], False))
+    found = texts.html(findings.text(runs, compare.comparisons(runs), HOSTILE[5], False))
     assert all(f" {name} (100 frames)" in found for name in shown[:5])
     assert f"Data: {shown[5]}." in found

@@ -135,7 +135,6 @@ def odometry(options: Any) -> None:
     from thesis_repro.data import kitti
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
-    from thesis_repro.report.record import run_record
 
     changes = {}
     for field in fields(odometry.OdometrySettings):
@@ -166,20 +165,20 @@ def odometry(options: Any) -> None:
     if sequence.has_truth:
         _warn(oddities.of_path(sequence.name, result.poses, sequence.poses))
     _warn(oddities.of_steps(sequence.name, result.failed, len(sequence)))
-    record = run_record(result, sequence)
+    record = _record(result, sequence)
     if options.video:
         from thesis_repro.report import video
 
         video.write_video(options.video, sequence, settings, masks)
     if options.plot:
-        from thesis_repro.report import style, trajectories
+        from thesis_repro.report import paths, style
 
         truth, poses = None, result.poses
         if sequence.has_truth:
             truth = sequence.poses
             poses = metrics.shifted(poses, truth)
         with style.applied():
-            drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
+            drawing = paths.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
             style.write_figure(drawing, options.plot)
     _print(
         options,
@@ -250,64 +249,50 @@ def study(options: Any) -> int:
     return int(bool(failed))
 
 
-def evaluate(options: Any) -> None:
-    """Compare trajectories with the ground truth.
-
-    Prints the thesis's RMSE and MAE, ATE, RPE, KITTI's t_rel and r_rel.
-    """
-    _load_evo()
-    from thesis_repro.checks import oddities
-    from thesis_repro.data.kitti import true_path
-    from thesis_repro.report import style, trajectories
-
-    sequences = trajectories.by_sequence(options.poses, options.kitti, options.sequence)
-    if options.plot and len(sequences) > 1:
-        raise InputError("--plot: shows only one sequence; name it with --sequence")
-    _check_outputs(options, *options.poses)
-    rows, matching = [], {"offset": options.t_offset}
-    if options.t_max_diff is not None:
-        matching["max_difference"] = options.t_max_diff
-    for sequence, files in sequences.items():
-        truth, times = true_path(options.kitti, sequence)
-        _warn(oddities.of_truth(sequence, truth, times))
-        paths = {
-            name: trajectories.read(file, times, options.frames, **matching)
-            for name, file in files.items()
-        }
-        truth = truth[: options.frames]
-        for name, (matched, poses) in paths.items():
-            _warn(
-                oddities.of_path(
-                    name, poses, truth[matched], options.align not in ("sim3", "scale")
-                )
-            )
-        rows += trajectories.evaluate(paths, truth, options.align, sequence)
-    if options.plot:
-        with style.applied():
-            drawing = trajectories.figure(
-                trajectories.aligned(paths, truth, options.align),
-                truth,
-                f"sequence {sequence}",
-                {name: matched for name, (matched, _) in paths.items()},
-            )
-            style.write_figure(drawing, options.plot)
-    rows += list(trajectories.means(rows))
-    _print(
-        options,
-        rows,
-        "evaluate.txt.j2",
-        alignment=options.align,
-        table=trajectories.table(rows, options.align),
-    )
-
-
 COMMANDS = {
     function.__name__.replace("_", "-"): function
-    for function in (synthesize, check_data, predict, masks, odometry, study, evaluate)
+    for function in (synthesize, check_data, predict, masks, odometry, study)
 }
 
 
 # Helpers of several commands
+
+
+# the errors of `metrics.errors`, in its order, with their units
+ERRORS = (
+    "rmse_m",
+    "mae_m",
+    "ate_se3_m",
+    "relative_translation_percent",
+    "relative_rotation_deg_per_100m",
+)
+
+
+def _record(result: Any, sequence: Any) -> dict[str, Any]:
+    """Return the errors, keypoints, time and flags of an `odometry.Result`.
+
+    An error that is not determined is None.
+    """
+    from thesis_repro.odometry import metrics
+
+    errors: dict[str, float | None] = dict.fromkeys(ERRORS)
+    if sequence.has_truth:
+        values = metrics.errors(result.poses, sequence.poses).values()
+        measured = dict(zip(ERRORS, values, strict=True))
+        errors |= {name: value for name, value in measured.items() if value == value}  # not NaN
+    mean_keypoints = 0.0
+    detected = result.frames["detected"].dropna()
+    if len(detected):  # no frame may have structure
+        mean_keypoints = float(detected.mean())
+    seconds = result.frames.filter(like="_seconds").sum(axis=1)
+    return {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        **errors,
+        "mean_keypoints": mean_keypoints,
+        "ms_per_frame": 1000 * float(seconds.mean()),
+        "flagged": {flag: int(count) for flag, count in result.flagged.items()},
+    }
 
 
 def _load_evo() -> None:

@@ -314,37 +314,6 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         ),
         **_shared("--dask"),
     },
-    "evaluate": {
-        **_shared("--kitti"),
-        "--sequence": dict(
-            metavar="NN", help="sequence of the files; of folders, evaluate only this sequence"
-        ),
-        **_shared("--frames", "--plot", "--json"),
-        "poses": dict(
-            type=Path,
-            nargs="+",
-            metavar="FILE_OR_DIR",
-            help="trajectory in KITTI format (a line for each frame) or TUM format (matched by time, "
-            "keyframes suffice), or folder with NN.txt or NN.tum for each sequence, which also gets a mean",
-        ),
-        "--align": dict(
-            choices=("none", "se3", "sim3", "scale"),
-            default="none",
-            help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
-        ),
-        # named as evo's options
-        "--t_offset": dict(
-            type=float,
-            default=0.0,
-            metavar="SECONDS",
-            help="add this to the times of files in TUM format, such as ROS's (0)",
-        ),
-        "--t_max_diff": dict(
-            type=float,
-            metavar="SECONDS",
-            help="largest difference between the times of a pose and its frame (0.01)",
-        ),
-    },
 }
 # of these options, only one may be given
 EXCLUSIVE = {"odometry": ("--masks", "--labels"), "study": ("--jobs", "--dask")}

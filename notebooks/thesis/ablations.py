@@ -95,7 +95,8 @@ def _measure(
     results.stage(
         folder,
         options=options,
-        code=results.digest_of_code("thesis_repro.study.ablations"),
+        code=results.digest_of_code("thesis_repro.odometry", "thesis_repro.study.runner"),
+        ablations=results.digest_of_file(__file__),
         **results.made_with("opencv", "numpy", "numba"),
         sequence=results.digest_of_files(sequence.files),
         labels=results.digest_of_files([labels / path.name for path in sequence.frame_paths]),

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from thesis.captions import REPORTED
 from thesis_repro.data.cityscapes import LABELS
-from thesis_repro.report.captions import REPORTED
 from thesis_repro.study import compare, thesis_tables
 
 WORDS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))
