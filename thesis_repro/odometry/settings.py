@@ -3,16 +3,19 @@
 import math
 import numbers
 from dataclasses import dataclass, fields
+from importlib import import_module
 from typing import Any
 
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.estimators import ESTIMATORS
+from thesis_repro.odometry import estimators
 
 CHOICES = {
     "detector": ("shi-tomasi", "orb"),
     "mask_mode": ("detect", "filter"),
-    "estimator": tuple(ESTIMATORS),
+    "estimator": tuple(estimators.ESTIMATORS),
 }
+# settings that decide which keypoints are found
+DETECTION = ("detector", "max_keypoints", "min_distance", "mask_mode", "quality", "block_size")
 # {name: (least, most)}
 LIMITS = {
     "max_keypoints": (0, 2**31 - 1),
@@ -25,7 +28,6 @@ LIMITS = {
     "levels": (0, 10),
     "shuffle_seed": (0, 2**32 - 1),
     "scale_gate": (0, math.inf),
-    "fallback": (False, True),
 }
 
 
@@ -52,9 +54,6 @@ class OdometrySettings:
     (audit rows 13, 29). "refined": the smaller of the two possible rotations is taken, and the
     motion is refitted by least squares to all points near it. If a car cannot make this motion
     within a frame, another one is searched for (refined.motion_prior).
-    fallback: estimate a step from all keypoints if the masked keypoints do not determine its
-    motion, or if the motion differs too much from the previous step's (refined.motion_prior).
-    Without masks it does nothing.
     scale_gate: metres; a shorter step does not move the pose.
     """
 
@@ -70,8 +69,22 @@ class OdometrySettings:
     threshold: float = 0.0003
     shuffle_seed: int | None = None
     estimator: str = "thesis"
-    fallback: bool = False
     scale_gate: float = 0.1
+
+    def of_detection(self) -> tuple:
+        """Return the settings that decide which keypoints are found."""
+        return tuple(getattr(self, name) for name in DETECTION)
+
+    def detect_function(self) -> Any:
+        """Return what finds keypoints: OpenCV's call, or keypoints.detect for other choices."""
+        module = "thesis_repro.odometry.odometry"
+        if self.detector == "orb" or self.mask_mode == "filter":
+            module = "thesis_repro.odometry.keypoints"
+        return import_module(module).detect
+
+    def new_estimator(self, calls: Any) -> Any:
+        """Return a new object of the estimator. calls: see odometry.Calls."""
+        return estimators.new_estimator(self.estimator, calls)
 
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():

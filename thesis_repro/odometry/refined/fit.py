@@ -16,12 +16,13 @@ from llvmlite import binding
 from numba import types
 from numba.extending import get_cython_function_address
 
-from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.pose import MIN_CORRESPONDENCES, Motion
+from opencv_exact import epipolar
+from opencv_exact.compiling import compiled, inlined
 from thesis_repro.odometry.refined import matrices
 from thesis_repro.odometry.refined.normal_equations import normal_equations
-from thesis_repro.running.compiled import fast, inner
+from thesis_repro.odometry.types import Motion
 
+MIN_CORRESPONDENCES = 5
 MAX_ITERATIONS = 10
 REFINE_ROUNDS = 3
 SUPPORT_THRESHOLDS = 2  # a correspondence within so many thresholds supports a motion
@@ -168,7 +169,7 @@ def _deviations(
     return float(np.degrees(rotation_std)), float(np.degrees(heading_std)), condition
 
 
-@fast
+@compiled
 def columns(current, previous):
     """Correspondences (N, 2) as (4, N): x, y, u and v."""
     points = np.empty((4, len(current)))
@@ -178,13 +179,13 @@ def columns(current, previous):
     return points
 
 
-@fast
+@compiled
 def near(r, t, current, previous, limit):
     """N booleans: the correspondences whose Sampson distance from the motion is below the limit."""
     return _near(r, t, columns(current, previous), limit)
 
 
-@inner
+@inlined
 def _near(r, t, points, limit):
     """As `near`, of points (4, N)."""
     essential = matrices.product(matrices.skew(t), matrices.row_by_row(r))
@@ -197,7 +198,7 @@ def _near(r, t, points, limit):
     return mask
 
 
-@fast
+@compiled
 def _support(r, t, points, threshold):
     """The points (4, N) that support a motion."""
     mask = _near(r, t, points, SUPPORT_THRESHOLDS * threshold)
@@ -214,7 +215,7 @@ def _support(r, t, points, threshold):
     return support
 
 
-@fast
+@compiled
 def _rounds(r, t, points, support, threshold):
     """A motion fitted to its support (4, M), and again to the points (4, N) near it."""
     for k in range(REFINE_ROUNDS):
@@ -226,7 +227,7 @@ def _rounds(r, t, points, support, threshold):
     return r, t
 
 
-@fast
+@compiled
 def _minimise(r, t, points, scale):
     """Levenberg-Marquardt iteration: each step solves (H + damping diag H) change = -gradient."""
     damping = 1e-4
@@ -256,7 +257,7 @@ def _minimise(r, t, points, scale):
     return r, t
 
 
-@inner
+@inlined
 def _solve(matrix, right, integers):
     """Solve five linear equations with a symmetric matrix; right (5) becomes the solution.
 
@@ -268,7 +269,7 @@ def _solve(matrix, right, integers):
     _gesv(size, count, matrix.ctypes, size, pivots, right.ctypes, size, status)
 
 
-@fast
+@compiled
 def cheirality_votes(rotation, t, points, parallax):
     """Numbers of points (4, N) in front of both cameras under (rotation, t) and (rotation, -t).
 
@@ -304,7 +305,7 @@ def cheirality_votes(rotation, t, points, parallax):
     return forward, backward
 
 
-@inner
+@inlined
 def _moved(r, t, change):
     """Motion after a change (5) of its parameters.
 

@@ -8,11 +8,11 @@ angles.
 
 import numpy as np
 
-from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.opencv_exact.ransac import MAX_SAMPLES, draw, first_block
-from thesis_repro.odometry.opencv_exact.real_roots import LANES
-from thesis_repro.odometry.opencv_exact.rounding import WELL_CONDITIONED, solve
-from thesis_repro.running.compiled import fast, inner
+from opencv_exact import epipolar
+from opencv_exact.compiling import compiled, inlined
+from opencv_exact.ransac import MAX_SAMPLES, draw, first_block
+from opencv_exact.real_roots import LANES
+from opencv_exact.rounding import WELL_CONDITIONED, solve
 
 
 def ransac_with_prior(
@@ -59,7 +59,7 @@ def ransac_with_prior(
     return (best_rotation, best_translation) if most else None
 
 
-@fast
+@compiled
 def _best(
     solutions, columns, limit, rotation, translation, min_rotation_cosine, min_heading_cosine
 ):
@@ -97,7 +97,7 @@ def _best(
     return most, best_r, best_t
 
 
-@inner
+@inlined
 def _translation(e, t):
     """Write the unit translation of an essential matrix, with either sign.
 
@@ -116,7 +116,7 @@ def _translation(e, t):
     t[0], t[1], t[2] = t[0] / norm, t[1] / norm, t[2] / norm
 
 
-@inner
+@inlined
 def _rotation(e, t, r):
     """Write the rotation R of an essential matrix [t]x R (unit norm) for one sign of t.
 

@@ -12,9 +12,9 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from thesis_repro.odometry.opencv_exact import epipolar
+from opencv_exact import epipolar
+from opencv_exact.compiling import compiled, inlined
 from thesis_repro.odometry.refined import matrices
-from thesis_repro.running.compiled import fast, inner
 
 POINTS_PER_BLOCK = 64
 # Rows of a block, one quantity each. NUMBERS: five derivatives of the residual, then the residual.
@@ -26,7 +26,7 @@ ROWS = WEIGHTED + 6
 _intrinsic: Any = intrinsic  # mypy does not know that callers leave out the first argument
 
 
-@fast
+@compiled
 def normal_equations(r, t, points, scale, with_derivatives):
     """Cauchy cost of the Sampson distances, its Gauss-Newton matrix (5, 5) and its gradient (5).
 
@@ -137,7 +137,7 @@ def _add_products(typing_context, sums, rows, count):
     return types.void(sums, rows, count), generate
 
 
-@inner
+@inlined
 def _mirror(matrix):
     """Copy the lower triangle of a matrix (5, 5) to the upper one."""
     for k in range(5):
@@ -145,7 +145,7 @@ def _mirror(matrix):
             matrix[j, k] = matrix[k, j]
 
 
-@inner
+@inlined
 def _essential_and_derivatives(r, t):
     """E = [t]x R and its five derivatives (6, 9), row by row.
 
@@ -165,6 +165,6 @@ def _essential_and_derivatives(r, t):
     return essentials
 
 
-@inner
+@inlined
 def _write_product(a, b, entries):
     matrices.write(entries, matrices.product(a, b))

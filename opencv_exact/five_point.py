@@ -21,8 +21,8 @@ pose.recover_pose.
 
 import numpy as np
 
-from thesis_repro.odometry.opencv_exact.real_roots import LANES
-from thesis_repro.running.compiled import inner
+from opencv_exact.compiling import inlined
+from opencv_exact.real_roots import LANES
 
 SAMPLE_SIZE = 5
 MIN_INDEPENDENCE = 1e-8  # of five epipolar constraints; with less, no solution is trusted
@@ -97,7 +97,7 @@ SIGNS = _signs()
 TO_QUADRATIC, TO_CUBIC = _products()
 
 
-@inner
+@inlined
 def null_space(fives, rows, independences):
     """Step 1: basis X, Y, Z, W of the matrices that meet five epipolar constraints.
 
@@ -129,7 +129,7 @@ def null_space(fives, rows, independences):
             independences[lane] = share if share < independences[lane] else independences[lane]
 
 
-@inner
+@inlined
 def _write_constraint(five, row):
     """Write the factors (9, LANES) of E's entries in one epipolar constraint."""
     for lane in range(LANES):
@@ -139,7 +139,7 @@ def _write_constraint(five, row):
         row[6, lane], row[7, lane], row[8, lane] = x, y, 1.0
 
 
-@inner
+@inlined
 def _write_norms(row, norms):
     for lane in range(LANES):
         total = 0.0
@@ -148,7 +148,7 @@ def _write_norms(row, norms):
         norms[lane] = np.sqrt(total)
 
 
-@inner
+@inlined
 def _make_normal(row, other):
     """Make a row normal to another one of unit norm."""
     for lane in range(LANES):
@@ -159,14 +159,14 @@ def _make_normal(row, other):
             row[i, lane] -= along * other[i, lane]
 
 
-@inner
+@inlined
 def _write_unit_row(row, norms, unit_row):
     for lane in range(LANES):
         for i in range(9):
             unit_row[i, lane] = row[i, lane] / norms[lane]
 
 
-@inner
+@inlined
 def constraints(basis, equations):
     """Step 2: ten cubic equations in x, y, z for E = x X + y Y + z Z + W.
 
@@ -189,7 +189,7 @@ def constraints(basis, equations):
             _add_products(squares[p], minors[p], basis[q], equations[:, TO_CUBIC[p, q]])
 
 
-@inner
+@inlined
 def _add_squares(a, b, k, squares):
     """Add the products of the k-th columns of matrices a and b (9, LANES): the lower triangle."""
     for lane in range(LANES):
@@ -201,7 +201,7 @@ def _add_squares(a, b, k, squares):
         squares[8, lane] += a[6 + k, lane] * b[6 + k, lane]
 
 
-@inner
+@inlined
 def _finish_squares(squares):
     """Fill the upper triangle, and make of E E^T what gives the trace constraint.
 
@@ -217,7 +217,7 @@ def _finish_squares(squares):
         squares[8, lane] -= half
 
 
-@inner
+@inlined
 def _add_minors(a, b, minors):
     """Add the minors (3) of the second row of a and the third row of b."""
     for lane in range(LANES):
@@ -226,7 +226,7 @@ def _add_minors(a, b, minors):
         minors[2, lane] += a[3, lane] * b[7, lane] - a[4, lane] * b[6, lane]
 
 
-@inner
+@inlined
 def _add_products(squares, minors, matrix, equations):
     """Add the products with a matrix of the basis to one place of the equations (10, LANES)."""
     for lane in range(LANES):
@@ -239,7 +239,7 @@ def _add_products(squares, minors, matrix, equations):
                 equations[3 * i + j, lane] = total
 
 
-@inner
+@inlined
 def eliminate(a, b):
     """Step 3: write B(z) to b (3, 13, LANES; given as zeros).
 
@@ -259,7 +259,7 @@ def eliminate(a, b):
                     b[i, place + j - start, lane] -= a[5 + 2 * i, j, lane]
 
 
-@inner
+@inlined
 def _make_triangular(a):
     """Gauss-Jordan elimination with partial pivoting. Nothing uses what is left of the diagonal."""
     factors = np.empty(LANES)
@@ -272,7 +272,7 @@ def _make_triangular(a):
             _subtract(a[i, 10:], a[k, 10:], factors)
 
 
-@inner
+@inlined
 def _substitute_back(a):
     """Solve the triangular equations for the last six unknowns: B(z) needs no others."""
     factors = np.empty(LANES)
@@ -284,7 +284,7 @@ def _substitute_back(a):
         _divide(a[k], k)
 
 
-@inner
+@inlined
 def _swap_pivot(a, k):
     """Swap row k of each lane with the one that has the largest number in column k."""
     for lane in range(LANES):
@@ -297,7 +297,7 @@ def _swap_pivot(a, k):
                 a[k, j, lane], a[pivot, j, lane] = a[pivot, j, lane], a[k, j, lane]
 
 
-@inner
+@inlined
 def _subtract(row, top, factors):
     """Subtract a multiple of half a row from half a row, (10, LANES)."""
     for lane in range(LANES):
@@ -306,7 +306,7 @@ def _subtract(row, top, factors):
             row[j, lane] -= factor * top[j, lane]
 
 
-@inner
+@inlined
 def _divide(row, k):
     for lane in range(LANES):
         diagonal = row[k, lane]
@@ -314,7 +314,7 @@ def _divide(row, k):
             row[j, lane] /= diagonal
 
 
-@inner
+@inlined
 def determinant(b, polynomials):
     """Step 4: write the coefficients (11, LANES; lowest power first; given as zeros) of det B(z).
 
@@ -329,7 +329,7 @@ def determinant(b, polynomials):
         _add_expansion(minor, b[i], polynomials)
 
 
-@inner
+@inlined
 def _add_minor(first, second, minor):
     for lane in range(LANES):
         for p in range(4):
@@ -339,7 +339,7 @@ def _add_minor(first, second, minor):
                 )
 
 
-@inner
+@inlined
 def _add_expansion(minor, row, polynomials):
     for lane in range(LANES):
         for p in range(7):
@@ -347,7 +347,7 @@ def _add_expansion(minor, row, polynomials):
                 polynomials[10 - p - q, lane] += minor[p, lane] * row[8 + q, lane]
 
 
-@inner
+@inlined
 def row_values(c, z):
     """Values at z of the three polynomials in one row c (13) of B(z)."""
     return (
@@ -357,7 +357,7 @@ def row_values(c, z):
     )
 
 
-@inner
+@inlined
 def essential(normal, basis, z, matrix):
     """Step 6: write the essential matrix (9, unit norm) of a root z.
 

@@ -8,7 +8,7 @@ import pytest
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, pose
-from thesis_repro.odometry.opencv_exact import ransac, real_roots, rounding
+from opencv_exact import ransac, real_roots, rounding
 
 
 def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBABILITY):

@@ -1,15 +1,15 @@
 """Terms of the Sampson distance, for the RANSAC search and for the refined estimator."""
 
-from thesis_repro.running.compiled import inner
+from opencv_exact.compiling import inlined
 
 
-@inner
+@inlined
 def entries(e):
     """Entries of an array (9) as a tuple: single numbers stay in registers."""
     return e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8]
 
 
-@inner
+@inlined
 def sampson_terms(e, x, y, u, v):
     """Terms of one correspondence's Sampson distance: (algebraic, l0, l1, m0, m1).
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesis_repro.odometry.opencv_exact import five_point
-from thesis_repro.odometry.opencv_exact.five_point import MIN_INDEPENDENCE, SAMPLE_SIZE
-from thesis_repro.odometry.opencv_exact.real_roots import LANES, real_roots
-from thesis_repro.running.compiled import fast, inner
+from opencv_exact import five_point
+from opencv_exact.compiling import compiled, inlined
+from opencv_exact.five_point import MIN_INDEPENDENCE, SAMPLE_SIZE
+from opencv_exact.real_roots import LANES, real_roots
 
 ROUNDING = 2.0**-52  # of a number of size 1
 # Among 200,000 solutions of real and degenerate scenes, no difference was larger than 1.4 times the
@@ -60,7 +60,7 @@ class _Steps(NamedTuple):
     polynomials: np.ndarray  # (11, LANES), det B(z), lowest power first
 
 
-@fast
+@compiled
 def solve(fives, solutions):
     """Solve LANES samples of five correspondences, and write their Solutions.
 
@@ -92,7 +92,7 @@ def solve(fives, solutions):
         counts[lane] = roots.counts[lane] if sure[lane] else 0
 
 
-@inner
+@inlined
 def _first_steps(fives):
     """Steps 1 to 4."""
     independences, rows = np.empty(LANES), np.empty((9, 9, LANES))
@@ -111,7 +111,7 @@ def _first_steps(fives):
     return _Steps(independences, rows, b, b_sizes, errors, polynomials)
 
 
-@inner
+@inlined
 def _write_solution(steps, lane, root, error, work, matrix):
     """Write the essential matrix (9) of a root. Returns its margin.
 
@@ -126,7 +126,7 @@ def _write_solution(steps, lane, root, error, work, matrix):
     return margin if margin < WELL_CONDITIONED else SAFETY_FACTOR * margin
 
 
-@inner
+@inlined
 def _write_elimination_errors(a, errors):
     """Write the rounding errors of the six rows that B(z) is made from, OpenCV's way included.
 
@@ -151,7 +151,7 @@ def _write_elimination_errors(a, errors):
                 errors[i, lane] += abs(inverse[i, j]) * error
 
 
-@inner
+@inlined
 def _invert(triangle, inverse, sums):
     """Write the inverse of an upper triangle (6, 6), and the sums of the sizes in its rows."""
     for i in range(5, -1, -1):
@@ -165,7 +165,7 @@ def _invert(triangle, inverse, sums):
             sums[i] += abs(inverse[i, j])
 
 
-@inner
+@inlined
 def _write_determinant_errors(steps, places, work, errors):
     """Write the rounding errors (LANES) of det B(z) at a place of each lane, in units of ROUNDING.
 
@@ -192,7 +192,7 @@ def _write_determinant_errors(steps, places, work, errors):
         _add_errors(cofactors[i], wrong[i], sizes[i], sizes[p], sizes[q], errors)
 
 
-@inner
+@inlined
 def _write_row(b_row, places, values):
     """Write one row of B(z), (3, LANES)."""
     for lane in range(LANES):
@@ -200,7 +200,7 @@ def _write_row(b_row, places, values):
         values[0, lane], values[1, lane], values[2, lane] = first, second, third
 
 
-@inner
+@inlined
 def _write_sizes(b_sizes, error, next_error, places, sizes, wrong):
     """Write the sizes of the terms in one row of B(z), and its errors, (3, LANES).
 
@@ -217,7 +217,7 @@ def _write_sizes(b_sizes, error, next_error, places, sizes, wrong):
         wrong[2, lane] = both * (1 + size * powers) + third
 
 
-@inner
+@inlined
 def _write_cofactors(first, second, cofactors):
     """Write the cofactors of one row from the two other rows, each (3, LANES)."""
     for lane in range(LANES):
@@ -228,7 +228,7 @@ def _write_cofactors(first, second, cofactors):
             cofactors[j, lane] = left - right
 
 
-@inner
+@inlined
 def _add_errors(cofactors, wrong, sizes, first, second, errors):
     """Add one row's part of the errors. first, second: sizes in the two other rows."""
     for lane in range(LANES):
@@ -239,7 +239,7 @@ def _add_errors(cofactors, wrong, sizes, first, second, errors):
         errors[lane] = error + sizes[0, lane] * terms
 
 
-@inner
+@inlined
 def _best_row(cofactors):
     """Index of the largest row of cofactors.
 
@@ -259,7 +259,7 @@ def _best_row(cofactors):
     return best
 
 
-@inner
+@inlined
 def _solution_error(steps, lane, best, z, error, work):
     """First-order rounding error of the essential matrix of a root z, in units of ROUNDING.
 
@@ -305,7 +305,7 @@ def _solution_error(steps, lane, best, z, error, work):
     return (error / abs(slope) * np.sqrt(speed) + np.sqrt(tilt)) / np.sqrt(square)
 
 
-@inner
+@inlined
 def _row_slopes(c, z):
     """Derivatives at z of the three polynomials in one row c (13) of B(z)."""
     return (

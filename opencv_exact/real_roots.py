@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesis_repro.running.compiled import inner
+from opencv_exact.compiling import inlined
 
 # Samples solved side by side, one in each lane. Loops over fewer than 16 are not vectorised; with
 # more, more samples are solved in vain when a search ends.
@@ -34,7 +34,7 @@ class RealRoots(NamedTuple):
     heights: np.ndarray  # (10, LANES), values at the extrema
 
 
-@inner
+@inlined
 def real_roots(polynomials):
     """Solve LANES polynomials of degree ten (11, LANES; lowest power first).
 
@@ -89,7 +89,7 @@ def real_roots(polynomials):
     return RealRoots(solved, counts, roots, new_counts, extrema, heights)
 
 
-@inner
+@inlined
 def _prepare(polynomials):
     """Which polynomials can be solved, bounds of their roots, and all their derivatives.
 
@@ -114,7 +114,7 @@ def _prepare(polynomials):
     return solved, bounds, derivatives
 
 
-@inner
+@inlined
 def _root_bound(polynomials, lane):
     """Bound of the absolute values of all roots; -1 if the leading coefficient is too small."""
     bound = 0.0
@@ -129,7 +129,7 @@ def _root_bound(polynomials, lane):
     return bound
 
 
-@inner
+@inlined
 def _write_brackets(
     lane, extrema, bound, places, heights, bends, first_height, last_height, brackets
 ):
@@ -165,7 +165,7 @@ def _write_brackets(
     return count
 
 
-@inner
+@inlined
 def value(polynomial, z, lane):
     """Value at z of one of several polynomials (11, LANES; lowest power first).
 
@@ -181,14 +181,14 @@ def value(polynomial, z, lane):
     return even + odd * z
 
 
-@inner
+@inlined
 def _values(polynomial, places, values):
     """Write the values (LANES) of polynomials (11, LANES) at a place of each."""
     for lane in range(LANES):
         values[lane] = value(polynomial, places[lane], lane)
 
 
-@inner
+@inlined
 def _start_search(search, brackets, k, counts):
     """Prepare the search for root k of each lane, see `_newton_step`."""
     for lane in range(LANES):
@@ -202,7 +202,7 @@ def _start_search(search, brackets, k, counts):
         search[GOES_ON, lane] = 1.0 if k < counts[lane] else 0.0
 
 
-@inner
+@inlined
 def _newton_step(search, precision):
     """Make one step of Newton's method in each lane. Returns the number of lanes that go on.
 

@@ -1,146 +1,13 @@
-"""Relative motion of a calibrated camera from point correspondences (Section 2.2).
-
-The essential matrix comes first, then the motion.
-
-As in PySLAM, points of the current frame come first. So the rotation and the unit translation take
-coordinates of the current camera to coordinates of the previous camera. A camera-to-world pose is
-moved by them without an inverse.
-"""
-
-from dataclasses import dataclass
+"""cv2.recoverPose: the same bits, several times faster (the last step of `five_point`)."""
 
 import cv2
 import numpy as np
 
-from thesis_repro.odometry.opencv_exact import ransac
-from thesis_repro.running.compiled import fast, inner
+from opencv_exact.compiling import compiled, inlined
 
-PROBABILITY = 0.999  # of RANSAC
 MAX_DEPTH = 50.0  # in lengths of the translation; as in cv2.recoverPose, farther points do not vote
 # for homogeneous points of unit norm; points nearer to a limit are left to OpenCV
 LIMIT_MARGIN = 1e-7
-MIN_CORRESPONDENCES = 5
-FLOW_ROUNDS = 2  # they leave 0.1 pixels of a turn by 5 degrees; one leaves 10
-FLOW_DAMPING = 1e-10  # keeps equations solvable; with points all over a frame it changes nothing
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Motion of the camera between two frames.
-
-    If it is not known, `rotation` is None and `problem` says why.
-    """
-
-    rotation: np.ndarray | None = None  # 3x3
-    translation: np.ndarray | None = None  # 3, unit length
-    # N booleans: correspondences that agree with the essential matrix
-    inliers: np.ndarray | None = None
-    pose_inliers: int = 0  # correspondences in front of both cameras and not too far away
-    problem: str = ""
-
-
-def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Normalised image coordinates (N, 2), in double precision, of pixels (N, 2).
-
-    u * (1 / fx) + (-cx / fx) equals the product of the inverse camera matrix and (u, v, 1) to the
-    last bit. The formula (u - cx) / fx does not. RANSAC amplifies a difference in the last bit, so
-    the trajectory would be another one.
-    """
-    focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
-    return points * (1 / focal) + (-intrinsics[:2, 2] / focal)
-
-
-def essential_matrix(
-    current: np.ndarray, previous: np.ndarray, threshold: float
-) -> tuple[np.ndarray | None, np.ndarray, str]:
-    """Essential matrix of normalised correspondences (N, 2). Returns (matrix, inliers, problem).
-
-    If there is no matrix or more than one, `matrix` is None and `problem` says why. (From exactly
-    five correspondences, OpenCV returns all solutions in one array.)
-    """
-    no_inliers = np.zeros(len(current), bool)
-    if len(current) < MIN_CORRESPONDENCES:
-        return None, no_inliers, "fewer than five correspondences"
-    matrix, inliers = ransac.find_essential_matrix(current, previous, threshold, PROBABILITY)
-    if matrix is None or inliers is None or not np.isfinite(matrix).all():
-        return None, no_inliers, "no essential matrix"
-    if matrix.shape != (3, 3):
-        return None, no_inliers, "several essential matrices"
-    return matrix, inliers.ravel() > 0, ""
-
-
-@fast
-def rotation_and_zoom(current, previous, inliers, near):
-    """How well the motion of a camera that only turned or zoomed explains the points.
-
-    current, previous: normalised correspondences (N, 2). inliers: N booleans. Returns (share,
-    zoom). A rotation and a zoom of a camera that stays in its place would move the previous points
-    somewhere. share is that of the inliers whose current point is nearer to there than `near`.
-    1.01 is a zoom that shows everything one per cent closer.
-
-    Rotation and zoom are fitted by least squares. Each round linearises the motion (flow) that they
-    cause (Longuet-Higgins and Prazdny, 1980).
-    """
-    moved = previous.copy()
-    zoom = 1.0
-    for _ in range(FLOW_ROUNDS):
-        turn_x, turn_y, turn_z, growth = _flow(current, moved, inliers)
-        for k in range(len(moved)):
-            moved[k, 0], moved[k, 1] = _turned(moved[k, 0], moved[k, 1], turn_x, turn_y, turn_z)
-            moved[k, 0] *= 1 + growth
-            moved[k, 1] *= 1 + growth
-        zoom *= 1 + growth
-    count, close = 0, 0
-    for k in range(len(moved)):
-        dx = current[k, 0] - moved[k, 0]
-        dy = current[k, 1] - moved[k, 1]
-        count += inliers[k]
-        close += inliers[k] and dx * dx + dy * dy < near * near
-    return close / count, zoom
-
-
-@inner
-def _flow(current, moved, inliers):
-    """Three rotations and a zoom that move the inliers of `moved` to `current`, linearised."""
-    across = np.empty(4)  # change of x by the three rotations and by the zoom
-    down = np.empty(4)  # change of y
-    products = np.zeros((4, 4))
-    right = np.zeros(4)
-    for k in range(len(moved)):
-        if not inliers[k]:
-            continue
-        x, y = moved[k, 0], moved[k, 1]
-        dx, dy = current[k, 0] - x, current[k, 1] - y
-        across[0], across[1], across[2], across[3] = -x * y, 1 + x * x, -y, x
-        down[0], down[1], down[2], down[3] = -1 - y * y, x * y, x, y
-        for i in range(4):
-            right[i] += across[i] * dx + down[i] * dy
-            for j in range(i + 1):
-                products[i, j] += across[i] * across[j] + down[i] * down[j]
-    for i in range(4):  # points that do not determine all four leave the rest at about zero
-        products[i, i] += FLOW_DAMPING
-    _cholesky(products)
-    return _solve(products, right[0], right[1], right[2], right[3])
-
-
-@inner
-def _turned(x, y, turn_x, turn_y, turn_z):
-    """Image (x, y) of a point after a rotation by a vector (Rodrigues' formula)."""
-    angle = np.sqrt(turn_x * turn_x + turn_y * turn_y + turn_z * turn_z)
-    sine, cosine = 1.0, 0.5
-    if angle > 1e-6:
-        sine = np.sin(angle) / angle
-        cosine = (1 - np.cos(angle)) / (angle * angle)
-    # turn x point, and turn x (turn x point)
-    first_x, first_y, first_z = turn_y - turn_z * y, turn_z * x - turn_x, turn_x * y - turn_y * x
-    second_x = turn_y * first_z - turn_z * first_y
-    second_y = turn_z * first_x - turn_x * first_z
-    second_z = turn_x * first_y - turn_y * first_x
-    depth = 1 + sine * first_z + cosine * second_z
-    return (
-        (x + sine * first_x + cosine * second_x) / depth,
-        (y + sine * first_y + cosine * second_y) / depth,
-    )
 
 
 def recover_pose(
@@ -198,7 +65,7 @@ def _triangulate_and_count(
     return int(votes.sum())
 
 
-@fast
+@compiled
 def _count_in_front(current, previous, rotation, t, least):
     """Votes for (rotation, t) and (rotation, -t), and the points that are too close to a limit.
 
@@ -252,7 +119,7 @@ def _count_in_front(current, previous, rotation, t, least):
     return forward, backward, doubtful[:doubts]
 
 
-@inner
+@inlined
 def _least_eigenvector(b):
     """Unit eigenvector of the least eigenvalue of b (4, 4; lower triangle), by inverse iteration.
 
@@ -273,7 +140,7 @@ def _least_eigenvector(b):
     return False, x0, x1, x2, x3
 
 
-@inner
+@inlined
 def _cholesky(b):
     """Replace the lower triangle of b (4, 4) by its Cholesky factor.
 
@@ -292,7 +159,7 @@ def _cholesky(b):
     return True
 
 
-@inner
+@inlined
 def _solve(b, x0, x1, x2, x3):
     """Solution of the four equations whose Cholesky factor is b and whose right side is x."""
     y0 = x0 / b[0, 0]

@@ -22,11 +22,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thesis_repro.odometry.opencv_exact import epipolar
-from thesis_repro.odometry.opencv_exact.five_point import SAMPLE_SIZE
-from thesis_repro.odometry.opencv_exact.real_roots import LANES
-from thesis_repro.odometry.opencv_exact.rounding import Solutions, no_solutions, solve
-from thesis_repro.running.compiled import fast, inner
+from opencv_exact import epipolar
+from opencv_exact.compiling import compiled, inlined
+from opencv_exact.five_point import SAMPLE_SIZE
+from opencv_exact.real_roots import LANES
+from opencv_exact.rounding import Solutions, no_solutions, solve
 
 MAX_SAMPLES = 1000
 MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole search
@@ -161,7 +161,7 @@ def _opencv_solution(
     return _Solution(int(inliers[best]), matrix, masks[best].reshape(-1, 1))
 
 
-@inner
+@inlined
 def _samples_needed(probability, outliers):
     """Number of samples among which one is free of outliers with the given probability.
 
@@ -178,7 +178,7 @@ def _samples_needed(probability, outliers):
     return round(log_failure / log_missed)
 
 
-@fast
+@compiled
 def _inlier_masks(matrices, columns, limit):
     """Inlier masks (K, N) of K matrices.
 
@@ -196,7 +196,7 @@ def _inlier_masks(matrices, columns, limit):
     return masks
 
 
-@fast
+@compiled
 def draw(columns, block):
     """Draw the next LANES samples as OpenCV does."""
     count = np.uint64(columns.shape[1])
@@ -219,7 +219,7 @@ def draw(columns, block):
     block.state[0] = state
 
 
-@fast
+@compiled
 def _next_doubtful(columns, rough, extents, limit, probability, block, drawn, best):
     """Draw samples until one may or may not be better than the best one, or the search is over.
 
@@ -253,7 +253,7 @@ def _next_doubtful(columns, rough, extents, limit, probability, block, drawn, be
     return drawn, is_new, _Candidate(sample, fewest, most), _Candidate(sample, 0, 0)
 
 
-@inner
+@inlined
 def _inliers_of_sample(columns, rough, extents, limit, solutions, lane, best):
     """Bounds of the number of inliers of a sample's best solution.
 
@@ -271,7 +271,7 @@ def _inliers_of_sample(columns, rough, extents, limit, solutions, lane, best):
     return low, high
 
 
-@inner
+@inlined
 def _may_beat(e, margin, rough, extents, limit, best):
     """False if surely no matrix within the margin of e has more than `best` inliers.
 
@@ -302,7 +302,7 @@ def _may_beat(e, margin, rough, extents, limit, best):
     return True
 
 
-@inner
+@inlined
 def _largest_of_inliers(e, margin, extents, limit):
     """Bound of |algebraic| of an inlier, as computed from e in single precision.
 
@@ -318,7 +318,7 @@ def _largest_of_inliers(e, margin, extents, limit):
     return root * np.sqrt(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1) + doubt
 
 
-@partial(inner, fastmath={"contract"})
+@partial(inlined, fastmath={"contract"})
 def _surely_out(matrix, largest, x, y, u, v):
     """Number of correspondences whose |algebraic| is larger than that of any inlier.
 
@@ -336,7 +336,7 @@ def _surely_out(matrix, largest, x, y, u, v):
     return outliers
 
 
-@inner
+@inlined
 def _bounds(e, margin, columns, limit, best):
     """Least and most inliers that any matrix within the margin of e has.
 
@@ -362,7 +362,7 @@ def _bounds(e, margin, columns, limit, best):
     return low, high
 
 
-@inner
+@inlined
 def _bounds_of_block(e, margin, x, y, u, v, limit):
     """Least and most inliers of `_bounds` among the correspondences of one block."""
     root = np.sqrt(limit)
@@ -378,7 +378,7 @@ def _bounds_of_block(e, margin, x, y, u, v, limit):
     return low, high
 
 
-@inner
+@inlined
 def _change(margin, root, x, y, u, v):
     """How much |algebraic| minus `largest` (_bounds_of_block) may change within the margin.
 
