@@ -10,6 +10,7 @@ import numpy as np
 
 from thesis_repro import masks
 from thesis_repro.odometry import THESIS, keypoints
+from thesis_repro.odometry.odometry import track
 
 SAME = 2.0  # pixels: a keypoint within this distance of a tracked keypoint is the same one
 
@@ -91,8 +92,8 @@ def _track(
     """
     if not len(corners):
         return corners, np.zeros(0, bool)
-    tracked, followed = keypoints.track(before, after, corners)
-    back, returned = keypoints.track(after, before, tracked)
+    tracked, followed = track(before, after, corners)
+    back, returned = track(after, before, tracked)
     agrees = np.linalg.norm(back - corners, axis=1) < SAME
     return tracked, followed & returned & agrees
 
