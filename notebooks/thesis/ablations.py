@@ -19,7 +19,7 @@ from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
-from thesis_repro.odometry.passes import Masks
+from thesis_repro.odometry.runs import Masks
 from thesis_repro.odometry.pose import normalise
 from thesis_repro.running import results
 from thesis_repro.running.files import progress

@@ -15,7 +15,7 @@ from street import Street, Stripes
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.masks import MaskFolder
+from thesis_repro.mask_files import MaskFolder
 from thesis_repro.odometry import THESIS, Odometry, OdometrySettings, keypoints, metrics, pose
 from thesis_repro.running.settings import ROOT
 

@@ -106,7 +106,7 @@ def masks(options: Any) -> None:
 
     Masks are 8-bit PNG images: 255 keeps keypoints, 0 ignores them.
     """
-    from thesis_repro.masks import LabelMasks, write_masks
+    from thesis_repro.mask_files import LabelMasks, write_masks
 
     sequence, settings = _sequence(options), _mask_settings(options)
     if not options.dilation and settings.keep != "static":
@@ -389,7 +389,7 @@ def _mask_settings(options: Any, has_labels: bool = True) -> Any:
 
 def _masks(options: Any, sequence: Any) -> Any:
     """The masks that --masks or --labels name, or None."""
-    from thesis_repro.masks import LabelMasks, MaskFolder
+    from thesis_repro.mask_files import LabelMasks, MaskFolder
 
     settings = _mask_settings(options, options.labels)
     if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):

@@ -24,10 +24,8 @@ def detect(
     shi_tomasi: what finds Shi-Tomasi keypoints, with the arguments of `odometry.detect`.
     """
     inside = mask if settings.mask_mode == "detect" else None
-    if settings.detector == "orb":
-        points = _detect_orb(frame, settings, inside)
-    else:
-        points = shi_tomasi(frame, settings, inside)
+    find = _detect_orb if settings.detector == "orb" else shi_tomasi
+    points = find(frame, settings, inside)
     if mask is None or settings.mask_mode == "detect":
         return points
     columns, rows = np.rint(points).astype(int).T

@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import estimators
 
@@ -74,6 +76,12 @@ class OdometrySettings:
     def of_detection(self) -> tuple:
         """Return the settings that decide which keypoints are found."""
         return tuple(getattr(self, name) for name in DETECTION)
+
+    def order(self, frame: int, matches: int) -> np.ndarray | slice:
+        """Return the order in which RANSAC takes matches, (N,) indices; a slice: as they are."""
+        if self.shuffle_seed is None:
+            return slice(None)
+        return np.random.default_rng((self.shuffle_seed, frame)).permutation(matches)
 
     def detect_function(self) -> Any:
         """Return what finds keypoints: OpenCV's call, or keypoints.detect for other choices."""

@@ -19,7 +19,7 @@ from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.passes import is_flagged, poses_of
+from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import listed, progress
 from thesis_repro.study import compare, controls, workers

@@ -11,7 +11,7 @@ import pandas as pd
 from thesis_repro.checks import oddities, polarity
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.masks import MaskFolder
+from thesis_repro.mask_files import MaskFolder
 from thesis_repro.running import results
 from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
