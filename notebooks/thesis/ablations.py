@@ -21,7 +21,6 @@ from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators, metrics
 from thesis_repro.odometry.odometry import detect, normalise, track
 from thesis_repro.odometry.runs import Masks
-from thesis_repro.odometry.odometry import normalise
 from thesis_repro.running import results
 from thesis_repro.running.files import progress
 from thesis_repro.study import workers

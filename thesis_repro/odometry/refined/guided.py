@@ -7,12 +7,12 @@ angles.
 """
 
 import numpy as np
+from opencv_exact.rounding import WELL_CONDITIONED, solve
 
 from opencv_exact import epipolar
 from opencv_exact.compiling import compiled, inlined
 from opencv_exact.ransac import MAX_SAMPLES, draw, first_block
 from opencv_exact.real_roots import LANES
-from opencv_exact.rounding import WELL_CONDITIONED, solve
 
 
 def ransac_with_prior(
