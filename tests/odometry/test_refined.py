@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from street import Street
 
 from thesis_repro import odometry
-from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import THESIS, Matches, Odometry, metrics
-from thesis_repro.odometry.refined import RefinedEstimator, normal_equations
+from thesis_repro.odometry import THESIS, Matches, metrics
+from thesis_repro.odometry.refined import RefinedEstimator
 from thesis_repro.odometry.refined import fit as refine
 from thesis_repro.odometry.refined.motion_prior import (
     AMBIGUOUS,
@@ -70,20 +69,6 @@ def test_the_sign_survives_a_slow_step():
     assert refine.cheirality_votes(turn(0.2), AHEAD, refine.columns(matches), 1.0) == (0, 0)
 
 
-def test_normal_equations_are_sums_over_single_points():
-    points = np.random.default_rng(0).uniform(
-        -0.6, 0.6, (4, 2 * normal_equations.POINTS_PER_BLOCK + 7)
-    )
-    motion = Rotation.from_rotvec([0.01, 0.02, -0.01]).as_matrix(), np.array([0.0, 0.6, 0.8])
-    totals = normal_equations.normal_equations(*motion, points, 0.1, True)
-    parts = [
-        normal_equations.normal_equations(*motion, np.ascontiguousarray(point), 0.1, True)
-        for point in np.split(points, points.shape[1], axis=1)
-    ]
-    for total, terms in zip(totals, zip(*parts, strict=True), strict=True):
-        np.testing.assert_allclose(total, sum(terms), rtol=1e-12, atol=1e-12)
-
-
 def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
     matches = replace(seen(street(200), turn(1), AHEAD), inliers=np.arange(200) < 150)
     for sign in (1, -1):
@@ -113,16 +98,6 @@ def test_a_consistent_motion_is_used_as_it_is():
         degrees_apart(motion.rotation, used.rotation) < 1e-3 and used.translation @ AHEAD > 0.9999
     )
     np.testing.assert_array_equal(prior.rotation, used.rotation)
-
-
-def test_different_minima_end_in_the_same_motion():
-    matches = seen(street(60), turn(1), 0.15 * AHEAD, noise=1e-4)
-    start = refine.fit(turn(1), AHEAD, matches)
-    for off in (0.1, -0.1):  # as if RANSAC had led to another minimum
-        motion = replace(start, rotation=turn(off) @ start.rotation, support=start.support - 2)
-        prior = MotionPrior(turn(1), AHEAD, 0.15)
-        used, _, flag = check_consistency(motion, matches, 0.15, prior)
-        assert flag == "" and degrees_apart(start.rotation, used.rotation) < 0.01
 
 
 def test_of_two_motions_the_consistent_one_is_used_and_flagged():
@@ -227,42 +202,3 @@ def test_on_a_plain_drive_the_fit_has_no_flags_and_its_errors_are_smaller_and_va
         errors[estimator] = [metrics.rmse(result.poses, drive.poses) for result in results]
     assert np.mean(errors["refined"]) < np.mean(errors["inliers"])
     assert np.std(errors["refined"]) < 0.5 * np.std(errors["inliers"])
-
-
-@pytest.mark.real
-@pytest.mark.parametrize("seed", [None, 2, 4])
-def test_a_turn_is_estimated_from_few_keypoints(kitti_real, seed):
-    """05, frames 128 to 149.
-
-    The points are far away, so a shift to the side explains them as well as the turn.
-    """
-    sequence = Sequence(kitti_real, "05")
-    settings = replace(REFINED, max_keypoints=500, shuffle_seed=seed)
-    follower = Odometry(sequence.intrinsics, settings, sequence.poses[128])
-    follower.count = 128  # the shuffle's seed includes the frame number
-    metres = odometry.scales(sequence)
-    flags = set()
-    for index in range(128, 150):
-        step = follower.step(sequence.frame(index), metres[index] if index > 128 else 0.0)
-        if index > 128:
-            flags |= set(step.flags)
-            true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
-            assert degrees_apart(true[:3, :3], step.motion.rotation) < 0.5, index
-    assert flags <= {AMBIGUOUS}
-
-
-@pytest.mark.real
-def test_a_second_start_leaves_a_poor_minimum(kitti_real):
-    """05, frames 0 and 1.
-
-    Without a second start, six shuffles of 300 points give headings up to 11 degrees apart.
-    """
-    sequence = Sequence(kitti_real, "05")
-    directions = []
-    for seed in range(6):
-        follower = Odometry(
-            sequence.intrinsics, replace(REFINED, max_keypoints=300, shuffle_seed=seed or None)
-        )
-        follower.step(sequence.frame(0))
-        directions.append(follower.step(sequence.frame(1), 1.0).motion.translation)
-    assert np.degrees(np.arccos(np.min(np.array(directions) @ np.transpose(directions)))) < 4

@@ -250,34 +250,11 @@ def test_a_change_in_another_module_is_compiled_and_a_new_date_is_not(tmp_path):
         for name in ("outer.py", "adding.py"):
             os.utime(tmp_path / name, (date, date))
         result = subprocess.run(
-            [sys.executable, "-c", "from outer import f; print(f(1), f.stats.cache_hits)"],
+            [sys.executable, "-c", "from outer import f; print(f(1.0), len(f.stats.cache_hits))"],
             env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
             capture_output=True,
             text=True,
             check=True,
         )
-        results.append(result.stdout.split())
-    compiled_anew, from_cache = "Counter()", "Counter({"
-    assert [result[0] for result in results] == ["2", "2", "3"]
-    assert [result[1].startswith(from_cache) for result in results] == [False, True, False]
-    assert results[0][1] == compiled_anew
-
-
-@pytest.mark.real
-@pytest.mark.parametrize("name", ["00", "05", "06"])
-def test_same_bits_on_real_frames(kitti_real, name):
-    """A pair of frames each, with all matches and with few of them in another order."""
-    folder = kitti_real / "sequences" / name / "image_0"
-    frames = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in sorted(folder.iterdir())[:6]]
-    random = np.random.default_rng(0)
-    for before, frame in zip(frames, frames[1:]):
-        points = cv2.goodFeaturesToTrack(before, 2000, 0.01, 3)
-        tracked, status, _ = cv2.calcOpticalFlowPyrLK(before, frame, points, None)
-        camera = np.array([[718.856, 0, 607.19], [0, 718.856, 185.22], [0, 0, 1]])
-        current, previous = (
-            cv2.undistortPoints(side[status.ravel() == 1].astype(float), camera, None)[:, 0]
-            for side in (tracked, points)
-        )
-        order = random.permutation(len(current))[:200]
-        assert assert_same_bits(current, previous)
-        assert assert_same_bits(current[order], previous[order])
+        results.append(result.stdout.strip())
+    assert results == ["2.0 0", "2.0 1", "3.0 0"]
