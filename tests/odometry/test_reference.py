@@ -26,7 +26,7 @@ CALLS = {
     ),
 }
 PATHS = pd.read_csv(FOLDER / "poses.csv", dtype=str)
-LONG = 150  # frames; such paths take half a minute each
+LONG = 100  # frames; such paths take ten seconds each
 
 
 def recorded(run):
@@ -91,7 +91,7 @@ def test_the_hard_cases_are_among_the_steps():
     assert turns(town["refined_rotations"]).max() < 1
     assert (files["01_masked"]["flags"] == "ambiguous motion").sum() > 4
     assert set(files["few_points"]["matches"]) == {5, 6, 7, 8}
-    assert set(files["few_points"]["solutions"]) > {1, 2, 4}
+    assert set(files["few_points"]["solutions"]) == {1, 4, 6}
     assert files["no_parallax"]["votes"].tolist() == [0, 0]
 
 
