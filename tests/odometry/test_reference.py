@@ -13,7 +13,7 @@ import opencv_exact
 import thesis_repro
 from reference_steps import ESTIMATORS, FOLDER, STEPS, digest
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.masks import MaskFolder
+from thesis_repro.mask_files import MaskFolder
 from thesis_repro.odometry import OPENCV, THESIS, Matches
 from thesis_repro.odometry.odometry import PROBABILITY, VoteOfAll, normalise
 from thesis_repro.odometry.refined import RefinedEstimator

@@ -1,0 +1,288 @@
+"""The audit: where the thesis contradicts itself, its code or its libraries, and what that does.
+
+audit.json holds the rows and lists which columns are measured for them. `table` joins the
+measurements to the rows. Ratios come from `study.compare`. Intervals are those of Student's t over
+`n` values: sequences unless said otherwise.
+"""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from thesis import thesis_tables
+from thesis.captions import REPORTED
+from thesis_repro.data.cityscapes import LABELS
+from thesis_repro.study import compare
+
+WORDS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))
+WIDTHS = range(9, 12)  # the dilation widths that the thesis calls best
+TEXTS = ["quantity", "metric", "estimator", "unit", "data"]
+NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
+
+
+def measurement(
+    row: str, quantity: str, values: Any, unit: str = "", **more: Any
+) -> dict[str, Any]:
+    """Return one measurement for a row of the audit: a mean, its interval and number of values.
+
+    quantity: a text, or the key of one in audit.json. more: further columns (metric, estimator,
+    frames, data).
+    """
+    numbers = np.asarray(values, float).ravel()
+    numbers = numbers[~np.isnan(numbers)]
+    mean = np.nan
+    if len(numbers):
+        mean = numbers.mean()
+    low, high = compare.mean_interval(numbers)
+    return {
+        "row": row,
+        "quantity": WORDS["quantities"].get(quantity, quantity),
+        "unit": unit,
+        "value": mean,
+        "low": low,
+        "high": high,
+        "n": len(numbers),
+        **more,
+    }
+
+
+def share(row: str, quantity: str, percentages: Any, **more: Any) -> dict[str, Any]:
+    """Return one measurement for a row of the audit: the mean of shares in percent.
+
+    The interval is cut at 0 and 100, which no share exceeds. A transform that needs no cut (the
+    logit) is not defined for shares of exactly 0 or 100, which occur.
+    """
+    mean = measurement(row, quantity, percentages, "%", **more)
+    low, high = np.clip([mean["low"], mean["high"]], 0, 100).tolist()
+    return {**mean, "low": low, "high": high}
+
+
+def ratio(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
+    """Return one measurement for a row of the audit: the geometric mean of one ratio a sequence."""
+    mean = compare.geometric_mean(ratios)
+    interval = {"low": mean["low"], "high": mean["high"], "n": mean["n"]}
+    return measurement(row, quantity, [], "ratio", value=mean["ratio"], **interval, **more)
+
+
+def table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
+    """Return the audit as a table with one line a measurement.
+
+    The first line of each row has the row's texts. data: the origin of measurements that name none.
+    Numbers are rounded (see `rounded`). Raises ValueError if a measurement's row is not in
+    audit.json.
+    """
+    headings = {"does": "the thesis or its code", "right": "what would be right"}
+    words = pd.DataFrame(WORDS["rows"]).rename(columns=headings)
+    numbers = pd.DataFrame(measurements).reindex(columns=["row", *NUMBERS])
+    numbers = numbers.astype(dict.fromkeys(TEXTS, object)).fillna({"data": data})
+    unknown = sorted(set(numbers["row"]) - set(words["row"]))
+    if unknown:
+        raise ValueError(f"audit.json has no rows for these measurements: {', '.join(unknown)}")
+    lines = words.merge(numbers, on="row", how="left").fillna(dict.fromkeys(TEXTS, ""))
+    repeated = lines["row"].duplicated()
+    lines.loc[repeated, words.columns.drop("row")] = ""
+    bounds = ["value", "low", "high"]
+    lines[bounds] = lines[bounds].map(rounded)
+    return lines.astype({"n": "Int64", "frames": "Int64"})
+
+
+def rounded(value: float) -> float:
+    """Round a number to four significant digits, or to eight close to 1.
+
+    Eight show whether an interval excludes 1.
+    """
+    digits = 4
+    if abs(value - 1) < 5e-4:
+        digits = 8
+    return float(f"{value:.{digits}g}")
+
+
+def measured(table: pd.DataFrame, kind: str) -> list[dict[str, Any]]:
+    """Return the measurements that audit.json lists for one kind of table.
+
+    Where audit.json gives a unit, they are means over sequences; "%" is a share. Otherwise they are
+    ratios to a reference method, or to another column ("over") of the same rows.
+    kind: "ablations" (`ablations.measure`), "study" (`runner.run_jobs`), "tracks" and "boundaries"
+    (as in `ablations`), "shares" (of pixels, one row a frame).
+    """
+    measurements = []
+    for spec in WORDS["measured"]:
+        if spec["runs"] != kind:
+            continue
+        for metric in spec["metrics"]:
+            if metric not in table:
+                continue
+            pairs = _estimator_pairs(spec, table, metric)
+            measurements += [_measure(spec, table, metric, *pair) for pair in pairs]
+    return _with_frames(measurements, table)
+
+
+def _estimator_pairs(
+    spec: dict[str, Any], table: pd.DataFrame, metric: str
+) -> Iterable[tuple[str, str]]:
+    """Return the estimators to measure, each with that of the reference.
+
+    It is ("", "") where the estimator makes no difference.
+    """
+    if "estimators" in spec:
+        return spec["estimators"]
+    if "estimator" in table and metric != "mean_keypoints":
+        return [(name, name) for name in compare.ESTIMATORS]
+    return [("", "")]
+
+
+def _measure(
+    spec: dict[str, Any],
+    table: pd.DataFrame,
+    metric: str,
+    estimator: str,
+    reference_estimator: str,
+) -> dict[str, Any]:
+    """Return the measurement of one metric and estimator that an entry of audit.json describes."""
+    rows = _select(table, estimator, spec.get("method"), spec.get("widths"))
+    label = spec.get("label", WORDS["metrics"].get(metric, ""))
+    names = {"metric": label, "estimator": estimator}
+    if "unit" in spec:
+        means = rows.groupby("sequence")[metric].mean()
+        if spec["unit"] == "%":
+            return share(spec["row"], spec["quantity"], means, **names)
+        return measurement(spec["row"], spec["quantity"], means, spec["unit"], **names)
+    if "over" in spec:
+        reference = rows.assign(**{metric: rows[spec["over"]]})
+    else:
+        widths = spec.get("reference_widths")
+        reference = _select(table, reference_estimator, spec.get("reference"), widths)
+    ratios = compare.ratios(rows, reference, metric)
+    return ratio(spec["row"], spec["quantity"], ratios, **names)
+
+
+def _select(
+    table: pd.DataFrame, estimator: str, method: str | None, widths: str | list | None
+) -> pd.DataFrame:
+    """Select the rows of an estimator, a method and some widths.
+
+    An empty estimator, or None, selects all. widths: a list, "tested" (`compare.tested_width`) or
+    "best" (each sequence's best width, of masks).
+    """
+    if estimator and "estimator" in table:
+        table = table[table["estimator"] == estimator]
+    if widths == "best":
+        return thesis_tables.of_chosen_width(compare.of_method(table, "masked"))
+    if widths == "tested":
+        widths = [compare.tested_width(table)]
+    if widths is not None:
+        table = table[table["dilation_width"].isin(widths)]
+    if method is not None:
+        table = table[table["method"] == method]
+    return table
+
+
+def _with_frames(measurements: list[dict[str, Any]], table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the measurements that have values, with the number of frames.
+
+    It is the table's mean number of frames a sequence, if known.
+    """
+    frames = np.nan
+    sequences = table.groupby("sequence")
+    if "frames" in table:
+        frames = round(sequences["frames"].first().mean())
+    elif "frame" in table:
+        frames = round(sequences["frame"].nunique().mean())
+    return [{**measurement, "frames": frames} for measurement in measurements if measurement["n"]]
+
+
+def of_tables() -> list[dict[str, Any]]:
+    """Return the rows that are arithmetic on numbers that the thesis reports.
+
+    They are rows 1, 3, 4, 9, 18, 35, 41, 45, 60, 66, 69, 78 and 89.
+    """
+    measurements = _of_changes("RMSE", "table_4_2_rmse_percent_change")
+    measurements += _of_changes("MAE", "table_4_3_mae_percent_change")
+    best = pd.DataFrame(REPORTED["table_4_1"])
+    keypoints = best["mean_keypoints"]
+    factors = 2000 / keypoints
+    classes = REPORTED["training"]["classes"]
+    parameters = REPORTED["figure_a1_model_summary"]["rows"][-1]["params"]
+    best_widths = best["dilation_width"].isin(WIDTHS).sum()
+    measurements += [
+        measurement("3", "reduction", 2000 / keypoints.mean(), "ratio"),
+        ratio("3", "reduction of each", factors),
+        measurement("3", "three", (factors >= 3).sum(), "sequences"),
+        measurement("9", "categories", len(LABELS)),
+        measurement("9", "outputs", classes),
+        measurement("9", "parameters", parameters // classes),
+        measurement("35", "widths", best_widths, "sequences"),
+        measurement("60", "keypoints", keypoints),
+    ]
+    measurements += [measurement(**constant) for constant in WORDS["arithmetic"]]
+    return [{**measurement, "data": "the thesis's numbers"} for measurement in measurements]
+
+
+def _of_changes(metric: str, key: str) -> list[dict[str, Any]]:
+    """Return rows 1, 4 and 41 for one metric. key: of its changes in percent in reported.json."""
+    change = pd.Series(REPORTED[key])
+    improved = int((change < 0).sum())
+    sign_test = binomtest(improved, len(change), alternative="greater").pvalue
+    larger = (change > 0).sum()
+    return [
+        measurement("1", "sum", change.sum(), "%", metric=metric),
+        measurement("1", "mean", change, "%", metric=metric),
+        measurement("1", "median", change.median(), "%", metric=metric),
+        ratio("1", "ratio", 1 + change / 100, metric=metric),
+        measurement("4", "larger", larger, "sequences", metric=metric),
+        measurement("41", "improved", improved, "sequences", metric=metric),
+        measurement("41", "sign", 100 * sign_test, "%", metric=metric),
+    ]
+
+
+def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return rows 2, 31, 35, 39 and those that audit.json lists, from the runs of notebook 08.
+
+    shuffled: its repetitions of all keypoints, see `thesis_tables.null_distribution`.
+    """
+    masked = compare.of_method(runs, "masked")
+    baseline = compare.of_method(runs, "baseline")
+    best = thesis_tables.of_chosen_width(masked)
+    stability = thesis_tables.stability(masked, baseline)
+    by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
+    by_rmse = by_width["rmse"].groupby("sequence").idxmin()
+    by_mae = by_width["mae"].groupby("sequence").idxmin()
+    rmse = by_width["rmse"]
+    rmse_ratios = rmse.loc[by_mae].to_numpy() / rmse.loc[by_rmse].to_numpy()
+    best_ratios = compare.ratios(best, baseline, "rmse")
+    widths = thesis_tables.best_widths(masked)["dilation_width"]
+    measurements = [
+        ratio("2", "best same", best_ratios, metric="RMSE"),
+        ratio("31", "mae chooses", rmse_ratios, metric="RMSE"),
+        measurement("31", "other width", (by_rmse != by_mae).sum(), "sequences"),
+        measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences"),
+        ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
+        share("2", "same best", stability["same_best"]),
+    ]
+    widths_run = masked["dilation_width"].nunique()
+    studies = thesis_tables.null_distribution(shuffled, widths_run, "rmse")
+    for name in ("mean", "median"):
+        values = studies.agg(name, axis=1)
+        low, high = thesis_tables.middle(values)
+        interval = {"low": low, "high": high, "n": len(studies)}
+        measurements.append(
+            measurement("39", f"null {name}", values.mean(), "%", metric="RMSE", **interval)
+        )
+    reported = pd.Series(REPORTED["table_4_2_rmse_percent_change"]).mean()
+    as_low = 100 * (studies.mean(axis=1) <= reported).mean()
+    measurements.append(measurement("39", "as low", as_low, "%", metric="RMSE"))
+    return _with_frames(measurements, runs) + measured(runs, "study")
+
+
+def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return row 14 and those that audit.json lists, from the runs of `ablations.measure`."""
+    measurements = []
+    spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
+    for estimator, factors in spread.groupby("estimator")["factor"]:
+        measurements.append(ratio("14", "spread", factors, metric="RMSE", estimator=estimator))
+    return _with_frames(measurements, runs) + measured(runs, "ablations")

@@ -1,0 +1,336 @@
+"""Figures 2.2, 2.7 to 2.9, 2.11 and 2.12, drawn from the project's network and data.
+
+Cells of the notebooks draw diagrams and plots of one formula or table (2.1, 2.3 to 2.6, 3.4, 3.5,
+4.1, 4.17, A.1).
+"""
+
+from typing import Any, NamedTuple
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from thesis_repro.odometry import metrics
+from thesis_repro.report import paths, style
+from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
+
+
+def figure_2_02(
+    patch: np.ndarray,
+    kernel: np.ndarray,
+    bias: float,
+    feature_map: np.ndarray,
+    activated: np.ndarray,
+    pixel: tuple[int, int],
+) -> plt.Figure:
+    """Figure 2.2: a kernel of the trained network's first layer on a patch of its input.
+
+    It shows Equation 2.1. The upper panels show the patch (h, w, channels), its feature map (h, w)
+    and the activation after normalisation and ReLU (h, w). The lower panels show the sum at one
+    pixel (row, column): the kernel (k, k, channels) times the pixel's receptive field, plus the
+    bias.
+    """
+    figure, axes = style.new_figure(2, 3, height=4.7, height_ratios=[1.35, 1])
+    (patch_panel, response_panel, activation_panel), lower = axes
+    row, column = pixel
+    height, width = patch.shape[:2]
+    limit = np.abs(feature_map).max()
+    style.show_image(patch_panel, patch[..., 0], f"input x, {height}x{width}", vmin=0, vmax=255)
+    style.show_image(
+        response_panel, feature_map, "feature map y", cmap="PuOr", vmin=-limit, vmax=limit
+    )
+    activation = f"normalised, ReLU: {activated[row, column]:.2f}"
+    style.show_image(activation_panel, activated, activation, vmin=0)
+    reach = kernel.shape[0] // 2
+    _mark(figure, patch_panel, pixel, 2 * reach + 1, "gray value")
+    _mark(figure, response_panel, pixel, 1, "response")
+    _mark(figure, activation_panel, pixel, 1, "activation")
+    field = patch[row - reach : row + reach + 1, column - reach : column + reach + 1]
+    products = field * kernel
+    sums = products.sum(axis=(0, 1))
+    show_numbers(lower[0], field[..., 0], "its receptive field x (marked)", ".0f")
+    show_numbers(lower[1], kernel[..., 0], "times the kernel's weights w", ".4f")
+    show_numbers(lower[2], products[..., 0], "is w x", ".2f")
+    remark = ""
+    if len(sums) > 1:
+        remark = " (above: the first channel)"
+    terms = " + ".join(f"{term:.2f}" for term in sums)
+    total = bias + sums.sum()
+    figure.supxlabel(f"y = b + Σ w x = {bias:.2f} + {terms} ≈ {total:.1f}{remark}", fontsize=9)
+    return figure
+
+
+def window_of_most_contrast(image: np.ndarray, side: int) -> tuple[slice, slice]:
+    """Return the square window of an image (size, size) in which its values vary most.
+
+    It is not at the edge of the image, where a convolution adds zeros to it.
+    """
+    places = range(1, len(image) - side, side // 4)
+    windows = [np.s_[row : row + side, left : left + side] for row in places for left in places]
+    return max(windows, key=lambda window: image[window].std())
+
+
+def _mark(
+    figure: plt.Figure, panel: plt.Axes, pixel: tuple[int, int], side: int, unit: str
+) -> None:
+    """Add a colour scale to an image, and a square of `side` pixels around a pixel."""
+    figure.colorbar(panel.images[0], ax=panel, shrink=0.85, pad=0.03, label=unit)
+    row, column = pixel
+    corner = (column - side / 2, row - side / 2)
+    panel.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=RED))
+
+
+UNET_PARTS = {
+    "InputLayer": ("input", "#999999"),
+    "Activation": ("convolution, normalisation, ReLU", BLUE),
+    "MaxPooling2D": ("max pooling", ORANGE),
+    "Conv2DTranspose": ("transposed convolution", GREEN),
+    "Concatenate": ("concatenation", SKY),
+    "output": ("1x1 convolution, softmax", RED),
+}
+
+
+class Box(NamedTuple):
+    """The box of a layer in Figure 2.7."""
+
+    left: float
+    right: float
+    middle: float  # height of its middle
+
+
+def figure_2_07(model: Any) -> plt.Figure:
+    """Figure 2.7: the U-Net, one box a stage.
+
+    The height of a box shows the image size, its width the number of channels. Shapes and skip
+    connections are read from the layers of the Keras model.
+    """
+    figure, axes = style.new_figure(height=4.0)
+    axes.set_axis_off()
+    boxes: dict[str, Box] = {}
+    left, previous = 0.0, None
+    for layer in model.layers:
+        kind = type(layer).__name__
+        if layer is model.layers[-1]:
+            kind = "output"
+        if kind not in UNET_PARTS:
+            continue
+        side, channels = layer.output.shape[2:]
+        scale = side / model.input_shape[2]
+        width = 0.09 + 0.045 * np.log2(channels)
+        half = 0.175 + 0.525 * scale
+        box = Box(left, left + width, 1.5 * np.log2(scale))
+        bottom, top, center = box.middle - half, box.middle + half, left + width / 2
+        _, color = UNET_PARTS[kind]
+        axes.add_patch(Rectangle((left, bottom), width, 2 * half, color=color, linewidth=0))
+        axes.text(center, top + 0.06, channels, ha="center", va="bottom", fontsize=6)
+        if kind in ("InputLayer", "MaxPooling2D", "Concatenate"):
+            size = f"{side}x{side}"
+            axes.text(center, bottom - 0.08, size, ha="center", va="top", fontsize=7)
+        if previous:
+            ends = (previous.right, left), (previous.middle, box.middle)
+            axes.plot(*ends, color="#bbbbbb", linewidth=0.8, zorder=0)
+        if kind == "Concatenate":
+            inputs = [boxes[tensor._keras_history.operation.name] for tensor in layer.input]
+            skipped = min(inputs)  # the one further to the left
+            _arrow(axes, (skipped.right, skipped.middle), (left, box.middle), "#777777")
+        boxes[layer.name] = previous = box
+        left = box.right + 0.32
+    axes.autoscale_view()
+    handles: list[Any] = [Patch(color=color, label=text) for text, color in UNET_PARTS.values()]
+    handles.append(
+        Line2D([], [], color="#777777", marker=">", markersize=5, label="skip connection")
+    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
+    """Figure 2.8: camera poses C of a sequence from above, and the motions T between them.
+
+    Equations 2.2, 2.3. poses: a few (n, 4, 4) camera-to-world poses, metres. Short arrows show the
+    viewing direction.
+    """
+    # the first camera is at the origin and looks up the page
+    poses = np.linalg.inv(poses[0]) @ poses
+    positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
+    figure, axes = style.new_figure(height=3.8)
+    axes.plot(*positions.T, "o", markersize=4, color="black")
+    axes.quiver(
+        *positions.T,
+        *ahead.T,
+        color=BLUE,
+        zorder=3,
+        angles="xy",
+        units="height",
+        scale=11,
+        width=0.01,
+    )
+    for index, position in enumerate(positions):
+        axes.annotate(f"$C_{{{index}}}$", position, 16 * right[index], **FORMULA)
+    for index in range(1, len(poses)):
+        _draw_motion(axes, poses, index)
+    axes.set(
+        xlabel="x, to the right of the first camera (m)", ylabel="z, ahead of the first camera (m)"
+    )
+    axes.set_title(title)
+    # a square around the path, with room for the formulas
+    x, z = (positions.max(axis=0) + positions.min(axis=0)) / 2
+    room = 0.65 * max(np.ptp(positions, axis=0).max(), 1)
+    axes.set(xlim=(x - room, x + room), ylim=(z - room, z + room), aspect="equal")
+    legend = axes.legend(
+        title="motion: length, turn",
+        loc="center left",
+        bbox_to_anchor=(1, 0.5),
+        handlelength=0,
+        handletextpad=0,
+    )
+    legend.get_title().set_fontsize(8)
+    # rc_context would also reset whether notebooks show figures
+    plt.setp(legend.get_texts(), parse_math=True)
+    return figure
+
+
+FORMULA: dict[str, Any] = {
+    "textcoords": "offset points",
+    "ha": "center",
+    "va": "center",
+    "fontsize": 10,
+    "parse_math": True,
+}
+
+
+def _draw_motion(axes: plt.Axes, poses: np.ndarray, index: int) -> None:
+    """Draw the motion to a pose from the one before it, with its formula, length and angle."""
+    motion = np.linalg.inv(poses[index - 1]) @ poses[index]  # Equation 2.3, for T
+    formula = f"$T_{{{index},{index - 1}}}$"
+    length = np.linalg.norm(motion[:3, 3])
+    start, end = poses[index - 1 : index + 1, [0, 2], 3]
+    _arrow(axes, start, end, RED, shrinkA=3, shrinkB=3, connectionstyle="arc3,rad=-0.3")
+    left = (end - start)[::-1] * (-1, 1)
+    beside = (start + end) / 2 + 0.15 * left
+    offset = 11 * left / max(length, 1e-9)
+    axes.annotate(formula, beside, offset, color=RED, **FORMULA)
+    text = f"{formula}: {length:.1f} m, {metrics.angles(motion):.1f}°"
+    axes.plot([], [], " ", label=text)
+
+
+def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure:
+    """Figure 2.9: the 60 ORB matches of smallest descriptor distance between two frames.
+
+    first, second: (height, width).
+    """
+    orb = cv2.ORB_create(1000)
+    points, descriptors = orb.detectAndCompute(first, None)
+    second_points, second_descriptors = orb.detectAndCompute(second, None)
+    matches = []
+    if points and second_points:
+        matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+        matches = matcher.match(descriptors, second_descriptors)
+    best = sorted(matches, key=lambda match: match.distance)[:60]
+    gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
+    both = np.vstack([first, gap, second])
+    offset = (0, first.shape[0] + gap.shape[0])
+    figure, (axes,) = style.frame_panels(both)
+    figure.set_figheight(figure.get_figheight() + 0.55)  # of the colour scale
+    style.show_image(
+        axes, both, f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
+    )
+    ends = []
+    for match in best:
+        below = np.add(second_points[match.trainIdx].pt, offset)
+        ends.append((points[match.queryIdx].pt, below))
+    distances = [match.distance for match in best]
+    lines = LineCollection(ends, array=distances, cmap="plasma", linewidth=0.8)
+    axes.add_collection(lines)
+    figure.colorbar(
+        lines,
+        ax=axes,
+        location="bottom",
+        shrink=0.5,
+        aspect=40,
+        pad=0.02,
+        label="descriptor bits that differ, of 256",
+    )
+    return figure
+
+
+def figure_2_10(estimates: dict[str, np.ndarray], true: np.ndarray, title: str) -> plt.Figure:
+    """Figure 2.10: estimated paths, {name: (n, 4, 4)}, and how far each drifts from the truth."""
+    return paths.figure(estimates, true, title)
+
+
+def figure_2_11(
+    first: np.ndarray,
+    second: np.ndarray,
+    in_both: tuple[np.ndarray, np.ndarray],
+    lost: np.ndarray,
+    new: np.ndarray,
+    titles: list[str],
+) -> plt.Figure:
+    """Figure 2.11: one scene from two viewpoints, with the keypoints of both and of one frame.
+
+    in_both: the same keypoints in the first and in the second frame, a pair of arrays. lost, new:
+    those of the first and of the second frame only (see `flicker.found_again`). All arrays are
+    (n, 2) pixels.
+    """
+    figure, axes = style.frame_panels(first, 2)
+    for panel, image, title, points in zip(axes, (first, second), titles, in_both, strict=True):
+        style.show_image(panel, image, title)
+        label = f"{len(points)} in both frames"
+        panel.scatter(*points.T, s=5, color=GREEN, linewidths=0, label=label)
+    only = f"{len(lost)} in the first frame only"
+    axes[0].scatter(*lost.T, s=9, color=RED, marker="x", linewidths=0.8, label=only)
+    only = f"{len(new)} in the second frame only"
+    axes[1].scatter(*new.T, s=9, color=ORANGE, marker="^", linewidths=0, label=only)
+    style.legend_below(figure, axes, 3)
+    return figure
+
+
+def figure_2_12(
+    frame: np.ndarray,
+    frame_keypoints: np.ndarray,
+    label_map: np.ndarray,
+    label_keypoints: np.ndarray,
+    titles: tuple[str, str],
+) -> plt.Figure:
+    """Figure 2.12: a frame, its Shi-Tomasi keypoints, and those of its label map, with counts."""
+    figure, axes = style.frame_panels(frame, 3)
+    style.show_image(axes[0], frame, f"(a) {titles[0]}")
+    style.show_image(axes[1], frame, f"(b) {len(frame_keypoints)} keypoints on the frame")
+    axes[1].scatter(*frame_keypoints.T, **KEYPOINT)
+    colors = style.label_colors(label_map, frame)
+    style.show_image(axes[2], colors, f"(c) {len(label_keypoints)} keypoints on {titles[1]}")
+    dots = axes[2].scatter(
+        *label_keypoints.T,
+        s=7,
+        color="white",
+        edgecolors="black",
+        linewidths=0.4,
+        label="keypoint",
+    )
+    style.class_legend(figure, label_map, also=[dots])
+    return figure
+
+
+def _arrow(axes: plt.Axes, start: Any, end: Any, color: str, **options: Any) -> None:
+    properties = {"arrowstyle": "-|>", "color": color, "linewidth": 0.9} | options
+    axes.annotate("", end, start, zorder=0, arrowprops=properties)
+
+
+def show_numbers(
+    axes: plt.Axes, values: np.ndarray, title: str, form: str, colors: np.ndarray | None = None
+) -> None:
+    """Show an array as a table of numbers.
+
+    Its background is given colors (h, w, 4) or a color scale whose middle is zero.
+    """
+    image = values
+    if colors is not None:
+        image = colors
+    limit = 2 * np.abs(values).max()
+    style.show_image(axes, image, title, cmap="PuOr", vmin=-limit, vmax=limit)
+    for (row, column), value in np.ndenumerate(values):
+        axes.text(column, row, format(value, form), ha="center", va="center")

@@ -1,0 +1,507 @@
+"""Figures 4.2 to 4.16: single frames, errors in metres, and keypoints.
+
+`thesis_repro.report.comparison` shows ratios of errors.
+
+`runs` is the table of `runner.run_jobs`. Lines and bars show the mean over repetitions, or the
+only run.
+Bands and error bars go from the lowest to the highest repetition.
+"""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from thesis import thesis_tables
+from thesis.flicker import View
+from thesis_repro.data.cityscapes import colorize
+from thesis_repro.odometry import THESIS
+from thesis_repro.report import style, texts
+from thesis_repro.report.style import (
+    BASELINE,
+    EDGE_COLOR,
+    KEYPOINT,
+    MASKED,
+    PAGE_WIDTH,
+    PINK,
+    REDUCED,
+    TRUTH,
+)
+from thesis_repro.study import compare
+
+METHODS = {
+    "baseline": ("all keypoints", BASELINE, "//"),
+    "masked": ("masked, best width", MASKED, ""),
+    "reduced": ("plainly reduced", REDUCED, "\\\\"),
+}
+BAND = "lowest to highest of the repetitions"
+# cross on a lost run (see `metrics.step_errors`), and on a mean over runs of which one is lost
+LOST: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "x",
+    "color": "black",
+    "markersize": 6,
+    "markeredgewidth": 1.4,
+    "zorder": 4,
+    "clip_on": False,
+    "label": "lost run",
+}
+
+
+def figure_4_02(
+    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, model_name: str
+) -> plt.Figure:
+    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction.
+
+    Section 4.1.
+    """
+    figure, axes = style.new_figure(1, 3, height=2.5)
+    style.show_image(axes[0], image, "image")
+    style.show_image(axes[1], colorize(label_map), "label map")
+    style.show_image(axes[2], colorize(prediction), f"prediction of\n{model_name}")
+    style.class_legend(figure, label_map, prediction)
+    return figure
+
+
+def figure_4_03(
+    frame: np.ndarray, prediction: np.ndarray, title: str, label_map: np.ndarray | None = None
+) -> plt.Figure:
+    """Figure 4.3: a KITTI frame and its predicted label map at the network's size.
+
+    If the true label map is known, it stands below.
+    """
+    label_maps = {"prediction": prediction}
+    if label_map is not None:
+        label_maps["true label map"] = label_map
+    pictures = {title: frame}
+    for name, classes in label_maps.items():
+        pictures[name] = style.label_colors(classes, frame)
+    return style.pictures(frame, pictures, label_maps=label_maps.values())
+
+
+def figure_4_04(
+    frame: np.ndarray, edge_image: np.ndarray, keypoints: np.ndarray, title: str
+) -> plt.Figure:
+    """Figure 4.4: the keypoints, (n, 2) pixels, that the mask keeps along predicted boundaries."""
+    figure, (axes,) = style.frame_panels(frame)
+    bright = max(np.percentile(frame, 98), 1)
+    brighter = np.clip(230 * (frame / bright) ** 0.6, 0, 255).astype(np.uint8)
+    style.show_image(axes, style.with_edges(brighter, edge_image), title)
+    axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
+    return figure
+
+
+def figure_4_05(
+    frame: np.ndarray,
+    all_keypoints: np.ndarray,
+    prediction: np.ndarray,
+    mask: np.ndarray,
+    kept_keypoints: np.ndarray,
+    dilation_width: int,
+    title: str,
+) -> plt.Figure:
+    """Figure 4.5: the procedure in five panels.
+
+    They are the frame, all keypoints, the prediction, its dilated edges and the kept keypoints.
+    """
+    all_title = f"(b) all {len(all_keypoints)} Shi-Tomasi keypoints"
+    kept_title = f"(e) the {len(kept_keypoints)} keypoints that the mask keeps"
+    pictures = {
+        f"(a) {title}": frame,
+        all_title: frame,
+        "(c) prediction": style.label_colors(prediction, frame),
+        f"(d) Canny edges dilated by {dilation_width}x{dilation_width}": mask,
+        kept_title: frame,
+    }
+    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
+    return style.pictures(frame, pictures, keypoints, label_maps=[prediction])
+
+
+def figure_overview(
+    frame: np.ndarray, all_keypoints: np.ndarray, mask: np.ndarray, kept_keypoints: np.ndarray
+) -> plt.Figure:
+    """Draw all keypoints of a frame beside those on its mask; keypoints are (n, 2) pixels."""
+    all_title = f"all {len(all_keypoints)} keypoints"
+    kept_title = f"the {len(kept_keypoints)} keypoints on the mask (light)"
+    dimmed = np.where(mask > 0, frame, frame // 3)
+    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
+    return style.pictures(frame, {all_title: frame, kept_title: dimmed}, keypoints, columns=2)
+
+
+MARKERS = "os^Dv"  # of lines, beside their colours and dashes
+# around a keypoint of the frame before
+RING: dict[str, Any] = {"s": 34, "facecolors": "none", "edgecolors": PINK, "linewidths": 1.1}
+
+
+def figure_4_08(views: list[View], title: str) -> plt.Figure:
+    """Figure 4.8: one place in consecutive frames, where keypoints jump.
+
+    views: from `flicker.follow_window`.
+    """
+    figure, axes = style.new_figure(1, len(views), height=3.4)
+    for panel, view in zip(axes, views, strict=True):
+        height, width = view.crop.shape
+        text = f"frame {view.frame}: {len(view.keypoints)} keypoints"
+        if view.expected is not None:
+            text += f";\n{view.jumped} of {len(view.expected)} rings without a keypoint"
+            panel.scatter(*view.expected.T, **RING)
+        style.show_image(panel, style.with_edges(view.crop, view.edges), text)
+        panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
+        # a circle at the border would widen the panel
+        panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    edge_color = tuple(np.array(EDGE_COLOR) / 255)
+    handles = [
+        Patch(color=edge_color, label="edges of the predicted label map"),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="o",
+            markersize=4,
+            color=KEYPOINT["color"],
+            label="keypoints",
+        ),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="o",
+            markersize=6,
+            markerfacecolor="none",
+            color=PINK,
+            label="where keypoints of the frame before are now",
+        ),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    figure.suptitle(title, fontsize=9)
+    return figure
+
+
+# by how much errors may be enlarged in a figure of paths
+ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100)
+
+
+def figure_paths(
+    truths: dict[str, np.ndarray],
+    rows: pd.DataFrame,
+    paths: dict[tuple[str, str], np.ndarray],
+    method: str,
+) -> plt.Figure:
+    """Figures 4.6, 4.11, 4.12: the paths from above, and below each its distance to the truth.
+
+    Small errors are enlarged in the paths, by a factor that is in the panel's title.
+    truths: {sequence: ground-truth positions (n, 3)}. rows: the runs to draw, of one method;
+    repetition 0 is bold, the other repetitions are faint. paths: {(sequence, run): estimated
+    positions (n, 3)}. All paths of a sequence, also those of other methods, choose its factor and
+    the limits of its panel, so that the figures can be compared.
+    """
+    groups = {name: runs.sort_values("repetition") for name, runs in rows.groupby("sequence")}
+    columns = min(4, len(groups))
+    count = -(-len(groups) // columns)
+    figure, axes = style.new_figure(
+        2 * count,
+        columns,
+        height=count * (PAGE_WIDTH / columns * 0.85 + 1.25) + 0.4,
+        squeeze=False,
+        height_ratios=[2, 1] * count,
+    )
+    # panels of a path and of its error
+    pairs = list(zip(axes[::2].flat, axes[1::2].flat, strict=True))
+    for panel in np.ravel(pairs[len(groups) :]):
+        panel.remove()
+    errors = compare.spread(rows, "rmse")
+    for (above, below), (name, runs) in zip(pairs, groups.items(), strict=False):
+        true = truths[name]
+        above.plot(true[:, 0], true[:, 2], color=TRUTH, linewidth=3, alpha=0.3, label="true path")
+        # paths meet at frame 1, as for the RMSE
+        differences = {
+            run: positions - positions[1] - (true - true[1])
+            for (sequence, run), positions in paths.items()
+            if sequence == name
+        }
+        factor = _enlargement(true, differences)
+        for difference in differences.values():
+            above.update_datalim((true + factor * difference)[:, [0, 2]])
+        _draw_estimates(above, below, true, differences, factor, runs)
+        mean, *span = map(texts.two_digits, errors.loc[name])
+        if len(runs) > 1:
+            mean += f" ({'-'.join(span)})"
+        enlarged = "errors not enlarged"
+        if factor > 1:
+            enlarged = f"errors x{factor} in the path"
+        above.set_title(f"{name}{_setting(runs)}\n{mean} m\n{enlarged}", fontsize=8)
+        above.set_aspect("equal", adjustable="datalim")
+        below.set_ylim(0, None)
+        below.set_xlabel("way (m)", fontsize=7.5, labelpad=1)
+        for panel in (above, below):
+            panel.tick_params(labelsize=6.5)
+            panel.locator_params(nbins=4)
+    for above, below in pairs[::columns]:
+        above.set_ylabel("z (m) over x (m)", fontsize=7.5)
+        below.set_ylabel("distance (m)", fontsize=7.5)
+    style.legend_below(figure, [above for above, _ in pairs[: len(groups)]], 4)
+    repeated = ""
+    if rows["repetition"].any():
+        repeated = ", mean (lowest-highest of the repetitions)"
+    figure.suptitle(f"RMSE of each sequence{repeated}", fontsize=9)
+    return figure
+
+
+def _enlargement(true: np.ndarray, differences: dict[str, np.ndarray]) -> int:
+    """Return by how much errors are enlarged in a path.
+
+    true: positions (n, 3). differences: {run: (n, 3)}, the errors of all its estimates.
+    """
+    largest = max(np.abs(list(differences.values())).max(), 1e-9)
+    extent = np.ptp(true[:, [0, 2]], axis=0).max()
+    room = max(0.15 * extent / largest, 1)
+    return max(scale for scale in ENLARGEMENTS if scale <= room)
+
+
+def _setting(runs: pd.DataFrame) -> str:
+    """Return what is special in a sequence's runs: the width of the mask or number of keypoints."""
+    run = runs.iloc[0]
+    if run["method"] == "masked":
+        return f", width {run['dilation_width']:.0f}"
+    if run["method"] == "reduced":
+        return f", {run['max_keypoints']:.0f} keypoints"
+    return ""
+
+
+def _draw_estimates(
+    above: plt.Axes,
+    below: plt.Axes,
+    true: np.ndarray,
+    differences: dict[str, np.ndarray],
+    factor: int,
+    runs: pd.DataFrame,
+) -> None:
+    """Draw the estimated paths of a sequence from above, and below their distances to the true one.
+
+    true: positions (n, 3). differences: {run: (n, 3)} from it, enlarged by the factor above.
+    """
+    steps = np.linalg.norm(np.diff(true, axis=0), axis=1)
+    along = np.concatenate([[0], np.cumsum(steps)])
+    for run in runs.itertuples():
+        line: dict[str, Any] = {
+            "color": METHODS[run.method][1],
+            "linewidth": 0.6,
+            "alpha": 0.45,
+            "label": "matched points shuffled",
+        }
+        if run.repetition == 0:
+            line |= {"linewidth": 1.2, "alpha": 1, "label": "estimated path", "zorder": 3}
+        drawn = true + factor * differences[run.run]
+        distance = np.linalg.norm(differences[run.run], axis=1)
+        above.plot(drawn[:, 0], drawn[:, 2], **line)
+        below.plot(along, distance, **line)
+        if run.lost:
+            above.plot(drawn[-1, 0], drawn[-1, 2], **LOST)
+            below.plot(along[-1], distance[-1], **LOST)
+
+
+def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
+    """Figure 4.7: the keypoints that masks keep against dilation width.
+
+    They are shown as a part of the thesis's 2000.
+    """
+    keypoints = _by_width(compare.of_method(runs, "masked"), "mean_keypoints")
+    figure, axes = style.new_figure(height=4.0)
+    _lines(axes, keypoints / THESIS.max_keypoints)
+    axes.set(
+        xlabel="dilation width (pixels)",
+        ylabel=f"keypoints, part of {THESIS.max_keypoints}",
+        title="Keypoints kept by masks of increasing dilation width, by sequence",
+    )
+    return figure
+
+
+def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
+    """Figures 4.9, 4.10: the metric against dilation width, one line a sequence.
+
+    Below, one panel a sequence has a bar at each width that was repeated, and the band of the
+    repetitions with all keypoints.
+    """
+    masked = compare.of_method(runs, "masked")
+    baseline = compare.spread(compare.of_method(runs, "baseline"), metric)
+    names = sorted(masked["sequence"].unique())
+    label = f"{metric.upper()} (m)"
+    rows = -(-len(names) // 4)
+    # Any, because subfigures may also return a single one
+    figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
+    axes = above.subplots()
+    _lines(axes, _by_width(masked, metric))
+    axes.set(
+        xlabel="dilation width (pixels)",
+        ylabel=label,
+        title=f"{metric.upper()} against dilation width, by sequence",
+    )
+    _, panels = style.small_panels(names, "width (pixels)", below)
+    for panel, name in zip(panels, names, strict=True):
+        of_sequence = masked[masked["sequence"] == name]
+        _draw_repetitions(panel, of_sequence, metric)
+        row = baseline.loc[name]
+        panel.axhspan(
+            row["lowest"],
+            row["highest"],
+            color=BASELINE,
+            alpha=0.2,
+            linewidth=0,
+            label=f"all keypoints, {BAND}",
+        )
+        panel.axhline(
+            row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean"
+        )
+        panel.set_ylim(0, None)
+    below.supylabel(label, fontsize=8)
+    style.legend_below(below, panels, 2)
+    return figure
+
+
+def _draw_repetitions(panel: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
+    """Draw the errors with masks of one sequence against dilation width."""
+    errors = compare.spread(runs, metric, by="dilation_width")
+    panel.vlines(
+        errors.index,
+        errors["lowest"],
+        errors["highest"],
+        color=MASKED,
+        alpha=0.35,
+        linewidth=4,
+        label=f"masked, {BAND}",
+    )
+    panel.plot(
+        errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1, label="masked, mean"
+    )
+    lost = errors["mean"][runs.groupby("dilation_width")["lost"].any()]
+    if len(lost):
+        panel.plot(lost.index, lost, **LOST)
+
+
+def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
+    """Figures 4.13, 4.15: the metric of all sequences with the three METHODS.
+
+    These are all keypoints, the best mask and plainly reduced keypoints.
+    """
+    names, tables = _spread_by_method(runs, metric)
+    figure, axes = style.new_figure(height=3.2)
+    for offset, (method, table) in enumerate(tables.items()):
+        positions = np.arange(len(names)) + (offset - 1) * 0.27
+        _bar(axes, positions, table, 0.25, method)
+    axes.set_xticks(range(len(names)), names)
+    axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
+    axes.grid(axis="x", visible=False)
+    style.legend_below(figure, [axes], 4)
+    return figure
+
+
+def figure_of_sequences(runs: pd.DataFrame, metric: str) -> plt.Figure:
+    """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel a sequence.
+
+    Each panel has a scale of its own.
+    """
+    names, tables = _spread_by_method(runs, metric)
+    figure, panels = style.small_panels(names)
+    for panel, name in zip(panels, names, strict=True):
+        for offset, (method, table) in enumerate(tables.items()):
+            _bar(panel, [offset], table.loc[[name]], 0.8, method)
+        panel.set_xticks([])
+        panel.grid(axis="x", visible=False)
+    figure.supylabel(f"{metric.upper()} (m)", fontsize=8)
+    style.legend_below(figure, panels, 4)
+    return figure
+
+
+def _by_width(runs: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Return means over the repetitions, one row a sequence and one column a dilation width."""
+    return runs.groupby(["sequence", "dilation_width"])[column].mean().unstack()
+
+
+def _lines(axes: plt.Axes, table: pd.DataFrame) -> None:
+    """Draw one line for each row of a table with one column for each dilation width."""
+    for index, (_, row) in enumerate(table.iterrows()):
+        marker = MARKERS[index % len(MARKERS)]
+        axes.plot(row.index, row, marker=marker, markersize=3.5, **style.line_style(index))
+    axes.set_xticks(table.columns.astype(int))
+    axes.set_ylim(0, None)
+    _name_lines(axes, table)
+
+
+def _name_lines(axes: plt.Axes, table: pd.DataFrame) -> None:
+    """Write a line's name to the right of its end, as far from other names as is needed to read."""
+    colors = [line.get_color() for line in axes.lines]
+    lines = table.ffill(axis=1).assign(color=colors)
+    width = table.columns[-1]
+    lines = lines.sort_values(width)
+    height = axes.get_ylim()[1]
+    distance = height / max(len(lines), 18)
+    places = lines[width].to_numpy(copy=True)
+    for index in range(1, len(places)):
+        places[index] = max(places[index], places[index - 1] + distance)
+    highest = height + distance * np.arange(1 - len(places), 1)
+    for (name, line), place in zip(lines.iterrows(), np.minimum(places, highest), strict=True):
+        axes.annotate(
+            str(name),
+            (width, line[width]),
+            (1.02, place),
+            textcoords=axes.get_yaxis_transform(),
+            va="center",
+            fontsize=8,
+            arrowprops={
+                "arrowstyle": "-",
+                "relpos": (0, 0.5),
+                "shrinkA": 1,
+                "shrinkB": 3,
+                "color": line["color"],
+            },
+        )
+
+
+def _spread_by_method(runs: pd.DataFrame, metric: str) -> tuple[list[str], dict[str, pd.DataFrame]]:
+    """Return the sequences and a table for each method of the thesis.
+
+    A table has one row a sequence: mean, lowest, highest, and whether a run is lost.
+    """
+    tables = {}
+    for method in METHODS:
+        rows = compare.of_method(runs, method)
+        if method == "masked":
+            rows = thesis_tables.of_chosen_width(rows)
+        lost = rows.groupby("sequence")["lost"].any()
+        tables[method] = compare.spread(rows, metric).assign(lost=lost)
+    names = sorted(tables["baseline"].index)
+    return names, {method: table.reindex(names) for method, table in tables.items()}
+
+
+def _bar(
+    axes: plt.Axes,
+    positions: np.ndarray | list[int],
+    table: pd.DataFrame,
+    width: float,
+    method: str,
+) -> None:
+    """Draw bars at the means of a table, with error bars from lowest to highest repetition."""
+    label, color, hatch = METHODS[method]
+    axes.bar(
+        positions,
+        table["mean"],
+        width,
+        label=label,
+        color=color,
+        hatch=hatch,
+        edgecolor="white",
+        linewidth=0,
+    )
+    lost = table["lost"].eq(True).to_numpy()
+    if lost.any():
+        axes.plot(np.array(positions)[lost], table["mean"][lost], **LOST)
+    table = table.where(table["highest"] > table["lowest"])  # a single run has no error bar
+    mean = table["mean"]
+    errors = [mean - table["lowest"], table["highest"] - mean]
+    axes.errorbar(
+        positions, mean, yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2
+    )

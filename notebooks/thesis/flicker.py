@@ -1,0 +1,131 @@
+"""How masked keypoints jump from frame to frame.
+
+The thesis names it as a cause of errors (Sections 4.2, 5.1).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from thesis_repro import masks
+from thesis_repro.odometry import THESIS
+from thesis_repro.odometry.odometry import detect, track
+
+SAME = 2.0  # pixels: a keypoint within this distance of a tracked keypoint is the same one
+
+
+class View(NamedTuple):
+    """A window of a frame: crop and edges (h, w), and points (n, 2) in pixels of the crop."""
+
+    frame: int
+    crop: np.ndarray
+    edges: np.ndarray
+    keypoints: np.ndarray
+    # keypoints of the previous frame, tracked to this one; None for the first frame
+    expected: np.ndarray | None
+    jumped: int  # number of expected points without a keypoint of this frame within SAME pixels
+
+
+def follow_window(
+    frames: Sequence[np.ndarray],
+    label_maps: Sequence[np.ndarray],
+    dilation_width: int,
+    first: int = 0,
+) -> list[View]:
+    """Show how masked keypoints jump between consecutive frames (Figure 4.8).
+
+    Returns a View of each frame.
+    frames: (height, width) uint8 each. label_maps: one for each frame, (h, w) uint8 of any size.
+    first: number of the first frame. The window has a quarter of the frame's height. It starts
+    where most keypoints jump between the first two frames, or in the middle of the frame if none
+    jumps. Then it follows the median motion of its keypoints.
+    """
+    size = np.array(frames[0].shape[::-1])
+    half = size.min() // 8
+    edge_images = [masks.edges(label_map, frames[0].shape) for label_map in label_maps]
+    points = [
+        detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
+        for frame, edge_image in zip(frames, edge_images, strict=True)
+    ]
+    center = size / 2
+    tracked, followed = _track(frames[0], frames[1], points[0])
+    jumping = points[0][followed & _far(tracked, points[1])]
+    if len(jumping):
+        center = _densest(jumping, half)
+    views: list[View] = []
+    in_window = expected = np.zeros((0, 2), np.float32)
+    for index, (frame, edge_image) in enumerate(zip(frames, edge_images, strict=True)):
+        if index:
+            tracked, followed = _track(frames[index - 1], frame, in_window)
+            expected = tracked[followed]
+            if len(expected):
+                center = center + np.median(expected - in_window[followed], axis=0)
+        low = np.clip(np.round(center - half).astype(int), 0, size - 2 * half)
+        high = low + 2 * half
+        crop = np.s_[low[1] : high[1], low[0] : high[0]]
+        in_window = _inside(points[index], low, high)
+        expected = _inside(expected, low, high)
+        jumped = int(_far(expected, points[index]).sum())
+        shown_expected = None
+        if index:
+            shown_expected = expected - low
+        view = View(
+            first + index, frame[crop], edge_image[crop], in_window - low, shown_expected, jumped
+        )
+        views.append(view)
+    return views
+
+
+def _densest(points: np.ndarray, half: int) -> np.ndarray:
+    """Return the point with most points in the window around it, which reaches `half` pixels."""
+    near = np.abs(points[:, None] - points).max(axis=-1) < half
+    return points[near.sum(axis=1).argmax()]
+
+
+def _track(
+    before: np.ndarray, after: np.ndarray, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Track keypoints (n, 2) to the next frame.
+
+    Returns their positions (n, 2) there and whether tracking back agrees with them, (n,) bool.
+    """
+    if not len(corners):
+        return corners, np.zeros(0, bool)
+    tracked, followed = track(before, after, corners)
+    back, returned = track(after, before, tracked)
+    agrees = np.linalg.norm(back - corners, axis=1) < SAME
+    return tracked, followed & returned & agrees
+
+
+def _inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the points inside a window with the corners `low` and `high`."""
+    inside = (points >= low) & (points < high)
+    return points[inside.all(axis=1)]
+
+
+def _far(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return, for each point, whether no point of `others` is within SAME pixels."""
+    distances = np.linalg.norm(points[:, None] - others, axis=-1)
+    return np.asarray(distances.min(axis=1, initial=np.inf) > SAME)
+
+
+def found_again(
+    first: np.ndarray,
+    second: np.ndarray,
+    first_mask: np.ndarray | None = None,
+    second_mask: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Find the keypoints of a frame again in a later one; returns four arrays of (n, 2) pixels.
+
+    They are the positions of found keypoints in the first frame and in the second frame, the lost
+    keypoints of the first frame, and the new keypoints of the second. A keypoint is found if
+    Lucas-Kanade tracks it to within SAME pixels of a keypoint of the second frame. The masks are
+    for the detector, (height, width) uint8.
+    """
+    before = detect(first, THESIS, first_mask)
+    after = detect(second, THESIS, second_mask)
+    tracked, followed = _track(first, second, before)
+    again = followed & ~_far(tracked, after)
+    new = _far(after, tracked[again])
+    return before[again], tracked[again], before[~again], after[new]

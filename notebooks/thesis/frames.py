@@ -1,0 +1,101 @@
+"""Pictures of single frames for notebooks 6 and 7: masks, keypoints, tracks and lines."""
+
+from collections.abc import Iterable, Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from thesis_repro.masks import dilate
+from thesis_repro.report import style
+from thesis_repro.report.style import GREEN, RED
+
+
+def gradients(enlarged: np.ndarray, strength: np.ndarray, edge_image: np.ndarray) -> plt.Figure:
+    """Draw an enlarged label map, the strength of its gradient, and its edges; (h, w) each."""
+    figure, axes = style.frame_panels(enlarged, rows=3)
+    style.show_image(axes[0], enlarged, "ids, enlarged bilinearly", cmap="nipy_spectral")
+    style.show_image(axes[1], np.minimum(strength, 60), "|Gx| + |Gy|, up to 60")
+    # thin lines would drop out where the picture is reduced
+    wider = dilate(edge_image, 5)
+    style.show_image(axes[2], wider, "edges: local maxima above the thresholds, drawn wider")
+    return figure
+
+
+def coverages(widths: Sequence[int], covered: dict[str, list[float]], title: str) -> plt.Figure:
+    """Draw the coverage of masks (%) against dilation width, {kind of boundaries: values}."""
+    figure, axes = plt.subplots(figsize=(7.2, 2.8), layout="constrained")
+    for (kind, values), line in zip(covered.items(), ("-o", "--s"), strict=True):
+        axes.plot(widths, values, line, markersize=3, label=f"{kind} boundaries")
+    axes.set(
+        xlabel="dilation width (pixels)",
+        ylabel="coverage of the frame (%)",
+        ylim=(0, None),
+        title=title,
+    )
+    axes.legend()
+    return figure
+
+
+def mask_and_keypoints(
+    frame: np.ndarray, edge_image: np.ndarray, mask: np.ndarray, keypoints: np.ndarray, title: str
+) -> plt.Figure:
+    """Draw the edges, the mask and the keypoints (n, 2) of a frame. title: of the edges."""
+    figure, axes = style.frame_panels(frame, rows=3)
+    style.show_image(axes[0], dilate(edge_image, 5), f"{title}, drawn wider")
+    style.show_image(axes[1], mask, f"mask: {100 * (mask > 0).mean():.1f} % of the frame")
+    style.show_image(axes[2], frame, f"{len(keypoints)} keypoints on the mask")
+    axes[2].scatter(*keypoints.T, **style.KEYPOINT)
+    return figure
+
+
+def corners(frame: np.ndarray, strength: np.ndarray, points: np.ndarray, title: str) -> plt.Figure:
+    """Draw the strength of a corner at each pixel (h, w), and the keypoints (n, 2)."""
+    figure, axes = style.frame_panels(frame, rows=2)
+    logarithm = np.log(strength + strength.max() / 1e4)
+    style.show_image(axes[0], logarithm, "R of every pixel (logarithm)")
+    style.show_image(axes[1], frame, title)
+    axes[1].scatter(*points.T, **style.KEYPOINT)
+    return figure
+
+
+def tracks(
+    frame: np.ndarray,
+    old: np.ndarray,
+    new: np.ndarray,
+    title: str,
+    inliers: np.ndarray | None = None,
+) -> plt.Figure:
+    """Draw tracks on a frame, from old to new points (n, 2).
+
+    inliers: (n,) booleans; the others are red. None: all are green.
+    """
+    figure, (axis,) = style.frame_panels(frame)
+    style.show_image(axis, frame, title)
+    if inliers is None:
+        inliers = np.ones(len(old), bool)
+    for chosen, color in ((inliers, GREEN), (~inliers, RED)):
+        ends = np.stack([old[chosen], new[chosen]], axis=1)
+        axis.plot(*ends.transpose(2, 1, 0), color=color, linewidth=0.7)
+    axis.set(xlim=(0, frame.shape[1]), ylim=(frame.shape[0], 0))
+    return figure
+
+
+def lines(frame: np.ndarray, coefficients: np.ndarray, points: np.ndarray) -> plt.Figure:
+    """Draw lines a u + b v + c = 0, coefficients (n, 3) in pixels, and a point (n, 2) for each."""
+    figure, (axis,) = style.frame_panels(frame)
+    style.show_image(axis, frame, f"epipolar lines of {len(points)} inliers, and the points")
+    width = frame.shape[1]
+    for (a, b, c), point in zip(coefficients, points, strict=True):
+        (line,) = axis.plot([0, width], [-c / b, -(c + a * width) / b], linewidth=0.8)
+        axis.plot(*point, "o", color=line.get_color(), markersize=4, markerfacecolor="none")
+    axis.set(xlim=(0, width), ylim=(frame.shape[0], 0))
+    return figure
+
+
+def patches(pictures: Iterable[tuple[np.ndarray, str]], title: str) -> plt.Figure:
+    """Draw two patches (63, 63), with their titles, beside each other."""
+    figure, axes = style.new_figure(1, 2, height=2.4, width=4.8)
+    for axis, (patch, text) in zip(axes, pictures, strict=True):
+        style.show_image(axis, patch, text)
+    figure.suptitle(title, fontsize=9)
+    return figure

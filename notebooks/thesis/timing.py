@@ -1,0 +1,199 @@
+"""Time every dilation width, and each stage from a frame's file to its pose.
+
+The widths are timed as in the thesis (Figure 4.17). The stages include the network, as Section
+5.2.2 asks for. They are timed as in a live system: one frame after the other, the network on one
+image at a time, all cores.
+"""
+
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from thesis_repro import mask_files, masks, odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
+from thesis_repro.running import results
+from thesis_repro.running.files import progress, write_text
+from thesis_repro.running.settings import cores
+from thesis_repro.study import workers
+from thesis_repro.study.jobs import CONTROL_WIDTH, Job
+from thesis_repro.study.runner import checked_masks
+from thesis_repro.study.sources import Source, by_name
+
+STAGES = ("read", "segmentation", "mask", "detection", "tracking", "pose")
+FRAMES = 20  # on which the stages are timed
+WARM_UP = 3  # frames before them, which load compiled code and fill caches
+
+
+@contextmanager
+def opencv_threads(count: int) -> Iterator[None]:
+    """Use `count` threads in OpenCV's functions inside a with block; -1 for one thread a core."""
+    previous_count = cv2.getNumThreads()
+    cv2.setNumThreads(count)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(previous_count)
+
+
+def time_runs(
+    jobs: Iterable[Job],
+    sequences: Iterable[Sequence],
+    labels: Path | Iterable[Source],
+    folder: Path,
+    *,
+    processes: int = 1,
+) -> pd.DataFrame:
+    """Time each job as a separate run; returns a table with one row a run.
+
+    Its columns are sequence, run, method, dilation_width and seconds. The first two steps are not
+    timed, because they load compiled code. The jobs of a sequence take turns at every frame, so
+    that other programs slow all of them equally. Call it after `runner.run_jobs`, with the same
+    folder and label maps. Times in the folder are not measured again.
+    """
+    jobs, sources = list(jobs), by_name(labels)
+    calls = []
+    for sequence in sequences:
+        sequence_jobs = [job for job in jobs if job.sequence == sequence.name]
+        path = folder / sequence.name / f"seconds-{len(sequence)}.csv"
+        calls.append((sequence_jobs, sequence, sources, path))
+    with workers.open_pool(processes) as pool:
+        timed = pool.run(_time_jobs, calls)
+        tables = dict(progress(timed, "timing", total=len(calls), unit="sequence"))
+    return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
+
+
+def _time_jobs(
+    jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
+) -> pd.DataFrame:
+    if path.is_file():
+        earlier = pd.read_csv(path, dtype={"sequence": str})
+        if {job.name for job in jobs} <= set(earlier["run"]):
+            return earlier
+    scales = odometry.scales(sequence)
+    masks_by_job, _ = checked_masks(jobs, sequence, sources)
+    odometries = {job: odometry.Odometry(sequence.intrinsics, job.settings) for job in masks_by_job}
+    seconds = dict.fromkeys(masks_by_job, 0.0)
+    with opencv_threads(1):  # one thread makes times comparable
+        for index in range(len(sequence)):
+            frame = sequence.frame(index)
+            for job, job_masks in masks_by_job.items():
+                mask_files.forget_edges()  # a separate run would have to find them
+                mask, mask_seconds = None, 0.0
+                if job_masks is not None:
+                    mask, mask_seconds = _timed(job_masks.__getitem__, index)
+                step = odometries[job].step(frame, scales[index], mask)
+                if index > 1:
+                    # Section 4.2 counts the odometry and the making of the mask, not the prediction
+                    seconds[job] += mask_seconds + sum(step.seconds.values())
+    rows = [
+        {
+            "sequence": job.sequence,
+            "run": job.name,
+            "method": job.method,
+            "dilation_width": job.dilation_width,
+            "seconds": job_seconds,
+        }
+        for job, job_seconds in seconds.items()
+    ]
+    results.write_table(path, pd.DataFrame(rows))
+    return pd.read_csv(path, dtype={"sequence": str})
+
+
+def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.DataFrame:
+    """Time each stage of a frame, with all keypoints and with masks.
+
+    Returns a table of method, stage, milliseconds (medians).
+    Stages: read (the frame's file), segmentation (resize to the model's input, network, class of
+    every pixel), mask (label map to 320x320, edges, dilation), detection, tracking, pose (essential
+    matrix, then rotation and translation). model: a Keras model of `segmentation`. width: of the
+    masks, pixels. The methods take turns.
+    Raises InputError for a sequence with too few frames.
+    """
+    sequence = sequence.subset(FRAMES + WARM_UP)
+    if len(sequence) < WARM_UP + 2:
+        raise InputError(
+            f"sequence {sequence.name}: {len(sequence)} frames; timing needs {WARM_UP + 2} or more"
+        )
+    scales = odometry.scales(sequence)
+    unmasked_odometry = odometry.Odometry(sequence.intrinsics)
+    masked_odometry = odometry.Odometry(sequence.intrinsics)
+    rows: list[dict[str, Any]] = []
+    with opencv_threads(-1):
+        for index in progress(range(len(sequence)), "timing"):
+            frame, read = _timed(sequence.frame, index)
+            label_map, segmentation = _timed(_segment, model, frame)
+            mask, masking = _timed(_mask, label_map, frame.shape, width)
+            unmasked = unmasked_odometry.step(frame, scales[index], None)
+            masked = masked_odometry.step(frame, scales[index], mask)
+            if index < WARM_UP:
+                continue
+            network = {"segmentation": segmentation, "mask": masking}
+            rows += [
+                {"method": "all keypoints", "read": read, **_stages_of(unmasked)},
+                {"method": f"masked, width {width}", "read": read, **network, **_stages_of(masked)},
+            ]
+    by_method = pd.DataFrame(rows).groupby("method", sort=False)
+    medians = 1000 * by_method[list(STAGES)].median()
+    table = medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds")
+    return table.dropna().reset_index()
+
+
+def _stages_of(step: odometry.Step) -> dict[str, float]:
+    """Return the seconds of the stages that a step of the odometry has."""
+    return {
+        "detection": step.seconds["detect"],
+        "tracking": step.seconds["track"],
+        "pose": step.seconds["essential"] + step.seconds["pose"],
+    }
+
+
+def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
+    """Write measured timings to a file and return them, with a column for the processor.
+
+    keep: return the timings of an existing file instead. Figures in git keep their timings, which
+    would otherwise change with every machine and every run.
+    """
+    if not (keep and path.is_file()):
+        write_text(path, measured.assign(processor=processor()).to_csv(index=False))
+    return pd.read_csv(path, dtype={"sequence": str})
+
+
+def processor() -> str:
+    """Return the name of this machine's processor, and its number of cores in use."""
+    name = platform.processor() or platform.machine()
+    with suppress(OSError, StopIteration):  # on Linux these are only "x86_64"
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(": ", 1)[1] for line in lines if line.startswith("model name"))
+    return f"{name}, {cores()} cores"
+
+
+def _timed(function: Callable, *arguments: Any) -> tuple[Any, float]:
+    started = time.perf_counter()
+    result = function(*arguments)
+    return result, time.perf_counter() - started
+
+
+def _segment(model: Any, frame: np.ndarray) -> np.ndarray:
+    from thesis_repro.segmentation import prediction
+
+    _, height, width, channels = model.input_shape
+    if channels == 3:
+        frame = cv2.cvtColor(frame, cv2.COLOR_GRAY2RGB)
+    image = cv2.resize(frame, (width, height)).reshape(height, width, channels)
+    return prediction.predict(model, image[None])[0]
+
+
+def _mask(label_map: np.ndarray, size: tuple[int, int], width: int) -> np.ndarray:
+    from thesis_repro.segmentation import prediction
+
+    # label maps are written in the thesis's size, whatever the size of the model's output
+    label_map = cv2.resize(label_map, (prediction.SIZE,) * 2, interpolation=cv2.INTER_NEAREST)
+    return masks.keypoint_mask(label_map, size, width)
