@@ -21,7 +21,8 @@ from thesis_repro.odometry.odometry import normalise
 
 FOLDER = Path(__file__).parent.parent / "tests" / "reference"
 ESTIMATORS = {"thesis": THESIS, "refined": replace(THESIS, estimator="refined")}
-# {run: (its sequence, its first and its last recorded step)}; step n ends in frame n
+# {run: (its sequence, its first and its last recorded step, its keypoints in place of 2000)};
+# step n ends in frame n
 STEPS = {
     "00": ("00", 1, 3),
     "00_masked": ("00", 1, 4),
@@ -32,10 +33,9 @@ STEPS = {
     "06": ("06", 1, 3),
     "07": ("07", 1, 3),  # steps of 0.1 m: nearly all points are too far away to vote
     "07_masked": ("07", 1, 7),  # the vote turns the camera by 180 degrees in step 4
-    "05_few": ("05", 129, 149),  # the turn again; a shift to the side explains it as well
-    "05_start": ("05", 1, 1),  # a minimum that a second start leaves
+    "05_few": ("05", 129, 149, 500),  # the turn again; a shift to the side explains it as well
+    "05_start": ("05", 1, 1, 300),  # a minimum that a second start leaves
 }
-KEYPOINTS = {"05_few": 500, "05_start": 300}  # in place of 2000
 FEW = (5, 6, 7, 8)  # points
 DECIMALS = 7  # of poses in a digest: different processors change them by up to 6e-14 m
 
@@ -79,8 +79,7 @@ def estimated(previous, current, camera):
 
 def steps(sequence, masks, first, last, count=2000):
     """Return one row for each step. The refined estimator knows nothing before the first one."""
-    settings = replace(ESTIMATORS["refined"], max_keypoints=count)
-    follower = Odometry(sequence.intrinsics, settings)
+    follower = Odometry(sequence.intrinsics, replace(ESTIMATORS["refined"], max_keypoints=count))
     follower.step(sequence.frame(first - 1), mask=masks[first - 1])
     rows = []
     for index in range(first, last + 1):
@@ -132,13 +131,12 @@ def write(name, rows, camera):
 def main(kitti, masks):
     """Write all files."""
     paths = []
-    for run, (name, first, last) in STEPS.items():
+    for run, (name, *wanted) in STEPS.items():
         sequence = Sequence(kitti, name)
         folder = MaskFolder(masks, sequence) if "masked" in run else None
-        masks_or_none = folder or [None] * len(sequence)
-        rows = steps(sequence, masks_or_none, first, last, KEYPOINTS.get(run, 2000))
+        rows = steps(sequence, folder or [None] * len(sequence), *wanted)
         write(run, rows, sequence.intrinsics)
-        if run in KEYPOINTS:
+        if len(wanted) > 2:
             continue
         settings = {estimator: (value, folder) for estimator, value in ESTIMATORS.items()}
         for estimator, result in run_many(sequence, settings).items():
@@ -146,8 +144,9 @@ def main(kitti, masks):
     street = Sequence(kitti, "00")
     write("few_points", few_points(street), street.intrinsics)
     write("no_parallax", no_parallax(street), street.intrinsics)
-    table = pd.DataFrame(paths, columns=["run", "estimator", "frames", "sha256"])
-    table.to_csv(FOLDER / "poses.csv", index=False, lineterminator="\n")
+    pd.DataFrame(paths, columns=["run", "estimator", "frames", "sha256"]).to_csv(
+        FOLDER / "poses.csv", index=False, lineterminator="\n"
+    )
 
 
 if __name__ == "__main__":
