@@ -13,16 +13,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
-from thesis_repro.odometry.pose import normalise
 
 from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
+from thesis_repro.odometry.odometry import normalise, track
 from thesis_repro.odometry.runs import Masks
 from thesis_repro.running import results
-from thesis_repro.running.files import progress
+from thesis_repro.running.files import progress, write_text
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import measures
@@ -85,8 +85,8 @@ def measure(
     ]
     with workers.open_pool(processes) as pool:
         measured = pool.run(_measure, calls)
-        tables = dict(progress(measured, "ablations", total=len(calls), unit="sequence"))
-    return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
+        tables = list(progress(measured, "ablations", total=len(calls), unit="sequence"))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _measure(
@@ -103,7 +103,7 @@ def _measure(
         model=results.made_from(labels),
     )
     path = folder / "runs.csv"
-    if not results.has_table(path):
+    if not path.is_file():
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **options)
         run_results = odometry.run_many(
@@ -117,7 +117,7 @@ def _measure(
             row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]
             rows.append(row)
         table = pd.DataFrame(rows).assign(sequence=sequence.name)
-        results.write_table(path, table)
+        write_text(path, table.to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
@@ -223,7 +223,7 @@ def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: in
             points = keypoints.detect(before, THESIS, mask)
             if len(points) < 10:
                 continue
-            moved, tracked = keypoints.track(before, after, points)
+            moved, tracked = track(before, after, points)
             distances = sampson_distances(
                 points[tracked], moved[tracked], motion, sequence.intrinsics
             )

@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 from scipy.stats import ttest_1samp
 
-from thesis_repro.study import compare, thesis_tables
+from thesis import thesis_tables
+from thesis_repro.study import compare
 
 EIGHT = [f"{number:02d}" for number in range(8)]
 
@@ -277,18 +278,18 @@ def test_the_literal_procedure_uses_one_repetition_alone():
 
 def test_the_best_of_many_widths_looks_better_if_masks_do_nothing():
     _, baseline = parts_of(lambda *_: 1.0, repetitions=400, noise=0.2)
-    studies = thesis_tables.changes_if_masks_did_nothing(baseline, 15, "rmse")
+    studies = thesis_tables.null_distribution(baseline, 15, "rmse")
     assert studies.shape == (thesis_tables.STUDIES, 11)
     # a standard normal's least of 15 is -1.736 on average, its median 0
     expected = 100 * (np.exp(-1.736 * 0.2) - 1)
     assert studies.median(axis=1).mean() == pytest.approx(expected, abs=2.5)
-    single = thesis_tables.changes_if_masks_did_nothing(baseline, 1, "rmse")
+    single = thesis_tables.null_distribution(baseline, 1, "rmse")
     assert single.median(axis=1).mean() == pytest.approx(0, abs=2)
     # the width is chosen by the RMSE, and another error judges it
     other = baseline.assign(mae=1 / baseline["rmse"])
-    assert (thesis_tables.changes_if_masks_did_nothing(other, 15, "mae").mean() > 0).all()
+    assert (thesis_tables.null_distribution(other, 15, "mae").mean() > 0).all()
     once = baseline[baseline["repetition"] == 0]
-    assert thesis_tables.changes_if_masks_did_nothing(once, 15, "rmse").empty
+    assert thesis_tables.null_distribution(once, 15, "rmse").empty
 
 
 def test_time_savings_are_negative_percentages_over_all_sequences():

@@ -140,7 +140,7 @@ def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
         patch.setattr(runner.odometry, "run_many", None)  # would fail
         again = study.run(folder)
     assert again.table.equals(runs)
-    assert (again.made, again.kept, again.failed) == (0, len(runs), 0)
+    assert (again.made, again.kept, again.failed_jobs) == (0, len(runs), 0)
     other = tmp_path / "other"
     shutil.copytree(small_labels, other)
     for path in other.rglob("*.png"):
@@ -280,12 +280,6 @@ def test_the_old_option_for_names_shows_the_new_form(capsys):
         main(["study", "--kitti", "kitti", "--labels", "mine", "--name", "net", "--output", "out"])
     error = capsys.readouterr().err
     assert end.value.code == 2 and error.count("\n") == 1 and "--labels net=" in error
-
-
-def test_a_sequence_named_like_a_column_is_refused(tiny_kitti):
-    (tiny_kitti / "sequences" / "00").rename(tiny_kitti / "sequences" / "low")
-    with pytest.raises(InputError, match="sequences/low: "):
-        Study(tiny_kitti, ("low",), (), ()).check()
 
 
 def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_labels, tmp_path):
