@@ -27,7 +27,7 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from thesis_repro import masks, odometry
+from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry
 from thesis_repro.odometry import odometry as page
@@ -138,8 +138,8 @@ def mask_cost(sequence, labels):
         if method != "true-labels"
     ]
     for index in range(len(sequence)):
-        for column, forget in enumerate((lambda: None, masks.forget_edges)):
-            masks.forget_edges()
+        for column, forget in enumerate((lambda: None, mask_files.forget_edges)):
+            mask_files.forget_edges()
             for kind in kinds:
                 forget()
                 costs[column] += seconds(lambda: kind[index], time.process_time)  # noqa: B023

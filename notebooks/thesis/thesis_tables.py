@@ -1,7 +1,7 @@
 """What the thesis's own comparison gives (Section 4.2, Tables 4.1 to 4.3).
 
-The choice of a width is in `study.best_width`; other comparisons are in `study.compare`. A change
-is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
+The choice of a width is in `study.best_width`; all other comparisons are in `study.compare`. A
+change is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
 `baseline` are the runs with masks and with all keypoints, from `compare.of_method`.
 """
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from thesis_repro.data.trajectories import read_poses, write_kitti_poses, write_tum
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.masks import LabelMasks, label_map_of
+from thesis_repro.mask_files import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, findings, page, paths, style, tables
 from thesis_repro.running import results

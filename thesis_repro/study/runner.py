@@ -33,6 +33,18 @@ from thesis_repro.study.methods import (
 from thesis_repro.study.sources import Source, by_name
 from thesis_repro.study.workers import open_pool
 
+# rooms whose code decides the results
+CODE = (
+    "opencv_exact",
+    "thesis_repro.odometry",
+    "thesis_repro.masks",
+    "thesis_repro.data",
+    "thesis_repro.study.jobs",
+    "thesis_repro.study.methods",
+    "thesis_repro.study.controls",
+    "thesis_repro.study.sources",
+)
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -63,6 +75,7 @@ def run_jobs(
     *,
     processes: int = 1,
     scheduler: str | None = None,
+    scale_gate: float = odometry.THESIS.scale_gate,
 ) -> Outcome:
     """Run the jobs that have no result yet; returns the table of all runs and how many ran.
 
@@ -71,7 +84,7 @@ def run_jobs(
     folder: for the results; results from other data, code or mask settings in it are moved aside.
     processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
     a scheduler need this package, and the three folders under the same paths. One thread a worker
-    is best.
+    is best. scale_gate: metres, of all runs, see OdometrySettings.
 
     Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results
     of separate runs. A stopped study repeats only the passes that it was in. A job that fails is
@@ -86,7 +99,9 @@ def run_jobs(
         for sequence in opened.values():
             _stage(folder, sequence, sources_by_name)
         waiting = _unfinished(jobs, folder)
-        reasons = _run_passes(waiting, opened, sources_by_name, folder, processes, scheduler)
+        reasons = _run_passes(
+            waiting, opened, sources_by_name, folder, processes, scheduler, scale_gate
+        )
     warnings = _report(reasons)
     rows = []
     for job in jobs:
@@ -147,6 +162,7 @@ def _run_passes(
     folder: Path,
     processes: int,
     scheduler: str | None,
+    scale_gate: float,
 ) -> dict[Job, str]:
     """Run jobs; returns which of them failed, and why."""
 
@@ -161,7 +177,7 @@ def _run_passes(
         for pass_jobs in sorted(passes, key=frames, reverse=True):
             sequence = sequences[pass_jobs[0].sequence]
             record = results.record(folder / sequence.name)
-            calls.append((pass_jobs, sequence, sources, folder, record))
+            calls.append((pass_jobs, sequence, sources, folder, record, scale_gate))
         with progress(None, "odometry", total=frames(jobs), unit="frame") as bar:
             for pass_jobs, pass_reasons in pool.run(_run_pass, calls):
                 reasons |= pass_reasons
@@ -211,7 +227,7 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": results.digest_of_code("thesis_repro.odometry", "thesis_repro.study.jobs"),
+        "code": results.digest_of_code(*CODE),
         **results.made_with("opencv", "numpy", "numba"),
     }
 
@@ -259,6 +275,7 @@ def _run_pass(
     sources: dict[str, Source],
     folder: Path,
     record: dict,
+    scale_gate: float,
 ) -> tuple[list[Job], dict[Job, str]]:
     """Run jobs of one sequence in one pass, here or on another machine.
 
@@ -270,7 +287,9 @@ def _run_pass(
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
         masks_by_job, reasons = checked_masks(_unfinished(jobs, folder), sequence, sources)
-        runs = {job.name: (job.settings, masks) for job, masks in masks_by_job.items()}
+        runs = {}
+        for job, masks in masks_by_job.items():
+            runs[job.name] = replace(job.settings, scale_gate=scale_gate), masks
         run_results = odometry.run_many(sequence, runs)
         for job in masks_by_job:
             frames = run_results[job.name].frames
