@@ -36,10 +36,6 @@ def ratio_of(rows, reference):
     return compare.geometric_mean(compare.ratios(rows, reference, "rmse"))
 
 
-def test_a_change_in_percent_is_negative_if_the_value_is_smaller():
-    assert thesis_tables.percent_change(3.0, 4.0) == -25.0
-
-
 def test_known_ratios_are_found_and_inverted_by_swapping():
     masked, baseline = arms(runs_of({"masked": 0.5}, noise=0.3), "masked", "baseline")
     forth, back = ratio_of(masked, baseline), ratio_of(baseline, masked)
@@ -94,18 +90,14 @@ def test_intervals_that_exclude_the_true_mean_by_chance():
         return random.normal(0, 0.1, shape) + 2.5 * (random.random(shape) < 1 / 6)
 
     percent = pd.DataFrame(index=[6, 8, 11])
-    ranks = percent.copy()
     for name, draw in draws.items():
         for count in percent.index:
             studies = draw((2000, count))
             intervals = np.array([compare.mean_interval(row) for row in studies])
             low, high = intervals.T
             percent.loc[count, name] = 100 * ((low > 0) | (high < 0)).mean()
-            p_values = np.array([compare.rank_test(row) for row in studies[:500]])
-            ranks.loc[count, name] = 100 * (p_values < 0.05).mean()
-    print(percent.T, "rank test", ranks.T, sep="\n")
+    print(percent.T)
     assert percent["normal"].between(4, 6).all() and (percent["heavy tails"] < 5).all()
-    assert (ranks[["normal", "heavy tails", "either lost"]] < 7.5).all(axis=None)
 
 
 def test_the_rank_test_sees_a_small_loss_everywhere_that_one_lost_sequence_hides():
@@ -234,16 +226,6 @@ def test_leaving_one_out_shows_that_the_best_width_is_chance():
         rows = thesis_tables.of_chosen_width(masked, chosen[choice])
         changes = thesis_tables.changes(rows, baseline, "rmse")
         assert (changes < 0).sum() == better
-
-
-def test_leaving_one_out_ignores_the_errors_of_that_sequence():
-    masked, baseline = parts_of(separate_optimum, noise=0.3)
-    chosen = thesis_tables.chosen_widths(masked, baseline)["left_out"]
-    changed, left_out = masked.copy(), masked["sequence"] == "04"
-    changed.loc[left_out, "rmse"] = np.random.default_rng(5).uniform(0.01, 50, left_out.sum())
-    assert thesis_tables.chosen_widths(changed, baseline)["left_out"]["04"] == chosen["04"]
-    without = thesis_tables.chosen_widths(masked[~left_out], baseline[baseline["sequence"] != "04"])
-    assert without["fixed"].iloc[0] == chosen["04"]
 
 
 def test_a_width_that_failed_in_one_sequence_is_not_chosen_for_all():

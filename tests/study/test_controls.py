@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from street import Street, Stripes
 
 from thesis import ablations, thesis_tables
 from thesis_repro import mask_files, masks
@@ -156,31 +155,6 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     enlarged = cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
     _, method_masks = runs["no-vegetation", "thesis", 0]
     assert np.array_equal(method_masks[0] == 0, np.isin(enlarged, (21, 22)))
-
-
-@pytest.mark.parametrize("amount, low, high", [(300, 280, 300), (0.5, 0.48, 0.5)])
-def test_random_keypoints_are_a_subset_of_the_asked_size(small_world, amount, low, high):
-    sequence = Sequence(small_world / "kitti", "00").subset(2)
-    drawn = ablations.random_keypoints(sequence, amount, 0)
-    points = keypoints.detect(sequence.frame(0), THESIS, drawn)
-    detected = keypoints.detect(sequence.frame(0), THESIS)
-    count = len(points)
-    if isinstance(amount, float):
-        count /= len(detected)
-    assert low <= count <= high
-    assert set(map(tuple, points.astype(int))) <= set(map(tuple, detected.astype(int)))
-    assert np.array_equal(drawn, ablations.random_keypoints(sequence, amount, 0))
-
-
-def test_tracks_of_a_known_motion_have_small_residuals_and_cover_fields():
-    street = Street(3)
-    corner = np.zeros(street.size, np.uint8)
-    corner[60:100, 380:440] = 255
-    masks_by_name = {"all": None, "stripes": Stripes(40), "corner": [corner] * 3}
-    table = ablations.tracks(street, masks_by_name, pairs=2)
-    means = table.groupby("method")[["residual", "fields"]].mean()
-    assert (means["residual"] < 1).all()
-    assert means.loc["corner", "fields"] < means.loc["all", "fields"]
 
 
 def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
