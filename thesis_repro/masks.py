@@ -18,7 +18,7 @@ from thesis_repro.data.cityscapes import ID, N_CLASSES, read_label_map
 from thesis_repro.data.kitti import Sequence, check_size
 from thesis_repro.errors import InputError, need
 from thesis_repro.running import results
-from thesis_repro.running.files import is_whole, listed, numbers_of, progress, read_gray, write_png
+from thesis_repro.running.files import listed, numbers_of, progress, read_gray, write_png
 
 BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
 CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a boundary up to two pixels away
@@ -336,11 +336,11 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             **asdict(masks.settings),
             dilation_width=masks.dilation_width,
             frames=results.digest_of_files(masks.frame_paths),
-            code=results.digest_of_code("thesis_repro.masks"),
+            code=results.digest_of_code("thesis_repro.masks", "thesis_repro.data.cityscapes"),
             **results.made_with("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
-            if not is_whole(folder / path.name):
+            if not (folder / path.name).is_file():
                 write_png(folder / path.name, masks[index])
 
 

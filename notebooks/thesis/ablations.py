@@ -25,7 +25,7 @@ from thesis_repro.running import results
 from thesis_repro.running.files import progress
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.runner import measures
+from thesis_repro.study.runner import CODE, measures
 
 Run = tuple[OdometrySettings, Masks | None]
 Runs = dict[tuple[str, str, int], Run]  # by method, estimator, repetition
@@ -95,7 +95,7 @@ def _measure(
     results.stage(
         folder,
         options=options,
-        code=results.digest_of_code("thesis_repro.odometry", "thesis_repro.study.runner"),
+        code=results.digest_of_code(*CODE),
         ablations=results.digest_of_file(__file__),
         **results.made_with("opencv", "numpy", "numba"),
         sequence=results.digest_of_files(sequence.files),
@@ -103,7 +103,7 @@ def _measure(
         model=results.made_from(labels),
     )
     path = folder / "runs.csv"
-    if not results.has_table(path):
+    if not path.is_file():
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **options)
         run_results = odometry.run_many(

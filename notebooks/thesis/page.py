@@ -272,7 +272,7 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
 def main() -> None:
     """Write the page of the run of the current settings."""
     settings = read_settings()
-    update(settings, settings.figures)
+    update(settings, settings.published)
     if note := trainings.network_note(settings):
         print(note)
 

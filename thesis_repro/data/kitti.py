@@ -1,11 +1,10 @@
 """KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
-import os
 from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
 from functools import cached_property
-from itertools import islice, pairwise
+from itertools import pairwise
 from numbers import Integral
 from pathlib import Path
 from statistics import median_low
@@ -13,9 +12,9 @@ from statistics import median_low
 import numpy as np
 
 from thesis_repro.data import kitti_raw
-from thesis_repro.data.trajectories import read_poses, read_times
+from thesis_repro.data.trajectories import read_poses, read_times, text_of
 from thesis_repro.errors import InputError, need
-from thesis_repro.running.files import check_readable, images, numbers_of, read_gray
+from thesis_repro.running.files import images, numbers_of, read_gray
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
 # distortion.
@@ -30,17 +29,16 @@ CAMERAS = {
     "03": _CAMERA_03,
     **{f"{n:02d}": _CAMERA_04 for n in range(4, 11)},
 }
-
-# Number of frames of each complete sequence with ground truth.
-FRAME_COUNTS = dict(
-    zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201), strict=True)
-)
+# width and height that go with a focal length and a centre's u, which tell KITTI's cameras apart
+KNOWN_SIZES = {
+    (round(camera.fx, 3), round(camera.cx, 3)): (camera.width, camera.height)
+    for camera in CAMERAS.values()
+}
 
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
-MAX_MISSING_NAMED = 10_000  # frames
 MAX_SPEED = 10_000  # metres a second
 MAX_FPS = 10_000  # frames a second
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
@@ -55,7 +53,7 @@ def sequences(root: str | Path) -> list[str]:
     names = []
     for name in with_frames(root):
         _, _, poses = locate(root, name)
-        if name in FRAME_COUNTS or os.path.lexists(poses):
+        if name in CAMERAS or poses.exists():
             names.append(name)
     if not names:
         raise InputError(
@@ -78,35 +76,13 @@ def with_frames(root: str | Path) -> list[str]:
 
 
 def folders_with_frames(parent: Path) -> list[Path]:
-    """Folders of sequences in a folder, in sorted order.
-
-    A broken link counts, so that `Sequence` reports it.
-    """
-    return sorted(
-        folder
-        for folder in parent.iterdir()
-        if (folder.is_dir() and has_frames(folder)) or _is_broken_link(folder)
-    )
-
-
-def _is_broken_link(path: Path) -> bool:
-    return path.is_symlink() and not path.exists()
+    """Folders of sequences in a folder, in sorted order."""
+    return sorted(folder for folder in parent.iterdir() if folder.is_dir() and has_frames(folder))
 
 
 def has_frames(folder: Path) -> bool:
-    """Whether a folder is that of a sequence, or holds images itself.
-
-    A sequence counts if it has frames of the right camera only, or cannot be read: `Sequence`
-    reports it then, and other sequences can still be used.
-    """
-    try:
-        if images_of(folder) != folder or images(folder):
-            return True
-    except InputError:
-        return True
-    return (folder / "image_1").is_dir() or any(
-        _is_broken_link(folder / camera) for camera in IMAGE_FOLDERS
-    )
+    """Whether a folder is that of a sequence, or holds images itself."""
+    return images_of(folder) != folder or bool(images(folder))
 
 
 def folder_of(root: str | Path) -> Path:
@@ -126,26 +102,23 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     """Folder of a sequence's frames.
 
     The default is the left camera's, gray or else colour. If neither exists, it is the sequence's
-    folder itself. Raises InputError if the camera is unknown, or if the folder is missing or may
-    not be read.
+    folder itself. Raises InputError if the camera is unknown, or if the folder is missing.
     """
     folder = Path(folder)
-    check_readable(folder, os.X_OK)
     cameras, inner = IMAGE_FOLDERS, ""
     if kitti_raw.is_drive(folder):
         cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
+    gray, color = (folder / name / inner for name in cameras[:2])
+    frame_folder = folder
     if camera is not None:
         if camera not in cameras:
             known = ", ".join(sorted(cameras))
             raise InputError(f"camera {camera!r}: unknown; choose one of {known}")
         frame_folder = folder / camera / inner
-    else:
-        gray, color = (folder / name / inner for name in cameras[:2])
-        frame_folder = folder
-        if gray.is_dir():
-            frame_folder = gray
-        elif color.is_dir():
-            frame_folder = color
+    elif gray.is_dir():
+        frame_folder = gray
+    elif color.is_dir():
+        frame_folder = color
     if not frame_folder.is_dir():
         raise InputError(f"{frame_folder}: no such folder; it must hold the frames")
     return frame_folder
@@ -201,32 +174,18 @@ class Sequence:
         frame_folder = images_of(self.folder, camera)
         self.frame_paths = images(frame_folder)
         if not self.frame_paths:
-            self._refuse_no_frames(frame_folder)
+            raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
         check_numbering(self.frame_paths)
         self.calibration_path, times_path = texts_of(self.folder, frame_folder)
         self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
-        # a broken link or a folder is reported when it is read
-        self.has_times = os.path.lexists(times_path)
+        self.has_times = times_path.exists()
         self.times = self._read_times(times_path, fps)
-        self.has_truth = os.path.lexists(self.poses_path)
+        self.has_truth = self.poses_path.exists()
         if self.has_truth:
             self._poses = truth_of(self.poses_path)
             check_count(self.poses_path, len(self._poses), self.frame_paths)
         if speed is not None:
-            if not self.has_times and fps is None:
-                raise InputError(
-                    f"{times_path}: no such file; a speed needs the times of the frames, or their "
-                    "number a second (--fps)"
-                )
-            self._check_speed(speed)
-
-    def _refuse_no_frames(self, frame_folder: Path) -> None:
-        if images_of(self.folder) == self.folder and (self.folder / "image_1").is_dir():
-            raise InputError(
-                f"{frame_folder}: holds no PNG or JPEG frames of the left camera, to which the ground "
-                "truth belongs (--camera image_1 takes the right one)"
-            )
-        raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
+            self._check_speed(speed, self.has_times or fps is not None)
 
     def _read_times(self, path: Path, fps: float | None) -> np.ndarray:
         if self.has_times:
@@ -241,10 +200,15 @@ class Sequence:
             raise InputError(f"fps {fps:g}: must be above 0 and at most {MAX_FPS} frames a second")
         return np.arange(len(self)) / fps
 
-    def _check_speed(self, speed: float) -> None:
+    def _check_speed(self, speed: float, has_times: bool) -> None:
         if self.has_truth:
             raise InputError(
                 f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
+            )
+        if not has_times:
+            raise InputError(
+                f"speed {speed}: needs the times of the frames (times.txt), or their number a second "
+                "(--fps)"
             )
         if not 0 < speed <= MAX_SPEED:
             raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s")
@@ -290,6 +254,16 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.frame_paths)
+
+    @property
+    def description(self) -> str:
+        """One line that says what the sequence holds, and what is assumed for what it lacks."""
+        line = f"sequence {self.name}: {len(self)} frames of {self.size[1]}x{self.size[0]}"
+        if not self.has_truth:
+            line += "; no ground truth, so step lengths follow from --speed, or are 1 m"
+        if not self.has_times:
+            line += f"; no times, so {1 / FRAME_TIME:g} frames a second"
+        return line
 
     def __repr__(self) -> str:
         return f"Sequence({str(self.root)!r}, {self.name!r}): {len(self)} frames"
@@ -357,28 +331,6 @@ def name_of(root: str | Path, name: str) -> str:
     return locate(root, name)[1].name
 
 
-def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Ground truth of a sequence without reading its frames.
-
-    Returns poses, (n, 4, 4), and their times, (n,), seconds. root, name: as in Sequence. Without
-    times.txt, ten frames a second are assumed.
-    """
-    _, folder, path = locate(root, name)
-    poses = truth_of(path)
-    frame_folder = folder
-    if kitti_raw.is_drive(folder):
-        frame_folder = images_of(folder)
-    _, times_path = texts_of(folder, frame_folder)
-    if not os.path.lexists(times_path):
-        return poses, FRAME_TIME * np.arange(len(poses))
-    times = times_of(times_path)
-    if len(times) != len(poses):
-        raise InputError(
-            f"{times_path}: {len(times)} times for {len(poses)} poses in {path}; one a frame is needed"
-        )
-    return poses, times
-
-
 def truth_of(path: Path) -> np.ndarray:
     """Ground truth, (n, 4, 4), from a file of poses, or from the folder of a raw drive's OXTS."""
     if path.match(kitti_raw.OXTS):
@@ -399,58 +351,34 @@ def check_numbering(paths: list[Path]) -> None:
     A number can be missing only if frames count by one. Names that do not count by one are
     accepted, for example every fifth frame, or times.
     """
-    for (number, path), (next_number, next_path) in pairwise(zip(numbers_of(paths) or [], paths)):
-        if number == next_number:
-            raise InputError(f"{next_path}: has the same number as {path.name}; remove one of them")
-    missing = missing_frames(paths)
-    if missing:
-        raise InputError(f"{missing[0]}: this frame is missing; the odometry needs all frames")
-
-
-def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
-    """Paths of the missing frames, at most MAX_MISSING_NAMED.
-
-    There are none unless the frames' numbers count by one. count: the expected number of frames. If
-    it is given, frames missing at the start and at the end are found as well. Numbers start at 0
-    (as in KITTI), at 1, or at the number of the first of `paths`.
-    """
-    numbers = numbers_of(paths)
-    if not numbers:
-        return []
+    numbers = numbers_of(paths) or []
     steps = [after - before for before, after in pairwise(numbers)]
-    if steps and median_low(steps) != 1:
-        return []
-    if count is None and len(steps) < 2:
-        return []
-    first, end = numbers[0], numbers[-1] + 1
-    if count is not None:
-        for start in (0, 1):
-            if start <= first and end <= start + count:
-                first = start
-                break
-        end = max(end, first + count)
-    present = set(numbers)
-    missing = (number for number in range(first, end) if number not in present)
-    path = paths[0]
-    letters = path.stem.rstrip("0123456789")
-    digits = min(len(path.stem) for path in paths) - len(letters)
-    return [
-        path.with_name(f"{letters}{number:0{digits}d}{path.suffix}")
-        for number in islice(missing, MAX_MISSING_NAMED)
-    ]
+    if 0 in steps:
+        first = steps.index(0)
+        raise InputError(
+            f"{paths[first + 1]}: has the same number as {paths[first].name}; remove one of them"
+        )
+    if len(steps) < 2 or median_low(steps) != 1:
+        return
+    for number, step, path in zip(numbers, steps, paths):
+        if step != 1:
+            letters = path.stem.rstrip("0123456789")
+            digits = min(len(path.stem) for path in paths) - len(letters)
+            name = f"{letters}{number + 1:0{digits}d}{path.suffix}"
+            count = numbers[-1] - numbers[0] + 1 - len(paths)
+            raise InputError(
+                f"{path.with_name(name)}: this frame is missing ({count} are); the odometry needs all "
+                "frames"
+            )
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
     """Raise InputError unless a file has `count` lines for as many frames."""
-    if count == len(frame_paths):
-        return
-    missing = missing_frames(frame_paths, max(count, len(frame_paths)))
-    first = ""
-    if missing:
-        first = f" (the first missing: {missing[0].name})"
-    raise InputError(
-        f"{path}: {count} lines for {len(frame_paths)} frames{first}; one line a frame is needed"
-    )
+    if count != len(frame_paths):
+        raise InputError(
+            f"{path}: {count} lines for {len(frame_paths)} frames, {frame_paths[0].name} to "
+            f"{frame_paths[-1].name}; one line a frame is needed"
+        )
 
 
 def check_size(
@@ -480,12 +408,10 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
         key = f"P_rect_{camera[-2:]}"
     form = f"must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-        lines = [line for line in text.splitlines() if line.startswith(f"{key}:")]
-        matrix = np.array(lines[0].split()[1:], np.float64)
-        matrix = matrix.reshape(3, 4)[:, :3]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}; it {form}") from None
+        lines = [line for line in text_of(path).splitlines() if line.startswith(f"{key}:")]
+        matrix = np.array(lines[0].split()[1:], np.float64).reshape(3, 4)[:, :3]
+    except InputError as error:
+        raise InputError(f"{error}; it {form}") from None
     except (ValueError, IndexError):
         matrix = np.zeros((3, 3))
     if not is_camera_matrix(matrix):
@@ -514,6 +440,12 @@ def check_camera(
             f"{frame}: {width}x{height} pixels; each side needs {MIN_FRAME_SIDE} or more"
         )
     (fx, _, u), (_, fy, v), _ = intrinsics
+    of_kitti = KNOWN_SIZES.get((round(fx, 3), round(u, 3)))
+    if of_kitti and of_kitti != (width, height):
+        raise InputError(
+            f"{path}: is KITTI's for frames of {of_kitti[0]}x{of_kitti[1]} pixels, but these have "
+            f"{width}x{height}; scale or shift focal lengths and centre as the frames were"
+        )
     center_fits = 0 <= u <= width and 0 <= v <= height
     focal_lengths_fit = all(width / 100 < focal < width * 100 for focal in (fx, fy))
     if not (center_fits and focal_lengths_fit):

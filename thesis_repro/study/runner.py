@@ -5,7 +5,7 @@ run again.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,18 @@ from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, keypoint_control
 from thesis_repro.study.methods import METHODS, masks_of_method
 from thesis_repro.study.sources import Source, by_name
 from thesis_repro.study.workers import open_pool
+
+# rooms whose code decides the results
+CODE = (
+    "opencv_exact",
+    "thesis_repro.odometry",
+    "thesis_repro.masks",
+    "thesis_repro.data",
+    "thesis_repro.study.jobs",
+    "thesis_repro.study.methods",
+    "thesis_repro.study.controls",
+    "thesis_repro.study.sources",
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +69,7 @@ def run_jobs(
     *,
     processes: int = 1,
     scheduler: str | None = None,
+    scale_gate: float = odometry.THESIS.scale_gate,
 ) -> Outcome:
     """Run the jobs that have no result yet; returns the table of all runs and how many ran.
 
@@ -65,7 +78,7 @@ def run_jobs(
     folder: for the results; results from other data, code or mask settings in it are moved aside.
     processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
     a scheduler need this package, and the three folders under the same paths. One thread a worker
-    is best.
+    is best. scale_gate: metres, of all runs, see OdometrySettings.
 
     Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results
     of separate runs. A stopped study repeats only the passes that it was in. A job that fails is
@@ -80,7 +93,9 @@ def run_jobs(
         for sequence in opened.values():
             _stage(folder, sequence, sources_by_name)
         waiting = _unfinished(jobs, folder)
-        reasons = _run_passes(waiting, opened, sources_by_name, folder, processes, scheduler)
+        reasons = _run_passes(
+            waiting, opened, sources_by_name, folder, processes, scheduler, scale_gate
+        )
     warnings = _report(reasons)
     rows = []
     for job in jobs:
@@ -134,6 +149,7 @@ def _run_passes(
     folder: Path,
     processes: int,
     scheduler: str | None,
+    scale_gate: float,
 ) -> dict[Job, str]:
     """Run jobs; returns which of them failed, and why."""
 
@@ -148,7 +164,7 @@ def _run_passes(
         for pass_jobs in sorted(passes, key=frames, reverse=True):
             sequence = sequences[pass_jobs[0].sequence]
             record = results.record(folder / sequence.name)
-            calls.append((pass_jobs, sequence, sources, folder, record))
+            calls.append((pass_jobs, sequence, sources, folder, record, scale_gate))
         with progress(None, "odometry", total=frames(jobs), unit="frame") as bar:
             for pass_jobs, pass_reasons in pool.run(_run_pass, calls):
                 reasons |= pass_reasons
@@ -198,7 +214,7 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": results.digest_of_code("thesis_repro.odometry", "thesis_repro.study.jobs"),
+        "code": results.digest_of_code(*CODE),
         **results.made_with("opencv", "numpy", "numba"),
     }
 
@@ -246,6 +262,7 @@ def _run_pass(
     sources: dict[str, Source],
     folder: Path,
     record: dict,
+    scale_gate: float,
 ) -> tuple[list[Job], dict[Job, str]]:
     """Run jobs of one sequence in one pass, here or on another machine.
 
@@ -257,7 +274,9 @@ def _run_pass(
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
         masks_by_job, reasons = checked_masks(_unfinished(jobs, folder), sequence, sources)
-        runs = {job.name: (job.settings, masks) for job, masks in masks_by_job.items()}
+        runs = {}
+        for job, masks in masks_by_job.items():
+            runs[job.name] = replace(job.settings, scale_gate=scale_gate), masks
         run_results = odometry.run_many(sequence, runs)
         for job in masks_by_job:
             frames = run_results[job.name].frames

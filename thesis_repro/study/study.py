@@ -6,8 +6,8 @@ from pathlib import Path
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
+from thesis_repro.odometry import THESIS
 from thesis_repro.running import results
-from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
@@ -20,7 +20,7 @@ class Study:
 
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
-    of each sequence, None for all.
+    of each sequence, None for all. scale_gate: metres, see OdometrySettings.
     """
 
     kitti: Path
@@ -31,6 +31,7 @@ class Study:
     estimators: tuple[str, ...] = ("thesis",)
     repetitions: int = 1
     frames: int | None = None
+    scale_gate: float = THESIS.scale_gate
 
     @cached_property
     def opened(self) -> list[Sequence]:
@@ -39,10 +40,8 @@ class Study:
 
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
-        if not 1 <= self.repetitions <= MOST_REPETITIONS:
-            raise InputError(
-                f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}"
-            )
+        if self.repetitions < 1:
+            raise InputError(f"--repetitions {self.repetitions}: must be 1 or more")
         if self.tested is not None and self.tested < 1:
             raise InputError(
                 f"--controls {self.tested}: must be a dilation width, 1 or more pixels"
@@ -107,9 +106,10 @@ class Study:
             folder=folder / RUNS,
             processes=processes,
             scheduler=scheduler,
+            scale_gate=self.scale_gate,
         )
         with results.claimed(folder):
-            results.stage(folder, replace=False, frames=self.frames)
+            results.stage(folder, replace=False, frames=self.frames, scale_gate=self.scale_gate)
             first_jobs = jobs.first_jobs(
                 self.opened,
                 dict.fromkeys(self.estimators, self.widths),

@@ -14,7 +14,6 @@ from joblib.externals.loky import get_reusable_executor
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import messages
-from thesis_repro.running.settings import scheduler_address
 
 TIMEOUT = 8  # seconds that a scheduler has to answer
 LOST = "a worker process was lost; finished results are kept; repeat the command"
@@ -41,7 +40,7 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     processes: their number. scheduler: its address, "tcp://host:8786".
     Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
     """
-    if scheduler_address(scheduler) is None:
+    if scheduler is None:
         executor = get_reusable_executor(processes, initializer=messages.leave_ctrl_c_to_parent)
         try:
             yield Pool(processes, executor)
