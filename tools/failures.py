@@ -10,7 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from thesis_repro.odometry import THESIS, Odometry, metrics, pose, scales
+from thesis_repro.odometry import THESIS, Odometry, metrics, scales
+from thesis_repro.odometry.odometry import normalise
 from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, near, with_uncertainty
 from thesis_repro.report import style
 
@@ -97,8 +98,8 @@ def _agreeing(step, motion, sequence):
 
     They agree with `motion` if they are near its epipolar lines.
     """
-    current = pose.normalise(step.current, sequence.intrinsics)
-    previous = pose.normalise(step.previous, sequence.intrinsics)
+    current = normalise(step.current, sequence.intrinsics)
+    previous = normalise(step.previous, sequence.intrinsics)
     limit = SUPPORT_THRESHOLDS * SETTINGS.threshold
     return current, previous, near(motion.rotation, motion.translation, current, previous, limit)
 
