@@ -15,7 +15,8 @@ import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.masks import LabelMasks, MaskFolder, coverage, label_map_of
+from thesis_repro.mask_files import LabelMasks, MaskFolder, label_map_of
+from thesis_repro.masks import coverage
 from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import read_settings
 
@@ -58,7 +59,7 @@ def check_kitti(root: Path) -> tuple[list[str], list[str]]:
     for name in kitti.with_frames(root):
         sequence = _attempt(problems, kitti.Sequence, root, name)
         if _attempt(problems, getattr, sequence, "size", None):
-            facts.append(sequence.description)
+            facts += [sequence.description, *of_sequence(sequence)]
             if name in with_truth:
                 _attempt(problems, getattr, sequence, "poses")
             _attempt_each(problems, sequence.frame, range(len(sequence)), f"sequence {name}")
@@ -91,7 +92,7 @@ def report(
     cityscapes_root: Path | None = None,
     kitti_semantic: Path | None = None,
 ) -> bool:
-    """Print the content of the folders, problems and warnings.
+    """Print the content of the folders, and problems.
 
     Returns True if there are no problems.
     """
@@ -105,13 +106,8 @@ def report(
             facts, problems_of_root = check(root)
             print("\n  ".join(map(one_line, [root, *facts])))
             problems += problems_of_root
-    lines = [f"wrong: {problem}" for problem in problems]
-    if kitti_root and not problems:
-        for name in kitti.with_frames(kitti_root):
-            warnings = of_sequence(kitti.Sequence(kitti_root, name))
-            lines += [f"warning: {warning}" for warning in warnings]
-    for line in lines:
-        print(one_line(line), file=sys.stderr)
+    for problem in problems:
+        print(f"wrong: {one_line(problem)}", file=sys.stderr)
     return not problems
 
 
@@ -180,7 +176,7 @@ def of_run(
             f"sequence {name}: {failed} of {frames} frames have a flag; do frames, calibration and "
             "poses fit together?"
         )
-    if dropped > MAX_DROPPED * frames:
+    if dropped >= MAX_DROPPED * frames:
         warnings.append(
             f"sequence {name}: {dropped} of {frames} steps are no longer than the scale gate of "
             f"{scale_gate:g} m, so their motion and rotation were left out; --scale-gate 0 takes all"
@@ -195,11 +191,16 @@ def of_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) -> list[
     """
     folder, shares = source.paths[0].parent, _shares_kept(source)
     if isinstance(source, LabelMasks) and source.settings.ids == "labels":
-        highest = np.flatnonzero(_class_shares(source)).max()
-        if highest < len(cityscapes.TRAINED):
+        ids = np.flatnonzero(_class_shares(source))
+        if ids.max() < len(cityscapes.TRAINED):
             return [
-                f"{folder}: label maps hold no id above {highest}, so no sky, vegetation or cars; "
+                f"{folder}: label maps hold no id above {ids.max()}, so no sky, vegetation or cars; "
                 "--ids train reads train ids"
+            ]
+        if ids.max() == cityscapes.ID["license plate"]:
+            return [
+                f"{folder}: label maps hold id {ids.max()}, a license plate, but a garage in KITTI-360; "
+                "--ids FILE gives ids the names that are meant"
             ]
     if min(shares) < MIN_SHARE or min(shares) == 1:
         return [
@@ -207,7 +208,7 @@ def of_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) -> list[
             "inverts ready-made masks"
         ]
     made_from = (results.record(folder) or {}).get("frames")
-    frames = files.images(sequence.frame_paths[0].parent)
+    frames = kitti.frames_in(sequence.frame_paths[0].parent)
     # a study may use only the first frames
     used = sequence.frame_paths, frames, frames[: len(files.listed(folder))]
     if made_from and made_from not in map(results.digest_of_files, used):

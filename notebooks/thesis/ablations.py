@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import masks, odometry
+from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
@@ -161,8 +161,10 @@ def _methods(sequence: Sequence, labels: Path, dilation_width: int) -> dict[str,
         is_vegetation = np.isin(enlarged(index), VEGETATION)
         return np.where(is_vegetation, np.uint8(0), np.uint8(255))
 
-    thesis_masks = masks.LabelMasks(labels, sequence, dilation_width)
-    symmetric = masks.LabelMasks(labels, sequence, dilation_width, MaskSettings(symmetric=True))
+    thesis_masks = mask_files.LabelMasks(labels, sequence, dilation_width)
+    symmetric = mask_files.LabelMasks(
+        labels, sequence, dilation_width, MaskSettings(symmetric=True)
+    )
     number = _mean_number(sequence, thesis_masks)
     methods: dict[str, Run] = {
         "baseline": (THESIS, None),

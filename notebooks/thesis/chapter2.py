@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from thesis_repro.odometry import metrics
-from thesis_repro.report import style
+from thesis_repro.report import paths, style
 from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 
@@ -255,6 +255,11 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
         label="descriptor bits that differ, of 256",
     )
     return figure
+
+
+def figure_2_10(estimates: dict[str, np.ndarray], true: np.ndarray, title: str) -> plt.Figure:
+    """Figure 2.10: estimated paths, {name: (n, 4, 4)}, and how far each drifts from the truth."""
+    return paths.figure(estimates, true, title)
 
 
 def figure_2_11(

@@ -92,7 +92,7 @@ def masks(options: Any) -> None:
 
     Masks are 8-bit PNG images: 255 keeps keypoints, 0 ignores them.
     """
-    from thesis_repro.masks import LabelMasks, write_masks
+    from thesis_repro.mask_files import LabelMasks, write_masks
 
     sequence, settings = _sequence(options), _mask_settings(options)
     if not options.dilation and settings.keep != "static":
@@ -322,7 +322,6 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     Raises InputError if there are no images, or if frames of a sequence are missing.
     """
     from thesis_repro.data import kitti
-    from thesis_repro.running import files
 
     folders = [root]
     if root.is_dir() and not kitti.has_frames(root):
@@ -332,7 +331,7 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
         folders = kitti.folders_with_frames(parent) or [root]
     for folder in folders:
         image_folder = kitti.images_of(folder)
-        paths = files.images(image_folder)
+        paths = kitti.frames_in(image_folder)
         if not paths:
             raise InputError(f"{image_folder}: holds no PNG or JPEG images")
         if image_folder != folder:
@@ -365,7 +364,7 @@ def _mask_settings(options: Any, has_labels: bool = True) -> Any:
 
 def _masks(options: Any, sequence: Any) -> Any:
     """The masks that --masks or --labels name, or None."""
-    from thesis_repro.masks import LabelMasks, MaskFolder
+    from thesis_repro.mask_files import LabelMasks, MaskFolder
 
     settings = _mask_settings(options, options.labels)
     if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):

@@ -180,7 +180,7 @@ def read_label_map(path: str | Path, train_ids: bool = False) -> np.ndarray:
         )
     raise InputError(
         f"{path}: label id {invalid} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
-        "--ids train for train ids (0 to 18, 255)"
+        "--ids train for train ids (0 to 18, 255), or --ids FILE for a table of other ids"
     )
 
 

@@ -1,5 +1,6 @@
-"""Trajectory files: reads and writes poses in the formats of KITTI and TUM, and reads times."""
+"""Trajectory files: poses in the formats of KITTI, TUM and EuRoC, and times."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,12 @@ def text_of(path: str | Path) -> str:
         raise InputError(f"{path}: cannot be read: {reason}") from None
 
 
-def _read_numbers(path: str | Path, columns: int) -> tuple[np.ndarray, list[int]]:
+def _read_numbers(path: str | Path, *columns: int) -> tuple[np.ndarray, list[int]]:
     """Return the numbers of a file, (n, columns), and the number of the line of each row.
 
-    Empty lines are skipped.
+    columns: their possible numbers, the same one in each line. Empty lines are skipped.
     """
+    form = f"must hold {columns[0]} finite numbers a line, one line a frame"
     rows, line_numbers = [], []
     for number, line in enumerate(text_of(path).split("\n"), 1):
         if not line.strip():
@@ -34,14 +36,13 @@ def _read_numbers(path: str | Path, columns: int) -> tuple[np.ndarray, list[int]
             row = np.array(line.split(), np.float64)
         except ValueError:
             row = np.empty(0)
-        if len(row) != columns or not np.isfinite(row).all():
-            raise InputError(
-                f"{path}, line {number}: must hold {columns} finite numbers a line, one line a frame"
-            )
+        if len(row) not in columns or not np.isfinite(row).all():
+            raise InputError(f"{path}, line {number}: {form}")
+        columns = (len(row),)
         rows.append(row)
         line_numbers.append(number)
     if not rows:
-        raise InputError(f"{path}: must hold {columns} finite numbers a line, one line a frame")
+        raise InputError(f"{path}: {form}")
     return np.array(rows), line_numbers
 
 
@@ -59,14 +60,19 @@ def read_times(path: str | Path) -> np.ndarray:
 
 
 def read_poses(path: str | Path) -> np.ndarray:
-    """Camera-to-world poses, (n, 4, 4), metres, from 12 numbers a line.
+    """Camera-to-world poses, (n, 4, 4), metres, from 12 or 16 numbers a line.
 
-    These are the first three rows of each pose. Raises InputError if a line is not a right-handed
-    rotation and a position.
+    These are the first three or all four rows of each pose. The number of the frame may stand
+    before them. Raises InputError if a line is not a right-handed rotation and a position, or if
+    the numbers of the frames do not count by one.
     """
-    rows, line_numbers = _read_numbers(path, 12)
+    rows, line_numbers = _read_numbers(path, 12, 13, 16, 17)
+    if rows.shape[1] in (13, 17):
+        if (np.diff(rows[:, 0]) != 1).any():
+            raise InputError(f"{path}: the first numbers do not count the frames one by one")
+        rows = rows[:, 1:]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
+    poses.reshape(-1, 16)[:, : rows.shape[1]] = rows
     bad_rows = np.flatnonzero(~are_poses(poses))
     if len(bad_rows):
         raise InputError(
@@ -74,6 +80,42 @@ def read_poses(path: str | Path) -> np.ndarray:
             "in metres"
         )
     return poses
+
+
+def have_times(path: Path) -> bool:
+    """Whether the poses of a file have times: in EuRoC's format (.csv), or in TUM's."""
+    lines = [line for line in text_of(path).splitlines() if line.strip() and line[0] != "#"]
+    return path.suffix == ".csv" or bool(lines and len(lines[0].split()) == 8)
+
+
+def read_poses_at(path: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of the frames at times (n,), seconds, from a file in TUM's or EuRoC's format.
+
+    Returns the indices of the frames that have a pose within 0.01 seconds, (m,), and their poses,
+    (m, 4, 4), as evo associates them. Raises InputError if there are none, or for a malformed file.
+    """
+    # these take 0.4 s to load
+    from evo import EvoException
+    from evo.core.sync import associate_trajectories
+    from evo.core.trajectory import PoseTrajectory3D
+    from evo.tools import file_interface
+
+    nowhere = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
+    frames = PoseTrajectory3D(*nowhere, times, name=f"the times of the frames of {path.parent}")
+    lines = [" ".join(line.split()) for line in text_of(path).splitlines()]
+    file = io.StringIO("\n".join(filter(None, lines)))
+    read = file_interface.read_tum_trajectory_file
+    if path.suffix == ".csv":
+        read = file_interface.read_euroc_csv_trajectory
+    try:
+        frames, truth = associate_trajectories(frames, read(file))
+    except (EvoException, ValueError) as error:
+        raise InputError(f"{path}: {error}") from None
+    poses = np.array(truth.poses_se3)
+    if not are_poses(poses).all():
+        raise InputError(f"{path}: must hold finite positions and unit quaternions")
+    indices, first = np.unique(np.searchsorted(times, frames.timestamps), return_index=True)
+    return indices, poses[first]
 
 
 def are_poses(poses: np.ndarray) -> np.ndarray:
@@ -87,7 +129,8 @@ def are_poses(poses: np.ndarray) -> np.ndarray:
         errors = np.abs(products - np.eye(3)).max(axis=(1, 2))
         is_right_handed = np.linalg.det(rotations) > 0
     is_near = np.abs(positions).max(axis=1) <= MAX_POSITION
-    return (errors <= ROTATION_TOLERANCE) & is_right_handed & is_near
+    is_pose = (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
+    return is_pose & (errors <= ROTATION_TOLERANCE) & is_right_handed & is_near
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:
