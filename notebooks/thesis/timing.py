@@ -19,7 +19,7 @@ import pandas as pd
 from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.running.files import progress, write_text
-from thesis_repro.running.settings import cores
+from thesis_repro.running.settings import Settings, cores
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import checked_masks
@@ -146,6 +146,16 @@ def _stages_of(step: odometry.Step) -> dict[str, float]:
         "tracking": step.seconds["track"],
         "pose": step.seconds["essential"] + step.seconds["pose"],
     }
+
+
+def folder(settings: Settings) -> Path:
+    """Return the folder of the timings that are drawn.
+
+    For the figures in git it holds those that were recorded on one machine, else those of the run.
+    """
+    if settings.figures_in_git:
+        return settings.published / "timings"
+    return settings.figures / "timings"
 
 
 def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
