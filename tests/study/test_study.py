@@ -15,7 +15,7 @@ from typeset import PDFLATEX, assert_fits
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.masks import LabelMasks, write_masks
+from thesis_repro.mask_files import LabelMasks, write_masks
 from thesis_repro.report import study as report
 from thesis_repro.report import tables
 from thesis_repro.study import compare, runner

@@ -25,14 +25,8 @@ means that the pose does not change:
 | step shorter than the gate (PySLAM's      | "stationary": kept                                 |
 | rule)                                     |                                                    |
 | rotation larger than a car's              | "too large a turn": the pose moves, as in PySLAM   |
-| inliers move as if the camera only turned | "no parallax": the pose moves, in a direction that |
-| or stood still                            | the points do not determine                        |
-| inliers move as if all were equally far,  | "zoom": the pose moves, ahead or back              |
-| as under a zoom                           |                                                    |
 
-With settings.fallback and masks, the flag "all keypoints used" marks steps estimated from all
-keypoints. The masked keypoints did not determine the motion, or it differed too much from the
-previous step's. With estimator="refined" there are two more flags, and the pose is always moved
+With estimator="refined" there are two more flags, and the pose is always moved
 (see refined.motion_prior):
 
 | motion                                    | flag: rule                                         |
@@ -45,12 +39,18 @@ previous step's. With estimator="refined" there are two more flags, and the pose
 |                                           | previous motion, with this step's length           |
 """
 
-from thesis_repro.odometry.odometry import Odometry, Step
-from thesis_repro.odometry.passes import Result, run, run_many, scales, start_pose
+from thesis_repro.odometry.odometry import OPENCV, Calls, Odometry
+from thesis_repro.odometry.runs import Masks, Result, run, run_many, scales, start_pose
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
+from thesis_repro.odometry.types import Matches, Motion, Step
 
 __all__ = [
+    "OPENCV",
     "THESIS",
+    "Calls",
+    "Masks",
+    "Matches",
+    "Motion",
     "Odometry",
     "OdometrySettings",
     "Result",

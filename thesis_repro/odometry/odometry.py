@@ -1,428 +1,253 @@
-"""The odometry, frame by frame: keypoints, the motion between two frames, and the new pose."""
+"""Monocular visual odometry as PySLAM has it (Section 3.7): four calls of OpenCV a frame.
 
-import time
+The loop is `Odometry.step`. The rules for frames on which PySLAM would crash, and the flags that a
+frame can get, are in the table in odometry/__init__.py.
+"""
+
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache, partial
-from numbers import Real
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
-from thesis_repro.data.kitti import check_camera, is_camera_matrix
-from thesis_repro.data.trajectories import are_poses
-from thesis_repro.errors import InputError, need
-from thesis_repro.odometry import keypoints, pose
-from thesis_repro.odometry.estimators import ESTIMATORS, Essential
-from thesis_repro.odometry.pose import Motion
-from thesis_repro.odometry.refined.fit import RefinedMotion, fit, with_uncertainty
-from thesis_repro.odometry.refined.guided import ransac_with_prior
-from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency, is_consistent
+from thesis_repro.errors import need
+from thesis_repro.odometry import types
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.running import messages
+from thesis_repro.odometry.types import NO_POINTS, Matches, Motion, Step
 
-TIMED_PARTS = ("detect", "track", "essential", "pose")
-ROTATION_COLUMNS = [f"r{i}{j}" for i in range(3) for j in range(3)]
-# flags of a step that used the fallback, and of one that is shorter than the gate
-ALL_KEYPOINTS, STATIONARY = "all keypoints used", "stationary"
+PROBABILITY = 0.999  # that RANSAC has tried a sample without wrong matches
+TERMINATION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)  # of the tracker
+MIN_MATCHES = 5  # for an essential matrix
 MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
+MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
+STATIONARY = "stationary"  # flag of a step that is shorter than the gate
 
 
-@dataclass(eq=False)
-class Step:
-    """Results for one frame.
+# The four calls
 
-    Its N correspondences are `previous` and `current`, (N, 2) pixels; `inliers` is (N,).
-    Later steps do not depend on its arrays.
+
+def detect(
+    frame: np.ndarray, settings: OdometrySettings = THESIS, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Find Shi-Tomasi keypoints, (N, 2) float32 pixels, strongest first (Equation 3.13).
+
+    mask: (height, width) uint8; keypoints lie only where it is not 0.
+    """
+    points = cv2.goodFeaturesToTrack(
+        frame,
+        settings.max_keypoints,
+        settings.quality,
+        settings.min_distance,
+        mask=mask,
+        blockSize=settings.block_size,
+    )
+    if points is None:
+        return NO_POINTS
+    return points.reshape(-1, 2)
+
+
+def track(
+    previous: np.ndarray,
+    current: np.ndarray,
+    points: np.ndarray,
+    settings: OdometrySettings = THESIS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Track points (N, 2) into the current frame by Lucas-Kanade (Equation 3.15).
+
+    Returns the tracked points, (N, 2) float32, and whether each was found, (N,) booleans.
+    """
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(
+        previous,
+        current,
+        points,
+        None,
+        winSize=(settings.window, settings.window),
+        maxLevel=settings.levels,
+        criteria=TERMINATION,
+    )
+    return tracked, status.ravel() == 1
+
+
+def find_essential_matrix(
+    current: np.ndarray, previous: np.ndarray, threshold: float
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Estimate the essential matrix of matches (N, 2) by RANSAC (Equation 2.5).
+
+    Returns (matrix, inliers); the matrix is None, or several in one array, if there is no single
+    one. Points of the current frame come first, as in PySLAM.
+    """
+    return cv2.findEssentialMat(current, previous, 1.0, (0, 0), cv2.RANSAC, PROBABILITY, threshold)
+
+
+def recover_pose(
+    matrix: np.ndarray, current: np.ndarray, previous: np.ndarray
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """Let matches (N, 2) vote for one of the four motions of an essential matrix: (votes, R, t)."""
+    votes, rotation, translation, _ = cv2.recoverPose(matrix, current, previous)
+    return votes, rotation, translation.ravel()
+
+
+class Calls(NamedTuple):
+    """The four functions that a step calls.
+
+    Others may take their places, such as your own keypoints or matches.
     """
 
-    frame: int
-    scale: float = 0.0  # metres moved since the previous frame that was not skipped
-    points: int | None = None  # number of points given to the tracker
-    detected: int | None = None  # number of new keypoints; None if the detector did not run
-    previous: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
-    current: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
-    # current and previous in normalised image coordinates, once they were asked for
-    normalised: tuple[np.ndarray, np.ndarray] | None = None
-    # tracked into the next frame
-    keypoints: np.ndarray = field(default_factory=lambda: keypoints.NO_POINTS)
-    motion: Any = Motion()  # a RefinedMotion if it was refined
-    pose: np.ndarray = field(default_factory=lambda: np.eye(4))  # camera to world, metres
-    updated: bool = False  # whether this step moved the pose
-    flags: list[str] = field(default_factory=list)
-    # if a fallback is possible, finds the matches of all keypoints; copies of the step share them
-    all_matches: Callable[[], "_Matches"] | None = None
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED_PARTS, 0.0))
-
-    @property
-    def inliers(self) -> np.ndarray:
-        """Correspondences that agree with the essential matrix, (N,) booleans."""
-        if self.motion.inliers is None:
-            return np.zeros(len(self.current), bool)
-        return self.motion.inliers
-
-    def copy(self) -> "Step":
-        """Copy with the same correspondences, for another estimator."""
-        return replace(self, flags=list(self.flags), seconds=dict(self.seconds))
-
-    def row(self) -> dict[str, Any]:
-        """One row of Result.frames."""
-        tracked = inliers = pose_inliers = None
-        if self.points is not None:
-            tracked = len(self.current)
-            inliers = int(self.inliers.sum())
-            pose_inliers = self.motion.pose_inliers
-        return {
-            "frame": self.frame,
-            "points": self.points,
-            "detected": self.detected,
-            "tracked": tracked,
-            "inliers": inliers,
-            "pose_inliers": pose_inliers,
-            "scale": self.scale,
-            "updated": self.updated,
-            "flag": "; ".join(self.flags),
-            **dict(zip("xyz", self.pose[:3, 3].tolist(), strict=True)),
-            **dict(zip(ROTATION_COLUMNS, self.pose[:3, :3].ravel().tolist(), strict=True)),
-            **{f"{name}_seconds": value for name, value in self.seconds.items()},
-        }
+    detect: Callable = detect
+    track: Callable = track
+    find_essential_matrix: Callable = find_essential_matrix
+    recover_pose: Callable = recover_pose
 
 
-FRAME_COLUMNS = tuple(Step(0).row())
+OPENCV = Calls()
+
+
+def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Normalised image coordinates (N, 2), in double precision, of pixels (N, 2) (Equation 2.4).
+
+    u * (1 / fx) + (-cx / fx) equals the product of the inverse camera matrix and (u, v, 1) to the
+    last bit. The formula (u - cx) / fx does not. RANSAC amplifies a difference in the last bit, so
+    the trajectory would be another one.
+    """
+    focal_lengths = np.array([intrinsics[0, 0], intrinsics[1, 1]])
+    return points * (1 / focal_lengths) + (-intrinsics[:2, 2] / focal_lengths)
+
+
+# The loop
+
+
+class VoteOfAll(NamedTuple):
+    """PySLAM's estimator: the motion that most matches vote for, outliers included."""
+
+    calls: Calls = OPENCV
+
+    def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
+        """Return the motion of a step (see types.Estimator)."""
+        votes, rotation, translation = self.calls.recover_pose(
+            essential, matches.current, matches.previous
+        )
+        return Motion(rotation, translation, votes)
 
 
 class Odometry:
-    """Monocular visual odometry, frame by frame.
-
-    `step(frame, scale, mask)` takes the next gray frame (height, width), the distance moved since
-    the previous frame in metres, and an optional mask of the same size, uint8 or bool (keypoints
-    are forbidden where it is 0). It returns a Step. It calls `observe`, `estimate` and `compose`.
-    `estimate` uses no state of earlier steps. With settings.fallback, `compose` may estimate a
-    step anew.
-    """
+    """Monocular visual odometry, frame by frame: each frame is a call of `step`."""
 
     def __init__(
         self,
-        intrinsics: np.ndarray,
+        intrinsics: Any,
         settings: OdometrySettings = THESIS,
-        start: np.ndarray | None = None,
-        shared: keypoints.SharedKeypoints | None = None,
+        start: Any = None,
+        calls: Calls | None = None,
     ):
         """Start before the first frame.
 
         intrinsics: 3x3, pixels, as (fx, 0, u), (0, fy, v), (0, 0, 1). start: pose of the first
-        frame, 4x4. shared: keypoints shared with other runs. Raises InputError for another matrix,
-        and for a start that is no pose.
+        frame, 4x4; None for the identity. calls: functions in place of OpenCV's.
+        Raises InputError for another matrix, and for a start that is no pose.
         """
         need("settings", settings, OdometrySettings)
-        self.intrinsics = np.array(intrinsics, np.float64)
+        self.intrinsics = types.camera_matrix(intrinsics)
         self.settings = settings
-        self.pose = np.eye(4) if start is None else np.array(start, np.float64)
-        if not is_camera_matrix(self.intrinsics):
-            raise InputError(
-                "intrinsics: must be (fx, 0, u), (0, fy, v), (0, 0, 1) in pixels, not "
-                f"{self.intrinsics.tolist()}"
-            )
-        is_pose = self.pose.shape == (4, 4) and are_poses(self.pose[None]).all()
-        if not is_pose or not np.array_equal(self.pose[3], [0, 0, 0, 1]):
-            raise InputError("start: must be a pose, 4x4: a right-handed rotation and a position")
-        self.prior = (
-            MotionPrior.straight_ahead()
-        )  # used by the refined estimator and the fallback only
-        self.shared = shared
-        self.count = 0
+        self.calls = calls or OPENCV._replace(detect=settings.detect_function())
+        self.estimator: types.Estimator = settings.new_estimator(self.calls)
+        self.pose = types.start_pose(start)
+        self.count = 0  # of frames so far
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
-        self.points = keypoints.NO_POINTS
-        self.gap = 0.0  # metres moved during skipped (flat) frames
-        warm_up(settings.estimator == "refined" or settings.fallback)
+        self.points = NO_POINTS
+        self.skipped_metres = 0.0  # moved during flat frames
 
-    def step(self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None) -> Step:
-        """Take the next frame: `observe`, `estimate` and `compose`."""
-        with messages.held_signals():
-            step = self.observe(frame, scale, mask)
-            self.estimate(step)
-            return self.compose(step)
+    def step(self, frame: Any, scale: Any = 0.0, mask: Any = None) -> Step:
+        """Take the next frame. Returns a Step.
 
-    def observe(
-        self, frame: np.ndarray, scale: float = 0.0, mask: np.ndarray | None = None
-    ) -> Step:
-        """Track the points into this frame and detect new keypoints.
-
-        Returns a Step without a motion.
+        frame: (height, width) uint8. scale: metres moved since the frame before. mask: of the same
+        size, uint8 or bool; keypoints lie only where it is not 0.
+        Raises InputError for a frame, scale or mask of another kind.
         """
-        frame = np.asarray(frame)  # cv2.imread returns None for a missing file
-        if mask is not None:
-            mask = np.asarray(mask)
-            if mask.dtype == bool:
-                mask = mask.view(np.uint8)
-        need(f"frame {self.count}: scale", np.asarray(scale)[()], Real)
-        scale = float(scale)
-        self._check(frame, scale, mask)
-        if self.shared is None:  # shared keypoints know a frame by its identity
-            frame = frame.copy()  # the caller may read the next frame into the same array
-        step = Step(frame=self.count, scale=scale)
+        frame = types.gray_frame(frame, self.count, self.intrinsics, self.previous)
+        mask = types.allowed_pixels(mask, self.count, frame)
+        step = Step(self.count, types.step_length(scale, self.count) + self.skipped_metres)
         self.count += 1
-        if self.previous is not None:
-            step.scale += self.gap
         if frame[::8, ::8].std() < MIN_CONTRAST:
             step.flags.append("flat frame")
-            self.gap = step.scale
-            return step
-        self.gap = 0.0
-        if self.settings.fallback and mask is not None and self.previous is not None:
-            find = partial(_matches_without_mask, self.previous, frame, self.settings)
-            step.all_matches = cache(find)
-        self._track(step, frame)
+            self.skipped_metres = step.scale
+        else:
+            self.skipped_metres = 0.0
+            if step.frame > 0:
+                self._track(step, frame)
+            if step.points:
+                self._estimate(step)
+            self._detect(step, frame, mask)
+            self.previous = frame
+        step.pose = self.pose.copy()
+        return step
+
+    def _track(self, step: Step, frame: np.ndarray) -> None:
+        """Track the points of the previous frame into this one (Section 3.7.2)."""
+        step.points = len(self.points)
+        if step.points == 0:
+            step.flags.append("no points")
+            return
+        with step.timed("track"):
+            tracked, was_found = self.calls.track(self.previous, frame, self.points, self.settings)
+        step.previous = self.points[was_found]
+        step.current = tracked[was_found]
+
+    def _estimate(self, step: Step) -> None:
+        """Estimate the motion from the matched points, and move the pose (Section 3.7.3)."""
+        current = normalise(step.current, self.intrinsics)
+        previous = normalise(step.previous, self.intrinsics)
+        threshold = self.settings.threshold
+        order = self.settings.order(step.frame, len(current))
+        step.matches = Matches(current, previous, threshold, order=order)
+        if len(current) < MIN_MATCHES:
+            step.flags.append("fewer than five correspondences")
+            return
+        with step.timed("essential"):
+            matrix, inliers = self.calls.find_essential_matrix(
+                current[order], previous[order], threshold
+            )
+        if matrix is None or not np.isfinite(matrix).all():
+            step.flags.append("no essential matrix")
+            return
+        if matrix.shape != (3, 3):  # from five matches, OpenCV returns all solutions in one array
+            step.flags.append("several essential matrices")
+            return
+        agrees = np.empty(len(current), bool)
+        agrees[order] = inliers.ravel() > 0
+        step.matches = Matches(current, previous, threshold, agrees, order)
+        agree_by_chance = step.matches.agree_by_chance()
+        moves = step.scale > self.settings.scale_gate and not agree_by_chance
+        with step.timed("pose"):
+            step.motion = self.estimator.motion(matrix, step.matches, step.scale, moves)
+        if moves:
+            self._move(step)
+        elif agree_by_chance:
+            step.flags.append("no agreement")
+        else:
+            step.flags.append(STATIONARY)
+
+    def _move(self, step: Step) -> None:
+        """Move the pose by the motion over the step's length (Equations 2.2 and 2.3)."""
+        rotation, translation = step.motion.rotation, step.motion.translation
+        if step.motion.flag:
+            step.flags.append(step.motion.flag)
+        if np.trace(rotation) < 1 + 2 * np.cos(np.radians(MAX_TURN)):
+            step.flags.append("too large a turn")
+        moved = np.eye(4)
+        moved[:3, :3] = self.pose[:3, :3] @ rotation
+        moved[:3, 3] = self.pose[:3, 3] + step.scale * (self.pose[:3, :3] @ translation)
+        self.pose = moved
+        step.updated = True
+
+    def _detect(self, step: Step, frame: np.ndarray, mask: np.ndarray | None) -> None:
+        """Replace all points by new keypoints if too few were tracked (Section 3.7.1)."""
         points = step.current
         if len(points) < self.settings.redetect_below or not len(points):
-            started = time.perf_counter()
-            detected = self._tracker.detect(frame, self.settings, mask)
-            step.seconds["detect"] = time.perf_counter() - started
+            with step.timed("detect"):
+                detected = self.calls.detect(frame, self.settings, mask)
             step.detected = len(detected)
             if len(detected):
                 points = detected
             else:
                 step.flags.append("no keypoints")
-        self.previous = frame
         self.points, step.keypoints = points.copy(), points
-        return step
-
-    @property
-    def _tracker(self) -> Any:
-        """What detects and tracks: the shared keypoints or the module, with the same functions."""
-        return self.shared or keypoints
-
-    def _track(self, step: Step, frame: np.ndarray) -> None:
-        """Track the points of the previous frame into this one: the step's correspondences."""
-        started = time.perf_counter()
-        if self.previous is not None and len(self.points):
-            step.points = len(self.points)
-            tracked, was_tracked = self._tracker.track(
-                self.previous, frame, self.points, self.settings.window, self.settings.levels
-            )
-            step.previous = self.points.compress(was_tracked, axis=0)
-            step.current = tracked.compress(was_tracked, axis=0)
-            self._normalised(step)  # copies of the step, in other runs, share it
-        elif self.previous is not None or step.frame > 0:
-            step.points = 0
-            step.flags.append("no points")
-        step.seconds["track"] = time.perf_counter() - started
-
-    def _normalised(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
-        """The step's correspondences (current, previous) in normalised coordinates."""
-        if step.normalised is None:
-            current = pose.normalise(step.current, self.intrinsics)
-            step.normalised = current, pose.normalise(step.previous, self.intrinsics)
-        return step.normalised
-
-    def estimate(self, step: Step, essential: Essential | None = None) -> Essential | None:
-        """Estimate the motion from the step's correspondences. Returns the essential matrix.
-
-        essential: the result of another Odometry for the same correspondences. Its settings may
-        differ in passes.AFTER_ESSENTIAL only.
-        """
-        if not step.points:
-            return None
-        if essential is None:
-            essential = _essential(step, self._normalised(step), self.settings)
-        step.seconds["essential"] = essential.seconds
-        if essential.matrix is None:
-            step.motion = Motion(problem=essential.problem)
-            return essential
-        started = time.perf_counter()
-        estimator = ESTIMATORS[self.settings.estimator]
-        step.motion = estimator.motion(essential, self.settings.threshold)
-        step.seconds["pose"] = time.perf_counter() - started
-        return essential
-
-    def compose(self, step: Step) -> Step:
-        """Move the pose by the step's motion, or keep it if a rule says so.
-
-        The rules are in the table in odometry/__init__.py.
-        """
-        is_long = step.scale > self.settings.scale_gate
-        if step.all_matches is not None and is_long and self._in_doubt(step):
-            self._use_all_keypoints(step, step.all_matches())
-        step.all_matches = None  # it holds two frames
-        if step.points:
-            flag = self._flag_if_kept(step)
-            if flag is None:
-                self._move(step)
-            else:
-                step.flags.append(flag)
-        step.pose = self.pose.copy()
-        self.prior = self.prior.copy()  # step.motion has the arrays of the original
-        return step
-
-    def _flag_if_kept(self, step: Step) -> str | None:
-        """Flag of a step that keeps the pose; None if the step moves it."""
-        motion = step.motion
-        if motion.rotation is None:
-            return motion.problem
-        if _by_chance(motion.inliers):
-            return "no agreement"
-        if step.scale <= self.settings.scale_gate:
-            return STATIONARY
-        return None
-
-    def _move(self, step: Step) -> None:
-        """Move the pose, and flag a motion that is doubtful."""
-        if self.settings.estimator == "refined":
-            self._check_consistency(step)
-        elif self.settings.fallback:
-            motion = step.motion
-            self.prior = MotionPrior(motion.rotation, motion.translation, step.scale)
-        self._check_turn(step)
-        self._check_parallax(step)
-        rotation = self.pose[:3, :3]
-        moved = np.eye(4)
-        moved[:3, :3] = rotation @ step.motion.rotation
-        moved[:3, 3] = self.pose[:3, 3] + step.scale * (rotation @ step.motion.translation)
-        self.pose = moved
-        step.updated = True
-
-    def _in_doubt(self, step: Step) -> bool:
-        """Whether the masked keypoints do not determine the motion, or it is not consistent."""
-        motion = step.motion
-        if motion.rotation is None or _by_chance(motion.inliers):
-            return True
-        if not isinstance(motion, RefinedMotion):
-            refined = with_uncertainty(
-                motion.rotation,
-                motion.translation,
-                *self._normalised(step),
-                motion.inliers,
-                self.settings.threshold,
-            )
-            motion = replace(refined, translation=motion.translation)
-        return not is_consistent(motion, step.scale, self.prior)
-
-    def _use_all_keypoints(self, step: Step, matches: "_Matches") -> None:
-        """Estimate the step anew, without a mask."""
-        if not matches.points:
-            return
-        step.points, step.previous, step.current = matches
-        step.normalised = None
-        step.flags.append(ALL_KEYPOINTS)
-        self.estimate(step)
-
-    def _check_consistency(self, step: Step) -> None:
-        """Compare the motion with the previous step's, and replace or flag it."""
-        started = time.perf_counter()
-        step.motion, self.prior, flag = check_consistency(
-            step.motion, *self._normalised(step), step.scale, self.settings.threshold, self.prior
-        )
-        if flag:
-            step.flags.append(flag)
-        step.seconds["pose"] += time.perf_counter() - started
-
-    def _check_turn(self, step: Step) -> None:
-        """Flag a step that turns more than a car can."""
-        cosine = (np.trace(step.motion.rotation) - 1) / 2
-        if cosine < np.cos(np.radians(MAX_TURN)):
-            step.flags.append("too large a turn")
-
-    def _check_parallax(self, step: Step) -> None:
-        """Flag a step without parallax.
-
-        Its points do not tell in which direction it went, or whether it was a zoom.
-        """
-        largest = MAX_TRACKING_ERROR / self.intrinsics[0, 0]
-        share, zoom = pose.rotation_and_zoom(*self._normalised(step), step.inliers, largest)
-        if share >= 0.95:
-            step.flags.append("zoom" if abs(zoom - 1) > MIN_ZOOM else "no parallax")
-
-    def _check(self, frame: np.ndarray, scale: float, mask: np.ndarray | None) -> None:
-        """Raise InputError unless frame, scale and mask fit the camera and the frames before."""
-        if frame.dtype != np.uint8 or frame.ndim != 2:
-            raise InputError(
-                f"frame {self.count}: {frame.dtype} of shape {frame.shape}; "
-                "the odometry needs 8-bit gray, (height, width)"
-            )
-        check_camera("intrinsics", self.intrinsics, f"frame {self.count}", frame.shape)
-        if not np.isfinite(scale) or scale < 0:
-            raise InputError(f"frame {self.count}: scale {scale} is not a distance in metres")
-        if mask is not None and (mask.shape != frame.shape or mask.dtype != np.uint8):
-            raise InputError(
-                f"frame {self.count}: the mask is {mask.dtype} of shape {mask.shape}, the frame uint8 of "
-                f"shape {frame.shape}; masks must be 8-bit and as large as their frames"
-            )
-        if self.previous is not None and frame.shape != self.previous.shape:
-            raise InputError(
-                f"frame {self.count}: shape {frame.shape}, earlier frames {self.previous.shape}; "
-                "all frames must have the same size"
-            )
-        if mask is not None and np.count_nonzero(mask) > np.count_nonzero(mask == mask.max()):
-            raise InputError(
-                f"frame {self.count}: the mask holds {len(np.unique(mask))} different values; a mask has "
-                "0 and 255 (keypoint_mask makes masks from label maps)"
-            )
-
-
-class _Matches(NamedTuple):
-    """Correspondences of two frames, (N, 2) pixels, found for a number of points."""
-
-    points: int
-    previous: np.ndarray
-    current: np.ndarray
-
-
-def _matches_without_mask(
-    previous_frame: np.ndarray, frame: np.ndarray, settings: OdometrySettings
-) -> _Matches:
-    """Correspondences of all keypoints of the previous frame."""
-    points = keypoints.detect(previous_frame, settings)
-    if not len(points):
-        return _Matches(0, points, points)
-    tracked, was_tracked = keypoints.track(
-        previous_frame, frame, points, settings.window, settings.levels
-    )
-    return _Matches(len(points), points[was_tracked], tracked[was_tracked])
-
-
-def _essential(
-    step: Step, normalised: tuple[np.ndarray, np.ndarray], settings: OdometrySettings
-) -> Essential:
-    """Essential matrix of a step's correspondences, which are shuffled if the settings say so."""
-    started = time.perf_counter()
-    order: np.ndarray | slice = slice(None)
-    if settings.shuffle_seed is not None:
-        random = np.random.default_rng((settings.shuffle_seed, step.frame))
-        order = random.permutation(len(step.current))
-    current, previous = (points[order] for points in normalised)
-    matrix, inliers, problem = pose.essential_matrix(current, previous, settings.threshold)
-    seconds = time.perf_counter() - started
-    return Essential(current, previous, order, matrix, inliers, problem, seconds)
-
-
-def _by_chance(inliers: np.ndarray) -> bool:
-    """Whether there are no more inliers (N booleans) than two unrelated frames have."""
-    # With PySLAM's threshold, two unrelated frames have 7 inliers among 20 points, 9 among 100, 12
-    # among 300, and 24 to 43 among 1600. In consecutive real frames, 45 to 85 % of the points are
-    # inliers.
-    return inliers.sum() <= 8 + 0.03 * len(inliers)
-
-
-# pixels. If the camera only turned or zoomed, 95 % of the inliers lie nearer to such a motion. In
-# all steps longer than the gate, the same share lies within 1.2 pixels or more on eight sequences
-# of KITTI, and 0.55 or more in the embedded world.
-MAX_TRACKING_ERROR = 0.45
-MIN_ZOOM = 0.001  # a zoom is larger; a rotation alone gives up to 0.0004
-MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
-
-
-@lru_cache
-def warm_up(refined: bool) -> None:
-    """Load or compile the compiled functions.
-
-    So the measured time of the first frame does not include it.
-    """
-    keypoints.detect(np.zeros((8, 8), np.uint8), THESIS)
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2))
-    pose.essential_matrix(points, points + 0.01 * points[::-1], 1e-3)
-    pose.recover_pose(np.diag([1.0, 1.0, 0.0]), points, points)
-    pose.rotation_and_zoom(points, points, np.ones(8, bool), 1.0)
-    if refined:
-        ahead = np.array([0.0, 0.0, 1.0])
-        fit(np.eye(3), ahead, points, points, np.ones(8, bool), 1.0)
-        ransac_with_prior(points, points[::-1], 1.0, np.eye(3), ahead, 180.0, 180.0)

@@ -78,7 +78,7 @@ def write_label_maps(
         results.stage(folder, **_made_from(model, paths, batch_size, scale))
         pairs = [(path, folder / name) for path, name in zip(paths, names)]
         batches = [pairs[start : start + batch_size] for start in range(0, len(pairs), batch_size)]
-        batches = [batch for batch in batches if not all(files.is_whole(path) for _, path in batch)]
+        batches = [batch for batch in batches if not all(path.is_file() for _, path in batch)]
         missing = sum(map(len, batches))
         run, shape = _compiled(model, scale), model.input_shape[1:]
         bar = files.progress(None, "label maps", len(paths), initial=len(paths) - missing)
@@ -98,7 +98,12 @@ def _made_from(model: Any, paths: list[Path], batch_size: int, scale: float) -> 
         "frames": results.digest_of_files(paths),
         "batch_size": batch_size,  # the network's arithmetic may round differently for another one
         **results.made_with("tensorflow", "keras", "opencv"),
-        "code": results.digest_of_code("thesis_repro.segmentation.prediction"),
+        "code": results.digest_of_code(
+            "thesis_repro.segmentation.prediction",
+            "thesis_repro.segmentation.exact",
+            "thesis_repro.data.cityscapes",
+            "thesis_repro.data.kitti",
+        ),
         "arithmetic": segmentation.arithmetic(),
     }
     if scale != 1:
@@ -108,7 +113,7 @@ def _made_from(model: Any, paths: list[Path], batch_size: int, scale: float) -> 
 
 def _write(pair: tuple[Path, Path], label_map: np.ndarray) -> None:
     target = pair[1]
-    if not files.is_whole(target):  # an existing file may have been corrected by hand
+    if not target.is_file():  # an existing file may have been corrected by hand
         files.write_png(
             target, cv2.resize(label_map, (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
         )

@@ -197,7 +197,7 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
     if batches.transforms:
         transforms = A.to_dict(batches.transforms)
     return {
-        "code": results.digest_of_code("thesis_repro.segmentation.training"),
+        "code": results.digest_of_code("thesis_repro.segmentation", "thesis_repro.data.cityscapes"),
         "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),

@@ -9,7 +9,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from thesis_repro.running.compiled import inner
+from opencv_exact.compiling import inlined
 
 _intrinsic: Any = intrinsic  # mypy does not know that callers leave out the first argument
 
@@ -24,7 +24,7 @@ def _multiply_add(typing_context, a, b, c):
     return types.float64(types.float64, types.float64, types.float64), generate
 
 
-@inner
+@inlined
 def _row_times_matrix(a0, a1, a2, b):
     """Product of a row and a 3x3 matrix.
 
@@ -37,7 +37,7 @@ def _row_times_matrix(a0, a1, a2, b):
     )
 
 
-@inner
+@inlined
 def product(a, b):
     """Product of two 3x3 matrices."""
     p0, p1, p2 = _row_times_matrix(a[0], a[1], a[2], b)
@@ -46,46 +46,45 @@ def product(a, b):
     return p0, p1, p2, p3, p4, p5, p6, p7, p8
 
 
-@inner
+@inlined
 def row_by_row(m):
     """An array (3, 3) as a tuple."""
     return m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2]
 
 
-@inner
+@inlined
 def skew(v):
     """Matrix [v]x of the cross product with v (Equation 2.5)."""
     return 0.0, -v[2], v[1], v[2], 0.0, -v[0], -v[1], v[0], 0.0
 
 
-@inner
-def normalised(v0, v1, v2):
-    """Unit vector (3) in the direction of (v0, v1, v2)."""
-    norm = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-    return v0 / norm, v1 / norm, v2 / norm
+@inlined
+def cross(a, b):
+    """Cross product of two vectors (3)."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@inner
+@inlined
+def dot(a, b):
+    """Scalar product of two vectors (3)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def normalised(v):
+    """Unit vector (3) in the direction of v."""
+    norm = np.sqrt(dot(v, v))
+    return v[0] / norm, v[1] / norm, v[2] / norm
+
+
+@inlined
 def tangents(t):
     """Two unit vectors that are perpendicular to the unit vector t and to each other."""
     # cross product with the axis that t is farthest from
     if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):
-        x, y, z = 0.0, t[2], -t[1]
+        first = normalised((0.0, t[2], -t[1]))
     elif abs(t[1]) <= abs(t[2]):
-        x, y, z = -t[2], 0.0, t[0]
+        first = normalised((-t[2], 0.0, t[0]))
     else:
-        x, y, z = t[1], -t[0], 0.0
-    first = normalised(x, y, z)
-    second = (
-        t[1] * first[2] - t[2] * first[1],
-        t[2] * first[0] - t[0] * first[2],
-        t[0] * first[1] - t[1] * first[0],
-    )
-    return first, second
-
-
-@inner
-def write(array, entries):
-    """Write the entries of a matrix to an array (9)."""
-    for k in range(9):
-        array[k] = entries[k]
+        first = normalised((t[1], -t[0], 0.0))
+    return first, cross(t, first)

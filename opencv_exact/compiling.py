@@ -1,0 +1,45 @@
+"""How the functions of this package are compiled by Numba."""
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.extending import is_jitted
+
+
+def compiled(function: Callable, **options: Any) -> Callable:
+    """Compile a function of numbers and arrays, without Python's lock.
+
+    Division by zero gives infinity or NaN, as in numpy and OpenCV. The machine code is cached on
+    disk. Compiled functions may call functions of their own folder and of this package.
+
+    Numba compiles a function anew for each combination of types and memory layouts. So callers pass
+    C-contiguous arrays of one type.
+    """
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
+    dispatcher: Any = None
+    try:
+        dispatcher = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # Numba finds no folder that it may write its cache to
+        return numba.njit(**options)(function)
+    if is_jitted(dispatcher):  # NUMBA_DISABLE_JIT=1 returns the function as it is
+        folder = Path(function.__code__.co_filename).parent
+        # Numba compares date and size of the file that defines a function, so it misses changes of
+        # the functions that are called from other files. Instead it compares this digest.
+        dispatcher._cache._cache_file._source_stamp = _digest_of_modules(folder)
+    return dispatcher
+
+
+def inlined(function: Callable, **options: Any) -> Callable:
+    """Compile a function that is inlined into compiled functions. Python cannot call it."""
+    return compiled(function, forceinline=True, no_cpython_wrapper=True, **options)
+
+
+@cache
+def _digest_of_modules(folder: Path) -> str:
+    """Digest of the modules in a folder and in this package."""
+    paths = sorted({*folder.glob("*.py"), *Path(__file__).parent.glob("*.py")})
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()

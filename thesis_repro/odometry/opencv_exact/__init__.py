@@ -1,1 +1,0 @@
-"""OpenCV's RANSAC for the essential matrix: the same bits in less than half the time."""

@@ -1,0 +1,203 @@
+"""Run the odometry over a sequence: one run, or many runs in one pass, which share their work."""
+
+import time
+from collections.abc import Mapping, Sized
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import pandas as pd
+
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.errors import InputError
+from thesis_repro.odometry.odometry import STATIONARY, Calls, Odometry
+from thesis_repro.odometry.settings import THESIS, OdometrySettings
+from thesis_repro.odometry.types import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
+from thesis_repro.running import messages
+from thesis_repro.running.files import progress
+
+COUNTS = ("points", "detected", "tracked", "inliers", "pose_inliers")  # blank where there is none
+
+
+@runtime_checkable
+class Masks(Protocol):
+    """An object whose item i is the mask of frame i, (height, width) uint8.
+
+    Keypoints are forbidden where it is 0.
+    """
+
+    def __getitem__(self, index: int, /) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Result of one run.
+
+    poses: (n, 4, 4) camera to world, metres. frames: one row a frame, see Step.row; missing values
+    are blank. A result equals only itself; compare poses with np.array_equal.
+    """
+
+    poses: np.ndarray
+    frames: pd.DataFrame
+    settings: OdometrySettings = THESIS
+
+    @property
+    def flagged(self) -> pd.Series:
+        """Number of frames by flag."""
+        texts = self.frames["flag"]
+        flags = texts[texts != ""].str.split("; ").explode()
+        return flags.value_counts()
+
+    @property
+    def failed_steps(self) -> int:
+        """Number of frames with a flag other than "stationary"."""
+        return int(is_flagged(self.frames).sum())
+
+    @property
+    def dropped_steps(self) -> int:
+        """Number of steps that did not move the pose because they are shorter than the gate."""
+        return int((self.frames["flag"] == STATIONARY).sum())
+
+
+def is_flagged(frames: pd.DataFrame) -> pd.Series:
+    """Whether a frame has a flag other than "stationary", booleans (n,), see Result.frames."""
+    return ~frames["flag"].isin(["", STATIONARY])
+
+
+def start_pose(sequence: Sequence) -> np.ndarray:
+    """First pose of the estimate.
+
+    It is the identity, as in PySLAM, unless the ground truth starts at another pose. Complete KITTI
+    sequences start at the identity (up to 1e-10); excerpts do not.
+    """
+    if not sequence.has_truth:
+        return np.eye(4)
+    first = sequence.poses[0]
+    if np.abs(first - np.eye(4)).max() < 1e-6:
+        return np.eye(4)
+    return first
+
+
+def scales(sequence: Sequence) -> np.ndarray:
+    """Distances between the true positions of consecutive frames, (n,), metres. The first one is 0.
+
+    Without ground truth, these are the sequence's `assumed_steps`.
+    """
+    if not sequence.has_truth:
+        return sequence.assumed_steps
+    lengths = np.zeros(len(sequence.poses))
+    for index, step in enumerate(np.diff(sequence.poses[:, :3, 3], axis=0)):
+        lengths[index + 1] = np.linalg.norm(step)
+    return lengths
+
+
+def run(
+    sequence: Sequence,
+    settings: OdometrySettings = THESIS,
+    masks: Masks | None = None,
+    description: str | None = None,
+    calls: Calls | None = None,
+) -> Result:
+    """Run the odometry over a kitti.Sequence. Returns a Result.
+
+    masks: see Masks. description: text of the progress bar; None for no bar. calls: functions in
+    place of OpenCV's, see odometry.Calls.
+    Raises InputError if a frame cannot be read, if a mask and its frame differ in size, if there
+    are fewer masks than frames, and for another kind of sequence, settings or masks.
+    """
+    check(sequence, masks)
+    odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), calls)
+    step_lengths = scales(sequence)
+    rows = []
+    for index in _indices(sequence, description):
+        started = time.perf_counter()
+        mask = None if masks is None else masks[index]
+        mask_seconds = time.perf_counter() - started
+        step = odometry.step(sequence.frame(index), step_lengths[index], mask)
+        rows.append([*step.row().values(), mask_seconds])
+    return _result(rows, settings)
+
+
+def run_many(
+    sequence: Sequence,
+    runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
+    description: str | None = None,
+) -> dict[str, Result]:
+    """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}.
+
+    The results equal those of separate runs. What several runs ask for is done once: frames are
+    decoded, corner strengths computed, points tracked, and equal matches searched for an essential
+    matrix. OpenCV's search and vote are replaced by faster ones with the same bits (opencv_exact).
+    The times of the four calls are blank, because they cannot be measured for a single run.
+    """
+    from thesis_repro.odometry.sharing import SharedCalls  # compiles functions on first use
+
+    together = SharedCalls()
+    odometries = {}
+    for name, (settings, masks) in runs.items():
+        check(sequence, masks)
+        odometries[name] = Odometry(
+            sequence.intrinsics, settings, start_pose(sequence), together.calls
+        )
+    step_lengths = scales(sequence)
+    rows: dict[str, list[list]] = {name: [] for name in runs}
+    for index in _indices(sequence, description):
+        frame = sequence.frame(index)
+        frame.setflags(write=False)  # so that all runs share it
+        together.expect(frame, odometries.values())
+        masks_of_frame = _masks_of_frame(runs, index)
+        for name, odometry in odometries.items():
+            mask, mask_seconds = masks_of_frame[id(runs[name][1])]
+            step = odometry.step(frame, step_lengths[index], mask)
+            step.seconds = dict.fromkeys(TIMED_PARTS, np.nan)
+            rows[name].append([*step.row().values(), mask_seconds])
+    return {name: _result(rows[name], settings) for name, (settings, _) in runs.items()}
+
+
+def _masks_of_frame(
+    runs: Mapping[str, tuple[OdometrySettings, Masks | None]], index: int
+) -> dict[int, tuple[np.ndarray | None, float]]:
+    """The mask of a frame and the seconds to make it, by the identity of the masks object."""
+    masks_of_frame: dict[int, tuple[np.ndarray | None, float]] = {id(None): (None, 0.0)}
+    for _, masks in runs.values():
+        if masks is not None and id(masks) not in masks_of_frame:
+            started = time.perf_counter()
+            mask = masks[index]
+            masks_of_frame[id(masks)] = mask, time.perf_counter() - started
+    return masks_of_frame
+
+
+def check(sequence: Any, masks: Any) -> None:
+    """Raise InputError unless a sequence is one, and its masks are enough masks or None."""
+    if not hasattr(sequence, "frame"):
+        raise InputError(
+            f"sequence: must be a thesis_repro.Sequence, not {type(sequence).__name__}"
+        )
+    is_short = isinstance(masks, Sized) and len(masks) < len(sequence)
+    if is_short or not isinstance(masks, Masks | None):
+        raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
+
+
+def _indices(sequence: Sequence, description: str | None) -> Any:
+    """The numbers of the frames, with a progress bar if there is a description."""
+    indices = range(len(sequence))
+    if description is not None:
+        yield from progress(indices, description)
+        return
+    for index in indices:
+        messages.check_stop()
+        yield index
+
+
+def _result(rows: list[list], settings: OdometrySettings) -> Result:
+    frames = pd.DataFrame(rows, columns=[*FRAME_COLUMNS, "mask_seconds"])
+    frames = frames.astype(dict.fromkeys(COUNTS, "Int64"))
+    return Result(poses_of(frames), frames, settings)
+
+
+def poses_of(frames: pd.DataFrame) -> np.ndarray:
+    """Poses (n, 4, 4) from a table with one row a frame (Result.frames)."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3] = frames[ROTATION_COLUMNS].to_numpy().reshape(-1, 3, 3)
+    poses[:, :3, 3] = frames[["x", "y", "z"]]
+    return poses
