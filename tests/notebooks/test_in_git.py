@@ -37,7 +37,7 @@ def test_lessons_import_at_most_six_names_of_the_package(name):
 @pytest.mark.parametrize("name", LESSONS)
 def test_knobs_stand_one_a_line_in_one_cell(name):
     (knobs,) = (
-        text for text in cells(name, "code").values() if text.startswith("# EDIT HERE: the knobs")
+        text for text in cells(name, "code").values() if text.startswith("# EDIT HERE: knobs")
     )
     targets = [node.targets for node in ast.parse(knobs).body]
     assert all(len(names) == 1 and names[0].id.isupper() for names in targets)
