@@ -152,7 +152,7 @@ figures: $(EXECUTED)
 # This file is rewritten only if a byte of the data has changed. Then the notebooks run again.
 $(RUN)/checked: .venv/ready FORCE
 	@mkdir -p $(@D)
-	@$(if $(strip $(DATA_OPTIONS)),$(BIN)/python -m thesis_repro.checks.check $@,[ -e $@ ] || touch $@)
+	@$(if $(strip $(DATA_OPTIONS)),$(BIN)/python -m thesis_repro.checks $@,[ -e $@ ] || touch $@)
 
 FORCE:
 

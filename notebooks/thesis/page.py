@@ -20,12 +20,11 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from thesis import captions, trainings
+from thesis import captions, thesis_tables, trainings
 from thesis_repro.report import page, tables, texts
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import atomic, listed, write_text
 from thesis_repro.running.settings import ROOT, Settings, read_settings
-from thesis_repro.study import thesis_tables
 
 GALLERY = "README.md"
 REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence.py)
@@ -273,7 +272,7 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
 def main() -> None:
     """Write the page of the run of the current settings."""
     settings = read_settings()
-    update(settings, settings.figures)
+    update(settings, settings.published)
     if note := trainings.network_note(settings):
         print(note)
 

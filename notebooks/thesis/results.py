@@ -10,12 +10,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from thesis import chapter4, gap, plots, tables, trainings
+from thesis import chapter4, gap, plots, tables, thesis_tables, trainings
 from thesis_repro.data import kitti
 from thesis_repro.report import comparison, findings, style
 from thesis_repro.running.files import needed, write_text
 from thesis_repro.running.settings import Settings
-from thesis_repro.study import compare, runner, thesis_tables
+from thesis_repro.study import compare, runner
 
 PATHS = {"figure_4_06": "baseline", "figure_4_11": "masked", "figure_4_12": "reduced"}
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import pandas as pd
 
+from thesis import thesis_tables
 from thesis.captions import REPORTED
 from thesis_repro.report.tables import IMPROVED, three_digits
-from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study import compare
 
 
 def table_4_1(runs: pd.DataFrame, reported_as: str) -> pd.DataFrame:
@@ -46,7 +47,7 @@ def table_of_change(
     The metric ("rmse" or "mae") is in metres, Equation 4.1 in percent. The column "one run each"
     has the thesis's literal procedure: one run of all keypoints and of each width (repetition 0),
     also for the choice of the width. Beside it stands what this procedure gives if masks do nothing
-    (`thesis_tables.changes_if_masks_did_nothing`), simulated from `shuffled`: runs with all
+    (`thesis_tables.null_distribution`), simulated from `shuffled`: runs with all
     keypoints, many repetitions.
     The last rows have the sum of the percentages (the thesis's "aggregate"), their mean with
     Student's t interval, and their median. A lost run counts as not improved.
@@ -56,7 +57,7 @@ def table_of_change(
     single = masked[masked["repetition"] == 0]
     first_best = thesis_tables.of_chosen_width(single)
     widths = masked["dilation_width"].nunique()
-    studies = thesis_tables.changes_if_masks_did_nothing(shuffled, widths, metric)
+    studies = thesis_tables.null_distribution(shuffled, widths, metric)
     columns = {
         "change (%)": thesis_tables.changes(best, baseline, metric),
         SINGLE: thesis_tables.changes_of_repetition(masked, baseline, metric),
@@ -139,7 +140,7 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
 
     Changes are in percent: mean, median, improved and lost (sequences) of repetition 0; lowest and
     highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
-    nothing (`thesis_tables.changes_if_masks_did_nothing`).
+    nothing (`thesis_tables.null_distribution`).
     """
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     widths = masked["dilation_width"].nunique()
@@ -154,7 +155,7 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
         ]
         means = [changes.mean() for changes in by_repetition]
         best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
-        studies = thesis_tables.changes_if_masks_did_nothing(shuffled, widths, metric)
+        studies = thesis_tables.null_distribution(shuffled, widths, metric)
         null_means = studies.mean(axis=1)
         null_low, null_high = thesis_tables.middle(null_means)
         row = {

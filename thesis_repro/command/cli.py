@@ -3,24 +3,22 @@
 import json
 import os
 import shlex
-import signal
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, replace
 from importlib import import_module
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
 from thesis_repro.errors import InputError, missing_package, one_line
 from thesis_repro.running import messages
-from thesis_repro.running.settings import PROFILES, SEED, check_outside
+from thesis_repro.running.settings import ALL_WIDTHS, PROFILES, SEED
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
-OUTPUT_FILES = {
+OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "output": ("poses in KITTI format", ()),
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
@@ -46,19 +44,13 @@ def synthesize(options: Any) -> None:
 
 
 def check_data(options: Any) -> int:
-    """Check folders of KITTI, Cityscapes or KITTI's street scenes.
-
-    Says what they hold, what is damaged, and what can be run.
-    """
-    from thesis_repro.checks import check
+    """Check folders of KITTI, Cityscapes or KITTI's street scenes for damage."""
+    from thesis_repro import checks
 
     roots = options.kitti, options.cityscapes, options.kitti_semantic
     if not any(roots):
-        raise InputError(
-            "no folder to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic"
-        )
-    is_complete = check.report(*roots, options.deep)
-    return int(not is_complete)
+        raise InputError("no folder to check: give --kitti, --cityscapes or --kitti-semantic")
+    return int(not checks.report(*roots))
 
 
 def predict(options: Any) -> None:
@@ -67,7 +59,6 @@ def predict(options: Any) -> None:
     Label maps hold Cityscapes ids as 8-bit PNG, 320x320, named like the frames.
     """
     from thesis_repro.segmentation import quietly
-    from thesis_repro.study import workers
 
     images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
     # the name of a link, not of what it points to, because `study` looks for this name
@@ -82,20 +73,15 @@ def predict(options: Any) -> None:
         if has_subfolders:
             output /= name
         sequences.append((paths[: options.frames], output))
-    image_folders = [paths[0].parent for paths, _ in sequences]
-    _check_outputs(options, *options.images, *image_folders, options.model)
+    _check_outputs(options, *options.images)
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
     model_file = options.model or prediction.SHIPPED
     with messages.logged(options.folder, options.command_line) as run:
         new = 0
-        if options.dask:
-            with workers.open_pool(1, options.dask) as pool:
-                new = prediction.spread_label_maps(pool.run, model_file, sequences)
-        else:
-            model = training.load_model(model_file)
-            for paths, output in sequences:
-                new += prediction.write_label_maps(model, paths, output)
+        model = training.load_model(model_file)
+        for paths, output in sequences:
+            new += prediction.write_label_maps(model, paths, output, scale=float(options.scale))
         total = sum(len(paths) for paths, _ in sequences)
         lines = [f"{output}: {len(paths)} label maps" for paths, output in sequences]
         run.end("\n".join(lines), total - new)
@@ -115,8 +101,8 @@ def masks(options: Any) -> None:
         LabelMasks(options.labels, sequence, width, settings)
         for width in sorted(set().union(*options.dilation or [(1,)]))
     ]
-    _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
-    _warn(_print_oddities(sequence, mask_sets))
+    _check_outputs(options, options.labels, sequence.folder)
+    _warn(_check_masks(sequence, mask_sets))
     for label_masks in mask_sets:
         width = label_masks.dilation_width
         folder = options.folder
@@ -129,10 +115,9 @@ def masks(options: Any) -> None:
 
 def odometry(options: Any) -> None:
     """Run the visual odometry on one sequence; print its errors, number of keypoints and time."""
-    _load_evo()
-    from thesis_repro import odometry
-    from thesis_repro.checks import oddities
-    from thesis_repro.data import kitti
+    with redirect_stdout(sys.stderr):  # evo prints a line when it first writes its own settings
+        import_module("evo.main_ape")
+    from thesis_repro import checks, odometry
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
 
@@ -147,24 +132,15 @@ def odometry(options: Any) -> None:
     mask_sets = []
     if masks:
         mask_sets = [masks]
-    _check_outputs(
-        options,
-        sequence.poses_path,
-        *kitti.texts_of(sequence.folder, sequence.frame_paths[0].parent),
-        options.masks,
-        options.labels,
-        sequence.folder,
-        sequence.frame_paths[0].parent,
-    )
-    _warn(_print_oddities(sequence, mask_sets))
+    _check_outputs(options, sequence.poses_path, options.masks, options.labels, sequence.folder)
+    _warn(_check_masks(sequence, mask_sets))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
         write_kitti_poses(options.output, result.poses)
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
-    if sequence.has_truth:
-        _warn(oddities.of_path(sequence.name, result.poses, sequence.poses))
-    _warn(oddities.of_steps(sequence.name, result.failed, len(sequence)))
+    steps = len(sequence), result.failed_steps, result.dropped_steps
+    _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
     record = _record(result, sequence)
     if options.video:
         from thesis_repro.report import video
@@ -191,13 +167,9 @@ def odometry(options: Any) -> None:
 
 
 def study(options: Any) -> int:
-    """Compare your own label maps or masks with all keypoints and with controls.
-
-    Writes tables, figures and a page.
-    """
+    """Compare your own label maps or masks with all keypoints and with controls."""
     from thesis_repro.data import kitti
     from thesis_repro.running import results
-    from thesis_repro.running.settings import ALL_WIDTHS, cores
     from thesis_repro.study import sources
     from thesis_repro.study.study import Study
 
@@ -227,6 +199,7 @@ def study(options: Any) -> int:
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
         options.frames,
+        options.scale_gate,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -237,14 +210,14 @@ def study(options: Any) -> int:
     with messages.logged(folder, options.command_line) as run, results.claimed(folder):
         warnings = []
         for sequence, masks in planned.shown_masks():
-            warnings += _print_oddities(sequence, masks)
+            warnings += _check_masks(sequence, masks)
         warnings = _warn(warnings)
-        outcome = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += outcome.warnings + _warn(planned.path_oddities(outcome.table, folder))
+        outcome = planned.run(folder, options.jobs, options.dask)
+        warnings += outcome.warnings + _warn(_check_runs(outcome.table))
         page = study.write(planned, outcome.table, folder, warnings)
         failed = ""
-        if outcome.failed:
-            failed = f", {outcome.failed:,} failed (see above)"
+        if outcome.failed_jobs:
+            failed = f", {outcome.failed_jobs:,} failed (see above)"
         run.end(f"{len(outcome.table):,} runs{failed}; open {page} in a browser", outcome.kept)
     return int(bool(failed))
 
@@ -295,12 +268,6 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     }
 
 
-def _load_evo() -> None:
-    """Import evo, which prints a line when it first writes its settings into the home folder."""
-    with redirect_stdout(sys.stderr):
-        import_module("evo.main_ape")
-
-
 def _sequence(options: Any) -> Any:
     from thesis_repro.data.kitti import Sequence
 
@@ -314,16 +281,25 @@ def _sequence(options: Any) -> Any:
     return sequence.subset(options.frames)
 
 
-def _print_oddities(sequence: Any, mask_sets: Iterable) -> list[str]:
+def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     """Print what masks of a sequence hold, and return warnings of doubtful input."""
-    from thesis_repro.checks import oddities
+    from thesis_repro import checks
 
-    warnings = oddities.of_sequence(sequence)
+    warnings = checks.of_sequence(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
-            line, mask_warnings = oddities.of_masks(masks, sequence)
-            messages.log.info(one_line(line))
-            warnings += mask_warnings
+            messages.log.info(checks.describe_masks(masks, sequence))
+            warnings += checks.of_masks(masks, sequence)
+    return warnings
+
+
+def _check_runs(runs: Any) -> list[str]:
+    """Return warnings of the first run of each sequence. runs: the table of a study."""
+    from thesis_repro import checks
+
+    warnings = []
+    for run in runs[runs["method"] == "baseline"].drop_duplicates("sequence").itertuples():
+        warnings += checks.of_run(run.sequence, run.frames, run.flagged)
     return warnings
 
 
@@ -335,7 +311,7 @@ def _warn(lines: Iterable[str]) -> list[str]:
         places.setdefault(fault, []).append(place)
     merged = [f"{', '.join(names)}: {fault}" for fault, names in places.items()]
     for line in merged:
-        messages.log.warning(one_line(line))
+        messages.log.warning(line)
     return merged
 
 
@@ -346,7 +322,6 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     Raises InputError if there are no images, or if frames of a sequence are missing.
     """
     from thesis_repro.data import kitti
-    from thesis_repro.running import files
 
     folders = [root]
     if root.is_dir() and not kitti.has_frames(root):
@@ -356,7 +331,7 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
         folders = kitti.folders_with_frames(parent) or [root]
     for folder in folders:
         image_folder = kitti.images_of(folder)
-        paths = files.images(image_folder)
+        paths = kitti.frames_in(image_folder)
         if not paths:
             raise InputError(f"{image_folder}: holds no PNG or JPEG images")
         if image_folder != folder:
@@ -411,39 +386,27 @@ def _output_files(options: Any) -> dict[str, Path]:
 
 
 def _check_outputs(options: Any, *inputs: Path | None) -> None:
-    """Raise InputError if an output cannot be written, or would overwrite or mix with inputs.
+    """Raise InputError, before anything runs, for an output that cannot be written.
 
-    It is called before anything runs.
+    Data is only read: no output may lie in a folder of it.
     """
-    from thesis_repro.running.files import check_output
-
-    data = [path for path in (vars(options).get("kitti"), *inputs) if path]
-    for path in list(data):
-        data += _layout_around(path.resolve())
-    folder, used = vars(options).get("folder"), set()
-    if folder:
-        check_outside(f"--output {folder}", folder, data)
-        if any(path.resolve().is_relative_to(folder.resolve()) for path in data):
-            raise InputError(f"--output {folder}: holds input of this command; name another folder")
-    for name, path in _output_files(options).items():
+    data = [path.resolve() for path in (vars(options).get("kitti"), *inputs) if path]
+    outputs = _output_files(options)
+    for name, path in outputs.items():
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
-        check_output(path)
-        check_outside(f"--{name} {path}", path, data)
-        if path.resolve() in used:
-            raise InputError(f"--{name} {path}: is another output of this command; name another")
-        used.add(path.resolve())
-
-
-def _layout_around(path: Path) -> list[Path]:
-    """Return the folders sequences and poses of the KITTI layout that holds a sequence, or []."""
-    from thesis_repro.data import kitti
-
-    for inner, folder in pairwise([path, *path.parents]):
-        if folder.name == "sequences" and inner.is_dir() and kitti.has_frames(inner):
-            return [folder, folder.with_name("poses")]
-    return []
+    for path in filter(None, [vars(options).get("folder"), *outputs.values()]):
+        for folder in data:
+            if path.resolve().is_relative_to(folder):
+                raise InputError(
+                    f"{path}: lies in {folder}, which is only read; name another place"
+                )
+        parent = path.absolute().parent
+        while not parent.exists():
+            parent = parent.parent
+        if not os.access(parent, os.W_OK):
+            raise InputError(f"{path}: {parent} may not be written to; name another place")
 
 
 def _print(options: Any, record: Any, template: str, **values: Any) -> None:
@@ -455,49 +418,21 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
         text = texts.render(template, record=record, **values).rstrip()
     print(text)
     for name, path in _output_files(options).items():
-        messages.log.info(one_line(f"{path}: {OUTPUT_FILES[name][0]}"))
-
-
-def _replace_closed_streams() -> None:
-    for stream in ("stdout", "stderr"):
-        if getattr(sys, stream) is None:
-            null = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  stays open as the stream
-            setattr(sys, stream, null)
+        messages.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    _replace_closed_streams()
     if arguments is None:
         arguments = sys.argv[1:]
     options = build_parser(COMMANDS).parse_args(arguments)
     options.command_line = shlex.join(["thesis-repro", *arguments])
-    messages.print_messages()
-    try:
+    os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
+
+    def command() -> object:
         try:
-            os.getcwd()
-        except FileNotFoundError:
-            raise InputError("the working folder was deleted; change to another one") from None
-        with messages.stoppable():
-            messages.check_environment()
-            gigabytes = 2
-            if options.function is predict:
-                gigabytes = 4
-            messages.need_addresses(gigabytes)
-            code = options.function(options) or 0
-            sys.stdout.flush()
-            return code
-    except BrokenPipeError:  # the reader of the output has ended, such as head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
-    except ImportError as error:
-        return messages.report_error(missing_package(error) or error)
-    except Exception as error:
-        return messages.report_error(error)
-    except KeyboardInterrupt as stop:
-        with suppress(OSError):  # the terminal may be gone
-            print("stopped; run the same command again to resume", file=sys.stderr)
-        number = signal.SIGINT
-        if stop.args:
-            number = stop.args[0]
-        return 128 + number
+            return options.function(options)
+        except ImportError as error:
+            raise missing_package(error) or error from None
+
+    return messages.run(command)

@@ -5,7 +5,7 @@ The pairs are in the official or the thesis's flat layout.
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -99,11 +99,11 @@ LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
 
 
 class Pair(NamedTuple):
-    """An image and its label map; a missing file is None."""
+    """An image and its label map."""
 
     name: str  # the common part of both file names
-    image: Any  # Path or None
-    label: Any  # Path or None
+    image: Path
+    label: Path
 
 
 def colorize(label_map: np.ndarray) -> np.ndarray:
@@ -114,25 +114,11 @@ def colorize(label_map: np.ndarray) -> np.ndarray:
 def pairs(root: str | Path, split: str, limit: int | None = None) -> list[Pair]:
     """Pairs of image and label map of one split ("train" or "val"), sorted by name.
 
-    limit: largest number of pairs; None for all. They are spread evenly over the split, because it
-    is sorted by city. The appendix pairs two unsorted directory listings by position (A.2); this
-    function pairs equal names. Raises InputError if a folder is missing, a split is empty, or an
-    image has no label map.
-    """
-    split_pairs = listing(root, split)
-    for pair in split_pairs:
-        check_complete(pair)
-    count = len(split_pairs)
-    if limit is None or limit >= count:
-        return split_pairs
-    return [split_pairs[index * count // limit] for index in range(limit)]
-
-
-def listing(root: str | Path, split: str) -> list[Pair]:
-    """Pairs of one split, sorted by name, including incomplete pairs.
-
     Reads the official layout (leftImg8bit, gtFine) and the appendix's flat layout (train,
-    trainannot). Raises InputError if there are no images.
+    trainannot). limit: largest number of pairs; None for all. They are spread evenly over the
+    split, because it is sorted by city. The appendix pairs two unsorted directory listings by
+    position (A.2); this function pairs equal names. Raises InputError if a folder is missing, a
+    split is empty, or an image has no label map.
     """
     root = Path(root)
     if (root / "leftImg8bit").is_dir():  # one folder a city
@@ -150,20 +136,19 @@ def listing(root: str | Path, split: str) -> list[Pair]:
         )
     if not images:
         raise InputError(f"{image_folder}: no PNG images")
-    return [Pair(name, images.get(name), labels.get(name)) for name in sorted(images | labels)]
+    if images.keys() != labels.keys():
+        name = min(images.keys() ^ labels.keys())
+        alone = images.get(name) or labels.get(name)
+        raise InputError(f"{alone}: each image needs a label map, and each label map an image")
+    names = sorted(images)
+    if limit is not None and limit < len(names):
+        names = [names[index * len(names) // limit] for index in range(limit)]
+    return [Pair(name, images[name], labels[name]) for name in names]
 
 
 def _by_name(folder: Path, pattern: str, ending: str) -> dict[str, Path]:
     """Return the files of a folder by their names without an ending."""
     return {path.name.removesuffix(ending): path for path in listed(folder, pattern + ending)}
-
-
-def check_complete(pair: Pair) -> None:
-    """Raise InputError if the image or the label map is missing."""
-    if pair.label is None:
-        raise InputError(f"{pair.image}: has no label map")
-    if pair.image is None:
-        raise InputError(f"{pair.label}: has no image")
 
 
 def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> np.ndarray:
@@ -195,7 +180,7 @@ def read_label_map(path: str | Path, train_ids: bool = False) -> np.ndarray:
         )
     raise InputError(
         f"{path}: label id {invalid} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
-        "--ids train for train ids (0 to 18, 255)"
+        "--ids train for train ids (0 to 18, 255), or --ids FILE for a table of other ids"
     )
 
 

@@ -1,21 +1,30 @@
 """KITTI odometry: frames, camera, times and ground truth of a sequence or a raw drive."""
 
-import os
+import re
 from collections import namedtuple
 from collections.abc import Iterator
 from copy import copy
-from functools import cached_property
-from itertools import islice, pairwise
+from decimal import Decimal
+from functools import cache, cached_property
+from itertools import pairwise
 from numbers import Integral
 from pathlib import Path
 from statistics import median_low
 
+import cv2
 import numpy as np
 
-from thesis_repro.data import kitti_raw
-from thesis_repro.data.trajectories import read_poses, read_times
+from thesis_repro.data import cameras, kitti_raw
+from thesis_repro.data.trajectories import (
+    have_times,
+    read_poses,
+    read_poses_at,
+    read_times,
+    text_of,
+)
 from thesis_repro.errors import InputError, need
-from thesis_repro.running.files import check_readable, images, numbers_of, read_gray
+from thesis_repro.running import messages
+from thesis_repro.running.files import images, numbers_of, read_gray
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
 # distortion.
@@ -30,19 +39,17 @@ CAMERAS = {
     "03": _CAMERA_03,
     **{f"{n:02d}": _CAMERA_04 for n in range(4, 11)},
 }
-
-# Number of frames of each complete sequence with ground truth.
-FRAME_COUNTS = dict(
-    zip(CAMERAS, (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201), strict=True)
-)
+# width and height that go with a focal length and a centre's u, which tell KITTI's cameras apart
+KNOWN_SIZES = {
+    (round(camera.fx, 3), round(camera.cx, 3)): (camera.width, camera.height)
+    for camera in CAMERAS.values()
+}
 
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
+DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
-MAX_MISSING_NAMED = 10_000  # frames
-MAX_SPEED = 10_000  # metres a second
-MAX_FPS = 10_000  # frames a second
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
@@ -55,7 +62,7 @@ def sequences(root: str | Path) -> list[str]:
     names = []
     for name in with_frames(root):
         _, _, poses = locate(root, name)
-        if name in FRAME_COUNTS or os.path.lexists(poses):
+        if name in CAMERAS or poses.exists():
             names.append(name)
     if not names:
         raise InputError(
@@ -78,35 +85,13 @@ def with_frames(root: str | Path) -> list[str]:
 
 
 def folders_with_frames(parent: Path) -> list[Path]:
-    """Folders of sequences in a folder, in sorted order.
-
-    A broken link counts, so that `Sequence` reports it.
-    """
-    return sorted(
-        folder
-        for folder in parent.iterdir()
-        if (folder.is_dir() and has_frames(folder)) or _is_broken_link(folder)
-    )
-
-
-def _is_broken_link(path: Path) -> bool:
-    return path.is_symlink() and not path.exists()
+    """Folders of sequences in a folder, in sorted order."""
+    return sorted(folder for folder in parent.iterdir() if folder.is_dir() and has_frames(folder))
 
 
 def has_frames(folder: Path) -> bool:
-    """Whether a folder is that of a sequence, or holds images itself.
-
-    A sequence counts if it has frames of the right camera only, or cannot be read: `Sequence`
-    reports it then, and other sequences can still be used.
-    """
-    try:
-        if images_of(folder) != folder or images(folder):
-            return True
-    except InputError:
-        return True
-    return (folder / "image_1").is_dir() or any(
-        _is_broken_link(folder / camera) for camera in IMAGE_FOLDERS
-    )
+    """Whether a folder is that of a sequence, or holds images itself."""
+    return images_of(folder) != folder or bool(images(folder))
 
 
 def folder_of(root: str | Path) -> Path:
@@ -126,29 +111,46 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     """Folder of a sequence's frames.
 
     The default is the left camera's, gray or else colour. If neither exists, it is the sequence's
-    folder itself. Raises InputError if the camera is unknown, or if the folder is missing or may
-    not be read.
+    folder itself. Raises InputError if the camera is unknown, or if the folder is missing.
     """
     folder = Path(folder)
-    check_readable(folder, os.X_OK)
     cameras, inner = IMAGE_FOLDERS, ""
     if kitti_raw.is_drive(folder):
         cameras, inner = kitti_raw.IMAGE_FOLDERS, kitti_raw.FRAMES
+    names: tuple[str, ...] = cameras[:2]
     if camera is not None:
+        names = (camera,)
         if camera not in cameras:
             known = ", ".join(sorted(cameras))
             raise InputError(f"camera {camera!r}: unknown; choose one of {known}")
-        frame_folder = folder / camera / inner
-    else:
-        gray, color = (folder / name / inner for name in cameras[:2])
-        frame_folder = folder
-        if gray.is_dir():
-            frame_folder = gray
-        elif color.is_dir():
-            frame_folder = color
-    if not frame_folder.is_dir():
-        raise InputError(f"{frame_folder}: no such folder; it must hold the frames")
-    return frame_folder
+    for name in names:
+        if (folder / name / inner).is_dir():
+            return folder / name / inner
+    if camera is not None or not folder.is_dir():
+        raise InputError(f"{folder / (camera or '')}: no such folder; it must hold the frames")
+    return folder
+
+
+def frames_in(folder: Path) -> list[Path]:
+    """Images of a folder in the order of their numbers.
+
+    Names such as 0.15 and 0.2 are ordered by value if they differ in their number of decimals.
+    """
+    paths = images(folder)
+    if not all(DECIMAL.fullmatch(path.stem) for path in paths):
+        return paths
+    if len({len(path.stem.partition(".")[2]) for path in paths}) > 1:
+        paths.sort(key=lambda path: Decimal(path.stem))
+        _say_once(
+            f"{folder}: frames are in the order of their names as decimal numbers, {paths[0].stem} to "
+            f"{paths[-1].stem}; if nanoseconds follow the dot, rename them to nine digits each"
+        )
+    return paths
+
+
+@cache
+def _say_once(line: str) -> None:
+    messages.log.info(line)
 
 
 def camera_of(frame_folder: Path) -> str:
@@ -184,6 +186,8 @@ class Sequence:
         camera: str | None = None,
         speed: float | None = None,
         fps: float | None = None,
+        truth: str | Path | None = None,
+        calibration: str | Path | None = None,
     ) -> None:
         """Find, read and check the files of a sequence, except its frames.
 
@@ -193,61 +197,82 @@ class Sequence:
         times.txt and poses.txt.
         camera: one of IMAGE_FOLDERS, see `images_of`. speed: metres a second, for a sequence
         without ground truth; the default is one metre a frame. fps: frames a second, for a
-        sequence without times.txt.
+        sequence without times.txt. truth: file of the ground truth, in any form that poses.txt may
+        have. calibration: file of a camera, see `cameras.read_camera`; its distortion is taken out
+        of the frames.
         """
         need("sequence", name, str | Path)
         self.root, self.folder, self.poses_path = locate(root, name)
+        if truth is not None:
+            self.poses_path = Path(truth)
         self.name, self.speed = self.folder.name, speed
         frame_folder = images_of(self.folder, camera)
-        self.frame_paths = images(frame_folder)
+        self.frame_paths = frames_in(frame_folder)
         if not self.frame_paths:
-            self._refuse_no_frames(frame_folder)
+            raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
         check_numbering(self.frame_paths)
         self.calibration_path, times_path = texts_of(self.folder, frame_folder)
-        self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
-        # a broken link or a folder is reported when it is read
-        self.has_times = os.path.lexists(times_path)
+        self.distortion = np.empty(0)
+        if calibration is not None:
+            self.calibration_path = Path(calibration)
+            self.intrinsics, self.distortion = cameras.read_camera(calibration)
+        else:
+            self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
+        self.has_times = times_path.exists()
         self.times = self._read_times(times_path, fps)
-        self.has_truth = os.path.lexists(self.poses_path)
+        self.has_truth = truth is not None or self.poses_path.exists()
         if self.has_truth:
-            self._poses = truth_of(self.poses_path)
-            check_count(self.poses_path, len(self._poses), self.frame_paths)
+            self._read_truth(self.poses_path)
         if speed is not None:
-            if not self.has_times and fps is None:
-                raise InputError(
-                    f"{times_path}: no such file; a speed needs the times of the frames, or their "
-                    "number a second (--fps)"
-                )
-            self._check_speed(speed)
-
-    def _refuse_no_frames(self, frame_folder: Path) -> None:
-        if images_of(self.folder) == self.folder and (self.folder / "image_1").is_dir():
-            raise InputError(
-                f"{frame_folder}: holds no PNG or JPEG frames of the left camera, to which the ground "
-                "truth belongs (--camera image_1 takes the right one)"
-            )
-        raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
+            self._check_speed(speed, self.has_times or fps is not None)
 
     def _read_times(self, path: Path, fps: float | None) -> np.ndarray:
         if self.has_times:
             if fps is not None:
                 raise InputError(f"fps {fps:g}: leave it out; {path} has the times of the frames")
-            times = times_of(path)
+            read = kitti_raw.read_times if path.name == kitti_raw.TIMES else read_times
+            times = read(path)
             check_count(path, len(times), self.frame_paths)
             return times
         if fps is None:
+            _say_once(
+                f"{path}: no such file, so {1 / FRAME_TIME:g} frames a second are assumed (--fps gives "
+                "another number)"
+            )
             return FRAME_TIME * np.arange(len(self))
-        if not 0 < fps <= MAX_FPS:
-            raise InputError(f"fps {fps:g}: must be above 0 and at most {MAX_FPS} frames a second")
+        if not 0 < fps < np.inf:
+            raise InputError(f"fps {fps:g}: must be a number of frames a second, above 0")
         return np.arange(len(self)) / fps
 
-    def _check_speed(self, speed: float) -> None:
+    def _read_truth(self, path: Path) -> None:
+        """Read the ground truth. Frames before and after poses with times are left out."""
+        is_drive = path.match(kitti_raw.OXTS)
+        if is_drive or not have_times(path):
+            self._poses = kitti_raw.read_poses(self.folder) if is_drive else read_poses(path)
+            check_count(path, len(self._poses), self.frame_paths)
+            return
+        indices, self._poses = read_poses_at(path, self.times)
+        first, end = indices[0], indices[-1] + 1
+        gaps = np.setdiff1d(np.arange(first, end), indices)
+        if len(gaps):
+            raise InputError(f"{path}: {self.frame_paths[gaps[0]].name} has no pose within 0.01 s")
+        if len(indices) < len(self):
+            _say_once(f"{path}: has poses of {len(indices)} of {len(self)} frames, which are used")
+        self.frame_paths = self.frame_paths[first:end]
+        self.times = self.times[first:end]
+
+    def _check_speed(self, speed: float, has_times: bool) -> None:
         if self.has_truth:
             raise InputError(
                 f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
             )
-        if not 0 < speed <= MAX_SPEED:
-            raise InputError(f"speed {speed}: must be above 0 and at most {MAX_SPEED} m/s")
+        if not has_times:
+            raise InputError(
+                f"speed {speed}: needs the times of the frames (times.txt), or their number a second "
+                "(--fps)"
+            )
+        if not 0 < speed < np.inf:
+            raise InputError(f"speed {speed}: must be metres a second, above 0")
 
     @property
     def poses(self) -> np.ndarray:
@@ -276,9 +301,9 @@ class Sequence:
 
         Frames and calibration, and the files of times and poses if they exist.
         """
-        paths = list(self.frame_paths)
-        texts = *texts_of(self.folder, self.frame_paths[0].parent), self.poses_path
-        paths += filter(Path.is_file, texts)
+        _, times_path = texts_of(self.folder, self.frame_paths[0].parent)
+        texts = self.calibration_path, times_path, self.poses_path
+        paths = [*self.frame_paths, *filter(Path.is_file, texts)]
         if kitti_raw.is_drive(self.folder):
             paths += kitti_raw.files(self.folder)
         return paths
@@ -291,13 +316,21 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.frame_paths)
 
+    @property
+    def description(self) -> str:
+        """One line that says what the sequence holds, and what is assumed for what it lacks."""
+        line = f"sequence {self.name}: {len(self)} frames of {self.size[1]}x{self.size[0]}"
+        if not self.has_truth:
+            line += "; no ground truth, so step lengths follow from --speed, or are 1 m"
+        return line
+
     def __repr__(self) -> str:
         return f"Sequence({str(self.root)!r}, {self.name!r}): {len(self)} frames"
 
     @cached_property
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
-        size = read_gray(self.frame_paths[0]).shape
+        size = self._read(self.frame_paths[0]).shape
         check_camera(self.calibration_path, self.intrinsics, self.frame_paths[0], size)
         return size
 
@@ -306,9 +339,36 @@ class Sequence:
 
         Raises InputError if it is unreadable or has another size.
         """
-        image = read_gray(self.frame_paths[index])
+        image = self._read(self.frame_paths[index])
         check_size(self.frame_paths[index], image.shape, self.size)
-        return image
+        return self.undistorted(image)
+
+    def _read(self, path: Path) -> np.ndarray:
+        if self._white is None:
+            return read_gray(path)
+        pixels = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH)
+        if pixels is None:
+            raise InputError(f"{path}: cannot be read; it is not a complete image")
+        return cv2.convertScaleAbs(pixels, alpha=255 / self._white)
+
+    @cached_property
+    def _white(self) -> int | None:
+        """Gray value that becomes 255, in frames of 16 bits: the largest one of the first frame."""
+        pixels = cv2.imread(str(self.frame_paths[0]), cv2.IMREAD_ANYDEPTH)
+        if pixels is None or pixels.dtype == np.uint8:
+            return None
+        white = max(int(pixels.max()), 1)
+        _say_once(f"{self.folder}: frames have 16 bits; {white}, the first one's maximum, is white")
+        return white
+
+    def undistorted(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+        """Image of the frame's size without the camera's distortion, as OpenCV takes it out.
+
+        Frames are so already. For masks and label maps made from files, give cv2.INTER_NEAREST.
+        """
+        if not self.distortion.any():
+            return image
+        return cameras.undistorted(image, self.intrinsics, self.distortion, interpolation)
 
     def frames(self) -> Iterator[np.ndarray]:
         """Yield the frames in order."""
@@ -332,7 +392,8 @@ class Sequence:
 def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]:
     """Root, folder and poses of a sequence.
 
-    The poses are a file, or the OXTS's folder of a raw drive. The arguments are those of Sequence.
+    The poses are root/poses/NN.txt or else poses.txt in the sequence's folder, or the OXTS's folder
+    of a raw drive. The arguments are those of Sequence.
     """
     folder = Path(name).resolve()
     poses = folder / "poses.txt"
@@ -349,6 +410,8 @@ def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]
         folder, poses = folder_of(root) / name, root / "poses" / f"{name}.txt"
     if kitti_raw.is_drive(folder):
         poses = folder / kitti_raw.OXTS
+    elif not poses.exists() and (folder / "poses.txt").exists():
+        poses = folder / "poses.txt"
     return root or folder.parent, folder, poses
 
 
@@ -357,100 +420,30 @@ def name_of(root: str | Path, name: str) -> str:
     return locate(root, name)[1].name
 
 
-def true_path(root: str | Path | None, name: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Ground truth of a sequence without reading its frames.
-
-    Returns poses, (n, 4, 4), and their times, (n,), seconds. root, name: as in Sequence. Without
-    times.txt, ten frames a second are assumed.
-    """
-    _, folder, path = locate(root, name)
-    poses = truth_of(path)
-    frame_folder = folder
-    if kitti_raw.is_drive(folder):
-        frame_folder = images_of(folder)
-    _, times_path = texts_of(folder, frame_folder)
-    if not os.path.lexists(times_path):
-        return poses, FRAME_TIME * np.arange(len(poses))
-    times = times_of(times_path)
-    if len(times) != len(poses):
-        raise InputError(
-            f"{times_path}: {len(times)} times for {len(poses)} poses in {path}; one a frame is needed"
-        )
-    return poses, times
-
-
-def truth_of(path: Path) -> np.ndarray:
-    """Ground truth, (n, 4, 4), from a file of poses, or from the folder of a raw drive's OXTS."""
-    if path.match(kitti_raw.OXTS):
-        return kitti_raw.read_poses(path.parents[1])
-    return read_poses(path)
-
-
-def times_of(path: Path) -> np.ndarray:
-    """Times, (n,), seconds, from a file of seconds, or from a raw drive's file of time stamps."""
-    if path.name == kitti_raw.TIMES:
-        return kitti_raw.read_times(path)
-    return read_times(path)
-
-
 def check_numbering(paths: list[Path]) -> None:
-    """Raise InputError if two frames have the same number, or if a number is missing.
+    """Raise InputError if frames count by one, and one is missing.
 
-    A number can be missing only if frames count by one. Names that do not count by one are
-    accepted, for example every fifth frame, or times.
+    Names that do not count by one are accepted, for example every fifth frame, or times.
     """
-    for (number, path), (next_number, next_path) in pairwise(zip(numbers_of(paths) or [], paths)):
-        if number == next_number:
-            raise InputError(f"{next_path}: has the same number as {path.name}; remove one of them")
-    missing = missing_frames(paths)
-    if missing:
-        raise InputError(f"{missing[0]}: this frame is missing; the odometry needs all frames")
-
-
-def missing_frames(paths: list[Path], count: int | None = None) -> list[Path]:
-    """Paths of the missing frames, at most MAX_MISSING_NAMED.
-
-    There are none unless the frames' numbers count by one. count: the expected number of frames. If
-    it is given, frames missing at the start and at the end are found as well. Numbers start at 0
-    (as in KITTI), at 1, or at the number of the first of `paths`.
-    """
-    numbers = numbers_of(paths)
-    if not numbers:
-        return []
+    numbers = numbers_of(paths) or []
     steps = [after - before for before, after in pairwise(numbers)]
-    if steps and median_low(steps) != 1:
-        return []
-    if count is None and len(steps) < 2:
-        return []
-    first, end = numbers[0], numbers[-1] + 1
-    if count is not None:
-        for start in (0, 1):
-            if start <= first and end <= start + count:
-                first = start
-                break
-        end = max(end, first + count)
-    present = set(numbers)
-    missing = (number for number in range(first, end) if number not in present)
-    path = paths[0]
-    letters = path.stem.rstrip("0123456789")
-    digits = min(len(path.stem) for path in paths) - len(letters)
-    return [
-        path.with_name(f"{letters}{number:0{digits}d}{path.suffix}")
-        for number in islice(missing, MAX_MISSING_NAMED)
-    ]
+    if len(steps) < 2 or median_low(steps) != 1 or DECIMAL.fullmatch(paths[0].stem):
+        return
+    for number, step, path in zip(numbers, steps, paths):
+        if step > 1:
+            letters = path.stem.rstrip("0123456789")
+            digits = min(len(path.stem) for path in paths) - len(letters)
+            name = f"{letters}{number + 1:0{digits}d}{path.suffix}"
+            raise InputError(f"{path.with_name(name)}: this frame is missing; all are needed")
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:
     """Raise InputError unless a file has `count` lines for as many frames."""
-    if count == len(frame_paths):
-        return
-    missing = missing_frames(frame_paths, max(count, len(frame_paths)))
-    first = ""
-    if missing:
-        first = f" (the first missing: {missing[0].name})"
-    raise InputError(
-        f"{path}: {count} lines for {len(frame_paths)} frames{first}; one line a frame is needed"
-    )
+    if count != len(frame_paths):
+        raise InputError(
+            f"{path}: {count} lines for {len(frame_paths)} frames, {frame_paths[0].name} to "
+            f"{frame_paths[-1].name}; one line a frame is needed"
+        )
 
 
 def check_size(
@@ -480,12 +473,10 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
         key = f"P_rect_{camera[-2:]}"
     form = f"must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-        lines = [line for line in text.splitlines() if line.startswith(f"{key}:")]
-        matrix = np.array(lines[0].split()[1:], np.float64)
-        matrix = matrix.reshape(3, 4)[:, :3]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}; it {form}") from None
+        lines = [line for line in text_of(path).splitlines() if line.startswith(f"{key}:")]
+        matrix = np.array(lines[0].split()[1:], np.float64).reshape(3, 4)[:, :3]
+    except InputError as error:
+        raise InputError(f"{error}; it {form}") from None
     except (ValueError, IndexError):
         matrix = np.zeros((3, 3))
     if not is_camera_matrix(matrix):
@@ -514,6 +505,12 @@ def check_camera(
             f"{frame}: {width}x{height} pixels; each side needs {MIN_FRAME_SIDE} or more"
         )
     (fx, _, u), (_, fy, v), _ = intrinsics
+    of_kitti = KNOWN_SIZES.get((round(fx, 3), round(u, 3)))
+    if of_kitti and of_kitti != (width, height):
+        raise InputError(
+            f"{path}: is KITTI's for frames of {of_kitti[0]}x{of_kitti[1]} pixels, but these have "
+            f"{width}x{height}; scale or shift focal lengths and centre as the frames were"
+        )
     center_fits = 0 <= u <= width and 0 <= v <= height
     focal_lengths_fit = all(width / 100 < focal < width * 100 for focal in (fx, fy))
     if not (center_fits and focal_lengths_fit):

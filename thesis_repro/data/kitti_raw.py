@@ -6,11 +6,11 @@ link. `kitti.Sequence` reads the frames. Poses follow KITTI's development kit (G
 meets robotics: The KITTI dataset, 2013).
 """
 
-import os
 from pathlib import Path
 
 import numpy as np
 
+from thesis_repro.data.trajectories import text_of
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import listed
 
@@ -25,7 +25,7 @@ def is_drive(folder: str | Path) -> bool:
 
     It then has the measurements of the OXTS, a GPS with inertial sensors.
     """
-    return os.path.isdir(Path(folder) / OXTS)  # False also if the folder may not be read
+    return (Path(folder) / OXTS).is_dir()
 
 
 def calibration(folder: str | Path, name: str = "cam_to_cam") -> Path:
@@ -48,7 +48,7 @@ def read_times(path: str | Path) -> np.ndarray:
 
     Raises InputError unless they increase.
     """
-    lines = _text(Path(path)).strip().splitlines()
+    lines = text_of(path).strip().splitlines()
     try:
         stamps = np.array(lines, "datetime64[ns]")
     except ValueError as error:
@@ -106,24 +106,16 @@ def _imu_poses(measured: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read: {reason}") from None
-
-
 def _numbers(path: Path, key: str | None, count: int) -> np.ndarray:
     """Return the `count` numbers of a file's first line, or of its line `key`."""
-    prefix, name = "", "a line"
+    prefix = ""
     if key is not None:
-        prefix, name = f"{key}:", f"a line '{key}:'"
-    lines = [line for line in _text(path).splitlines() if line.startswith(prefix)]
+        prefix = f"{key}:"
+    lines = [line for line in text_of(path).splitlines() if line.startswith(prefix)]
     try:
         numbers = np.array(lines[0].removeprefix(prefix).split(), np.float64)
     except (ValueError, IndexError):
         numbers = np.empty(0)
     if len(numbers) != count or not np.isfinite(numbers).all():
-        raise InputError(f"{path}: must hold {name} of {count} finite numbers")
+        raise InputError(f"{path}: must hold a line '{prefix}' of {count} finite numbers")
     return numbers

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from thesis_repro.report import texts
-from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 
 # what the template of the findings says of every comparison, whatever was run
@@ -99,7 +99,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
     widths = masked["dilation_width"].nunique()
     same_best, repeated = None, 0
     if widths > 1:
-        stability = thesis_tables.stability(masked, compare.of_method(runs, "baseline"))
+        stability = best_width.stability(masked, compare.of_method(runs, "baseline"))
         mean = stability["same_best"].mean()
         if not pd.isna(mean):
             same_best, repeated = float(mean), int(stability["same_best"].count())

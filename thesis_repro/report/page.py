@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from thesis_repro.report import tables, texts
-from thesis_repro.running import results
 from thesis_repro.running.settings import ROOT
 
 PAGE = "index.html"
@@ -22,7 +21,15 @@ ARTEFACTS = json.loads((Path(__file__).parent / "captions.json").read_text(encod
 OPENING = ("findings", "figure-comparison", "table-summary")  # ids of those at the top of a page
 ROWS_SHOWN = 36  # of a table in a repository's gallery
 # packages that affect the numbers most
-PACKAGES = ("tensorflow", "keras", *results.OPENCV, "numpy")
+PACKAGES = (
+    "tensorflow",
+    "keras",
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+    "numpy",
+)
 # what only artefacts of the thesis have
 NOT_OF_THESIS: dict[str, Any] = {"number": None, "makers": [], "thesis": {}, "left_out": None}
 

@@ -1,21 +1,50 @@
-"""The controls: masks and settings that leave as many keypoints, chosen differently.
+"""What a study compares: one table of methods, and one of errors.
 
-They leave as many as the masks of the segmentation. If the odometry gains as much from a control,
-the segmentation is not what helps. Masks are indexed by frame number, as in `masks`.
+A method chooses the keypoints of a run. Beside all keypoints and masks, there are *controls*: masks
+and settings that leave as many keypoints as the masks of the segmentation, chosen differently. If
+the odometry gains as much from a control, the segmentation is not what helps. A new method is an
+entry in METHODS, a new error of a path one in ERRORS (and a number in `runner.path_errors`).
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
 
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
-from thesis_repro.masks import MaskSettings, dilate
+from thesis_repro.masks import KEEP, MaskSettings, dilate
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.keypoints import SharedKeypoints
+from thesis_repro.odometry.metrics import RELATIVE_LENGTH
+from thesis_repro.odometry.odometry import detect
 from thesis_repro.study.sources import FileMasks, Source
+
+
+class Error(NamedTuple):
+    """An error of a path. title, unit: in tables and figures. decides: whether masks help."""
+
+    title: str
+    unit: str
+    decides: bool = False
+
+
+# The deciding errors are those that a constant angle between camera and ground truth leaves alone.
+ERRORS = {
+    "se3": Error("aligned ATE", "m", decides=True),
+    "rotation": Error("rotation error a frame", "deg", decides=True),
+    "rmse": Error("RMSE", "m"),
+    "mae": Error("MAE", "m"),
+    "translation_percent": Error(f"translation error over {RELATIVE_LENGTH:g} m", "%"),
+    "rotation_deg_per_100m": Error(f"rotation error over {RELATIVE_LENGTH:g} m", "deg/100 m"),
+    "t_rel": Error("KITTI's t_rel", "%"),
+    "r_rel": Error("KITTI's r_rel", "deg/100 m"),
+}
+
+
+# Masks that are controls. They are indexed by frame number, as in `masks`.
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
 COVERAGE_TOLERANCE = 0.002  # of the frame
@@ -133,42 +162,80 @@ class ImageEdges(OtherFrame):
 
 
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-OF_MASKS = {
-    "other-frame": OtherFrame,
-    "mirrored": Mirrored,
-    "random-lines": RandomLines,
-    "image-edges": ImageEdges,
+
+
+# The methods
+
+
+class Method(NamedTuple):
+    """A way to choose the keypoints of a run.
+
+    title: in tables and figures. altered: the masks of the source, changed. settings: from the
+    source's mask settings to those of the method, for other masks from the same label maps.
+    has_masks: whether keypoints are found inside a mask. is_control: a control without
+    segmentation, which keeps as many keypoints as the masks do but knows nothing of the classes.
+    is_compared: in `compare.comparisons`.
+    """
+
+    title: str
+    altered: type[OtherFrame] | None = None
+    settings: Callable[[MaskSettings], MaskSettings] | None = None
+    has_masks: bool = True
+    is_control: bool = False
+    is_compared: bool = True
+
+
+def _corrected(settings: MaskSettings) -> MaskSettings:
+    return replace(CORRECTED, ids=settings.ids)
+
+
+def _keeping(keep: str) -> Callable[[MaskSettings], MaskSettings]:
+    return partial(replace, keep=keep)
+
+
+METHODS = {  # in the order in which they are shown
+    "baseline": Method("all keypoints", has_masks=False),
+    "masked": Method("masks"),
+    "exact-boundaries": Method(
+        "exact class boundaries", settings=partial(replace, boundaries="exact")
+    ),
+    "corrected": Method("corrected mask", settings=_corrected),
+    # as SLAM systems use a segmentation, see masks.KEEP
+    "static-boundaries": Method(
+        "boundaries of static things", settings=_keeping("static-boundaries")
+    ),
+    "static": Method("all but movable things", settings=_keeping("static")),
+    "inverse": Method("all but the boundaries", settings=_keeping("inverse")),
+    "true-labels": Method("true label maps", settings=partial(replace, ids="labels")),
+    "other-frame": Method("mask of another frame", OtherFrame, is_control=True),
+    "mirrored": Method("mirrored mask", Mirrored, is_control=True),
+    "random-lines": Method("random lines", RandomLines, is_control=True),
+    "image-edges": Method("edges of the image", ImageEdges, is_control=True),
+    "fewer": Method("fewer keypoints", has_masks=False, is_control=True),
+    "spread": Method("keypoints spread out", has_masks=False, is_control=True),
+    "reduced": Method("reduced keypoints", has_masks=False, is_compared=False),  # Figure 4.12
 }
-# as SLAM systems use a segmentation, see masks.KEEP
-LITERATURE = ("static", "inverse", "static-boundaries")
-OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
-# "fallback" is a setting of the odometry, with the same masks
-MASK_CONTROLS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)
+OF_LABEL_MAPS = ("exact-boundaries", "corrected", *KEEP[1:], "true-labels")
+# the methods with masks beside "masked", in the order of their runs
+MASK_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", *OF_LABEL_MAPS)
 
 
 def masks_of_method(
-    method: str, source: Source, sequence: Sequence, dilation_width: int | None
+    name: str, source: Source, sequence: Sequence, dilation_width: int | None
 ) -> ControlMasks:
-    """Return the masks of a sequence for a method: "masked" or one of MASK_CONTROLS.
+    """Return the masks of a sequence for a method that has masks.
 
     source: of the masks that a control is compared with. dilation_width: pixels, for masks from
     label maps.
     """
-    if method in OF_MASKS:
-        return OF_MASKS[method](source, sequence, dilation_width)
-    if method in ("masked", "fallback"):
-        return source.masks(sequence, dilation_width)
-    folder, settings = source.folder, source.settings
-    if method == "true-labels":
-        folder = true_labels(sequence.root, sequence.name)
-        settings = replace(settings, ids="labels")
-    elif method == "corrected":
-        settings = replace(CORRECTED, ids=settings.ids)
-    elif method in LITERATURE:
-        settings = replace(settings, keep=method)
-    else:
-        settings = replace(settings, boundaries="exact")
-    return replace(source, folder=folder, settings=settings).masks(sequence, dilation_width)
+    method = METHODS[name]
+    if method.altered:
+        return method.altered(source, sequence, dilation_width)
+    if method.settings:
+        source = replace(source, settings=method.settings(source.settings))
+    if name == "true-labels":
+        source = replace(source, folder=true_labels(sequence.root, sequence.name))
+    return source.masks(sequence, dilation_width)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:
@@ -178,14 +245,14 @@ def min_distance(sequence: Sequence, number: float) -> float:
     of the sequence, and is never below the distance of the thesis.
     """
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
-    frames = [(sequence.frame(index), SharedKeypoints()) for index in sample]
+    frames = [sequence.frame(index) for index in sample]
 
     def distance(steps: int) -> float:
         return round(THESIS.min_distance + steps * STEP, 6)
 
     def mean_number(steps: int) -> float:
         settings = replace(THESIS, min_distance=distance(steps))
-        numbers = [len(keypoints.detect(frame, settings)) for frame, keypoints in frames]
+        numbers = [len(detect(frame, settings)) for frame in frames]
         return float(np.mean(numbers))
 
     low, high = 0, round(min(sequence.size) / STEP)

@@ -1,0 +1,277 @@
+"""Frames, poses and label maps as people bring them from other tools and data sets."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from thesis_repro import mask_files
+from thesis_repro.data import kitti, label_ids
+from thesis_repro.data.cityscapes import COLORS, ID
+from thesis_repro.data.trajectories import read_poses, write_tum
+from thesis_repro.errors import InputError
+
+
+@pytest.fixture
+def own(tmp_path, tiny_kitti):
+    """A folder of four frames, with calibration and times."""
+    folder = tmp_path / "own"
+    shutil.copytree(tiny_kitti / "sequences/00/image_0", folder)
+    for name in ("calib.txt", "times.txt"):
+        shutil.copy(tiny_kitti / "sequences/00" / name, folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "stems, said",
+    [
+        (["0.1", "0.15", "0.2", "10.0"], True),
+        (["1305031102.175304", "1305031102.211214", "1305031102.243211", "1305031103.0"], True),
+        (["0.10", "0.15", "0.20", "0.90"], False),
+        (["rgb.0009", "rgb.0010", "rgb.0011", "rgb.0012"], False),
+    ],
+)
+def test_names_that_are_decimal_numbers_are_ordered_by_value(own, caplog, stems, said):
+    for path, stem in zip(sorted(own.glob("*.png")), stems):
+        path.rename(own / f"{stem}.png")
+    caplog.set_level("INFO")
+    for _ in range(2):
+        assert [path.stem for path in kitti.Sequence(None, own).frame_paths] == stems
+    lines = [line for line in caplog.messages if "decimal numbers" in line]
+    assert len(lines) == said
+    if stems[0].startswith("rgb"):
+        (own / "rgb.0010.png").unlink()
+        with pytest.raises(InputError, match=r"rgb.0010.png: this frame is missing"):
+            kitti.Sequence(None, own)
+
+
+def test_assumed_times_are_said_once(own, caplog):
+    (own / "times.txt").unlink()
+    caplog.set_level("INFO")
+    for fps in (None, None, 25):
+        kitti.Sequence(None, own, fps=fps)
+    (line,) = caplog.messages
+    assert "times.txt: no such file, so 10 frames a second" in line and "--fps" in line
+
+
+POSES = np.tile(np.eye(4), (4, 1, 1))
+POSES[:, :3, :3] = [cv2.Rodrigues(np.array([0, 0.1 * index, 0]))[0] for index in range(4)]
+POSES[:, 2, 3] = [0, 1, 2, 4]
+
+
+def lines(rows):
+    return "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        POSES[:, :3].reshape(4, 12),
+        POSES.reshape(4, 16),
+        np.column_stack([np.arange(7.0, 11), POSES[:, :3].reshape(4, 12)]),
+        np.column_stack([np.arange(4.0), POSES.reshape(4, 16)]),
+    ],
+)
+def test_poses_with_the_number_of_the_frame_and_with_four_rows(own, rows):
+    (own / "poses.txt").write_text(lines(rows))
+    assert np.array_equal(kitti.Sequence(None, own).poses, POSES)
+    rows = rows + np.eye(*rows.shape)  # another number, rotation or last row
+    (own / "poses.txt").write_text(lines(rows))
+    with pytest.raises(InputError, match="poses.txt"):
+        read_poses(own / "poses.txt")
+
+
+def test_poses_in_the_folder_of_a_sequence(tiny_kitti):
+    expected = kitti.Sequence(tiny_kitti, "00").poses
+    folder = (tiny_kitti / "sequences/00").rename(tiny_kitti / "sequences/mine")
+    (tiny_kitti / "poses/00.txt").rename(folder / "poses.txt")
+    assert kitti.sequences(tiny_kitti) == ["mine"]
+    for root, name in ((tiny_kitti, "mine"), (None, folder)):
+        assert np.array_equal(kitti.Sequence(root, name).poses, expected)
+
+
+def euroc(path, poses, times):
+    """Write the ground truth of EuRoC: nanoseconds, and quaternions with w first."""
+    write_tum(path, poses, times)
+    rows = np.loadtxt(path)[:, [0, 1, 2, 3, 7, 4, 5, 6]]
+    rows = np.column_stack([np.round(rows[:, 0] * 1e9), rows[:, 1:], np.zeros((len(rows), 9))])
+    path.write_text("#timestamp, p_RS_R_x [m], ...\n" + lines(rows).replace(" ", ","))
+
+
+@pytest.mark.parametrize("name, write", [("truth.txt", write_tum), ("data.csv", euroc)])
+def test_ground_truth_with_times_is_given_to_the_frames_of_these_times(own, name, write, caplog):
+    # at 200 Hz, from 0.1 s on, so the first frame has none; off by 2 ms
+    times = np.arange(0.102, 0.35, 0.005)
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, 2, 3] = np.arange(len(times))
+    write(own / name, poses, times)
+    caplog.set_level("INFO")
+    sequence = kitti.Sequence(None, own, truth=own / name)
+    assert [path.stem for path in sequence.frame_paths] == ["000001", "000002", "000003"]
+    np.testing.assert_allclose(sequence.times, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(sequence.poses[:, 2, 3], [0, 20, 40])
+    assert "3 of 4 frames" in caplog.text
+    for first, text in ((0, "found no matching timestamps"), (None, "000002.png has no pose")):
+        at = times + 100 if first == 0 else times
+        kept = np.abs(at - 0.2) > 0.02
+        write(own / name, poses[kept], at[kept])
+        with pytest.raises(InputError, match=rf"{name}: .*{text}"):
+            kitti.Sequence(None, own, truth=own / name)
+    with pytest.raises(InputError, match="gone.txt: cannot be read"):
+        kitti.Sequence(None, own, truth=own / "gone.txt")
+
+
+IDS = np.repeat([[7, 11], [34, 300]], 3, axis=0).astype(np.uint16)
+NAMES = {7: "road", 11: "building", 34: "building", 300: "unlabeled"}
+EXPECTED = np.array([[ID[NAMES[value]] for value in row] for row in IDS.tolist()], np.uint8)
+
+
+def table(folder, rows):
+    path = folder / "ids.csv"
+    path.write_text("id,name\n" + "".join(f"{key}, {name}\n" for key, name in rows))
+    return path
+
+
+def test_ids_of_other_data_sets_are_read_through_a_table(tmp_path):
+    path, ids = tmp_path / "a.png", table(tmp_path, NAMES.items())
+    cv2.imwrite(str(path), IDS)  # 16 bits
+    assert np.array_equal(label_ids.read(path, ids), EXPECTED)
+    small = np.minimum(IDS, 255).astype(np.uint8)
+    palette = Image.fromarray(small, "P")
+    palette.putpalette([number % 251 for number in range(768)])
+    palette.save(path)
+    with pytest.raises(InputError, match=r"a.png: holds 255, which .*ids.csv does not name"):
+        label_ids.read(path, ids)
+    ids = table(tmp_path, [*NAMES.items(), (255, "unlabeled")])
+    assert np.array_equal(label_ids.read(path, ids), EXPECTED)
+    cv2.imwrite(str(path), small[:3])
+    assert np.array_equal(label_ids.read(path, "labels"), small[:3])
+
+
+def test_colours_are_read_through_a_table(tmp_path):
+    path = tmp_path / "a.png"
+    names = ["road", "car", "sky", "pole", "unlabeled"]
+    labels = np.array([[ID[name] for name in names]], np.uint8)
+    cv2.imwrite(str(path), COLORS[labels][..., ::-1])
+    assert np.array_equal(label_ids.read(path, label_ids.COLORS), labels)
+    rows = [("#{:02x}{:02x}{:02x}".format(*COLORS[ID[name]]), name) for name in names]
+    assert np.array_equal(label_ids.read(path, table(tmp_path, rows)), labels)
+    with pytest.raises(InputError, match="holds #804080, which"):
+        label_ids.read(path, table(tmp_path, rows[1:]))
+    with pytest.raises(InputError, match="holds colours"):
+        label_ids.read(path, table(tmp_path, NAMES.items()))
+
+
+@pytest.mark.parametrize("text", ["7,road\n8\n", "7,road\n8,street\n", "7,road\nx,sky\n"])
+def test_a_bad_line_of_a_table_is_named(tmp_path, text):
+    (tmp_path / "ids.csv").write_text(text)
+    with pytest.raises(InputError, match="ids.csv, line 2: "):
+        label_ids.read_table(tmp_path / "ids.csv")
+
+
+CAMERA = "fx 50\nfy 51\ncx 32\ncy 24\nk1 -0.3\nk2 0.1\np1 0.01\np2 -0.02"
+NUMBERS = [float(line.split()[1]) for line in CAMERA.splitlines()]
+ORB_SLAM = "".join(f"Camera.{line.replace(' ', ': ')}\n" for line in CAMERA.splitlines())
+OPENCV = """camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 50., 0., 32., 0., 51., 24., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 4
+   dt: d
+   data: [ -0.3, 0.1, 0.01, -0.02 ]
+"""
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        ("camera.txt", " ".join(map(str, NUMBERS))),
+        ("camera.yaml", f"%YAML:1.0\n---\n{ORB_SLAM}"),
+        ("camera.yaml", f'%YAML:1.0\nCamera.type: "PinHole"\n{ORB_SLAM}'),
+        ("camera.yaml", ORB_SLAM.replace("Camera.", "Camera1.")),
+        ("camera.yml", f"%YAML:1.0\n---\n{OPENCV}"),
+    ],
+)
+def test_distortion_is_taken_out_as_opencv_does(own, name, text):
+    raw = kitti.Sequence(None, own).frame(2)
+    (own / "calib.txt").unlink()
+    (own / name).write_text(text)
+    sequence = kitti.Sequence(None, own, calibration=own / name)
+    assert np.array_equal(sequence.intrinsics, [[50, 0, 32], [0, 51, 24], [0, 0, 1]])
+    expected = cv2.undistort(raw, sequence.intrinsics, np.array(NUMBERS[4:]))
+    assert np.array_equal(sequence.frame(2), expected) and (expected != raw).any()
+    assert own / name in sequence.files
+    mask = np.where(raw > 99, np.uint8(255), np.uint8(0))
+    assert set(np.unique(sequence.undistorted(mask, cv2.INTER_NEAREST))) == {0, 255}
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        ("camera.txt", "50 50 32 24 0.1"),
+        ("camera.txt", "P0: 50 0 32"),
+        ("camera.yaml", "a: [1"),
+        ("camera.yaml", ORB_SLAM.replace("p1", "k3").replace("p2", "k4")),  # a fisheye camera
+    ],
+)
+def test_another_file_is_no_camera(own, name, text):
+    (own / name).write_text(text)
+    with pytest.raises(InputError, match=f"{name}: must hold fx fy cx cy"):
+        kitti.Sequence(None, own, calibration=own / name)
+
+
+def test_frames_of_16_bits_are_scaled_by_their_maximum(own, caplog):
+    caplog.set_level("INFO")
+    expected = [kitti.Sequence(None, own).frame(index) for index in range(4)]
+    for path, frame in zip(sorted(own.glob("*.png")), expected):
+        cv2.imwrite(str(path), frame.astype(np.uint16) * 16)
+    sequence = kitti.Sequence(None, own)
+    white = int(expected[0].max())
+    for index, frame in enumerate(sequence.frames()):
+        exact = np.minimum(expected[index].astype(float) * 255 / white, 255)
+        assert frame.dtype == np.uint8 and np.abs(frame - exact).max() <= 0.5
+    assert sum("16 bits" in line for line in caplog.messages) == 1
+    assert str(16 * white) in caplog.text
+
+
+BINARY = np.zeros((48, 64), np.uint8)
+BINARY[:36, 8:-8] = 255
+
+
+@pytest.mark.parametrize(
+    "name, pixels",
+    [
+        ("a.png", np.dstack([0 * BINARY, 0 * BINARY, 0 * BINARY, BINARY])),
+        ("a.png", np.dstack([BINARY | 255, BINARY | 255, BINARY | 255, BINARY])),
+        ("a.png", np.dstack([0 * BINARY, 0 * BINARY, BINARY])),
+        ("a.png", BINARY.astype(np.uint16) * 257),
+        ("a.png", BINARY // 255),
+        ("a.png", cv2.GaussianBlur(BINARY, (3, 3), 0.5)),
+        ("a.JPG", BINARY),
+    ],
+)
+def test_masks_of_other_tools(tmp_path, name, pixels):
+    data = cv2.imencode(name[1:].lower(), pixels)[1]
+    (tmp_path / name).write_bytes(data.tobytes())
+    path = mask_files._images_by_name(tmp_path)["a.png"]
+    assert path.name == name and np.array_equal(mask_files.read_mask(path), BINARY)
+
+
+def test_what_is_no_mask_is_named(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, BINARY.shape, np.uint8)
+    for pixels, text in (
+        (np.dstack([noise, noise, noise, BINARY]), "a picture and an alpha channel"),
+        (noise, "gray.*--labels"),
+        (np.repeat([[23, 11, 7, 0]], 48, axis=0).astype(np.uint8), "50% .* gray"),
+    ):
+        cv2.imwrite(str(tmp_path / "a.png"), pixels)
+        with pytest.raises(InputError, match=f"a.png: .*{text}"):
+            mask_files.read_mask(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="a.png: cannot be read"):
+        mask_files.read_mask(tmp_path / "a.png")

@@ -1,0 +1,121 @@
+"""What is missing, damaged or certainly wrong is one line with its file."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro import checks
+from thesis_repro.command.cli import main
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.mask_files import LabelMasks, MaskFolder
+from thesis_repro.masks import MaskSettings
+from thesis_repro.running import files, results
+
+IMAGES = "sequences/00/image_0"
+
+
+def test_every_damaged_file_is_named_and_the_exit_code_is_1(tiny_kitti, tiny_cityscapes, capsys):
+    shutil.copytree(tiny_kitti / "sequences/00", tiny_kitti / "sequences/01")
+    (tiny_kitti / "sequences/01/times.txt").write_text("0\n0.1\n0.1\n0.2\n")
+    frame = tiny_kitti / IMAGES / "000001.png"
+    frame.write_bytes(frame.read_bytes()[:100])
+    damaged = bytearray((tiny_kitti / IMAGES / "000002.png").read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    (tiny_kitti / IMAGES / "000002.png").write_bytes(damaged)
+    cv2.imwrite(str(tiny_kitti / IMAGES / "000003.png"), np.zeros((9, 9), np.uint8))
+    (tiny_cityscapes / "trainannot/street_3.png").unlink()
+    cv2.imwrite(str(tiny_cityscapes / "valannot/street_0.png"), np.full((16, 32), 200, np.uint8))
+    cv2.imwrite(str(tiny_cityscapes / "valannot/street_1.png"), np.full((8, 8), 7, np.uint8))
+    roots = ["--kitti", str(tiny_kitti), "--cityscapes", str(tiny_cityscapes)]
+    assert main(["check-data", *roots]) == 1
+    problems = sorted(capsys.readouterr().err.splitlines())
+    named = [
+        "000001.png",
+        "000002.png",
+        "000003.png: 9x9",
+        "times.txt, line 3",
+        "train/street_3.png",
+        "street_0.png: label id 200",
+        "street_1.png: 8x8",
+    ]
+    assert len(problems) == len(named)
+    for text in named:
+        assert sum(text in problem for problem in problems) == 1, text
+
+
+def test_sequences_without_ground_truth_need_no_poses(tiny_kitti):
+    folder = tiny_kitti / "sequences/11"
+    shutil.copytree(tiny_kitti / "sequences/00", folder)
+    (folder / "times.txt").unlink()
+    (folder / "image_0").rename(folder / "image_2")
+    (folder / "calib.txt").write_text("P2: 50 0 32 0 0 50 24 0 0 0 1 0\n")
+    assert checks.check_kitti(tiny_kitti)[1] == []
+    (tiny_kitti / "poses/00.txt").unlink()
+    (tiny_kitti / "poses/11.txt").touch()
+    _, problems = checks.check_kitti(tiny_kitti)
+    assert [line.split("poses/")[1][:6] for line in problems] == ["00.txt", "11.txt"]
+
+
+def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
+    for frame, reports in ((None, True), (None, False), (0, True)):
+        if frame is not None:
+            images = tiny_kitti / IMAGES
+            shutil.copy(images / "000001.png", images / f"{frame:06d}.png")
+        assert checks.main(tmp_path / "checked") == 0
+        assert (str(tiny_kitti) in capsys.readouterr().out) == reports
+
+
+def test_a_centre_far_from_the_middle_and_steps_that_were_left_out(tiny_kitti):
+    assert checks.of_sequence(Sequence(tiny_kitti, "00")) == []
+    calibration = tiny_kitti / "sequences/00/calib.txt"
+    calibration.write_text("P0: 50 0 37 0 0 50 24 0 0 0 1 0\n")
+    (line,) = checks.of_sequence(Sequence(tiny_kitti, "00"))
+    assert line.startswith("sequence 00: calib.txt") and "37, 24" in line
+    assert checks.of_run("00", frames=100, failed=50, dropped=9) == []
+    failed, dropped = checks.of_run("00", 100, 51, 10, 0.1)
+    assert "51 of 100" in failed and "10 of 100" in dropped and "--scale-gate" in dropped
+
+
+STREET = np.repeat([[23], [11], [7]], 16, axis=0).repeat(64, axis=1).astype(np.uint8)
+TRAIN = np.choose(STREET // 8, [0, 2, 10]).astype(np.uint8)
+HALF = np.repeat([[0, 255]], 48, axis=0).repeat(32, axis=1).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "kind, picture, options, warning",
+    [
+        ("labels", STREET, {}, None),
+        ("labels", TRAIN, {}, "--ids train"),
+        ("labels", TRAIN, {"ids": "train"}, None),
+        ("labels", STREET + 11, {}, "KITTI-360"),
+        ("labels", 0 * STREET + 23, {}, "0.0%"),
+        ("masks", HALF, {}, None),
+        ("masks", 0 * HALF, {}, "--invert"),
+        ("masks", HALF | 255, {}, "100.0%"),
+    ],
+)
+def test_masks_that_cannot_be_right(tiny_kitti, tmp_path, kind, picture, options, warning):
+    sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
+    for name in sequence.label_names:
+        files.write_png(folder / name, picture)
+    source = MaskFolder(folder, sequence)
+    if kind == "labels":
+        source = LabelMasks(folder, sequence, 3, MaskSettings(**options))
+        assert "label maps hold" in checks.describe_masks(source, sequence)
+    warnings = checks.of_masks(source, sequence)
+    assert [warning in line for line in warnings] == ([True] if warning else [])
+
+
+def test_masks_of_other_frames(tiny_kitti, tmp_path):
+    sequence, folder = Sequence(tiny_kitti, "00"), tmp_path / "masks"
+    results.stage(folder, frames=results.digest_of_files(sequence.frame_paths))
+    for name in sequence.label_names:
+        files.write_png(folder / name, HALF)
+    masks = MaskFolder(folder, sequence)
+    assert checks.of_masks(masks, sequence) == checks.of_masks(masks, sequence.subset(2)) == []
+    assert "50.0%" in checks.describe_masks(masks, sequence)
+    cv2.imwrite(str(sequence.frame_paths[0]), np.zeros((48, 64), np.uint8))
+    assert len(checks.of_masks(masks, sequence)) == 1

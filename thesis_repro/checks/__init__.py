@@ -1,1 +1,0 @@
-"""Checks of the data: what is missing or damaged, and what is readable but odd."""
