@@ -141,11 +141,11 @@ endif
 endif
 EXECUTED := $(patsubst notebooks/%,$(RUN)/notebooks/%,$(NOTEBOOKS))
 # A change of the page does not rerun the notebooks.
-SOURCES := $(shell find thesis_repro street_world notebooks/drawing -type f -not -path '*/__pycache__/*' -not -path '*/report/page.*' -not -name '*.html.j2' \
+SOURCES := $(shell find thesis_repro street_world notebooks/thesis -type f -not -path '*/__pycache__/*' -not -path '*/page.*' -not -name '*.html.j2' \
              -not -name 'page.css' -not -name 'captions.json')
 
 figures: $(EXECUTED)
-	@$(BIN)/python -m thesis_repro.report.page
+	@PYTHONPATH=$(CURDIR):$(CURDIR)/notebooks $(BIN)/python -m thesis.page
 	@$(BIN)/python -m thesis_repro.running.settings figures
 	@for notebook in $(EXECUTED); do [ -e $$notebook ] || exit 1; done
 
@@ -219,7 +219,7 @@ lint: setup
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
 LAB := $(if $(THESIS_REPRO_BUILD),$(THESIS_REPRO_BUILD),build)/lab
 lab: setup
-	@mkdir -p "$(LAB)" && for name in notebooks/*.ipynb notebooks/drawing; do \
+	@mkdir -p "$(LAB)" && for name in notebooks/*.ipynb notebooks/thesis; do \
 	  [ -e "$(LAB)/$${name##*/}" ] || cp -r "$$name" "$(LAB)" || exit 1; done
 	@echo "the notebooks are copies in $(LAB); delete one to get it anew"
 	@$(BIN)/jupyter lab "$(LAB)" --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate $(if $(filter 0,$(shell id -u)),--allow-root)

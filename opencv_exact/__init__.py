@@ -1,6 +1,13 @@
 """cv2.findEssentialMat (RANSAC) and cv2.recoverPose: the same bits, several times faster."""
 
 from opencv_exact.pose import recover_pose
-from opencv_exact.ransac import find_essential_matrix
+from opencv_exact.ransac import draw_samples, find_essential_matrix
+from opencv_exact.solver import Solutions, solve_five_points
 
-__all__ = ["find_essential_matrix", "recover_pose"]
+__all__ = [
+    "Solutions",
+    "draw_samples",
+    "find_essential_matrix",
+    "recover_pose",
+    "solve_five_points",
+]

@@ -15,7 +15,7 @@ A single sample keeps the processor waiting, because most operations need the on
 samples are solved side by side. Their arrays end with an axis of lanes, and the compiler vectorises
 the loops over it: those with nothing but numbers, or loops of constant length, inside.
 
-`rounding.solve` runs these steps. Nister's last step, rotation and translation from E, is
+`solver.solve` runs these steps. Nister's last step, rotation and translation from E, is
 pose.recover_pose.
 """
 

@@ -5,9 +5,9 @@ polynomial by an iteration that goes on long after the roots have converged. But
 one of all solutions. So this search solves few samples with OpenCV:
 
 1. Draw samples of five correspondences with OpenCV's random number generator, LANES at a time.
-2. Solve them quickly with `rounding.solve`. The last digits differ from OpenCV's, but the
-   difference is within a margin. The margin gives bounds of OpenCV's number of inliers. A test in
-   single precision rules out most solutions.
+2. Solve them quickly with `solver.solve`. The last digits differ from OpenCV's, but the difference
+   is within a margin. The margin gives bounds of OpenCV's number of inliers. A test in single
+   precision rules out most solutions.
 3. Let OpenCV solve a sample if the bounds do not decide whether it beats the best one so far. Let
    OpenCV also solve the winner.
 4. If the winner's number of inliers is outside its bounds, let OpenCV do the whole search.
@@ -26,7 +26,7 @@ from opencv_exact import epipolar
 from opencv_exact.compiling import compiled, inlined
 from opencv_exact.five_point import SAMPLE_SIZE
 from opencv_exact.real_roots import LANES
-from opencv_exact.rounding import Solutions, no_solutions, solve
+from opencv_exact.solver import Solutions, correspondences, no_solutions, solve
 
 MAX_SAMPLES = 1000
 MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole search
@@ -36,29 +36,41 @@ SCORING_BLOCK = 128
 SMALLEST = np.finfo(float).tiny  # normal number
 
 
-class _Solution(NamedTuple):
-    """OpenCV's best solution for a sample of five."""
+class _Points(NamedTuple):
+    """What a search looks through: N correspondences, and when one of them is an inlier."""
 
-    inliers: int  # among all correspondences
-    matrix: np.ndarray | None  # 3x3
-    mask: np.ndarray | None  # (N, 1) uint8
+    columns: np.ndarray  # (4, N), rows x, y, u, v
+    columns32: np.ndarray  # (4, N), in single precision
+    max_abs: np.ndarray  # (4,), largest absolute values of the columns
+    limit: float  # of the squared Sampson distance, rounded to single precision
+    threshold: float
+    probability: float
 
 
 class _Candidate(NamedTuple):
     """A sample of five, and bounds of the number of inliers of OpenCV's best solution for it."""
 
     sample: np.ndarray  # five indices
-    fewest: int
-    most: int
+    lower: int
+    upper: int
 
 
-class _Block(NamedTuple):
-    """LANES samples that were drawn and solved together."""
+class _Progress(NamedTuple):
+    """How far a search is."""
 
-    state: np.ndarray  # (1,) uint64, of the random number generator after them
-    samples: np.ndarray  # (LANES, 5)
-    fives: np.ndarray  # (5, 4, LANES), their correspondences
-    solutions: Solutions
+    drawn: int  # number of samples; the last ones are `samples`
+    random_state: np.ndarray  # (1,) uint64
+    samples: np.ndarray  # (LANES, 5), drawn and solved together
+    solutions: Solutions  # of these samples
+    best: _Candidate
+
+
+class _Solution(NamedTuple):
+    """OpenCV's best solution for a sample of five."""
+
+    inliers: int  # among all correspondences
+    matrix: np.ndarray | None  # 3x3
+    mask: np.ndarray | None  # (N, 1) uint8
 
 
 def find_essential_matrix(
@@ -75,57 +87,57 @@ def find_essential_matrix(
     columns = np.stack([*current.T, *previous.T])
     solution = None
     if len(current) >= MIN_FOR_SHORTCUT and np.isfinite(columns).all():
-        solution = _search(columns, threshold, probability)
+        with np.errstate(over="ignore"):
+            columns32 = columns.astype(np.float32)
+        max_abs = np.abs(columns).max(axis=1)
+        limit = float(np.float32(threshold * threshold))
+        solution = _search(_Points(columns, columns32, max_abs, limit, threshold, probability))
     if solution is None:
         return _opencv(current, previous, threshold, probability)
     return solution.matrix, solution.mask
 
 
-def _search(columns: np.ndarray, threshold: float, probability: float) -> _Solution | None:
+def draw_samples(points: int, samples: int) -> np.ndarray:
+    """Indices (samples, 5) of the first samples that OpenCV's RANSAC draws from so many points."""
+    indices, _ = _draw(_first_random_state(), points, samples)
+    return indices
+
+
+def _search(points: _Points) -> _Solution | None:
     """OpenCV's solution for the winning sample, or None if OpenCV has to do the whole search.
 
-    columns: correspondences (4, N), rows x, y, u, v. None: no sample won, or the bounds were wrong.
+    None: no sample won, or the bounds were wrong.
     """
-    limit = np.float32(threshold * threshold)
-    extents = np.abs(columns).max(axis=1)
-    with np.errstate(over="ignore"):
-        rough = columns.astype(np.float32)
-    block = first_block()
-    drawn = 0
+    no_samples = np.zeros((LANES, SAMPLE_SIZE), np.int64)
     # as in OpenCV, a sample counts only if its own five correspondences are inliers
-    best = _Candidate(np.zeros(SAMPLE_SIZE, np.int64), SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
+    best = _Candidate(no_samples[0], SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
+    progress = _Progress(0, _first_random_state(), no_samples, no_solutions(), best)
     solution = None  # of the best sample, once OpenCV has computed it
     while True:
-        drawn, is_new, best, challenger = _next_doubtful(
-            columns, rough, extents, float(limit), probability, block, drawn, best
-        )
-        if is_new:
+        progress, challenger = _next_doubtful(points, progress)
+        best = progress.best
+        if solution is not None and best.lower > solution.inliers:  # the best is another sample
             solution = None
-        is_over = challenger.most == 0
-        if is_over and (best.most < SAMPLE_SIZE or solution is not None):
+        is_over = challenger.upper == 0
+        if is_over and (best.upper < SAMPLE_SIZE or solution is not None):
             return solution
         # Now the exact number of inliers of the best sample matters: it decides whether the search
         # ends, or whether the challenger is better.
-        if is_over or best.fewest < best.most:
-            solution = _opencv_solution(columns, best.sample, threshold, probability, limit)
-            if not best.fewest <= solution.inliers <= best.most:
+        if is_over or best.lower < best.upper:
+            solution = _opencv_solution(points, best.sample)
+            if not best.lower <= solution.inliers <= best.upper:
                 return None
             best = _Candidate(best.sample, solution.inliers, solution.inliers)
-        if challenger.most > best.fewest:
-            other = _opencv_solution(columns, challenger.sample, threshold, probability, limit)
-            if other.inliers > best.fewest:
+        if challenger.upper > best.lower:
+            other = _opencv_solution(points, challenger.sample)
+            if other.inliers > best.lower:
                 best = _Candidate(challenger.sample, other.inliers, other.inliers)
                 solution = other
+        progress = progress._replace(best=best)
 
 
-def first_block() -> _Block:
-    """Space for the samples of a search, with OpenCV's generator at its start."""
-    return _Block(
-        np.array([OPENCV_SEED], np.uint64),
-        np.empty((LANES, SAMPLE_SIZE), np.int64),
-        np.empty((SAMPLE_SIZE, 4, LANES)),
-        no_solutions(),
-    )
+def _first_random_state() -> np.ndarray:
+    return np.array([OPENCV_SEED], np.uint64)
 
 
 def _opencv(
@@ -142,40 +154,17 @@ def _opencv(
     )
 
 
-def _opencv_solution(
-    columns: np.ndarray,
-    sample: np.ndarray,
-    threshold: float,
-    probability: float,
-    limit: np.float32,
-) -> _Solution:
+def _opencv_solution(points: _Points, sample: np.ndarray) -> _Solution:
     """OpenCV's best solution for a sample of five, and its inliers among all correspondences."""
-    five = np.ascontiguousarray(columns[:, sample].T)
-    stack, _ = _opencv(five[:, :2], five[:, 2:], threshold, probability)
+    five = np.ascontiguousarray(points.columns[:, sample].T)
+    stack, _ = _opencv(five[:, :2], five[:, 2:], points.threshold, points.probability)
     if stack is None:
         return _Solution(0, None, None)
-    masks = _inlier_masks(stack.reshape(-1, 9), columns, limit)
+    masks = _inlier_masks(stack.reshape(-1, 9), points.columns, points.limit)
     inliers = masks.sum(axis=1)
     best = int(inliers.argmax())  # the first one if several are equal, as in OpenCV
     matrix = stack[3 * best : 3 * best + 3].copy()
     return _Solution(int(inliers[best]), matrix, masks[best].reshape(-1, 1))
-
-
-@inlined
-def _samples_needed(probability, outliers):
-    """Number of samples among which one is free of outliers with the given probability.
-
-    outliers: their share of the correspondences.
-    """
-    # probability that a sample has an outlier
-    missed = 1.0 - math.pow(1.0 - outliers, float(SAMPLE_SIZE))
-    if missed < SMALLEST:
-        return 0
-    log_missed = math.log(missed)
-    log_failure = math.log(max(1.0 - probability, SMALLEST))
-    if log_missed >= 0 or -log_failure >= MAX_SAMPLES * -log_missed:
-        return MAX_SAMPLES
-    return round(log_failure / log_missed)
 
 
 @compiled
@@ -197,91 +186,100 @@ def _inlier_masks(matrices, columns, limit):
 
 
 @compiled
-def draw(columns, block):
-    """Draw the next LANES samples as OpenCV does."""
-    count = np.uint64(columns.shape[1])
+def _draw(random_state, points, samples):
+    """Draw samples as OpenCV does: indices (samples, 5), and the state of the generator (1,)."""
     low_bits = np.uint64(0xFFFFFFFF)
-    state = block.state[0]
-    for lane in range(LANES):
-        sample = block.samples[lane]
+    state = random_state[0]
+    indices = np.empty((samples, SAMPLE_SIZE), np.int64)
+    for row in range(samples):
         taken = 0
         while taken < SAMPLE_SIZE:
             state = (state & low_bits) * np.uint64(4164903690) + (state >> np.uint64(32))
-            index = np.int64((state & low_bits) % count)
-            new = True
-            for k in range(taken):
-                new = new and sample[k] != index
-            if new:
-                sample[taken] = index
-                for j in range(4):
-                    block.fives[taken, j, lane] = columns[j, index]
-                taken += 1
-    block.state[0] = state
-
-
-@compiled
-def _next_doubtful(columns, rough, extents, limit, probability, block, drawn, best):
-    """Draw samples until one may or may not be better than the best one, or the search is over.
-
-    rough: the columns in single precision. extents: largest absolute values of the four columns.
-    drawn: number of samples so far, of which the last ones are in `block`.
-    Returns the number of samples, whether the best one is another one, the best one, and the one in
-    doubt (no inliers if the search is over).
-    """
-    count = columns.shape[1]
-    sample, fewest, most = best
-    is_new = False
-    needed = MAX_SAMPLES
-    if most >= SAMPLE_SIZE:
-        needed = _samples_needed(probability, (count - most) / count)
-    while drawn < needed:
-        lane = drawn % LANES
-        if lane == 0:
-            draw(columns, block)
-            solve(block.fives, block.solutions)
-        drawn += 1
-        low, high = _inliers_of_sample(
-            columns, rough, extents, limit, block.solutions, lane, fewest
-        )
-        if low > most:  # surely better
-            sample, fewest, most = block.samples[lane].copy(), low, high
+            index = np.int64((state & low_bits) % np.uint64(points))
             is_new = True
-            needed = _samples_needed(probability, (count - most) / count)
-        elif high > fewest:
-            challenger = _Candidate(block.samples[lane].copy(), low, high)
-            return drawn, is_new, _Candidate(sample, fewest, most), challenger
-    return drawn, is_new, _Candidate(sample, fewest, most), _Candidate(sample, 0, 0)
+            for k in range(taken):
+                is_new = is_new and indices[row, k] != index
+            if is_new:
+                indices[row, taken] = index
+                taken += 1
+    return indices, np.array([state])
 
 
 @inlined
-def _inliers_of_sample(columns, rough, extents, limit, solutions, lane, best):
+def _samples_needed(probability, outliers):
+    """Number of samples among which one is free of outliers with the given probability.
+
+    outliers: their share of the correspondences.
+    """
+    # probability that a sample has an outlier
+    missed = 1.0 - math.pow(1.0 - outliers, float(SAMPLE_SIZE))
+    if missed < SMALLEST:
+        return 0
+    log_missed = math.log(missed)
+    log_failure = math.log(max(1.0 - probability, SMALLEST))
+    if log_missed >= 0 or -log_failure >= MAX_SAMPLES * -log_missed:
+        return MAX_SAMPLES
+    return round(log_failure / log_missed)
+
+
+@compiled
+def _next_doubtful(points, progress):
+    """Draw samples until one may or may not be better than the best one, or the search is over.
+
+    Returns the progress, and the sample in doubt (no inliers if the search is over).
+    """
+    drawn, random_state, samples, solutions, best = progress
+    count = points.columns.shape[1]
+    needed = MAX_SAMPLES
+    if best.upper >= SAMPLE_SIZE:
+        needed = _samples_needed(points.probability, (count - best.upper) / count)
+    while drawn < needed:
+        lane = drawn % LANES
+        if lane == 0:
+            samples, random_state = _draw(random_state, count, LANES)
+            solutions = solve(correspondences(points.columns, samples))
+        drawn += 1
+        lower, upper = _inliers_of_sample(points, solutions, lane, best.lower)
+        candidate = _Candidate(samples[lane], lower, upper)
+        if lower > best.upper:  # surely better
+            best = candidate
+            needed = _samples_needed(points.probability, (count - upper) / count)
+        elif upper > best.lower:
+            return _Progress(drawn, random_state, samples, solutions, best), candidate
+    nobody = _Candidate(best.sample, 0, 0)
+    return _Progress(drawn, random_state, samples, solutions, best), nobody
+
+
+@inlined
+def _inliers_of_sample(points, solutions, lane, best):
     """Bounds of the number of inliers of a sample's best solution.
 
     (0, 0) if it never has more than `best`.
     """
     if not solutions.sure[lane]:
-        return 0, columns.shape[1]
-    low, high = 0, 0
+        return 0, points.columns.shape[1]
+    lower, upper = 0, 0
     for k in range(solutions.counts[lane]):
         matrix, margin = solutions.matrices[lane, k], solutions.margins[lane, k]
-        if _may_beat(matrix, margin, rough, extents, limit, max(best, low)):
-            fewest, most = _bounds(matrix, margin, columns, limit, max(best, low))
-            low = max(low, fewest)
-            high = max(high, most)
-    return low, high
+        if _may_beat(matrix, margin, points, max(best, lower)):
+            low, high = _bounds(matrix, margin, points, max(best, lower))
+            lower = max(lower, low)
+            upper = max(upper, high)
+    return lower, upper
 
 
 @inlined
-def _may_beat(e, margin, rough, extents, limit, best):
+def _may_beat(e, margin, points, best):
     """False if surely no matrix within the margin of e has more than `best` inliers.
 
     This test runs in single precision. It compares `algebraic` alone with the largest value that
-    an inlier anywhere within the extents can have. That decides nearly always, because most
-    solutions are far off.
+    an inlier anywhere within max_abs can have. That decides nearly always, because most solutions
+    are far off.
     """
-    count = rough.shape[1]
+    x, y, u, v = points.columns32[0], points.columns32[1], points.columns32[2], points.columns32[3]
+    count = len(x)
     allowed = count - best  # outliers
-    largest = np.float32(1.00001 * _largest_of_inliers(e, margin, extents, limit))
+    largest = np.float32(1.00001 * _largest_of_inliers(e, margin, points.max_abs, points.limit))
     e0, e1, e2 = np.float32(e[0]), np.float32(e[1]), np.float32(e[2])
     e3, e4, e5 = np.float32(e[3]), np.float32(e[4]), np.float32(e[5])
     e6, e7, e8 = np.float32(e[6]), np.float32(e[7]), np.float32(e[8])
@@ -290,12 +288,7 @@ def _may_beat(e, margin, rough, extents, limit, best):
     for start in range(0, count, SCORING_BLOCK):
         stop = min(start + SCORING_BLOCK, count)
         outliers += _surely_out(
-            matrix,
-            largest,
-            rough[0, start:stop],
-            rough[1, start:stop],
-            rough[2, start:stop],
-            rough[3, start:stop],
+            matrix, largest, x[start:stop], y[start:stop], u[start:stop], v[start:stop]
         )
         if outliers >= allowed:
             return False
@@ -303,12 +296,9 @@ def _may_beat(e, margin, rough, extents, limit, best):
 
 
 @inlined
-def _largest_of_inliers(e, margin, extents, limit):
-    """Bound of |algebraic| of an inlier, as computed from e in single precision.
-
-    extents: largest |x|, |y|, |u| and |v|.
-    """
-    x, y, u, v = extents[0], extents[1], extents[2], extents[3]
+def _largest_of_inliers(e, margin, max_abs, limit):
+    """Bound of |algebraic| of an inlier, as computed from e in single precision."""
+    x, y, u, v = max_abs[0], max_abs[1], max_abs[2], max_abs[3]
     l0, l1 = abs(e[0]) * x + abs(e[1]) * y + abs(e[2]), abs(e[3]) * x + abs(e[4]) * y + abs(e[5])
     m0, m1 = abs(e[0]) * u + abs(e[3]) * v + abs(e[6]), abs(e[1]) * u + abs(e[4]) * v + abs(e[7])
     root = np.sqrt(limit)
@@ -337,50 +327,53 @@ def _surely_out(matrix, largest, x, y, u, v):
 
 
 @inlined
-def _bounds(e, margin, columns, limit, best):
+def _bounds(e, margin, points, best):
     """Least and most inliers that any matrix within the margin of e has.
 
     (0, 0) if it never has more than `best`.
     """
-    count = columns.shape[1]
-    low, high = 0, 0
+    x, y, u, v = points.columns[0], points.columns[1], points.columns[2], points.columns[3]
+    count = len(x)
+    matrix, root = epipolar.entries(e), np.sqrt(points.limit)
+    lower, upper = 0, 0
     for start in range(0, count, SCORING_BLOCK):
         stop = min(start + SCORING_BLOCK, count)
-        few, many = _bounds_of_block(
-            e,
-            margin,
-            columns[0, start:stop],
-            columns[1, start:stop],
-            columns[2, start:stop],
-            columns[3, start:stop],
-            limit,
+        low, high = _bounds_of_block(
+            matrix, margin, root, x[start:stop], y[start:stop], u[start:stop], v[start:stop]
         )
-        low += few
-        high += many
-        if high + count - stop <= best:
+        lower += low
+        upper += high
+        if upper + count - stop <= best:
             return 0, 0
-    return low, high
+    return lower, upper
 
 
 @inlined
-def _bounds_of_block(e, margin, x, y, u, v, limit):
-    """Least and most inliers of `_bounds` among the correspondences of one block."""
-    root = np.sqrt(limit)
-    matrix = epipolar.entries(e)
-    low, high = 0, 0
+def _bounds_of_block(matrix, margin, root, x, y, u, v):
+    """Least and most inliers of `_bounds` in one block, whose loop is vectorised."""
+    lower, upper = 0, 0
     for k in range(len(x)):
-        algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x[k], y[k], u[k], v[k])
-        # |algebraic| of an inlier is at most this
-        largest = root * np.sqrt(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)
-        doubt = _change(margin, root, x[k], y[k], u[k], v[k]) + 1e-6 * (abs(algebraic) + largest)
-        low += abs(algebraic) < largest - doubt
-        high += abs(algebraic) <= largest + doubt
-    return low, high
+        is_surely, is_maybe = _is_inlier(matrix, margin, root, x[k], y[k], u[k], v[k])
+        lower += is_surely
+        upper += is_maybe
+    return lower, upper
+
+
+@inlined
+def _is_inlier(matrix, margin, root, x, y, u, v):
+    """Whether a correspondence is an inlier of all matrices within the margin, and of any of them.
+
+    root: of the limit.
+    """
+    algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(matrix, x, y, u, v)
+    largest = root * np.sqrt(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1)  # |algebraic| of an inlier
+    doubt = _change(margin, root, x, y, u, v) + 1e-6 * (abs(algebraic) + largest)
+    return abs(algebraic) < largest - doubt, abs(algebraic) <= largest + doubt
 
 
 @inlined
 def _change(margin, root, x, y, u, v):
-    """How much |algebraic| minus `largest` (_bounds_of_block) may change within the margin.
+    """How much |algebraic| minus `largest` (_is_inlier) may change within the margin.
 
     By Cauchy and Schwarz: a matrix of norm `margin` changes (u, v, 1) E (x, y, 1)^T by at most the
     margin times the lengths of both vectors, and each epipolar line by at most the margin times

@@ -18,7 +18,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 from street_world import drives, street, textures
 from thesis_repro.data import kitti, trajectories
 from thesis_repro.running import messages, results
-from thesis_repro.running.files import is_whole, progress, write_png, write_text
+from thesis_repro.running.files import progress, write_png, write_text
 
 SEQUENCES = tuple(drives.DRIVES)
 BASELINE = 0.537  # metres between KITTI's cameras, for P1 and P3 of the calibration file
@@ -169,7 +169,7 @@ def write(
     }
     with results.claimed(out):
         results.stage(
-            out, replace=replace, code=results.digest_of_code("street_world.dataset"), **parameters
+            out, replace=replace, code=results.digest_of_code("street_world"), **parameters
         )
         pictures = []
         for picture in _pictures(out, **parameters):
@@ -179,7 +179,7 @@ def write(
         missing = [
             picture
             for picture in pictures
-            if not (is_whole(picture.image_path) and is_whole(picture.label_path))
+            if not (picture.image_path.is_file() and picture.label_path.is_file())
         ]
         _write_missing(missing, jobs)
         if only != "cityscapes":

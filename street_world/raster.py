@@ -24,10 +24,10 @@ reference, which costs more than the arithmetic.
 import math
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from thesis_repro.data.cityscapes import ID
-from thesis_repro.running.compiled import fast, inner
 
 # Columns of the face matrix; each row is a face.
 CORNER, EDGE_S, EDGE_T = 0, 3, 6  # three each; CORNER + Y is the corner's y
@@ -90,10 +90,17 @@ class Environment(NamedTuple):
     haze: float  # extinction, 1/m
 
 
+# How loops are compiled. Both kinds divide by zero as numpy does. Functions of the second kind are
+# inlined into those of the first, and Python cannot call them.
+OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+compiled = numba.njit(cache=True, **OPTIONS)
+inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, **OPTIONS)
+
+
 # Textures
 
 
-@inner
+@inlined
 def _between(place, log_size):
     """Return the two texels along one axis that a place lies between, and the second one's weight.
 
@@ -107,7 +114,7 @@ def _between(place, log_size):
     return x0 & (size - 1), (x0 + 1) & (size - 1), x - x0
 
 
-@inner
+@inlined
 def _mix(data, offset, log_width, x, y):
     """Interpolate one level of a texture; offset: its first byte; x, y: results of `_between`."""
     x0, x1, fx = x
@@ -119,7 +126,7 @@ def _mix(data, offset, log_width, x, y):
     return top * (1 - fy) + bottom * fy
 
 
-@inner
+@inlined
 def _level(step, levels):
     """Return the level for a step of that many texels, and the weight of the next level.
 
@@ -135,7 +142,7 @@ def _level(step, levels):
     return level, weight
 
 
-@inner
+@inlined
 def _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step):
     """Return a texture's value for a sample that covers u_step by v_step repeats.
 
@@ -160,7 +167,7 @@ def _filtered(data, start, texture, log_height, log_width, u, v, u_step, v_step)
     return value
 
 
-@inner
+@inlined
 def _place(coefficients, faces, index, row, x, w):
     """Return a sample's position u, v on a face's texture, and its steps to the next sample.
 
@@ -184,14 +191,14 @@ def _place(coefficients, faces, index, row, x, w):
     return u, v, max(abs(u_x), abs(u_y)), max(abs(v_x), abs(v_y))
 
 
-@inner
+@inlined
 def _inverse_depth(coefficients, index, row, x):
     """Return w of a face at a sample."""
     c, n = coefficients, index
     return c[n, W] + c[n, W_Y] * row + c[n, W_X] * x
 
 
-@inner
+@inlined
 def _alpha_level(start, sides, coefficients, faces, index, row, x):
     """Return the level of a face's alpha for one row of samples: first byte, rows and columns."""
     texture = int(faces[index, TEXTURE])
@@ -209,7 +216,7 @@ def _alpha_level(start, sides, coefficients, faces, index, row, x):
 # Which samples a face covers
 
 
-@inner
+@inlined
 def _turn(rotation, x, y, z):
     """Rotate a vector from street to camera coordinates."""
     return (
@@ -219,7 +226,7 @@ def _turn(rotation, x, y, z):
     )
 
 
-@inner
+@inlined
 def _cross(a, b):
     """Return the cross product of two vectors."""
     return (
@@ -229,7 +236,7 @@ def _cross(a, b):
     )
 
 
-@inner
+@inlined
 def _set_coefficients(c, first, vector, volume, focal, centre):
     """Fill in c[first : first + 3] for p . vector / volume, which is linear in x and y."""
     step_x = vector[0] / focal[0] / volume
@@ -239,7 +246,7 @@ def _set_coefficients(c, first, vector, volume, focal, centre):
     c[first + 2] = step_y
 
 
-@inner
+@inlined
 def _set_up(corner, edge_s, edge_t, view, c):
     """Fill in the nine coefficients `c` of a face; return the first and last row that it may cover.
 
@@ -279,7 +286,7 @@ def _set_up(corner, edge_s, edge_t, view, c):
     return max(0, math.ceil(y_min)), min(height - 1, math.floor(y_max))
 
 
-@inner
+@inlined
 def _narrow(value, slope, low, high):
     """Return the part of [low, high] where value + slope x >= 0."""
     if slope > 0:
@@ -291,7 +298,7 @@ def _narrow(value, slope, low, high):
     return low, high
 
 
-@inner
+@inlined
 def _span(c, triangle, row, width):
     """Return the first and last sample of a row inside a face.
 
@@ -318,7 +325,7 @@ def _span(c, triangle, row, width):
     return math.ceil(low), math.floor(high)
 
 
-@fast
+@compiled
 def _draw(faces, textures, view, coefficients, depth, nearest):
     """Find the nearest face at each sample.
 
@@ -384,7 +391,7 @@ def _shadows(faces: np.ndarray, sun: np.ndarray, position: np.ndarray) -> np.nda
 # From samples to pixels
 
 
-@inner
+@inlined
 def _most(labels, depths):
     """Return the most frequent label of a pixel's samples.
 
@@ -459,7 +466,7 @@ def _brightness(faces: np.ndarray, environment: Environment) -> np.ndarray:
     return faces[:, GAIN] * (environment.ambient + environment.direct * direct)
 
 
-@fast
+@compiled
 def _pixels(faces, brightness, textures, environment, coefficients, nearest, shadow):
     """Return image and label map from the nearest face and the shadow at each sample."""
     height, width = nearest.shape[0] // SUPERSAMPLING, nearest.shape[1] // SUPERSAMPLING

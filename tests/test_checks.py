@@ -9,7 +9,8 @@ import pytest
 from thesis_repro import checks
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings
+from thesis_repro.mask_files import LabelMasks, MaskFolder
+from thesis_repro.masks import MaskSettings
 from thesis_repro.running import files, results
 
 IMAGES = "sequences/00/image_0"

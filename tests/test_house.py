@@ -22,7 +22,7 @@ ALLOWED = {
     "report": METHOD | {"study"},
     "command": METHOD | {"checks", "study", "report", "street_world"},
     "street_world": BASE | {"data"},
-    "drawing": METHOD | {"study", "report"},
+    "thesis": METHOD | {"study", "report"},
     "__init__": METHOD,  # the face; at run time, a name is imported on its first use
     "__main__": {"command"},
 }
@@ -32,7 +32,7 @@ MODULES = {
     for folder, pattern in (
         (ROOT / "thesis_repro", "**/*.py"),
         (ROOT, "street_world/*.py"),
-        (ROOT / "notebooks", "drawing/*.py"),
+        (ROOT / "notebooks", "thesis/*.py"),
     )
     for path in sorted(folder.glob(pattern))
 }

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thesis_repro import masks
+from thesis_repro import mask_files, masks
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
@@ -149,23 +149,23 @@ def test_label_masks_and_written_masks_equal_the_filter(labelled, tmp_path):
     sequence, folder = labelled
     corrections = MaskSettings("exact", symmetric=True, classes=("sky",), movable=1, margin=3)
     for settings in (corrections, MaskSettings()):  # the second replaces the first
-        made = masks.LabelMasks(folder, sequence, 4, settings)
+        made = mask_files.LabelMasks(folder, sequence, 4, settings)
         expected = masks.keypoint_mask(bands("road", "sky"), (48, 64), 4, settings)
-        masks.write_masks(made, tmp_path / "masks")
+        mask_files.write_masks(made, tmp_path / "masks")
         assert len(made) == 4 and np.array_equal(made[3], expected)
-        assert np.array_equal(masks.MaskFolder(tmp_path / "masks", sequence)[1], expected)
+        assert np.array_equal(mask_files.MaskFolder(tmp_path / "masks", sequence)[1], expected)
 
 
 def test_label_maps_written_again_give_new_masks(labelled, tmp_path):
     sequence, folder = labelled
-    made = masks.LabelMasks(folder, sequence, 4)
+    made = mask_files.LabelMasks(folder, sequence, 4)
     for names in (("road", "sky"), ("sky", "road", "sky"), ("road", "sky", "car")):
         for path in made.paths:
             cv2.imwrite(str(path), bands(*names))
         expected = masks.keypoint_mask(bands(*names), (48, 64), 4)
         assert all(np.array_equal(made[index], expected) for index in range(4))
-        masks.write_masks(made, tmp_path / "masks")
-        written = masks.MaskFolder(tmp_path / "masks", sequence)
+        mask_files.write_masks(made, tmp_path / "masks")
+        written = mask_files.MaskFolder(tmp_path / "masks", sequence)
         assert all(np.array_equal(written[index], expected) for index in range(4))
 
 
@@ -173,7 +173,7 @@ def test_threads_share_label_masks(labelled):
     sequence, folder = labelled
     for index, path in enumerate(sequence.frame_paths):
         cv2.imwrite(str(folder / path.name), np.roll(bands("road", "sky", "car"), 3 * index, 1))
-    made = masks.LabelMasks(folder, sequence, 4)
+    made = mask_files.LabelMasks(folder, sequence, 4)
     expected = [made[index].tobytes() for index in range(4)]
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda index: made[index % 4].tobytes(), range(400)))
@@ -192,9 +192,9 @@ def test_a_mask_named_as_a_frame_is_that_frames(tiny_kitti, tmp_path, stems, mas
     cv2.imwrite(str(folder / mask), np.full((48, 64), 255, np.uint8))
     for frames in (sequence, sequence.subset(2)):
         with pytest.raises(InputError, match="no such mask"):
-            masks.MaskFolder(folder, frames)
+            mask_files.MaskFolder(folder, frames)
     (folder / mask).rename(folder / "bonnet.png")
-    assert set(masks.MaskFolder(folder, sequence).paths) == {folder / "bonnet.png"}
+    assert set(mask_files.MaskFolder(folder, sequence).paths) == {folder / "bonnet.png"}
 
 
 @pytest.mark.parametrize(
@@ -213,13 +213,22 @@ def test_wrong_settings_are_named(setting, value):
         MaskSettings(**{setting: value})
 
 
+def test_the_thesis_mask_is_its_three_calls():
+    label_map = streets()
+    enlarged = cv2.resize(label_map, SIZE[::-1])
+    for width in (1, 5, 10):
+        expected = cv2.dilate(cv2.Canny(enlarged, 5, 15), np.ones((width, width), np.uint8))
+        assert np.array_equal(masks.thesis_mask(label_map, SIZE, width), expected)
+        assert np.array_equal(masks.keypoint_mask(label_map.astype(int), SIZE, width), expected)
+
+
 def test_wrong_arguments_are_named(labelled):
     sequence, folder = labelled
     for width in (0, True, 2.0):
         with pytest.raises(InputError, match=f"dilation width {width}"):
-            masks.LabelMasks(folder, sequence, width)
+            mask_files.LabelMasks(folder, sequence, width)
     with pytest.raises(InputError, match="sequence"):
-        masks.LabelMasks(folder, "00", 4)
-    for several in (masks.LabelMasks(folder, sequence, 4), masks.MaskFolder(folder, sequence)):
+        mask_files.LabelMasks(folder, "00", 4)
+    for several in (mask_files.LabelMasks(folder, sequence, 4), mask_files.MaskFolder(folder, sequence)):
         with pytest.raises(InputError, match="index"):
             several[0:2]

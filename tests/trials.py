@@ -15,7 +15,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from thesis_repro.running import files
-from thesis_repro.running.folders import DIGESTS, LOG
+from thesis_repro.running.messages import LOG
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import ARITHMETIC
 
@@ -146,14 +146,14 @@ def refused(result, named, code=1, left=()):
 
 
 def contents(folder):
-    """{path: digest} of all files below a folder but logs and the digests of tables.
+    """{path: digest} of all files below a folder but logs.
 
     Times in tables, which differ between runs, are left out.
     """
     return {
         str(path.relative_to(folder)): sha256(_content(path)).hexdigest()
         for path in Path(folder).rglob("*")
-        if path.is_file() and path.name not in (LOG, DIGESTS)
+        if path.is_file() and path.name != LOG
     }
 
 

@@ -24,14 +24,15 @@ __all__ = [
 
 if TYPE_CHECKING:
     from thesis_repro.data.kitti import Sequence
-    from thesis_repro.masks import LabelMasks, keypoint_mask
+    from thesis_repro.mask_files import LabelMasks
+    from thesis_repro.masks import keypoint_mask
     from thesis_repro.odometry import THESIS, Odometry, OdometrySettings, run
     from thesis_repro.segmentation.unet import build_unet
 else:
     _HOMES = {
         "Sequence": "data.kitti",
         "keypoint_mask": "masks",
-        "LabelMasks": "masks",
+        "LabelMasks": "mask_files",
         "Odometry": "odometry",
         "OdometrySettings": "odometry",
         "THESIS": "odometry",

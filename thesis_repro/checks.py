@@ -15,7 +15,8 @@ import numpy as np
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.masks import LabelMasks, MaskFolder, coverage, label_map_of
+from thesis_repro.mask_files import LabelMasks, MaskFolder, label_map_of
+from thesis_repro.masks import coverage
 from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import read_settings
 
@@ -244,4 +245,4 @@ def _class_shares(source: LabelMasks) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    messages.run_main(lambda: sys.exit(main(Path(sys.argv[1]))))
+    messages.run_main(lambda: main(Path(sys.argv[1])))

@@ -34,9 +34,14 @@ from thesis_repro.running import messages
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
-from thesis_repro.study import controls, timing
+from thesis_repro.study import controls
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.sources import Source
+
+sys.path.append(str(ROOT / "notebooks"))
+
+# isort: split
+from thesis import timing
 
 FRAMES = 40  # from the sequence's start
 REPEATS = 3

@@ -7,10 +7,11 @@ import re
 
 import pandas as pd
 
-from thesis_repro.report import captions, style, texts
+from thesis_repro.report import style, texts
 from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
+CARD = ROOT / "thesis_repro/segmentation/weights/README.md"  # of the model in the package
 REAL, RENDERED = "real frames", "embedded world (rendered)"
 ALL_KEYPOINTS, EXACT = compare.METHODS["baseline"], compare.METHODS["true-labels"]
 PACKAGE = "the model in the package"
@@ -73,7 +74,7 @@ def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
 
 def _on_card():
     """Return the mean IoU of the model in the package on KITTI's pairs held out, from its card."""
-    card = (ROOT / captions.CARD).read_text(encoding="utf-8")
+    card = CARD.read_text(encoding="utf-8")
     pattern = r"\*\*Quality on (KITTI's .*?)\*\*.*?mean IoU \*\*([\d.]+)\*\*"
     pairs, mean_iou = re.search(pattern, card, re.DOTALL).groups()
     return float(mean_iou), f"{pairs}, 11 classes, from gray (model card)"

@@ -10,6 +10,7 @@ camera's direction does not disturb the estimate of a motion between two frames.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import cv2
@@ -24,8 +25,13 @@ from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.report import style, texts
 from thesis_repro.running import messages
 from thesis_repro.running.settings import ROOT, cores
-from thesis_repro.study import ablations, compare, jobs, runner
+from thesis_repro.study import compare, jobs, runner
 from thesis_repro.study.sources import Source
+
+sys.path.append(str(ROOT / "notebooks"))
+
+# isort: split
+from thesis import ablations
 
 # ids of label maps
 KINDS = {

@@ -25,7 +25,7 @@ from street_world import dataset as world
 from thesis_repro.data import cityscapes
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, messages, results
-from thesis_repro.segmentation import augmentation, memory, prediction, quality, training
+from thesis_repro.segmentation import augmentation, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
 
 BASE_FILTERS, WORLD_IMAGES, SEED = 16, 100, 0
@@ -123,7 +123,7 @@ class Views(training.Batches):
         self.sources, self.phase, self.epoch = sources, phase, 0
         # `dataset` reads the shape
         self.sets = [(np.empty((0, phase.size, phase.size, 1), np.uint8), None)]
-        self.light = augmentation.Augmenter(LIGHT)
+        self.light = A.Compose(LIGHT)
 
     def __len__(self):
         return EPOCH
@@ -140,7 +140,8 @@ class Views(training.Batches):
                 look = "kitti" if random.random() < KITTI_LOOK[name] else "camvid"
                 image, label = self.sources[name][random.integers(len(self.sources[name]))]
                 image, label = view(image, label, name, look, size, random)
-                pairs.append(self.light(image[..., None], label, random.integers(2**31)))
+                seed = random.integers(2**31)
+                pairs.append(augmentation.augment(self.light, image[..., None], label, seed))
             images, labels = map(np.stack, zip(*pairs))
             yield images, np.where(np.isin(labels, quality.EVALUATED), labels, augmentation.NOTHING)
 
@@ -211,7 +212,6 @@ def train(camvid, kitti_semantic, pseudo, folder):
         for image, label in all_sources["pseudo"]
     ]
     keras.utils.set_random_seed(SEED)
-    memory.keep_freed()
     model = build_unet((None, None, 1), cityscapes.N_CLASSES, BASE_FILTERS)
     optimizer = Muon(
         LEARNING_RATE,
@@ -235,13 +235,10 @@ def train(camvid, kitti_semantic, pseudo, folder):
         batches = Views(sources, phase)
         loss = weighted_loss(class_weights(sources, phase.shares))
         model.compile(optimizer, training.fused_loss(loss))
-        resumable = training.ResumableTraining(
-            results.stage(folder / name, **made_from), model, batches
-        )
+        resumable = training.ResumableTraining(results.stage(folder / name, **made_from), batches)
         model.fit(
             batches.dataset(),
             epochs=phase.epochs,
-            initial_epoch=resumable.first_epoch(phase.epochs),
             verbose=0,
             shuffle=False,
             callbacks=[keras.callbacks.LearningRateScheduler(rate), resumable],

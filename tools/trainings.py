@@ -9,6 +9,8 @@ its weights, the quality of its label maps, the ratios of errors with their inte
 of Table 4.2. A stopped run resumes.
 """
 
+import sys
+
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
 
 # isort: split
@@ -18,13 +20,18 @@ import pandas as pd
 import tensorflow as tf
 
 from thesis_repro.data import cityscapes, kitti
-from thesis_repro.report.trainings import TABLE
 from thesis_repro.running import files, messages, results
-from thesis_repro.running.settings import read_settings
-from thesis_repro.segmentation import memory, prediction, quality, training
+from thesis_repro.running.settings import ROOT, read_settings
+from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.study import compare, domain_gap, jobs, runner, thesis_tables, workers
+from thesis_repro.study import compare, jobs, runner, thesis_tables, workers
 from thesis_repro.study.sources import Source
+
+sys.path.append(str(ROOT / "notebooks"))
+
+# isort: split
+from thesis import domain_gap
+from thesis.trainings import TABLE
 
 SEEDS = range(10)  # the first one is the default run's
 METRICS = (*compare.JUDGING_METRICS, "rmse")
@@ -51,7 +58,6 @@ def train(settings, seed):
     model.compile(
         keras.optimizers.Adam(sizes.learning_rate), training.fused_loss(training.total_loss())
     )
-    model.optimizer.build(model.trainable_variables)
     folder = results.stage(
         settings.build / f"trainings/model_{seed}",
         **training.made_from(model, batches, validation),
@@ -60,14 +66,13 @@ def train(settings, seed):
     best = keras.callbacks.ModelCheckpoint(
         folder / training.MODEL, monitor="val_loss", save_best_only=True
     )
-    resumable = training.ResumableTraining(folder, model, batches, [stop, best])
+    resumable = training.ResumableTraining(folder, batches, [stop, best])
     model.fit(
         batches.dataset(),
         validation_data=validation.dataset(),
         epochs=sizes.epochs,
         shuffle=False,
         verbose=0,
-        initial_epoch=resumable.first_epoch(sizes.epochs),
         callbacks=[stop, best, resumable],
     )
     return folder / training.MODEL
@@ -76,7 +81,6 @@ def train(settings, seed):
 def label_maps(settings, seed):
     """Train and predict; return the source of masks, and {network, mean_iou} of the training."""
     tf.config.threading.set_intra_op_parallelism_threads(settings.sizes.threads)
-    memory.keep_freed()
     model = training.load_model(train(settings, seed))
     folder = settings.build / f"trainings/labels_{seed}"
     sequences = opened(settings)

@@ -78,7 +78,7 @@ def test_forms_of_widths_and_frames():
         options = PARSER.parse_args(["study", "--kitti", "a", "--output", "b", "--widths", *words])
         assert set().union(*options.widths) == widths
     for text, frames in (("all", None), ("40", 40)):
-        assert PARSER.parse_args(["evaluate", "a.txt", "--frames", text]).frames == frames
+        assert PARSER.parse_args(["odometry", "--sequence", "a", "--frames", text]).frames == frames
 
 
 def test_written_masks_give_the_same_path_as_label_maps(small_world, small_labels, tmp_path):
@@ -167,9 +167,6 @@ def test_names_that_are_not_utf8_are_shown_escaped(tiny_kitti, tmp_path, capsys)
     assert run("check-data", "--kitti", root) == 0
     assert run("masks", *where, *masks, "--output", tmp_path / f"masks {NOT_UTF8}") == 0
     assert run("odometry", *where, *masks, "--output", path, "--plot", drawing) == 0
-    link = tmp_path / f"{NOT_UTF8}.txt"
-    link.symlink_to(path)
-    assert run("evaluate", *where, path, link, "--plot", drawing) == 0
     printed = capsys.readouterr().out
     assert "caf\\udce9\\n\\x1b" in printed and "\x1b" not in printed
     assert ElementTree.parse(drawing)

@@ -146,7 +146,7 @@ def test_a_notebook_without_its_input_names_the_one_to_run_first(tmp_path):
         ("notebooks/07_visual_odometry.ipynb", ["07", "08", "09"]),
         ("thesis_repro/masks.py", [name[:2] for name in NOTEBOOKS]),
         ("street_world/street.py", [name[:2] for name in NOTEBOOKS]),
-        ("notebooks/drawing/chapter4.py", [name[:2] for name in NOTEBOOKS]),
+        ("notebooks/thesis/chapter4.py", [name[:2] for name in NOTEBOOKS]),
         ("thesis_repro/report/page.py", []),
     ],
 )

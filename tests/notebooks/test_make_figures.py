@@ -13,7 +13,7 @@ from thesis_repro.running.settings import ROOT
 def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     """On a copy of the project with two small notebooks."""
     root = tmp_path / "project"
-    for folder in ("thesis_repro", "street_world", "notebooks/drawing"):
+    for folder in ("thesis_repro", "street_world", "notebooks/thesis"):
         shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
     (root / ".venv").symlink_to(ROOT / ".venv")
     for name in ("Makefile", "environment.txt", "pyproject.toml"):

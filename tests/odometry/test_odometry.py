@@ -15,8 +15,10 @@ from street import Street, Stripes
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.masks import MaskFolder
-from thesis_repro.odometry import THESIS, Odometry, OdometrySettings, keypoints, metrics, pose
+from thesis_repro.mask_files import MaskFolder
+from thesis_repro.odometry import THESIS, Odometry, OdometrySettings, keypoints, metrics, sharing
+from thesis_repro.odometry.odometry import OPENCV, normalise, track
+from thesis_repro.odometry.types import ROTATION_COLUMNS
 from thesis_repro.running.settings import ROOT
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
@@ -50,7 +52,7 @@ def test_agrees_with_pyslam_on_every_frame(kitti_real, reference, sequence, erro
             np.testing.assert_array_equal(
                 result.frames[ours].to_numpy(float, na_value=np.nan), expected[theirs]
             )
-        columns = ["x", "y", "z", *odometry.odometry.ROTATION_COLUMNS]
+        columns = ["x", "y", "z", *ROTATION_COLUMNS]
         np.testing.assert_allclose(result.frames[columns], expected[columns], rtol=0, atol=1e-9)
         np.testing.assert_allclose(
             result.frames["scale"][1:], expected["gt_scale"][1:], rtol=0, atol=1e-12
@@ -140,7 +142,7 @@ def test_keypoints_have_opencvs_bits(drive, mask):
         for distance in (0, 1, 2.4, 3, 7)
         for limit in (10, 2000, 0)
     ]
-    shared = keypoints.SharedKeypoints()
+    shared = sharing.SharedCalls()
     for image, settings in [*cases, (frame, replace(THESIS, quality=0.05, block_size=9))]:
         expected = cv2.goodFeaturesToTrack(
             image,
@@ -158,15 +160,14 @@ def test_keypoints_have_opencvs_bits(drive, mask):
 
 def test_tracks_have_opencvs_bits(drive):
     frame = drive.frame(3)
-    points = keypoints.detect(frame, THESIS)
+    points = keypoints.detect(frame)
     # at -40 a window leaves the frame
     for shift, window in ((3, 21), (12, 21), (-40, 21), (12, 11)):
-        moved = np.roll(frame, shift, axis=1)
-        tracker = keypoints.TRACKER | {"winSize": (window, window)}
-        expected, status, _ = cv2.calcOpticalFlowPyrLK(frame, moved, points, None, **tracker)
-        tracked, success = keypoints.track(frame, moved, points, window)
-        np.testing.assert_array_equal(tracked, expected)
-        np.testing.assert_array_equal(success, status.ravel() == 1)
+        moved, settings = np.roll(frame, shift, axis=1), replace(THESIS, window=window)
+        for ours, expected in zip(
+            sharing.track(frame, moved, points, settings), track(frame, moved, points, settings)
+        ):
+            np.testing.assert_array_equal(ours, expected)
 
 
 def test_a_mask_in_the_detector_fills_the_limit_and_a_filter_does_not(drive):
@@ -177,53 +178,50 @@ def test_a_mask_in_the_detector_fills_the_limit_and_a_filter_does_not(drive):
     assert len(inside) == 500 and 100 < len(filtered) < 400
 
 
-# {kind: the matched points (previous, current) of a step, changed}
-CHANGED_MATCHES = {
-    "plain": lambda random, previous, current: (previous, current),
-    "swapped": lambda random, previous, current: (current, previous),
-    "few": lambda random, previous, current: (previous[:30], current[:30]),
-    "noisy": lambda random, previous, current: (
-        previous,
-        current + random.normal(0, 3e-3, current.shape),
-    ),
-    "still": lambda random, previous, current: (
-        previous,
-        previous + random.normal(0, 1e-5, current.shape),
-    ),
-    "nonsense": lambda random, previous, current: (random.permutation(previous), current),
-}
+def nearest_neighbours(points):
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    return np.sort(distances, axis=1)[:, 1]
 
 
-@pytest.mark.parametrize("kind", CHANGED_MATCHES)
-def test_the_pose_vote_has_opencvs_bits(drive, kind):
-    random = np.random.RandomState(1)
-    for index in range(3):
-        points = keypoints.detect(drive.frame(index), THESIS)
-        tracked, success = keypoints.track(drive.frame(index), drive.frame(index + 1), points)
-        matches = (pose.normalise(side[success], drive.intrinsics) for side in (points, tracked))
-        previous, current = CHANGED_MATCHES[kind](random, *matches)
-        matrix, _, problem = pose.essential_matrix(current, previous, THESIS.threshold)
-        assert problem == ""
-        votes, rotation, translation, _ = cv2.recoverPose(
-            matrix, current, previous, focal=1, pp=(0, 0)
-        )
-        ours = pose.recover_pose(matrix, current, previous)
-        assert ours[0] == votes
-        np.testing.assert_array_equal(ours[1], rotation)
-        np.testing.assert_array_equal(ours[2], translation.ravel())
+def test_spread_keypoints_are_as_many_and_farther_apart(drive):
+    frame, few = drive.frame(0), replace(THESIS, max_keypoints=100)
+    everything = keypoints.detect(frame, replace(THESIS, max_keypoints=0))
+    corners = keypoints.detect(frame, replace(THESIS, max_keypoints=0, min_distance=0))
+    spread = keypoints.detect(frame, replace(few, choice="spread"))
+    assert len(spread) == len(everything[:100]) == 100
+    assert {*map(tuple, spread)} <= {*map(tuple, corners)}
+    assert nearest_neighbours(spread).min() > 2 * nearest_neighbours(everything[:100]).min()
+    # the strongest one is always taken, and as many as there are if those are fewer
+    np.testing.assert_array_equal(spread[0], everything[0])
+    all_spread = keypoints.detect(frame, replace(THESIS, max_keypoints=10**6, choice="spread"))
+    np.testing.assert_array_equal(all_spread, everything)
+
+
+def test_a_filled_mask_leaves_no_field_empty(drive):
+    frame, mask = drive.frame(0), np.zeros(drive.size, np.uint8)
+    mask[:, :240] = 255
+    plain = keypoints.detect(frame, THESIS, mask)
+    filled = keypoints.detect(frame, replace(THESIS, fill=3), mask)
+    np.testing.assert_array_equal(filled[: len(plain)], plain)
+    everything = keypoints.detect(frame, replace(THESIS, max_keypoints=0))
+    for row in range(5):
+        for column in range(16):
+            counts = [
+                (points // (30, 32) == (column, row)).all(axis=1).sum()
+                for points in (plain, filled, everything)
+            ]
+            assert counts[1] == max(counts[0], min(3, counts[2])), (row, column, counts)
+    assert nearest_neighbours(filled).min() >= 3
 
 
 # Bad frames are flagged, and the run goes on
 
 
 class Changed(Street):
-    """A copy of a street with some frames replaced.
+    """A copy of a street with some frames replaced, which notes the frames read."""
 
-    It notes the frames read, and stops at one of them if asked to.
-    """
-
-    def __init__(self, sequence, replaced=None, poses=None, frames=None, killed_at=None):
-        self.intrinsics, self.killed_at, self.read = sequence.intrinsics, killed_at, []
+    def __init__(self, sequence, replaced=None, poses=None, frames=None):
+        self.intrinsics, self.read = sequence.intrinsics, []
         self.poses = (sequence.poses if poses is None else poses)[:frames]
         self.images = [
             (replaced or {}).get(index, image) for index, image in enumerate(sequence.images)
@@ -231,8 +229,6 @@ class Changed(Street):
 
     def frame(self, index):
         self.read.append(index)
-        if index == self.killed_at:
-            raise KeyboardInterrupt
         return super().frame(index)
 
 
@@ -252,11 +248,8 @@ def test_black_and_blown_out_frames_are_bridged(drive):
 
 
 @pytest.mark.parametrize("estimator", ["thesis", "inliers", "refined"])
-def test_implausible_motions_are_flagged_and_kept(drive, monkeypatch, estimator):
+def test_too_large_turns_are_flagged_and_kept(drive, monkeypatch, estimator):
     settings = replace(THESIS, estimator=estimator)
-    noise = np.random.RandomState(0).normal(0, 2, drive.frame(0).shape)
-    still = Changed(drive, {5: np.clip(drive.frame(4) + noise, 0, 255).astype(np.uint8)})
-    assert flags(odometry.run(still, settings))[5].endswith("no parallax")
     plain = odometry.run(drive, settings)
     monkeypatch.setattr(odometry.odometry, "MAX_TURN", 0.05)
     flagged = odometry.run(drive, settings)
@@ -301,18 +294,31 @@ def test_too_few_correspondences_keep_the_pose(drive, count, reason):
     assert not result.frames["updated"].any()
 
 
-def test_no_essential_matrix_keeps_the_pose(drive, monkeypatch):
-    odometry.odometry.warm_up(refined=False)
-    real, outcomes = pose.ransac.find_essential_matrix, iter(range(1, 10))
+def test_no_essential_matrix_keeps_the_pose(drive):
+    outcomes = iter(range(1, 10))
 
     def failing(*arguments):
-        return (None, None) if next(outcomes) == 3 else real(*arguments)
+        return (None, None) if next(outcomes) == 3 else OPENCV.find_essential_matrix(*arguments)
 
-    monkeypatch.setattr(pose.ransac, "find_essential_matrix", failing)
-    result = odometry.run(drive)
+    calls = OPENCV._replace(find_essential_matrix=failing)
+    result = odometry.run(drive, calls=calls)
     assert flags(result) == {3: "no essential matrix"}
     np.testing.assert_array_equal(result.poses[3], result.poses[2])
     assert result.frames["updated"][[2, 4, 6]].all()
+
+
+def test_own_matches_take_the_places_of_opencvs_calls(drive):
+    """The true motion of points in the distance, in place of the tracker."""
+    few = Changed(drive, frames=4)
+
+    def exact_track(previous, current, points, settings):
+        tracked, found = OPENCV.track(previous, current, points, settings)
+        return tracked, found & (points[:, 0] > 100)
+
+    result = odometry.run(few, calls=OPENCV._replace(track=exact_track))
+    plain = odometry.run(few)
+    assert (result.frames["tracked"] < plain.frames["tracked"])[1:].all()
+    assert metrics.rmse(result.poses, few.poses) < 0.05
 
 
 def standing(drive):
@@ -356,7 +362,7 @@ def test_inliers_of_shuffled_points_are_in_their_order(drive):
     step = follower.step(drive.frame(1), 0.4)
     matrix = np.cross(np.eye(3), step.motion.translation).T @ step.motion.rotation
     current, previous = (
-        np.c_[pose.normalise(side, drive.intrinsics), np.ones(len(side))]
+        np.c_[normalise(side, drive.intrinsics), np.ones(len(side))]
         for side in (step.current, step.previous)
     )
     lines, others = current @ matrix.T, previous @ matrix
@@ -378,13 +384,12 @@ def test_another_detector_follows_the_drive(drive):
 SETTINGS = {
     "thesis": THESIS,
     "tracked on": replace(THESIS, redetect_below=10),
-    "fallback": replace(THESIS, fallback=True),
     "refined": replace(THESIS, estimator="refined"),
 }
 
 
 def arrays_of(step):
-    motion = step.motion.rotation, step.motion.translation, step.motion.inliers
+    motion = step.motion.rotation, step.motion.translation, step.inliers
     arrays = step.pose, step.keypoints, step.previous, step.current, *motion
     return [array for array in arrays if array is not None]
 
@@ -409,7 +414,7 @@ def test_a_step_does_not_depend_on_arrays_of_the_caller(drive, settings):
     ids=["copy", "deepcopy", "pickle"],
 )
 def test_a_copy_goes_on_with_the_same_bits(drive, copied):
-    first = Odometry(drive.intrinsics, replace(SMALL, estimator="refined", fallback=True))
+    first = Odometry(drive.intrinsics, replace(SMALL, estimator="refined"))
     masks = Stripes(40)
     for index in range(3):
         first.step(drive.frame(index), 0.4, masks[index])
@@ -471,24 +476,22 @@ class Counted(Stripes):
 
 
 def test_runs_of_one_tracking_share_masks_and_essential_matrices(drive, monkeypatch):
-    estimated = []
+    searched = []
     stripes, few = Counted(20), Changed(drive, frames=6)
     runs = {
-        (order, estimator): (replace(THESIS, shuffle_seed=order, estimator=estimator), stripes)
-        for order in (None, 1)
+        (seed, estimator): (replace(THESIS, shuffle_seed=seed, estimator=estimator), stripes)
+        for seed in (None, 1)
         for estimator in ("thesis", "refined")
     }
-    for _, estimator in runs:
-        odometry.odometry.warm_up(estimator == "refined")  # it estimates essential matrices too
-    original = pose.essential_matrix
+    original = sharing.opencv_exact.find_essential_matrix
 
     def counting(*arguments):
-        estimated.append(1)
+        searched.append(1)
         return original(*arguments)
 
-    monkeypatch.setattr(pose, "essential_matrix", counting)
+    monkeypatch.setattr(sharing.opencv_exact, "find_essential_matrix", counting)
     together = odometry.run_many(few, runs)
-    assert stripes.asked == list(range(len(few))) and len(estimated) == 2 * (len(few) - 1)
+    assert stripes.asked == list(range(len(few))) and len(searched) == 2 * (len(few) - 1)
     for name, (settings, masks) in runs.items():
         assert_same(together[name], odometry.run(few, settings, masks))
     # the refined runs are equal for both orders here, the others differ
@@ -503,40 +506,23 @@ class NewSettings(OdometrySettings):
 
 
 @pytest.mark.parametrize(
-    "setting, value, times",
-    [
-        ("scale_gate", 0.2, 1),  # acts last
-        ("threshold", 0.001, 1),
-        ("quality", 0.02, 2),
-        ("invented", 1, 2),
-    ],
+    "setting, value, times", [("threshold", 0.001, 1), ("quality", 0.02, 2), ("invented", 1, 2)]
 )
-def test_runs_share_nothing_if_a_setting_differs_that_may_matter(drive, setting, value, times):
-    few, stripes = Changed(drive, frames=3), Counted(20)
-    settings = NewSettings(max_keypoints=300)
-    runs = {
-        "first": (settings, stripes),
-        "second": (replace(settings, **{setting: value}), stripes),
-    }
+def test_runs_share_no_keypoints_if_a_setting_differs_that_may_matter(
+    drive, monkeypatch, setting, value, times
+):
+    few, settings = Changed(drive, frames=3), NewSettings(max_keypoints=300)
+    searched = []
+    original = sharing.keypoints.detect
+
+    def counting(*arguments):
+        searched.append(1)
+        return original(*arguments)
+
+    monkeypatch.setattr(sharing.keypoints, "detect", counting)
+    runs = {"first": (settings, None), "second": (replace(settings, **{setting: value}), None)}
     odometry.run_many(few, runs)
-    assert len(stripes.asked) == times * len(few)
-
-
-def test_a_killed_pass_resumes_with_the_same_bits(drive, tmp_path, monkeypatch):
-    monkeypatch.setattr(odometry.passes, "CHECKPOINT", 4)
-    file = tmp_path / "state"
-    runs = {
-        name: run
-        for name, run in variants().items()
-        if name in ("all", "stripes-20", "kept", "refined")
-    }
-    with pytest.raises(KeyboardInterrupt):
-        odometry.run_many(Changed(drive, killed_at=6), runs, checkpoint=file)
-    resumed_drive = Changed(drive)
-    resumed = odometry.run_many(resumed_drive, runs, description="street", checkpoint=file)
-    assert resumed_drive.read == [4, 5, 6, 7, 8, 9]
-    for name, (settings, masks) in runs.items():
-        assert_same(resumed[name], odometry.run(drive, settings, masks))
+    assert len(searched) == times * len(few)
 
 
 @pytest.mark.parametrize(
@@ -546,7 +532,7 @@ def test_a_killed_pass_resumes_with_the_same_bits(drive, tmp_path, monkeypatch):
         ("detector", "fast"),
         ("max_keypoints", -1),
         ("threshold", 0.0),
-        ("fallback", "no"),
+        ("choice", "best"),
     ],
 )
 def test_wrong_settings_are_named(setting, value):

@@ -90,7 +90,7 @@ def test_a_script_keeps_its_logging_and_its_style(tmp_path):
         "matplotlib.rcParams['font.size'] = 33\n"
         "stream = io.StringIO()\n"
         "logging.basicConfig(stream=stream, level='INFO', format='%(name)s %(message)s')\n"
-        "from thesis_repro.report import comparison, style, trajectories, video\n"
+        "from thesis_repro.report import comparison, paths, style, video\n"
         "from thesis_repro.running import results\n"
         "with style.applied():\n"
         "    style.write_figure(style.new_figure()[0], 'figure.svg')\n"

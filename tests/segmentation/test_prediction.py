@@ -8,12 +8,12 @@ import keras
 import numpy as np
 import pytest
 
+from thesis import domain_gap
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError
 from thesis_repro.running import files, results
 from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.study import domain_gap
 
 pytestmark = pytest.mark.slow
 

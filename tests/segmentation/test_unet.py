@@ -1,7 +1,7 @@
 import pytest
 
+from thesis.captions import REPORTED
 from thesis_repro.errors import InputError
-from thesis_repro.report.captions import REPORTED
 from thesis_repro.segmentation.unet import build_unet, summary_rows
 
 FIGURE = REPORTED["figure_a1_model_summary"]

@@ -13,12 +13,12 @@ from trials import contents
 
 from street_world import dataset, drives, raster, street, textures
 from street_world.things import Faces
+from thesis import ablations
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.running.settings import PROFILES
-from thesis_repro.study import ablations
 
 pytestmark = pytest.mark.slow
 

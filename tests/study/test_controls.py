@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from street import Street, Stripes
 
+from thesis import ablations
 from thesis_repro import masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
-from thesis_repro.study import ablations, compare, controls, runner, thesis_tables
+from thesis_repro.study import compare, controls, runner, thesis_tables
 from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
 

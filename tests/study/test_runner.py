@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from thesis import timing
 from thesis_repro import masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
 from thesis_repro.running import messages
 from thesis_repro.segmentation import prediction, training
-from thesis_repro.study import compare, controls, runner, thesis_tables, timing, workers
+from thesis_repro.study import compare, controls, runner, thesis_tables, workers
 from thesis_repro.study.jobs import Job, first_jobs, reduced_jobs
 from thesis_repro.study.sources import Source
 

@@ -32,10 +32,7 @@ ODOMETRY = "odometry --kitti kitti --sequence 00 --output out/path.txt"
 LABELLED, MASKED = f"{ODOMETRY} --labels labels --dilation 3", f"{ODOMETRY} --masks masks"
 MASKS = "masks --kitti kitti --sequence 00 --labels labels --dilation 3 --output out"
 STUDY = "study --kitti kitti --labels labels --output out"
-EVALUATE, PREDICT = (
-    "evaluate --kitti kitti --sequence 00 path.txt",
-    "predict --images kitti/sequences/00 --output out",
-)
+PREDICT = "predict --images kitti/sequences/00 --output out"
 MODEL = f"{PREDICT} --model a.keras"
 NOISE = np.random.default_rng(0).integers(0, 256, (48, 64), np.uint8)
 
@@ -131,7 +128,6 @@ BROKEN = [
         },
     ),
     (ODOMETRY, TIMES, {"too few": b"0\n1\n"}),
-    (EVALUATE, "path.txt", {"missing": None, "too few": IDENTITY}),
     (
         MODEL,
         "a.keras",
@@ -165,7 +161,6 @@ REFUSED = [
 {ODOMETRY} --tum kitti/sequences/00/../new.txt -> ../new.txt
 odometry --sequence kitti/sequences/00 --output kitti/poses/07.txt -> poses/07.txt
 {MASKED} --video masks/new.mp4 -> masks/new.mp4
-{EVALUATE} --plot kitti/new.png -> kitti/new.png
 {MASKS[:-3]}kitti/masks -> --output kitti/masks
 predict --images kitti/sequences/00 --output kitti/sequences/99 -> kitti/sequences/99
 study --kitti kitti --labels labels --output labels/study -> labels/study
@@ -188,9 +183,7 @@ MISUSED = [
     ("odometry --kitti '' --sequence 00", "--kitti"),
     ("odometry --frames=1.5", "--frames"),
     ("odometry --speed fast", "--speed"),
-    ("evaluate path.txt --align most", "--align"),
     ("odometry --symmetric=yes", "--symmetric"),
-    ("evaluate path.txt --frames some", "--frames"),
     ("study --widths 5-1", "--widths"),
     (f"{LABELLED} --masks masks", "--masks"),
     (f"{STUDY} --jobs 0", "--jobs"),

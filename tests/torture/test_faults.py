@@ -248,7 +248,6 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
             "--plot",
             out / "$_$.png",
         ],
-        ["evaluate", *where, out / "p'$_$.txt", out / "q<script>.txt", "--plot", out / "both.svg"],
         ["check-data", "--kitti", root / "kitti", "--deep"],
         [
             "study",

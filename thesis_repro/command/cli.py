@@ -3,24 +3,22 @@
 import json
 import os
 import shlex
-import signal
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, replace
 from importlib import import_module
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
 from thesis_repro.errors import InputError, missing_package, one_line
 from thesis_repro.running import messages
-from thesis_repro.running.settings import PROFILES, SEED, check_outside
+from thesis_repro.running.settings import ALL_WIDTHS, PROFILES, SEED
 
 # options that name an output file: its content, and the endings that its name may have (none given:
 # any)
-OUTPUT_FILES = {
+OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "output": ("poses in KITTI format", ()),
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
@@ -46,19 +44,13 @@ def synthesize(options: Any) -> None:
 
 
 def check_data(options: Any) -> int:
-    """Check folders of KITTI, Cityscapes or KITTI's street scenes.
-
-    Says what they hold, what is damaged, and what can be run.
-    """
+    """Check folders of KITTI, Cityscapes or KITTI's street scenes for damage."""
     from thesis_repro import checks
 
     roots = options.kitti, options.cityscapes, options.kitti_semantic
     if not any(roots):
-        raise InputError(
-            "no folder to check: give --kitti (make: KITTI=), --cityscapes or --kitti-semantic"
-        )
-    is_complete = checks.report(*roots)
-    return int(not is_complete)
+        raise InputError("no folder to check: give --kitti, --cityscapes or --kitti-semantic")
+    return int(not checks.report(*roots))
 
 
 def predict(options: Any) -> None:
@@ -67,7 +59,6 @@ def predict(options: Any) -> None:
     Label maps hold Cityscapes ids as 8-bit PNG, 320x320, named like the frames.
     """
     from thesis_repro.segmentation import quietly
-    from thesis_repro.study import workers
 
     images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
     # the name of a link, not of what it points to, because `study` looks for this name
@@ -82,20 +73,15 @@ def predict(options: Any) -> None:
         if has_subfolders:
             output /= name
         sequences.append((paths[: options.frames], output))
-    image_folders = [paths[0].parent for paths, _ in sequences]
-    _check_outputs(options, *options.images, *image_folders, options.model)
+    _check_outputs(options, *options.images)
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
     model_file = options.model or prediction.SHIPPED
     with messages.logged(options.folder, options.command_line) as run:
         new = 0
-        if options.dask:
-            with workers.open_pool(1, options.dask) as pool:
-                new = prediction.spread_label_maps(pool.run, model_file, sequences)
-        else:
-            model = training.load_model(model_file)
-            for paths, output in sequences:
-                new += prediction.write_label_maps(model, paths, output)
+        model = training.load_model(model_file)
+        for paths, output in sequences:
+            new += prediction.write_label_maps(model, paths, output, scale=float(options.scale))
         total = sum(len(paths) for paths, _ in sequences)
         lines = [f"{output}: {len(paths)} label maps" for paths, output in sequences]
         run.end("\n".join(lines), total - new)
@@ -106,7 +92,7 @@ def masks(options: Any) -> None:
 
     Masks are 8-bit PNG images: 255 keeps keypoints, 0 ignores them.
     """
-    from thesis_repro.masks import LabelMasks, write_masks
+    from thesis_repro.mask_files import LabelMasks, write_masks
 
     sequence, settings = _sequence(options), _mask_settings(options)
     if not options.dilation and settings.keep != "static":
@@ -115,7 +101,7 @@ def masks(options: Any) -> None:
         LabelMasks(options.labels, sequence, width, settings)
         for width in sorted(set().union(*options.dilation or [(1,)]))
     ]
-    _check_outputs(options, options.labels, sequence.folder, sequence.frame_paths[0].parent)
+    _check_outputs(options, options.labels, sequence.folder)
     _warn(_check_masks(sequence, mask_sets))
     for label_masks in mask_sets:
         width = label_masks.dilation_width
@@ -129,12 +115,11 @@ def masks(options: Any) -> None:
 
 def odometry(options: Any) -> None:
     """Run the visual odometry on one sequence; print its errors, number of keypoints and time."""
-    _load_evo()
+    with redirect_stdout(sys.stderr):  # evo prints a line when it first writes its own settings
+        import_module("evo.main_ape")
     from thesis_repro import checks, odometry
-    from thesis_repro.data import kitti
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
-    from thesis_repro.report.record import run_record
 
     changes = {}
     for field in fields(odometry.OdometrySettings):
@@ -147,37 +132,29 @@ def odometry(options: Any) -> None:
     mask_sets = []
     if masks:
         mask_sets = [masks]
-    _check_outputs(
-        options,
-        sequence.poses_path,
-        *kitti.texts_of(sequence.folder, sequence.frame_paths[0].parent),
-        options.masks,
-        options.labels,
-        sequence.folder,
-        sequence.frame_paths[0].parent,
-    )
+    _check_outputs(options, sequence.poses_path, options.masks, options.labels, sequence.folder)
     _warn(_check_masks(sequence, mask_sets))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
         write_kitti_poses(options.output, result.poses)
     if options.tum:
         write_tum(options.tum, result.poses, sequence.times)
-    counts = result.failed_steps, result.dropped_steps
-    _warn(checks.of_run(sequence.name, len(sequence), *counts, settings.scale_gate))
-    record = run_record(result, sequence)
+    steps = len(sequence), result.failed_steps, result.dropped_steps
+    _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
+    record = _record(result, sequence)
     if options.video:
         from thesis_repro.report import video
 
         video.write_video(options.video, sequence, settings, masks)
     if options.plot:
-        from thesis_repro.report import style, trajectories
+        from thesis_repro.report import paths, style
 
         truth, poses = None, result.poses
         if sequence.has_truth:
             truth = sequence.poses
             poses = metrics.shifted(poses, truth)
         with style.applied():
-            drawing = trajectories.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
+            drawing = paths.figure({"estimate": poses}, truth, f"sequence {sequence.name}")
             style.write_figure(drawing, options.plot)
     _print(
         options,
@@ -190,13 +167,9 @@ def odometry(options: Any) -> None:
 
 
 def study(options: Any) -> int:
-    """Compare your own label maps or masks with all keypoints and with controls.
-
-    Writes tables, figures and a page.
-    """
+    """Compare your own label maps or masks with all keypoints and with controls."""
     from thesis_repro.data import kitti
     from thesis_repro.running import results
-    from thesis_repro.running.settings import ALL_WIDTHS, cores
     from thesis_repro.study import sources
     from thesis_repro.study.study import Study
 
@@ -226,6 +199,7 @@ def study(options: Any) -> int:
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
         options.frames,
+        options.scale_gate,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -238,80 +212,60 @@ def study(options: Any) -> int:
         for sequence, masks in planned.shown_masks():
             warnings += _check_masks(sequence, masks)
         warnings = _warn(warnings)
-        outcome = planned.run(folder, options.jobs or cores(), options.dask)
-        warnings += outcome.warnings + _warn(planned.run_warnings(outcome.table))
+        outcome = planned.run(folder, options.jobs, options.dask)
+        warnings += outcome.warnings + _warn(_check_runs(outcome.table))
         page = study.write(planned, outcome.table, folder, warnings)
         failed = ""
-        if outcome.failed:
-            failed = f", {outcome.failed:,} failed (see above)"
+        if outcome.failed_jobs:
+            failed = f", {outcome.failed_jobs:,} failed (see above)"
         run.end(f"{len(outcome.table):,} runs{failed}; open {page} in a browser", outcome.kept)
     return int(bool(failed))
 
 
-def evaluate(options: Any) -> None:
-    """Compare trajectories with the ground truth.
-
-    Prints the thesis's RMSE and MAE, ATE, RPE, KITTI's t_rel and r_rel.
-    """
-    _load_evo()
-    from thesis_repro.checks import oddities
-    from thesis_repro.data.kitti import true_path
-    from thesis_repro.report import style, trajectories
-
-    sequences = trajectories.by_sequence(options.poses, options.kitti, options.sequence)
-    if options.plot and len(sequences) > 1:
-        raise InputError("--plot: shows only one sequence; name it with --sequence")
-    _check_outputs(options, *options.poses)
-    rows, matching = [], {"offset": options.t_offset}
-    if options.t_max_diff is not None:
-        matching["max_difference"] = options.t_max_diff
-    for sequence, files in sequences.items():
-        truth, times = true_path(options.kitti, sequence)
-        _warn(oddities.of_truth(sequence, truth, times))
-        paths = {
-            name: trajectories.read(file, times, options.frames, **matching)
-            for name, file in files.items()
-        }
-        truth = truth[: options.frames]
-        for name, (matched, poses) in paths.items():
-            _warn(
-                oddities.of_path(
-                    name, poses, truth[matched], options.align not in ("sim3", "scale")
-                )
-            )
-        rows += trajectories.evaluate(paths, truth, options.align, sequence)
-    if options.plot:
-        with style.applied():
-            drawing = trajectories.figure(
-                trajectories.aligned(paths, truth, options.align),
-                truth,
-                f"sequence {sequence}",
-                {name: matched for name, (matched, _) in paths.items()},
-            )
-            style.write_figure(drawing, options.plot)
-    rows += list(trajectories.means(rows))
-    _print(
-        options,
-        rows,
-        "evaluate.txt.j2",
-        alignment=options.align,
-        table=trajectories.table(rows, options.align),
-    )
-
-
 COMMANDS = {
     function.__name__.replace("_", "-"): function
-    for function in (synthesize, check_data, predict, masks, odometry, study, evaluate)
+    for function in (synthesize, check_data, predict, masks, odometry, study)
 }
 
 
 # Helpers of several commands
 
 
-def _load_evo() -> None:
-    """Import evo, which prints a line when it first writes its settings into the home folder."""
-    with redirect_stdout(sys.stderr):
-        import_module("evo.main_ape")
+# the errors of `metrics.errors`, in its order, with their units
+ERRORS = (
+    "rmse_m",
+    "mae_m",
+    "ate_se3_m",
+    "relative_translation_percent",
+    "relative_rotation_deg_per_100m",
+)
+
+
+def _record(result: Any, sequence: Any) -> dict[str, Any]:
+    """Return the errors, keypoints, time and flags of an `odometry.Result`.
+
+    An error that is not determined is None.
+    """
+    from thesis_repro.odometry import metrics
+
+    errors: dict[str, float | None] = dict.fromkeys(ERRORS)
+    if sequence.has_truth:
+        values = metrics.errors(result.poses, sequence.poses).values()
+        measured = dict(zip(ERRORS, values, strict=True))
+        errors |= {name: value for name, value in measured.items() if value == value}  # not NaN
+    mean_keypoints = 0.0
+    detected = result.frames["detected"].dropna()
+    if len(detected):  # no frame may have structure
+        mean_keypoints = float(detected.mean())
+    seconds = result.frames.filter(like="_seconds").sum(axis=1)
+    return {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        **errors,
+        "mean_keypoints": mean_keypoints,
+        "ms_per_frame": 1000 * float(seconds.mean()),
+        "flagged": {flag: int(count) for flag, count in result.flagged.items()},
+    }
 
 
 def _sequence(options: Any) -> Any:
@@ -334,8 +288,18 @@ def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     warnings = checks.of_sequence(sequence)
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
-            messages.log.info(one_line(checks.describe_masks(masks, sequence)))
+            messages.log.info(checks.describe_masks(masks, sequence))
             warnings += checks.of_masks(masks, sequence)
+    return warnings
+
+
+def _check_runs(runs: Any) -> list[str]:
+    """Return warnings of the first run of each sequence. runs: the table of a study."""
+    from thesis_repro import checks
+
+    warnings = []
+    for run in runs[runs["method"] == "baseline"].drop_duplicates("sequence").itertuples():
+        warnings += checks.of_run(run.sequence, run.frames, run.flagged)
     return warnings
 
 
@@ -347,7 +311,7 @@ def _warn(lines: Iterable[str]) -> list[str]:
         places.setdefault(fault, []).append(place)
     merged = [f"{', '.join(names)}: {fault}" for fault, names in places.items()]
     for line in merged:
-        messages.log.warning(one_line(line))
+        messages.log.warning(line)
     return merged
 
 
@@ -400,7 +364,7 @@ def _mask_settings(options: Any, has_labels: bool = True) -> Any:
 
 def _masks(options: Any, sequence: Any) -> Any:
     """The masks that --masks or --labels name, or None."""
-    from thesis_repro.masks import LabelMasks, MaskFolder
+    from thesis_repro.mask_files import LabelMasks, MaskFolder
 
     settings = _mask_settings(options, options.labels)
     if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
@@ -422,39 +386,27 @@ def _output_files(options: Any) -> dict[str, Path]:
 
 
 def _check_outputs(options: Any, *inputs: Path | None) -> None:
-    """Raise InputError if an output cannot be written, or would overwrite or mix with inputs.
+    """Raise InputError, before anything runs, for an output that cannot be written.
 
-    It is called before anything runs.
+    Data is only read: no output may lie in a folder of it.
     """
-    from thesis_repro.running.files import check_output
-
-    data = [path for path in (vars(options).get("kitti"), *inputs) if path]
-    for path in list(data):
-        data += _layout_around(path.resolve())
-    folder, used = vars(options).get("folder"), set()
-    if folder:
-        check_outside(f"--output {folder}", folder, data)
-        if any(path.resolve().is_relative_to(folder.resolve()) for path in data):
-            raise InputError(f"--output {folder}: holds input of this command; name another folder")
-    for name, path in _output_files(options).items():
+    data = [path.resolve() for path in (vars(options).get("kitti"), *inputs) if path]
+    outputs = _output_files(options)
+    for name, path in outputs.items():
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
-        check_output(path)
-        check_outside(f"--{name} {path}", path, data)
-        if path.resolve() in used:
-            raise InputError(f"--{name} {path}: is another output of this command; name another")
-        used.add(path.resolve())
-
-
-def _layout_around(path: Path) -> list[Path]:
-    """Return the folders sequences and poses of the KITTI layout that holds a sequence, or []."""
-    from thesis_repro.data import kitti
-
-    for inner, folder in pairwise([path, *path.parents]):
-        if folder.name == "sequences" and inner.is_dir() and kitti.has_frames(inner):
-            return [folder, folder.with_name("poses")]
-    return []
+    for path in filter(None, [vars(options).get("folder"), *outputs.values()]):
+        for folder in data:
+            if path.resolve().is_relative_to(folder):
+                raise InputError(
+                    f"{path}: lies in {folder}, which is only read; name another place"
+                )
+        parent = path.absolute().parent
+        while not parent.exists():
+            parent = parent.parent
+        if not os.access(parent, os.W_OK):
+            raise InputError(f"{path}: {parent} may not be written to; name another place")
 
 
 def _print(options: Any, record: Any, template: str, **values: Any) -> None:
@@ -466,49 +418,21 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
         text = texts.render(template, record=record, **values).rstrip()
     print(text)
     for name, path in _output_files(options).items():
-        messages.log.info(one_line(f"{path}: {OUTPUT_FILES[name][0]}"))
-
-
-def _replace_closed_streams() -> None:
-    for stream in ("stdout", "stderr"):
-        if getattr(sys, stream) is None:
-            null = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  stays open as the stream
-            setattr(sys, stream, null)
+        messages.log.info(f"{path}: {OUTPUT_FILES[name][0]}")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    _replace_closed_streams()
     if arguments is None:
         arguments = sys.argv[1:]
     options = build_parser(COMMANDS).parse_args(arguments)
     options.command_line = shlex.join(["thesis-repro", *arguments])
-    messages.print_messages()
-    try:
+    os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
+
+    def command() -> object:
         try:
-            os.getcwd()
-        except FileNotFoundError:
-            raise InputError("the working folder was deleted; change to another one") from None
-        with messages.stoppable():
-            messages.check_environment()
-            gigabytes = 2
-            if options.function is predict:
-                gigabytes = 4
-            messages.need_addresses(gigabytes)
-            code = options.function(options) or 0
-            sys.stdout.flush()
-            return code
-    except BrokenPipeError:  # the reader of the output has ended, such as head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
-    except ImportError as error:
-        return messages.report_error(missing_package(error) or error)
-    except Exception as error:
-        return messages.report_error(error)
-    except KeyboardInterrupt as stop:
-        with suppress(OSError):  # the terminal may be gone
-            print("stopped; run the same command again to resume", file=sys.stderr)
-        number = signal.SIGINT
-        if stop.args:
-            number = stop.args[0]
-        return 128 + number
+            return options.function(options)
+        except ImportError as error:
+            raise missing_package(error) or error from None
+
+    return messages.run(command)

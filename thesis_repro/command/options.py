@@ -1,68 +1,15 @@
 """The options of the command line. cli.py has the commands."""
 
 import argparse
-import shlex
-import textwrap
 from collections.abc import Callable
-from functools import partial
+from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from thesis_repro.errors import InputError, one_line
-from thesis_repro.running.settings import (
-    PROFILES,
-    number,
-    read_frames,
-    read_widths,
-    scheduler_address,
-)
+from thesis_repro.running import settings
 
-
-class _Parser(argparse.ArgumentParser):
-    """An ArgumentParser with one-line errors and without abbreviated options.
-
-    It refuses empty paths.
-    """
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(allow_abbrev=False, **options)
-        self.register("type", Path, _path)
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"error: {one_line(message)}; see {self.prog} --help\n")
-
-
-def _path(text: str) -> Path:
-    if not text.strip():
-        raise argparse.ArgumentTypeError("is empty; name a file or a folder")
-    return Path(text)
-
-
-def _setting(read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Let argparse show the InputError of a function that reads an option.
-
-    By itself it would say "invalid value".
-    """
-
-    def read_text(text: str) -> Any:
-        try:
-            return read(text)
-        except InputError as error:
-            raise argparse.ArgumentTypeError(error) from None
-
-    return read_text
-
-
-def _compared_estimator(text: str) -> str:
-    from thesis_repro.study.jobs import ESTIMATORS  # here, because this import takes a second
-
-    if text not in ESTIMATORS:
-        raise InputError(f"{text!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
-    return text
-
-
-# options of several commands
+# options of several commands, as arguments of argparse's `add_argument`
 SHARED: dict[str, dict[str, Any]] = {
     "--kitti": dict(
         type=Path,
@@ -75,38 +22,29 @@ SHARED: dict[str, dict[str, Any]] = {
         help="00 to 21, or without --kitti a raw drive of KITTI or a folder with your own frames",
     ),
     "--frames": dict(
-        type=_setting(read_frames),
+        type=settings.number_of_frames,
         metavar="N|all",
-        help="use the first N frames of a sequence, >= 5 (all)",
+        help="use the first N frames of a sequence (all)",
     ),
     "--camera": dict(
         metavar="image_N",
         help="folder of the frames (image_0, or else image_2, read as gray; in a raw drive image_00, ...)",
     ),
-    "--cityscapes": dict(
-        type=Path, metavar="ROOT", help="Cityscapes folder (leftImg8bit/, gtFine/ or train/, ...)"
-    ),
     "--output": dict(
         type=Path, dest="folder", required=True, metavar="DIR", help="folder for all results"
-    ),
-    "--plot": dict(
-        type=Path, metavar="FILE", help="draw the paths and their errors (.png, .svg, .pdf, .jpg)"
-    ),
-    "--json": dict(action="store_true", help="print JSON instead of text"),
-    "--sequences": dict(
-        nargs="+", action="extend", default=[], metavar="NN", help="sequences to run (all in ROOT)"
     ),
     "--invert": dict(
         action="store_true", help="for --masks in which 0 keeps and other values ignore keypoints"
     ),
-    "--dask": dict(
-        type=_setting(scheduler_address),
-        metavar="ADDRESS",
-        help="run on the workers of a Dask scheduler, tcp://host:8786, with the same results",
+    "--scale-gate": dict(
+        type=float,
+        default=0.1,
+        metavar="METRES",
+        help="a shorter step leaves the pose as it is; 0 for slow cameras and many frames a second (0.1)",
     ),
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
-WIDTHS = dict(type=_setting(read_widths), nargs="+", action="extend", metavar="W,W")
+WIDTHS = dict(type=settings.list_of_widths, nargs="+", action="extend", metavar="W,W")
 MASK_OPTIONS: dict[str, dict[str, Any]] = {
     "--boundaries": dict(
         metavar="canny|exact",
@@ -170,17 +108,8 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     """
     name, equals, folder = text.partition("=")
     if not equals or "/" in name or Path(text).is_dir():
-        return None, _path(text)
-    # a shell replaces "~" only at the start of a word
-    return name, _path(folder).expanduser()
-
-
-def _refuse_name(text: str) -> NoReturn:
-    """Raise InputError for the option --name, which had to stand in the order of the folders."""
-    raise InputError(
-        f"a name stands before its folder now: --labels {shlex.quote(text)}=FOLDER, "
-        f"or --masks {shlex.quote(text)}=FOLDER"
-    )
+        return None, Path(text)
+    return name, Path(folder).expanduser()  # a shell replaces "~" only at the start of a word
 
 
 # the arguments of `add_argument` for each option of each command
@@ -189,20 +118,23 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "out": dict(
             type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
         ),
-        "--profile": dict(choices=tuple(PROFILES), default="demo", help="size of the world (demo)"),
+        "--profile": dict(
+            choices=tuple(settings.PROFILES), default="demo", help="size of the world (demo)"
+        ),
     },
     "check-data": {
-        **_shared("--kitti", "--cityscapes"),
+        **_shared("--kitti"),
+        "--cityscapes": dict(
+            type=Path,
+            metavar="ROOT",
+            help="Cityscapes folder (leftImg8bit/, gtFine/ or train/, ...)",
+        ),
         "--kitti-semantic": dict(
             type=Path, metavar="ROOT", help="folder of KITTI's street scenes: train/, trainannot/"
         ),
-        "--deep": dict(
-            action="store_true",
-            help="decode every file, on all cores, not only check its header and end",
-        ),
     },
     "predict": {
-        **_shared("--frames", "--dask", "--output"),
+        **_shared("--frames", "--output"),
         "--images": dict(
             type=Path,
             nargs="+",
@@ -215,6 +147,12 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             type=Path,
             metavar="FILE",
             help="trained model, .keras or .hdf5 (the model in the package)",
+        ),
+        "--scale": dict(
+            type=Fraction,
+            default=1,
+            metavar="FACTOR",
+            help="multiply gray values, 0 to 255, by this; 1/255 for a model that wants 0 to 1 (1)",
         ),
     },
     "masks": {
@@ -234,7 +172,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
     "odometry": {
         **_shared(*SEQUENCE),
         **MASK_OPTIONS,
-        **_shared("--invert", "--plot", "--json"),
+        **_shared("--invert", "--scale-gate"),
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
         ),
@@ -262,9 +200,6 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="shi-tomasi|orb",
             help="keypoint detector; the tracker stays the same (shi-tomasi)",
         ),
-        "--fallback": dict(
-            action="store_true", default=None, help="use all keypoints where masked ones fail"
-        ),
         "--max-keypoints": dict(
             type=int, metavar="N", help="maximum number of keypoints in a frame (2000)"
         ),
@@ -272,20 +207,32 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
         ),
         "--tum": dict(type=Path, metavar="FILE", help="write the estimated poses in TUM format"),
+        "--plot": dict(
+            type=Path,
+            metavar="FILE",
+            help="draw the paths and their errors (.png, .svg, .pdf, .jpg)",
+        ),
         "--video": dict(
             type=Path,
             metavar="OUT.webm",
             help="write a video of the frames, the keypoints and the path",
         ),
+        "--json": dict(action="store_true", help="print JSON instead of text"),
     },
     "study": {
         "--kitti": SHARED["--kitti"] | {"required": True},
-        **_shared("--sequences", "--frames", "--invert"),
+        "--sequences": dict(
+            nargs="+",
+            action="extend",
+            default=[],
+            metavar="NN",
+            help="sequences to run (all in ROOT)",
+        ),
+        **_shared("--frames", "--invert", "--scale-gate"),
         **MASK_OPTIONS,
         **_shared("--output"),
         "--labels": _source("labels", "label maps, any size"),
         "--masks": _source("masks", "masks, 255 keeps keypoints, 0 ignores them"),
-        "--name": dict(type=_setting(_refuse_name), help=argparse.SUPPRESS),
         "--widths": dict(
             **WIDTHS,
             help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",
@@ -298,64 +245,38 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             help="run controls, too, for masks of width W (10)",
         ),
         "--repetitions": dict(
-            type=int, default=5, metavar="N", help="shuffles of the matched points for each run (5)"
+            type=settings.positive_whole_number,
+            default=5,
+            metavar="N",
+            help="shuffles of the matched points for each run (5)",
         ),
         "--estimator": dict(
             nargs="+",
-            type=_setting(_compared_estimator),
-            metavar="thesis|refined",
+            choices=("thesis", "refined"),
             default=["thesis"],
             help="one or both (thesis)",
         ),
         "--jobs": dict(
-            type=_setting(partial(number, "JOBS")),
+            type=settings.positive_whole_number,
+            default=settings.cores(),
             metavar="N",
             help="number of processes (number of cores)",
         ),
-        **_shared("--dask"),
-    },
-    "evaluate": {
-        **_shared("--kitti"),
-        "--sequence": dict(
-            metavar="NN", help="sequence of the files; of folders, evaluate only this sequence"
-        ),
-        **_shared("--frames", "--plot", "--json"),
-        "poses": dict(
-            type=Path,
-            nargs="+",
-            metavar="FILE_OR_DIR",
-            help="trajectory in KITTI format (a line for each frame) or TUM format (matched by time, "
-            "keyframes suffice), or folder with NN.txt or NN.tum for each sequence, which also gets a mean",
-        ),
-        "--align": dict(
-            choices=("none", "se3", "sim3", "scale"),
-            default="none",
-            help="alignment to the ground truth for ATE, RPE (per frame), t_rel (%%) and r_rel (deg/100 m) (none)",
-        ),
-        # named as evo's options
-        "--t_offset": dict(
-            type=float,
-            default=0.0,
-            metavar="SECONDS",
-            help="add this to the times of files in TUM format, such as ROS's (0)",
-        ),
-        "--t_max_diff": dict(
-            type=float,
-            metavar="SECONDS",
-            help="largest difference between the times of a pose and its frame (0.01)",
+        "--dask": dict(
+            metavar="ADDRESS",
+            help="run on the workers of a Dask scheduler, tcp://host:8786, with the same results",
         ),
     },
 }
-# of these options, only one may be given
-EXCLUSIVE = {"odometry": ("--masks", "--labels"), "study": ("--jobs", "--dask")}
 
 
 def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
     """Return the parser. functions: of the commands, by name; their docstrings are the help."""
-    parser = _Parser(
+    parser = argparse.ArgumentParser(
         prog="thesis-repro",
-        description="Keypoint masks from semantic segmentation for monocular visual "
-        "odometry. thesis-repro COMMAND --help shows options, with defaults in parentheses, and examples.",
+        description="Keypoint masks from semantic segmentation for monocular visual odometry. "
+        "thesis-repro COMMAND --help shows options, with defaults in parentheses, and examples.",
+        allow_abbrev=False,
     )
     parser.add_argument(
         "--version", action="version", version=f"thesis-repro {version('thesis-repro')}"
@@ -363,27 +284,20 @@ def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     examples = Path(__file__).with_name("examples.txt").read_text(encoding="utf-8").splitlines()
     for name, function in functions.items():
-        # python -OO leaves docstrings out
-        description = " ".join((function.__doc__ or "").split())
         own_examples = [line for line in examples if line.startswith(f"thesis-repro {name} ")]
         sub = commands.add_parser(
             name,
-            help=description,
-            description=textwrap.fill(description, 80),
+            help=function.__doc__,
+            description=function.__doc__,
             epilog="\n".join(["examples:", *own_examples]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
         )
         sub.set_defaults(function=function)
-        exclusive_names: tuple[str, ...] = ()
-        if name in EXCLUSIVE:
-            exclusive_names = EXCLUSIVE[name]
-            exclusive = sub.add_mutually_exclusive_group()
         mask_options = sub.add_argument_group("how masks are made from label maps")
         for option, arguments in COMMANDS[name].items():
+            group = sub
             if option in MASK_OPTIONS:
-                mask_options.add_argument(option, **arguments)
-            elif option in exclusive_names:
-                exclusive.add_argument(option, **arguments)
-            else:
-                sub.add_argument(option, **arguments)
+                group = mask_options
+            group.add_argument(option, **arguments)
     return parser

@@ -4,10 +4,8 @@ The loop is `Odometry.step`. The rules for frames on which PySLAM would crash, a
 frame can get, are in the table in odometry/__init__.py.
 """
 
-import time
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -118,24 +116,13 @@ def normalise(points: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 # The loop
 
 
-class Estimator(Protocol):
-    """Completes the motion of a step: an essential matrix allows four motions."""
+class VoteOfAll(NamedTuple):
+    """PySLAM's estimator: the motion that most matches vote for, outliers included."""
+
+    calls: Calls = OPENCV
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step.
-
-        scale: metres. moves: whether the step will move the pose.
-        """
-
-
-class VoteOfAll:
-    """The motion that most matches vote for, outliers included, as in PySLAM."""
-
-    def __init__(self, calls: Calls = OPENCV):
-        self.calls = calls
-
-    def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
-        """Return the motion of a step (see Estimator)."""
+        """Return the motion of a step (see types.Estimator)."""
         votes, rotation, translation = self.calls.recover_pose(
             essential, matches.current, matches.previous
         )
@@ -162,7 +149,7 @@ class Odometry:
         self.intrinsics = types.camera_matrix(intrinsics)
         self.settings = settings
         self.calls = calls or OPENCV._replace(detect=settings.detect_function())
-        self.estimator: Estimator = settings.new_estimator(self.calls)
+        self.estimator: types.Estimator = settings.new_estimator(self.calls)
         self.pose = types.start_pose(start)
         self.count = 0  # of frames so far
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
@@ -178,17 +165,17 @@ class Odometry:
         """
         frame = types.gray_frame(frame, self.count, self.intrinsics, self.previous)
         mask = types.allowed_pixels(mask, self.count, frame)
-        step = Step(self.count, types.step_length(scale, self.count))
-        if self.previous is not None:
-            step.scale += self.skipped_metres
+        step = Step(self.count, types.step_length(scale, self.count) + self.skipped_metres)
         self.count += 1
         if frame[::8, ::8].std() < MIN_CONTRAST:
             step.flags.append("flat frame")
             self.skipped_metres = step.scale
         else:
             self.skipped_metres = 0.0
-            self._track(step, frame)
-            self._estimate(step)
+            if step.frame > 0:
+                self._track(step, frame)
+            if step.points:
+                self._estimate(step)
             self._detect(step, frame, mask)
             self.previous = frame
         step.pose = self.pose.copy()
@@ -196,61 +183,57 @@ class Odometry:
 
     def _track(self, step: Step, frame: np.ndarray) -> None:
         """Track the points of the previous frame into this one (Section 3.7.2)."""
-        if step.frame == 0:
-            return
         step.points = len(self.points)
         if step.points == 0:
             step.flags.append("no points")
             return
-        started = time.perf_counter()
-        tracked, was_found = self.calls.track(self.previous, frame, self.points, self.settings)
-        step.seconds["track"] = time.perf_counter() - started
+        with step.timed("track"):
+            tracked, was_found = self.calls.track(self.previous, frame, self.points, self.settings)
         step.previous = self.points[was_found]
         step.current = tracked[was_found]
 
     def _estimate(self, step: Step) -> None:
-        """Estimate the motion from the matches (Section 3.7.3), and move the pose."""
-        if not step.points:
-            return
+        """Estimate the motion from the matched points, and move the pose (Section 3.7.3)."""
         current = normalise(step.current, self.intrinsics)
         previous = normalise(step.previous, self.intrinsics)
-        order = self._order(step)
-        step.matches = Matches(current, previous, self.settings.threshold, order=order)
-        started = time.perf_counter()
-        matrix, inliers = None, None
-        if len(current) >= MIN_MATCHES:
+        threshold = self.settings.threshold
+        order = self.settings.order(step.frame, len(current))
+        step.matches = Matches(current, previous, threshold, order=order)
+        if len(current) < MIN_MATCHES:
+            step.flags.append("fewer than five correspondences")
+            return
+        with step.timed("essential"):
             matrix, inliers = self.calls.find_essential_matrix(
-                current[order], previous[order], self.settings.threshold
+                current[order], previous[order], threshold
             )
-        step.seconds["essential"] = time.perf_counter() - started
-        flag = _flag_of_matrix(matrix, len(current))
-        if flag:
-            step.flags.append(flag)
+        if matrix is None or not np.isfinite(matrix).all():
+            step.flags.append("no essential matrix")
+            return
+        if matrix.shape != (3, 3):  # from five matches, OpenCV returns all solutions in one array
+            step.flags.append("several essential matrices")
             return
         agrees = np.empty(len(current), bool)
         agrees[order] = inliers.ravel() > 0
-        step.matches = replace(step.matches, inliers=agrees)
-        self._complete(step, matrix)
+        step.matches = Matches(current, previous, threshold, agrees, order)
+        agree_by_chance = step.matches.agree_by_chance()
+        moves = step.scale > self.settings.scale_gate and not agree_by_chance
+        with step.timed("pose"):
+            step.motion = self.estimator.motion(matrix, step.matches, step.scale, moves)
+        if moves:
+            self._move(step)
+        elif agree_by_chance:
+            step.flags.append("no agreement")
+        else:
+            step.flags.append(STATIONARY)
 
-    def _complete(self, step: Step, matrix: np.ndarray) -> None:
-        """Complete the motion from an essential matrix, and move the pose (Equations 2.2, 2.3)."""
-        kept = ""
-        if _by_chance(step.inliers):
-            kept = "no agreement"
-        elif step.scale <= self.settings.scale_gate:
-            kept = STATIONARY
-        started = time.perf_counter()
-        step.motion = self.estimator.motion(matrix, step.matches, step.scale, not kept)
-        step.seconds["pose"] = time.perf_counter() - started
-        if kept:
-            step.flags.append(kept)
-            return
+    def _move(self, step: Step) -> None:
+        """Move the pose by the motion over the step's length (Equations 2.2 and 2.3)."""
+        rotation, translation = step.motion.rotation, step.motion.translation
         if step.motion.flag:
             step.flags.append(step.motion.flag)
-        rotation, translation = step.motion.rotation, step.motion.translation
         if np.trace(rotation) < 1 + 2 * np.cos(np.radians(MAX_TURN)):
             step.flags.append("too large a turn")
-        moved = self.pose.copy()
+        moved = np.eye(4)
         moved[:3, :3] = self.pose[:3, :3] @ rotation
         moved[:3, 3] = self.pose[:3, 3] + step.scale * (self.pose[:3, :3] @ translation)
         self.pose = moved
@@ -260,40 +243,11 @@ class Odometry:
         """Replace all points by new keypoints if too few were tracked (Section 3.7.1)."""
         points = step.current
         if len(points) < self.settings.redetect_below or not len(points):
-            started = time.perf_counter()
-            detected = self.calls.detect(frame, self.settings, mask)
-            step.seconds["detect"] = time.perf_counter() - started
+            with step.timed("detect"):
+                detected = self.calls.detect(frame, self.settings, mask)
             step.detected = len(detected)
             if len(detected):
                 points = detected
             else:
                 step.flags.append("no keypoints")
         self.points, step.keypoints = points.copy(), points
-
-    def _order(self, step: Step) -> np.ndarray | slice:
-        """The order in which RANSAC takes the matches, (N,) indices; a slice: as they are."""
-        if self.settings.shuffle_seed is None:
-            return slice(None)
-        random = np.random.default_rng((self.settings.shuffle_seed, step.frame))
-        return random.permutation(len(step.current))
-
-
-def _flag_of_matrix(matrix: np.ndarray | None, matches: int) -> str:
-    """Say why an essential matrix cannot be used; empty if it can."""
-    if matches < MIN_MATCHES:
-        return "fewer than five correspondences"
-    if matrix is None or not np.isfinite(matrix).all():
-        return "no essential matrix"
-    if matrix.shape != (3, 3):  # from five matches, OpenCV returns all solutions in one array
-        return "several essential matrices"
-    return ""
-
-
-def _by_chance(inliers: np.ndarray) -> bool:
-    """Whether there are no more inliers (N booleans) than two unrelated frames have.
-
-    With PySLAM's threshold, two unrelated frames have 7 inliers among 20 points, 9 among 100, 12
-    among 300, and 24 to 43 among 1600. In consecutive real frames, 45 to 85 % of the points are
-    inliers.
-    """
-    return inliers.sum() <= 8 + 0.03 * len(inliers)

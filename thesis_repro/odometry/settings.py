@@ -2,23 +2,37 @@
 
 import math
 import numbers
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from importlib import import_module
 from typing import Any
+
+import numpy as np
 
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import estimators
 
 CHOICES = {
     "detector": ("shi-tomasi", "orb"),
+    "choice": ("strongest", "spread"),
     "mask_mode": ("detect", "filter"),
     "estimator": tuple(estimators.ESTIMATORS),
 }
-# settings that decide which keypoints are found
-DETECTION = ("detector", "max_keypoints", "min_distance", "mask_mode", "quality", "block_size")
+# Settings that do not change which keypoints are found in a frame. Runs that differ in nothing else
+# share keypoints, so a new setting belongs here only if it acts later.
+AFTER_DETECTION = {
+    "redetect_below",
+    "window",
+    "levels",
+    "threshold",
+    "shuffle_seed",
+    "estimator",
+    "scale_gate",
+}
 # {name: (least, most)}
 LIMITS = {
     "max_keypoints": (0, 2**31 - 1),
+    "fill": (0, 1000),
     "min_distance": (0, 10_000),
     "redetect_below": (0, 2**31 - 1),
     "quality": (0, 1),
@@ -41,6 +55,10 @@ class OdometrySettings:
     relative to the strongest one; side of the square over which gradients are summed, pixels.
     window, levels: side of the tracker's window, pixels, and the number of times it halves the
     frame.
+    choice: the "strongest" max_keypoints, as in the thesis, or as many "spread" ones: the strongest
+    that are as far apart as their number allows (keypoints.spread).
+    fill: with a mask, number of keypoints in each of 16 x 5 fields of the frame that is filled up
+    from outside the mask (keypoints.filled). 0: none, as in the thesis.
     mask_mode: "detect" gives the mask to the detector, which returns up to max_keypoints inside it;
     "filter" drops keypoints outside the mask.
     redetect_below: if fewer points than this were tracked into a frame, new keypoints replace all
@@ -59,6 +77,8 @@ class OdometrySettings:
 
     detector: str = "shi-tomasi"
     max_keypoints: int = 2000
+    choice: str = "strongest"
+    fill: int = 0
     min_distance: float = 3
     mask_mode: str = "detect"
     redetect_below: int = 2000
@@ -73,14 +93,22 @@ class OdometrySettings:
 
     def of_detection(self) -> tuple:
         """Return the settings that decide which keypoints are found."""
-        return tuple(getattr(self, name) for name in DETECTION)
+        return tuple(value for name, value in vars(self).items() if name not in AFTER_DETECTION)
 
-    def detect_function(self) -> Any:
-        """Return what finds keypoints: OpenCV's call, or keypoints.detect for other choices."""
-        module = "thesis_repro.odometry.odometry"
+    def order(self, frame: int, matches: int) -> np.ndarray | slice:
+        """Return the order in which RANSAC takes matches, (N,) indices; a slice: as they are."""
+        if self.shuffle_seed is None:
+            return slice(None)
+        return np.random.default_rng((self.shuffle_seed, frame)).permutation(matches)
+
+    def detect_function(self) -> Callable:
+        """Return what finds keypoints: OpenCV's call, or `keypoints.detect` for other choices."""
+        if self.choice == "spread" or self.fill:
+            sharing = import_module("thesis_repro.odometry.sharing")
+            return sharing.SharedCalls().detect  # computes the strength of corners once a frame
         if self.detector == "orb" or self.mask_mode == "filter":
-            module = "thesis_repro.odometry.keypoints"
-        return import_module(module).detect
+            return import_module("thesis_repro.odometry.keypoints").detect
+        return import_module("thesis_repro.odometry.odometry").detect
 
     def new_estimator(self, calls: Any) -> Any:
         """Return a new object of the estimator. calls: see odometry.Calls."""
@@ -94,6 +122,8 @@ class OdometrySettings:
                     f"odometry setting {name}: {value!r} is unknown; "
                     f"choose one of {', '.join(choices)}"
                 )
+        if self.choice == "spread" and not self.max_keypoints:
+            raise InputError('odometry setting choice: "spread" needs max_keypoints of 1 or more')
         for field in fields(self):
             if field.name in LIMITS:
                 _check_number(field.name, getattr(self, field.name), field.type)

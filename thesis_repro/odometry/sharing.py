@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+
 import opencv_exact
 from opencv_exact.compiling import compiled
-
 from thesis_repro.odometry import keypoints
 from thesis_repro.odometry.odometry import PROBABILITY, TERMINATION, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings

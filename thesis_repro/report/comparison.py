@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from thesis_repro.report import style, texts
 from thesis_repro.report.style import BASELINE, MASKED
-from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import ESTIMATORS
 
 SHOWN = (*compare.JUDGING_METRICS, "rmse")
@@ -233,12 +233,12 @@ def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
 
 def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     """Return `table_widths` of one source."""
-    chosen = thesis_tables.chosen_widths(masked, baseline)
-    stability = thesis_tables.stability(masked, baseline)
+    chosen = best_width.chosen_widths(masked, baseline)
+    stability = best_width.stability(masked, baseline)
     metrics = [name for name in ("rmse", "se3") if name in masked]
     columns, lost = {}, {}
     for choice, label in CHOICES.items():
-        rows = thesis_tables.of_chosen_width(masked, chosen[choice])
+        rows = best_width.of_chosen_width(masked, chosen[choice])
         for metric in metrics:
             ratios = compare.ratios(rows, baseline, metric)
             name = f"{label}: {compare.METRICS[metric]}"

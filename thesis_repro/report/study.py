@@ -7,16 +7,15 @@ from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from thesis_repro.data.trajectories import read_poses, write_kitti_poses, write_tum
 from thesis_repro.errors import InputError, one_line
-from thesis_repro.masks import LabelMasks, label_map_of
+from thesis_repro.mask_files import LabelMasks, label_map_of
 from thesis_repro.odometry import THESIS, keypoints, metrics
-from thesis_repro.report import comparison, latex, page, style, tables, texts, trajectories
+from thesis_repro.report import comparison, findings, page, paths, style, tables
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, controls, runner
@@ -25,8 +24,6 @@ from thesis_repro.study.sources import KINDS, Source
 from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
-# columns that tell the rows of tables apart
-LATEX_LABELS = ("masks", "sequence", "estimator", "keypoints", "over", "width (pixels)")
 
 
 @style.applied()
@@ -50,11 +47,10 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     # for texts and tables
     runs = runs.assign(sequence=runs["sequence"].map(one_line))
     table = compare.comparisons(runs)
-    write_text(folder / "findings.md", texts.findings(runs, table, note, embedded))
-    unknown = study.of_unknown_polarity()
+    write_text(folder / "findings.md", findings.text(runs, table, note, embedded))
     figures = {
         "comparison": comparison.figure_comparison(table),
-        "sources": figure_sources(study, unknown),
+        "sources": figure_sources(study),
     }
     figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
     for name, figure in figures.items():
@@ -68,7 +64,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     for name, rows in numbers.items():
         if name == "summary" and len(rows):  # one column a source fits into a column of text
             rows = rows.set_index("masks").T.rename_axis("masks").reset_index()
-        write_text(folder / f"{name}.tex", f"% {note}\n{latex.latex(rows, LATEX_LABELS)}")
+        write_text(folder / f"{name}.tex", f"% {note}\n{latex(rows)}")
     numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX
     names = style.save_all(figures, numbers, folder, note)
     widths = sorted(runs["dilation_width"].dropna().astype(int).unique())
@@ -77,7 +73,6 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         [("text", "findings"), *names],
         study=study,
         warnings=warnings,
-        of_unknown_polarity=unknown,
         embedded=embedded,
         kinds=KINDS,
         estimators=ESTIMATORS,
@@ -98,19 +93,26 @@ def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
     for sequence in study.opened:
         name = sequence.name
         runs_of_sequence = unshuffled[unshuffled["sequence"] == name]
-        paths = {(name, "truth"): sequence.poses}
-        paths |= runner.run_poses(runs_of_sequence, folder / RUNS)
-        for (_, run), poses in paths.items():
+        all_poses = {(name, "truth"): sequence.poses}
+        all_poses |= runner.run_poses(runs_of_sequence, folder / RUNS)
+        for (_, run), poses in all_poses.items():
             write_kitti_poses(folder / PATHS / "kitti" / name / f"{run}.txt", poses)
             write_tum(folder / PATHS / "tum" / name / f"{run}.txt", poses, sequence.times)
 
 
-def figure_sources(study: Study, of_unknown_polarity: Collection[str] = ()) -> Figure:
+def latex(table: pd.DataFrame) -> str:
+    """Return a table as LaTeX, as wide as a column of text; it needs booktabs and graphicx."""
+    if table.empty:
+        return ""
+    text = table.to_latex(index=False, na_rep="", escape=True, float_format="{:g}".format)
+    return f"\\resizebox{{\\linewidth}}{{!}}{{%\n{text}}}\n"
+
+
+def figure_sources(study: Study) -> Figure:
     """Draw the middle frame of the first readable sequence, one row a source.
 
-    A row shows the source's label map, its mask and the kept keypoints. The plain frame replaces a
-    label map that is missing. of_unknown_polarity: names of sources whose masks may be inverted;
-    the keypoints that their inverted masks keep are drawn in place of a label map.
+    A row shows the source's label map (or the frame, if there is none), its mask and the kept
+    keypoints, so that a person sees which masks are inverted or lie elsewhere.
     """
     for sequence, sequence_masks in study.shown_masks():
         index = len(sequence) // 2
@@ -131,10 +133,6 @@ def figure_sources(study: Study, of_unknown_polarity: Collection[str] = ()) -> F
                 label_maps.append(label_map)
                 colors = style.label_colors(label_map, frame)
                 style.show_image(first, colors, f"{source.name}: label map")
-            elif source.name in of_unknown_polarity:
-                points = keypoints.detect(frame, THESIS, cv2.bitwise_not(mask))
-                first.set_title(f"{source.name}, inverted: {len(points)} keypoints")
-                first.scatter(*points.T, **style.KEYPOINT)
             points = keypoints.detect(frame, THESIS, mask)
             style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
             third.set_title(f"{source.name}: {len(points)} keypoints")
@@ -148,13 +146,13 @@ def figure_paths(study: Study, name: str, folder: Path) -> Figure:
     """Draw a path with all keypoints and one with each source's masks, shifted as for the RMSE."""
     (true,) = (sequence.poses for sequence in study.opened if sequence.name == name)
     poses_folder = folder / PATHS / "kitti" / name
-    paths = {}
+    shown = {}
     for job in study.shown_jobs(name):
         label = job.source or compare.METHODS[job.method]
         file = poses_folder / f"{job.name}.txt"
         if file.is_file():
-            paths[label] = metrics.shifted(read_poses(file), true)
-    return trajectories.figure(paths, true, f"sequence {name}")
+            shown[label] = metrics.shifted(read_poses(file), true)
+    return paths.figure(shown, true, f"sequence {name}")
 
 
 def _changed(source: Source) -> str:

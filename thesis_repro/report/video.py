@@ -19,7 +19,7 @@ from thesis_repro.odometry import (
     scales,
     start_pose,
 )
-from thesis_repro.odometry.passes import Masks
+from thesis_repro.odometry.runs import Masks
 from thesis_repro.report.style import BASELINE, TRUTH, applied
 from thesis_repro.running import messages
 from thesis_repro.running.files import atomic, progress

@@ -1,1 +1,1 @@
-"""What every run needs: settings, whole files, folders of results, messages, compiling."""
+"""What every run needs: settings, whole files, folders of results, messages."""

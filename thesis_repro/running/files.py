@@ -1,42 +1,32 @@
-"""Reading of images, atomic writing of files, and progress bars."""
+"""Reading of images, writing of whole files, and progress bars."""
 
 import os
 import re
 import secrets
-import stat
-import struct
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
-from PIL import Image, ImageFile, ImageOps
 from tqdm import tqdm
-from tqdm.utils import ObjectWrapper
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import messages
-from thesis_repro.running.folders import holds_results
 
 # matches the names that `temporary_path` returns
-TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\.\w+)?")
-BAR_DELAY = 1  # seconds before a progress bar appears
-# the last bytes of a complete file
-END_MARKS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
-TAIL = 4096  # bytes at the end of a file in which `glance` looks for its end mark
+TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\..*)?")
 
 
 def read_gray(path: str | Path) -> np.ndarray:
     """Read one image as 8-bit gray, shape (height, width). Colours become their luminance.
 
-    Raises InputError if the file is not a complete PNG or JPEG image with 8 bits a channel, and if
-    it claims more pixels than Pillow considers safe. JPEG has no checksums, so a changed byte
-    inside a JPEG file goes unnoticed.
+    Raises InputError if the file is not a complete image with 8 bits a channel.
     """
-    return _read(path, "L", cv2.IMREAD_GRAYSCALE)
+    return _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
 
 
 def read_color(path: str | Path) -> np.ndarray:
@@ -44,119 +34,56 @@ def read_color(path: str | Path) -> np.ndarray:
 
     Raises what `read_gray` raises.
     """
-    return _read(path, "RGB", cv2.IMREAD_COLOR)
+    pixels = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
 
 
 def read_ids(path: str | Path) -> np.ndarray:
     """Read one PNG of numbers such as class ids, shape (height, width) uint8.
 
-    No number is changed. Raises what `read_gray` raises, and InputError if reading as gray would
-    change numbers: for a palette, fewer than 8 bits, channels that differ, or another format.
+    No number is changed. Raises InputError if the file is not a complete gray PNG: if it has a
+    palette, fewer than 8 bits or channels that differ. 16 bits are read if no number exceeds 255.
     """
-    with _opened(path) as (_, image):
-        # contains Pillow's name of the stored mode: "L;4" is gray with 4 bits
-        stored = str(image.tile)
-    read = read_gray if image.mode == "L" else read_color
-    channels = np.atleast_3d(read(path))
-    if (
-        image.format != "PNG"
-        or image.mode in ("1", "P")
-        or "L;" in stored
-        or (channels != channels[..., :1]).any()
-    ):
+    channels = np.atleast_3d(_decoded(path, cv2.IMREAD_UNCHANGED, np.uint16))
+    with open(path, "rb") as file:
+        header = file.read(26)
+    is_gray_png = header.startswith(b"\x89PNG") and header[24] >= 8 and header[25] != 3
+    if not is_gray_png or (channels[..., :3] != channels[..., :1]).any() or channels.max() > 255:
         raise InputError(
-            f"{path}: must be an 8-bit gray PNG, which keeps ids as they are; convert it"
+            f"{path}: must be a gray PNG of numbers up to 255, which keeps ids as they are; convert it"
         )
-    return np.ascontiguousarray(channels[..., 0])
+    return channels[..., 0].astype(np.uint8)
 
 
-def glance(path: str | Path) -> tuple[int, int]:
-    """Return the size (height, width) of an image, and check that the file has its end.
+def _decoded(path: str | Path, flag: int, largest: type = np.uint8) -> np.ndarray:
+    """Decode an image. OpenCV checks PNG's checksums and the end of both formats.
 
-    Only the header is read. Nothing is decoded, so this is fast. Raises InputError as `read_gray`
-    does, except for damage in the middle.
-    """
-    with _opened(path) as (file, image):
-        end_mark = END_MARKS["PNG" if image.format == "PNG" else "JPEG"]
-        size = os.fstat(file.fileno()).st_size
-        file.seek(-min(TAIL, size), os.SEEK_END)
-        if end_mark not in file.read():
-            read_gray(path)  # some cameras and tools append bytes after the end mark
-        return image.size[::-1]
-
-
-def _read(path: str | Path, mode: str, flag: int) -> np.ndarray:
-    with _opened(path) as (file, image):
-        if image.format != "PNG":
-            image.draft(mode, image.size)  # decodes gray directly, as OpenCV does
-            return np.array(ImageOps.exif_transpose(image).convert(mode))
-        image.verify()  # compares the checksums, which the decoders of OpenCV and Pillow ignore
-        file.seek(0)
-        data = file.read()
-        if END_MARKS["PNG"] not in data:
-            raise OSError
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)  # faster than Pillow's decoder
-        if pixels is None:
-            Image.open(file).load()  # raises if the file is damaged; OpenCV gives no reason
-            raise MemoryError
-        if mode == "RGB":
-            return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
-        return pixels
-
-
-@contextmanager
-def _opened(path: str | Path) -> Iterator[tuple[BinaryIO, ImageFile.ImageFile]]:
-    """Open an image file and read its header: yields (file, image).
-
-    Turns all errors of the block into InputError.
+    largest: of the types of numbers that are allowed.
     """
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise InputError(f"{path}: is not a file; name an image file")
-            image = Image.open(file, formats=tuple(END_MARKS))
-            if ";16" in str(image.tile):
-                raise InputError(f"{path}: has 16 bits a channel; convert it to 8 bits a channel")
-            yield file, image
-    except InputError:
-        raise
-    except Image.DecompressionBombError:
-        raise InputError(f"{path}: claims more pixels than any camera has; remove it") from None
-    except cv2.error as error:  # such as a limit that OPENCV_IO_MAX_IMAGE_PIXELS sets
-        raise InputError(f"{path}: cannot be read: OpenCV: {error.err}") from None
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        IndexError,
-        struct.error,
-    ) as error:
-        reason = (
-            getattr(error, "strerror", None)
-            or "it is not a complete PNG or JPEG image; copy it again"
-        )
-        raise InputError(f"{path}: cannot be read: {reason}") from None
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), flag)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except cv2.error:  # an empty file
+        pixels = None
+    if pixels is None:
+        raise InputError(f"{path}: is not a complete PNG or JPEG image; copy it again")
+    if not np.can_cast(pixels.dtype, largest):
+        raise InputError(f"{path}: has 16 bits a channel; convert it to 8 bits a channel")
+    return pixels
+
+
+# Listing
 
 
 def listed(folder: str | Path, pattern: str = "*.png") -> list[Path]:
-    """Return the files of a folder that match a pattern, in sorted order.
+    """Return the files of a folder that match a pattern, in sorted order, without hidden ones.
 
-    Hidden (temporary) files are left out. Raises InputError if a folder may not be listed, because
-    its files would silently be missing.
+    Raises OSError for a folder that may not be listed.
     """
-    folders = [Path(folder)]
-    if "/" in pattern:
-        folders += Path(folder).glob(pattern.rpartition("/")[0])
-    for place in folders:
-        check_readable(place)
+    if Path(folder).is_dir():
+        os.listdir(folder)  # raises the error that glob would hide
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
-
-
-def check_readable(folder: Path, access: int = os.R_OK | os.X_OK) -> None:
-    """Raise InputError for a folder whose files this user may not list (R_OK) or open (X_OK)."""
-    if os.path.isdir(folder) and not os.access(folder, access):
-        raise InputError(f"{folder}: may not be read; change its permissions (chmod u+rx)")
 
 
 def images(folder: str | Path) -> list[Path]:
@@ -164,12 +91,9 @@ def images(folder: str | Path) -> list[Path]:
 
     Hidden files are left out. Raises InputError if the folder holds both kinds.
     """
-    pngs, jpegs = [], []
-    for path in listed(folder, "*"):
-        if path.suffix.lower() == ".png":
-            pngs.append(path)
-        elif path.suffix.lower() in (".jpg", ".jpeg"):
-            jpegs.append(path)
+    paths = listed(folder, "*")
+    pngs = [path for path in paths if path.suffix.lower() == ".png"]
+    jpegs = [path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")]
     if pngs and jpegs:
         raise InputError(f"{folder}: holds PNG and JPEG images; move those of one kind away")
     return sorted(pngs or jpegs, key=_natural_order)
@@ -186,83 +110,38 @@ def numbers_of(paths: Iterable[Path]) -> list[int] | None:
 
     Returns None if a name has none or the names start differently.
     """
-    numbers, starts = [], set()
-    for path in paths:
-        match = re.fullmatch(r"(.*?)(\d+)", path.stem)
-        if match is None:
-            return None
-        starts.add(match[1])
-        numbers.append(int(match[2]))
-    if len(starts) > 1:
+    parts = [re.findall(r"(.*?)(\d+)$", path.stem) for path in paths]
+    if not all(parts) or len({part[0][0] for part in parts}) > 1:
         return None
-    return numbers
+    return [int(part[0][1]) for part in parts]
 
 
-def is_whole(path: str | Path) -> bool:
-    """Return whether a file is an image with a valid header and end (see `glance`)."""
-    try:
-        return bool(glance(path))
-    except InputError:
-        return False
+# Writing
 
 
 @contextmanager
 def atomic(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path, and rename it to `path` when the block ends.
 
-    It is deleted if the block raises an error. A symbolic link is kept and its target is replaced;
-    in a folder of results, the link is.
+    It is deleted if the block raises an error. The target of a symbolic link is replaced.
     """
-    path = Path(path)
-    target = path
-    if path.is_symlink() and not any(map(holds_results, path.absolute().parents)):
-        target = path.resolve()
+    target = Path(path).resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_path(target)
     try:
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_WRONLY, 0o666))
         yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())  # otherwise a crash of the system could leave an empty file
         os.replace(temporary, target)
-    except Exception as error:
-        number, name = messages.number_of(error), getattr(error, "filename", None)
-        if number is None or name not in (None, str(temporary), temporary):
-            raise
-        # instead of the temporary name or none
-        raise OSError(number, os.strerror(number), str(path)) from error
+    except OSError as error:
+        if error.errno:
+            error.filename = str(path)  # what the user knows, not the temporary name
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a temporary path beside `path`, with a random name that nobody can predict."""
-    ending = path.suffix if re.fullmatch(r"\.\w{1,8}", path.suffix) else ""
-    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{ending}")
-
-
-def check_output(path: Path) -> None:
-    """Raise InputError if a file cannot be written to `path`.
-
-    Also if it could be moved away later with results around it.
-    """
-    # renaming a file cannot replace a device, a pipe or an open stream
-    is_stream = str(path).startswith(("/dev/std", "/dev/fd/", "/proc/")) or path.name == "-"
-    folders = (path.resolve() if path.is_symlink() else path.absolute()).parents
-    parent = next(folder for folder in folders if folder.exists())
-    is_file = path.is_file() or not path.exists()
-    if is_stream or not is_file or not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError(
-            f"{path}: cannot be written; name a file in a folder that you may write to"
-        )
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:  # OpenCV would crash
-        raise InputError(f"{path}: is no UTF-8; choose another name") from None
-    if any(map(holds_results, folders)):
-        raise InputError(
-            f"{path}: is in a folder of results, with which it could be moved; name a file elsewhere"
-        )
+    """Return a temporary path beside `path`, hidden and with a random name."""
+    return path.with_name(f".{path.stem[:40]}.thesis-repro-{secrets.token_hex(4)}{path.suffix[:8]}")
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -289,10 +168,21 @@ def needed(path: str | Path, notebook: str) -> Path:
 
     Raises InputError with the notebook's name if it is missing.
     """
-    path = Path(path)
-    if not path.exists():
+    if not Path(path).exists():
         raise InputError(f"{path}: does not exist yet; run notebook {notebook} first")
-    return path
+    return Path(path)
+
+
+# Progress
+
+
+class _Bar(tqdm):
+    """A progress bar over steps that a signal to stop does not break (`messages.unstopped`)."""
+
+    def __iter__(self) -> Iterator[Any]:
+        for item in super().__iter__():
+            with messages.unstopped():
+                yield item
 
 
 def progress(
@@ -304,47 +194,19 @@ def progress(
 ) -> tqdm:
     """Return a tqdm progress bar on standard error.
 
-    It is on the file that THESIS_REPRO_PROGRESS names, if that is set: `make figures` sets
-    it to its terminal for the bars inside notebooks. Without a terminal, the bar is replaced by a
-    line every 20 seconds.
+    THESIS_REPRO_PROGRESS may name another file: `make figures` names its terminal, for the bars
+    inside notebooks. Ctrl-C waits for the end of a step of the loop.
     """
-    own_file = None
-    with suppress(KeyError, OSError):
-        # the bar closes it
-        own_file = open(os.environ["THESIS_REPRO_PROGRESS"], "a", buffering=1)  # noqa: SIM115
-    stream = own_file or sys.stderr
-    options: dict[str, Any] = {"file": _Lines(stream), "mininterval": 20, "ascii": True}
-    if stream.isatty():
-        options = {"file": stream, "mininterval": 0.2, "dynamic_ncols": True, "leave": False}
-    bar = _Bar(
-        iterable,
-        desc=description,
-        total=total,
-        unit=unit,
-        initial=initial,
-        delay=BAR_DELAY,
-        smoothing=0,  # the average over the whole time predicts better than the last steps
-        **options,
-    )
-    bar.own_file = own_file
-    return bar
+    options: dict[str, Any] = {"file": sys.stderr, "mininterval": 0.2, "leave": False, "delay": 1}
+    other = os.environ.get("THESIS_REPRO_PROGRESS")
+    if other:
+        options["file"] = _opened(other)
+    if not options["file"].isatty():  # a log
+        options["mininterval"] = 20
+    return _Bar(iterable, description, total, unit=unit, initial=initial, **options)
 
 
-class _Bar(tqdm):
-    """A bar that closes the file which was opened for it."""
-
-    own_file: TextIO | None = None
-
-    def close(self) -> None:
-        """Clear or leave the bar."""
-        super().close()
-        if self.own_file:
-            self.own_file.close()
-
-
-class _Lines(ObjectWrapper):
-    """A file that turns the carriage returns of tqdm into lines."""
-
-    def write(self, text: str) -> None:
-        if text.strip():
-            self._wrapped.write(text.strip() + "\n")
+@cache
+def _opened(name: str) -> TextIO:
+    """Open a file for the bars of this process."""
+    return open(name, "a", buffering=1)

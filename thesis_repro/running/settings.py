@@ -7,42 +7,17 @@ KITTI=... PROFILE=...` sets these variables.
 import hashlib
 import os
 import re
-import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from joblib import cpu_count as cores
 
 from thesis_repro.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]  # of the checkout
 PREFIX = "THESIS_REPRO_"
-# of each number: minimum, maximum, and the step that it must be a multiple of
-LIMITS = {
-    "IMAGE_SIZE": (32, 4096, 16),
-    "BASE_FILTERS": (1, 1024, 1),
-    "BATCH_SIZE": (1, 4096, 1),
-    "EPOCHS": (1, 100_000, 1),
-    "FRAMES": (5, 10**7, 1),
-    "WIDTHS": (1, 1000, 1),
-    "REPETITIONS": (1, 1000, 1),
-    "JOBS": (1, 1024, 1),
-}
-MOST_REPETITIONS = LIMITS["REPETITIONS"][1]
-# the fields of a profile that a variable can replace
-SIZES = tuple(name for name in LIMITS if name != "JOBS")
-# PROGRESS is the file or terminal that progress bars are written to
-VARIABLES = (
-    "PROFILE",
-    "KITTI",
-    "CITYSCAPES",
-    "KITTI_SEMANTIC",
-    "BUILD",
-    "FIGURES",
-    "DASK_SCHEDULER",
-    "PROGRESS",
-    *LIMITS,
-)
 ALL_WIDTHS = tuple(range(1, 16))
 
 
@@ -166,8 +141,9 @@ class Settings:
     kitti_is_embedded: bool
     cityscapes_is_embedded: bool
     run: str
-    build: Path  # folder of all results of this run but its figures and tables
-    figures: Path
+    build: Path  # folder of all results of this run
+    figures: Path  # folder that its figures and tables are written to
+    published: Path  # folder that `make figures` copies the figures and tables to
     world: Path  # folder that the embedded world is written to
     jobs: int
     scheduler: str | None = None  # address of a Dask scheduler
@@ -184,11 +160,8 @@ class Settings:
 
     @property
     def figures_in_git(self) -> bool:
-        """Whether the figures folder is the one in git.
-
-        It holds the figures of the default run.
-        """
-        return self.figures == ROOT / "figures"
+        """Whether the figures of this run are those in git: the default run's."""
+        return self.published == ROOT / "figures"
 
     @property
     def data_note(self) -> str:
@@ -207,7 +180,75 @@ class Settings:
         return f"odometry: {odometry}; {labels}; {', '.join(parts)}"
 
     def __str__(self) -> str:
-        return f"run {self.run}; results: {_from_root(self.build)}"
+        return f"run {self.run}; results: {os.path.relpath(self.build, ROOT)}"
+
+
+# How settings are read. Each function raises ValueError for a text of another kind, and its name
+# says in messages which kind is wanted.
+
+
+def profile_name(text: str) -> str:
+    """Return the name of a profile."""
+    if text not in PROFILES:
+        raise ValueError
+    return text
+
+
+def positive_whole_number(text: str) -> int:
+    """Return the whole number from 1 on in a text."""
+    if int(text) < 1:
+        raise ValueError
+    return int(text)
+
+
+def number_of_frames(text: str) -> int | None:
+    """Return the number of frames in a text, or None for "all"."""
+    if text == "all":
+        return None
+    return positive_whole_number(text)
+
+
+def list_of_widths(text: str) -> tuple[int, ...]:
+    """Return the dilation widths, pixels, in a text such as "1-3,10", sorted."""
+    chosen: set[int] = set()
+    for word in text.split(","):
+        first, _, last = word.partition("-")
+        chosen.update(range(positive_whole_number(first), positive_whole_number(last or first) + 1))
+    if not chosen:  # such as 5-1
+        raise ValueError
+    return tuple(sorted(chosen))
+
+
+def existing_folder(text: str) -> Path:
+    """Return the folder that a text names; a relative one starts at the checkout."""
+    folder = ROOT / Path(text).expanduser()
+    if not folder.is_dir():
+        raise ValueError
+    return folder
+
+
+DATA = {"KITTI": existing_folder, "CITYSCAPES": existing_folder, "KITTI_SEMANTIC": existing_folder}
+SIZES: dict[str, Callable] = {  # of a profile
+    "IMAGE_SIZE": positive_whole_number,
+    "BASE_FILTERS": positive_whole_number,
+    "BATCH_SIZE": positive_whole_number,
+    "EPOCHS": positive_whole_number,
+    "FRAMES": number_of_frames,
+    "WIDTHS": list_of_widths,
+    "REPETITIONS": positive_whole_number,
+}
+SETTINGS: dict[str, Callable] = (
+    DATA
+    | SIZES
+    | {
+        "PROFILE": profile_name,
+        "BUILD": str,
+        "FIGURES": str,
+        "JOBS": positive_whole_number,
+        "DASK_SCHEDULER": str,
+        "PROGRESS": str,  # the file or terminal that progress bars are written to
+    }
+)
 
 
 def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
@@ -216,23 +257,24 @@ def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
     The default is os.environ. Raises InputError for an unknown variable, a data folder that does
     not exist, and a bad number.
     """
-    values = _values(os.environ if environment is None else environment)
+    if environment is None:
+        environment = os.environ
+    values: dict[str, Any] = {}
+    for variable, text in environment.items():
+        name = variable.removeprefix(PREFIX)
+        if name != variable and text:
+            values[name] = _read(name, text)
     profile = values.get("PROFILE", "demo")
-    if profile not in PROFILES:
-        raise InputError(f"PROFILE={profile}: unknown profile; choose one of {', '.join(PROFILES)}")
-    folders = _data_folders(values)
-    for name in {"BUILD", "FIGURES"} & values.keys():
-        if re.search(r"[`$\"'\\;&|<>()*?\[\]{}!\n]", values[name]):  # make passes them to a shell
-            raise InputError(f"{name}={values[name]}: has a character that shells treat specially")
-        check_outside(f"{name}={values[name]}", Path(values[name]), folders.values())
-    build = Path(values.get("BUILD", ROOT / "build")).absolute()
-    figures = Path(values.get("FIGURES", ROOT / "figures")).absolute()
-    world = build / f"world-{profile}"
-    sizes = _sizes(profile, values)
+    folders = {name: values[name] for name in DATA if name in values}
+    changes = {name.lower(): values[name] for name in SIZES if name in values}
+    sizes = replace(PROFILES[profile], **changes)
     run = _run_name(folders, profile, sizes)
+    published = ROOT / values.get("FIGURES", "figures")
     if run != "embedded-demo":
         # figures/ holds the figures of the default run; every other run gets a folder in it
-        figures /= run
+        published /= run
+    build = ROOT / values.get("BUILD", "build")
+    world = build / f"world-{profile}"
     return Settings(
         profile=profile,
         sizes=sizes,
@@ -242,66 +284,28 @@ def read_settings(environment: Mapping[str, str] | None = None) -> Settings:
         cityscapes_is_embedded="CITYSCAPES" not in folders,
         run=run,
         build=build / run,
-        figures=figures,
+        figures=build / run / "figures",
+        published=published,
         world=world,
-        jobs=number("JOBS", values.get("JOBS", str(cores()))),
-        scheduler=scheduler_address(values.get("DASK_SCHEDULER")),
+        jobs=values.get("JOBS") or cores(),
+        scheduler=values.get("DASK_SCHEDULER"),
         kitti_semantic=folders.get("KITTI_SEMANTIC"),
     )
 
 
-def _values(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the THESIS_REPRO_ variables that are not empty, by name without this prefix."""
-    values = {}
-    for variable, value in environment.items():
-        if variable.startswith(PREFIX) and value:
-            values[variable.removeprefix(PREFIX)] = value
-    for name in sorted(values.keys() - set(VARIABLES)):
-        raise InputError(f"{PREFIX}{name}: unknown setting; known are {', '.join(VARIABLES)}")
-    return values
-
-
-def _data_folders(values: Mapping[str, str]) -> dict[str, Path]:
-    """Return the user's folders of data, by the name of their variable."""
-    folders = {}
-    for name in ("KITTI", "CITYSCAPES", "KITTI_SEMANTIC"):
-        if name not in values:
-            continue
-        folders[name] = Path(values[name]).expanduser().absolute()
-        if not folders[name].is_dir():
-            raise InputError(f"{name}={values[name]}: no such folder")
-    return folders
-
-
-def _sizes(profile: str, values: Mapping[str, str]) -> Profile:
-    """Return the sizes of a profile, with those replaced that variables give."""
-    changed: dict[str, Any] = {}
-    for name in SIZES:
-        if name not in values:
-            continue
-        text = values[name]
-        if name == "WIDTHS":
-            changed["widths"] = read_widths(text)
-        elif name == "FRAMES":
-            changed["frames"] = read_frames(text)
-        else:
-            changed[name.lower()] = number(name, text)
-    return replace(PROFILES[profile], **changed)
-
-
-def check_outside(name: str, path: Path, data: Iterable[Path]) -> None:
-    """Raise InputError if an output lies in or below one of the paths given as data.
-
-    Data is only read. name: how the user gave the output.
-    """
-    for folder in data:
-        if path.resolve().is_relative_to(folder.resolve()):
-            raise InputError(f"{name}: lies in {folder}, which is data and only read; name another")
+def _read(name: str, text: str) -> Any:
+    if name not in SETTINGS:
+        raise InputError(f"{name}: unknown setting; known are {', '.join(SETTINGS)}")
+    try:
+        return SETTINGS[name](text)
+    except ValueError:
+        kind = SETTINGS[name].__name__.replace("_", " ")
+        raise InputError(f"{name}={text}: is no {kind}") from None
 
 
 def _run_name(folders: dict[str, Path], profile: str, sizes: Profile) -> str:
     """Name of the run: its data, its profile, and the sizes that differ from the profile's."""
-    data = [] if folders.keys() & {"KITTI", "CITYSCAPES"} else ["embedded"]
+    data = []
     for name, folder in folders.items():
         # make and shells treat other characters specially
         letters = re.sub(r"[^\w.+-]+", "-", folder.name)
@@ -309,6 +313,8 @@ def _run_name(folders: dict[str, Path], profile: str, sizes: Profile) -> str:
         path_digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:6]
         kind = name.lower().removeprefix("kitti_")
         data.append(f"{kind}-{letters}-{path_digest}")
+    if not folders.keys() & {"KITTI", "CITYSCAPES"}:
+        data.insert(0, "embedded")
     parts = ["_".join(data), profile]
     for name, text in _changed_sizes(profile, sizes).items():
         short = text.replace(", ", "_")
@@ -321,103 +327,16 @@ def _run_name(folders: dict[str, Path], profile: str, sizes: Profile) -> str:
 def _changed_sizes(profile: str, sizes: Profile) -> dict[str, str]:
     """The sizes that differ from the profile's, as text by name ("image size")."""
     texts = {}
-    for size in SIZES:
-        field = size.lower()
+    for field in map(str.lower, SIZES):
         value = getattr(sizes, field)
-        if value == getattr(PROFILES[profile], field):
-            continue
-        text = "all"
-        if value is not None:
+        if value != getattr(PROFILES[profile], field):
             text = str(value).strip("(),")  # of (5, 10), or of 5
-        texts[field.replace("_", " ")] = text
+            texts[field.replace("_", " ")] = text.replace("None", "all")
     return texts
 
 
-def number(name: str, text: str) -> int:
-    """Return the whole number in the text of setting `name`.
-
-    Raises InputError if its LIMITS do not allow it.
-    """
-    least, most, step = LIMITS[name]
-    if re.fullmatch("[0-9]{1,19}", text):
-        value = int(text)
-        if least <= value <= most and value % step == 0:
-            return value
-    allowed = f"from {least} to {most}"
-    if step > 1:
-        allowed += f", a multiple of {step}"
-    raise InputError(f"{name}={text[:60]}: must be a whole number {allowed}")
-
-
-def read_frames(text: str) -> int | None:
-    """Return the number of frames in a text, or None for "all".
-
-    Raises InputError for a bad number.
-    """
-    if text == "all":
-        return None
-    return number("FRAMES", text)
-
-
-def read_widths(text: str) -> tuple[int, ...]:
-    """Return the dilation widths, pixels, in a text such as "1-3,10", sorted.
-
-    Raises InputError for another text.
-    """
-    least, most, _ = LIMITS["WIDTHS"]
-    error = InputError(
-        f"WIDTHS={text[:60]}: must be whole numbers from {least} to {most}, such as 5,10 or 1-15"
-    )
-    widths: set[int] = set()
-    for word in text.replace(",", " ").split():
-        match = re.fullmatch("([0-9]{1,4})(?:-([0-9]{1,4}))?", word)
-        if match is None:
-            raise error
-        first, last = int(match[1]), int(match[2] or match[1])
-        if not least <= first <= last <= most:
-            raise error
-        widths.update(range(first, last + 1))
-    if not widths:
-        raise error
-    return tuple(sorted(widths))
-
-
-def scheduler_address(text: str | None) -> str | None:
-    """Return the address of a Dask scheduler, or None if there is none.
-
-    Raises InputError for any other text, for which Dask would start a new cluster or read a file.
-    """
-    if text is not None and not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d{1,5}", text):
-        raise InputError(
-            f"Dask scheduler {text}: must be tcp://host:port, as 'dask scheduler' prints it"
-        )
-    return text
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _from_root(path: Path) -> Path:
-    if path.is_relative_to(ROOT):
-        return path.relative_to(ROOT)
-    return path
-
-
-if __name__ == "__main__":
-    # The Makefile calls this: it prints the folder of the run, or with "figures" where the results
-    # are.
+if __name__ == "__main__":  # the Makefile asks for the folder of the run, below its own
     try:
-        _settings = read_settings()
+        print(os.path.relpath(read_settings().build, ROOT))
     except InputError as error:
-        sys.exit(f"error: {error}")
-    built = _from_root(_settings.build)
-    if sys.argv[1:] == ["figures"]:
-        page = _from_root(_settings.figures / "index.html")
-        print(f"tables and figures: open {page} in a browser; ", end="")
-        print(f"executed notebooks: {built / 'notebooks'}")
-    else:
-        print(built)
+        raise SystemExit(f"error: {error}") from None

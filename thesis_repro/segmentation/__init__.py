@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from thesis_repro.errors import InputError
 from thesis_repro.running import messages
 
 # Settings that give the same bits on x86 processors with AVX2, together with `exact.same_bits`.
@@ -37,19 +36,15 @@ OTHER_VARIABLES = {
 }
 
 
-def _set_variables() -> None:
-    """Set the variables that the libraries read at their import. Values of the user are kept."""
-    variables = dict(OTHER_VARIABLES)
-    if "tensorflow" not in sys.modules:  # otherwise too late; the record of results lacks them
-        variables |= ARITHMETIC
-    for name, value in variables.items():
-        os.environ.setdefault(name, value)
-    os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
-    for name in ("KERAS_MAX_EPOCHS", "KERAS_MAX_STEPS_PER_EPOCH"):  # end a training early, unsaid
-        os.environ.pop(name, None)
+# Values of the user are kept. After TensorFlow's import, ARITHMETIC would come too late, so it is
+# left out, and the record of results shows that.
+_variables = dict(OTHER_VARIABLES)
+if "tensorflow" not in sys.modules:
+    _variables |= ARITHMETIC
+for _name, _value in _variables.items():
+    os.environ.setdefault(_name, _value)
+os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
 
-
-_set_variables()
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
 
 
@@ -63,10 +58,7 @@ def quietly() -> Iterator[None]:
     """Hide the messages that TensorFlow's C++ code prints while it loads, whatever its log level.
 
     Errors are raised. The message that there is no GPU is hidden too.
-    Raises InputError under python -OO, which one of the libraries cannot be imported with.
     """
-    if sys.flags.optimize > 1:
-        raise InputError("python -OO: the segmentation's libraries need docstrings; use python -O")
     with messages.quiet():
         yield
         if not any(map(os.path.exists, GPUS)):

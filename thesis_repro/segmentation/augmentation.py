@@ -5,6 +5,7 @@ import warnings
 import albumentations as A
 import numpy as np
 
+from thesis_repro.errors import InputError
 from thesis_repro.running.files import progress
 
 # a pixel without a class: one-hot encoding gives zeros, like the border in the appendix
@@ -61,51 +62,43 @@ def transform_list(size: int, fill_mask: int = NOTHING) -> list:
     ]
 
 
-class Augmenter:
-    """Transforms whose result depends only on the image and the seed.
+def augment(
+    transforms: A.Compose, image: np.ndarray, label: np.ndarray, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Augment one image and its label map; the result depends only on these and on the seed.
 
-    Use one Augmenter a thread.
+    image: (height, width[, channels]) uint8. label: (height, width) uint8. Returns both in the same
+    shapes. Use one `A.Compose` a thread.
+    Raises InputError if the transforms return another type or another size (A.Normalize, A.ToFloat,
+    A.Resize).
     """
-
-    def __init__(self, transforms: list | A.Compose) -> None:
-        if not isinstance(transforms, A.Compose):
-            transforms = A.Compose(transforms)
-        self._compose = transforms
-
-    def to_dict(self) -> dict:
-        """Return the transforms and their settings in Albumentations' format (JSON values)."""
-        return A.to_dict(self._compose)
-
-    def __call__(
-        self, image: np.ndarray, label: np.ndarray, seed: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Augment one image and its label map.
-
-        The image is (height, width[, channels]) uint8, the label map (height, width) uint8.
-        """
-        self._compose.set_random_seed(int(seed))
-        result = self._compose(image=image, mask=label)
-        label = result["mask"]
-        # some drop a single channel
-        return result["image"].reshape(label.shape[:2] + image.shape[2:]), label
+    transforms.set_random_seed(int(seed))
+    result = transforms(image=image, mask=label)
+    augmented = result["image"]
+    if augmented.dtype != np.uint8 or augmented.shape[:2] != image.shape[:2]:
+        raise InputError(
+            f"transforms: return {augmented.dtype} images of {augmented.shape[:2]}; they must stay uint8 "
+            f"and {image.shape[:2]}, so leave out A.Normalize, A.ToFloat and A.Resize"
+        )
+    return augmented.reshape(image.shape), result["mask"]  # some drop a single channel
 
 
-def training_augmenter(size: int) -> Augmenter:
-    """Return the augmenter of the training set, with the appendix's transform list."""
-    return Augmenter(transform_list(size))
+def training_transforms(size: int) -> A.Compose:
+    """Return the transforms of the training set, the appendix's list."""
+    return A.Compose(transform_list(size))
 
 
-def validation_augmenter() -> Augmenter:
-    """Return the augmenter of the validation set: only a blur, by a mistake in the appendix.
+def validation_transforms() -> A.Compose:
+    """Return the transforms of the validation set: only a blur, by a mistake in the appendix.
 
     Between the two sets, A.3 draws Figure 3.1, which leaves `transform` set to the last one drawn,
-    the blur. Section 3.5.1 means `training_augmenter`.
+    the blur. Section 3.5.1 means `training_transforms`.
     """
-    return Augmenter([A.Blur(blur_limit=3, p=1)])
+    return A.Compose([A.Blur(blur_limit=3, p=1)])
 
 
 def augment_set(
-    images: np.ndarray, labels: np.ndarray, augmenter: Augmenter, seed: int
+    images: np.ndarray, labels: np.ndarray, transforms: A.Compose, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Augment every image of a set once (A.3).
 
@@ -115,8 +108,8 @@ def augment_set(
     augmented_images = np.empty_like(images)
     augmented_labels = np.empty_like(labels)
     for index in progress(range(len(images)), "augmenting", unit="image"):
-        augmented_images[index], augmented_labels[index] = augmenter(
-            images[index], labels[index], image_seed(seed, index)
+        augmented_images[index], augmented_labels[index] = augment(
+            transforms, images[index], labels[index], image_seed(seed, index)
         )
     return augmented_images, augmented_labels
 
@@ -131,5 +124,5 @@ def one_hot(label_maps: np.ndarray, n_classes: int) -> np.ndarray:
 
     NOTHING becomes zeros.
     """
-    classes = np.arange(n_classes, dtype=np.uint8)
-    return (label_maps[..., None] == classes).astype(np.float32)
+    is_class = label_maps[..., None] == np.arange(n_classes, dtype=np.uint8)
+    return is_class.astype(np.float32)

@@ -33,8 +33,14 @@ def same_bits(model: Any) -> Any:
 
 
 def _has_usual_settings(layer: keras.layers.BatchNormalization) -> bool:
-    unusual = layer.renorm or layer.synchronized or not (layer.scale and layer.center)
-    return layer.axis == -1 and layer.compute_dtype == "float32" and not unusual
+    return (
+        layer.axis == -1
+        and layer.compute_dtype == "float32"
+        and layer.scale
+        and layer.center
+        and not layer.renorm
+        and not layer.synchronized
+    )
 
 
 def _normalize(

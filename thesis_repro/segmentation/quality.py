@@ -40,12 +40,11 @@ def quality(model: Any, images: np.ndarray, labels: np.ndarray, batch_size: int 
     Only the scores of segmentation-models depend on the batch size (Sections 3.3 and 4.1).
     Raises InputError for an empty set, and for shapes that do not fit the model.
     """
-    if len(images) == 0:
-        raise InputError("quality: an empty set; it needs at least one image with its label map")
-    if images.shape[1:] != model.input_shape[1:] or images.shape[:3] != labels.shape:
+    training.check_images(images, model.input_shape)
+    if len(images) == 0 or images.shape[:3] != labels.shape:
         raise InputError(
-            f"quality: images {images.shape} and label maps {labels.shape}; the model takes "
-            f"{model.input_shape[1:]} and one label map for each image"
+            f"quality: images {images.shape} and label maps {labels.shape}; give at least one image, and a "
+            "label map for each"
         )
     scores = training.metrics()
 
@@ -62,9 +61,8 @@ def quality(model: Any, images: np.ndarray, labels: np.ndarray, batch_size: int 
         values, predicted = run(images[start : start + batch_size], true)
         batch_scores.append([float(value) for value in values])
         confusion += confusion_matrix(true, predicted.numpy())
-    mean_iou, accuracy, classes = cityscapes_scores(confusion)
     iou_score, f1_score = np.mean(batch_scores, axis=0)
-    return Quality(iou_score, f1_score, mean_iou, accuracy, classes, confusion)
+    return Quality(iou_score, f1_score, *cityscapes_scores(confusion), confusion)
 
 
 def confusion_matrix(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -74,8 +72,7 @@ def confusion_matrix(true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """
     known = true < N_CLASSES
     pairs = true[known].astype(np.int64) * N_CLASSES + predicted[known]
-    counts = np.bincount(pairs, minlength=N_CLASSES**2)
-    return counts.reshape(N_CLASSES, N_CLASSES)
+    return np.bincount(pairs, minlength=N_CLASSES**2).reshape(N_CLASSES, N_CLASSES)
 
 
 def cityscapes_scores(confusion: np.ndarray) -> tuple[float, float, pd.DataFrame]:

@@ -32,8 +32,7 @@ def build_unet(
             f"image size {height}x{width}: the U-Net halves it {DEPTH} times, so height and width must be "
             f"multiples of {2**DEPTH}"
         )
-    inputs = layers.Input(input_shape, name="input_2")
-    x = inputs
+    x = inputs = layers.Input(input_shape, name="input_2")
     skips = []
     for level in range(DEPTH):
         x = _conv_block(x, base_filters * 2**level, 2 * level, corrected_blocks)
@@ -77,15 +76,12 @@ def summary_rows(model: Any) -> list[dict[str, Any]]:
     """
     rows = []
     for layer in model.layers:
-        kind = type(layer).__name__
+        tensors = layer._inbound_nodes[0].input_tensors
         shape = f"{tuple(layer.output.shape)}"
-        sources = []
-        if kind == "InputLayer":
+        if not tensors:
             shape = f"[{shape}]"
-        else:
-            tensors = layer._inbound_nodes[0].input_tensors
-            sources = [f"{tensor._keras_history.operation.name}[0][0]" for tensor in tensors]
-        kind = kind.replace("BatchNormalization", "BatchNormal")
+        kind = type(layer).__name__.replace("BatchNormalization", "BatchNormal")
+        sources = [f"{tensor._keras_history.operation.name}[0][0]" for tensor in tensors]
         rows.append(
             {
                 "layer": f"{layer.name} ({kind})",

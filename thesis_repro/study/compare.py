@@ -34,59 +34,17 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from thesis_repro.odometry.metrics import RELATIVE_LENGTH
-from thesis_repro.study.controls import MASK_CONTROLS
+from thesis_repro.study import methods
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
+from thesis_repro.study.methods import ERRORS, MASK_CONTROLS
 
-# The compared errors and their names in tables. The judging metrics decide (see
-# `primary_comparison`), because a constant angle between camera and ground truth does not change
-# them.
-JUDGING_METRICS = {"se3": "aligned ATE", "rotation": "rotation error a frame"}
-SECONDARY_METRICS = {
-    "rmse": "RMSE",
-    "mae": "MAE",
-    "translation_percent": f"translation error over {RELATIVE_LENGTH:g} m",
-    "rotation_deg_per_100m": f"rotation error over {RELATIVE_LENGTH:g} m",
-    "t_rel": "KITTI's t_rel",
-    "r_rel": "KITTI's r_rel",
-}
-METRICS = {**JUDGING_METRICS, **SECONDARY_METRICS}
-UNITS = {
-    "se3": "m",
-    "rotation": "deg",
-    "rmse": "m",
-    "mae": "m",
-    "translation_percent": "%",
-    "rotation_deg_per_100m": "deg/100 m",
-    "t_rel": "%",
-    "r_rel": "deg/100 m",
-}
-
-METHODS = {  # in the order in which they are shown
-    "baseline": "all keypoints",
-    "masked": "masks",
-    "exact-boundaries": "exact class boundaries",
-    "corrected": "corrected mask",
-    "fallback": "mask with fallback",
-    "static-boundaries": "boundaries of static things",
-    "static": "all but movable things",
-    "inverse": "all but the boundaries",
-    "true-labels": "true label maps",
-    "other-frame": "mask of another frame",
-    "mirrored": "mirrored mask",
-    "random-lines": "random lines",
-    "image-edges": "edges of the image",
-    "fewer": "fewer keypoints",
-    "spread": "keypoints spread out",
-}
-SEGMENTATION_FREE_CONTROLS = (
-    "other-frame",
-    "mirrored",
-    "random-lines",
-    "image-edges",
-    "fewer",
-    "spread",
-)
+# {name: title} of the methods and errors that are compared. The judging metrics decide (see
+# `primary_comparison`).
+METHODS = {name: method.title for name, method in methods.METHODS.items() if method.is_compared}
+SEGMENTATION_FREE_CONTROLS = [name for name, method in methods.METHODS.items() if method.is_control]
+METRICS = {name: error.title for name, error in ERRORS.items()}
+JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}
+UNITS = {name: error.unit for name, error in ERRORS.items()}
 
 # of `comparisons`, before those of the sequences
 COLUMNS = (

@@ -14,7 +14,7 @@ import numpy as np
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
 from thesis_repro.masks import MaskSettings, dilate
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.keypoints import SharedKeypoints
+from thesis_repro.odometry.odometry import detect
 from thesis_repro.study.sources import FileMasks, Source
 
 LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
@@ -133,42 +133,6 @@ class ImageEdges(OtherFrame):
 
 
 ControlMasks: TypeAlias = FileMasks | OtherFrame
-OF_MASKS = {
-    "other-frame": OtherFrame,
-    "mirrored": Mirrored,
-    "random-lines": RandomLines,
-    "image-edges": ImageEdges,
-}
-# as SLAM systems use a segmentation, see masks.KEEP
-LITERATURE = ("static", "inverse", "static-boundaries")
-OF_LABEL_MAPS = ("exact-boundaries", "corrected", *LITERATURE, "true-labels")
-# "fallback" is a setting of the odometry, with the same masks
-MASK_CONTROLS = ("fallback", *OF_MASKS, *OF_LABEL_MAPS)
-
-
-def masks_of_method(
-    method: str, source: Source, sequence: Sequence, dilation_width: int | None
-) -> ControlMasks:
-    """Return the masks of a sequence for a method: "masked" or one of MASK_CONTROLS.
-
-    source: of the masks that a control is compared with. dilation_width: pixels, for masks from
-    label maps.
-    """
-    if method in OF_MASKS:
-        return OF_MASKS[method](source, sequence, dilation_width)
-    if method in ("masked", "fallback"):
-        return source.masks(sequence, dilation_width)
-    folder, settings = source.folder, source.settings
-    if method == "true-labels":
-        folder = true_labels(sequence.root, sequence.name)
-        settings = replace(settings, ids="labels")
-    elif method == "corrected":
-        settings = replace(CORRECTED, ids=settings.ids)
-    elif method in LITERATURE:
-        settings = replace(settings, keep=method)
-    else:
-        settings = replace(settings, boundaries="exact")
-    return replace(source, folder=folder, settings=settings).masks(sequence, dilation_width)
 
 
 def min_distance(sequence: Sequence, number: float) -> float:
@@ -178,14 +142,14 @@ def min_distance(sequence: Sequence, number: float) -> float:
     of the sequence, and is never below the distance of the thesis.
     """
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
-    frames = [(sequence.frame(index), SharedKeypoints()) for index in sample]
+    frames = [sequence.frame(index) for index in sample]
 
     def distance(steps: int) -> float:
         return round(THESIS.min_distance + steps * STEP, 6)
 
     def mean_number(steps: int) -> float:
         settings = replace(THESIS, min_distance=distance(steps))
-        numbers = [len(keypoints.detect(frame, settings)) for frame, keypoints in frames]
+        numbers = [len(detect(frame, settings)) for frame in frames]
         return float(np.mean(numbers))
 
     low, high = 0, round(min(sequence.size) / STEP)

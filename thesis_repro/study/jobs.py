@@ -10,49 +10,39 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators
 from thesis_repro.study import controls
+from thesis_repro.study.methods import MASK_CONTROLS, METHODS, OF_LABEL_MAPS
 from thesis_repro.study.sources import Source
 
 # Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It
 # was fixed before any run. (The code of appendix A.8 dilates by 5, audit row 26.)
 CONTROL_WIDTH = 10
-# the second varies far less
-# {name: title} of the estimators that studies compare
+# {name: title} of the estimators that studies compare; shuffled points change the second far less
 ESTIMATORS = {
     name: estimator.title
     for name, estimator in estimators.ESTIMATORS.items()
     if estimator.is_compared
 }
-KEYPOINT_CONTROLS = ("fewer", "spread")  # as many keypoints as masks leave, without a mask
-UNMASKED = ("baseline", "reduced", *KEYPOINT_CONTROLS)
 # Passes for each of several workers. Every pass decodes and tracks anew: a sequence on two workers
 # takes 13 % more CPU time than in one pass, and with 4 pieces 35 %.
 PIECES = 2
-
-
-class MaskKey(NamedTuple):
-    """What decides the masks of a job, beside its sequence; the fields are those of `Job`."""
-
-    method: str
-    dilation_width: int | None
-    source: str
 
 
 @dataclass(frozen=True)
 class Job:
     """One run of the odometry over one sequence. The defaults are the thesis's settings.
 
-    method: "baseline", "masked" or "reduced" as in the thesis, or one of the controls.
-    dilation_width: pixels, for masks from label maps; for KEYPOINT_CONTROLS, the width of the masks
-    that leave as many keypoints. source: name of the source of the masks, or of the masks that gave
-    the number of keypoints; empty if there is only one source. max_keypoints, min_distance
-    (pixels): limits of the detector.
+    method: one of METHODS.
+    dilation_width: pixels, for masks from label maps; for "fewer" and "spread", the width of the
+    masks that leave as many keypoints. source: name of the source of the masks, or of the masks
+    that gave the number of keypoints; empty if there is only one source. max_keypoints,
+    min_distance (pixels): limits of the detector.
     estimator: "thesis" or "refined", see OdometrySettings.
     repetition: 0 is the thesis's single run; any other number is the seed that shuffles the matched
     points.
@@ -74,7 +64,7 @@ class Job:
         Examples: masked-05-0, mine/mirrored-10-refined-1, spread-7.5-0.
         """
         parts = [self.method]
-        if self.dilation_width is not None and self.method not in UNMASKED:
+        if self.dilation_width is not None and METHODS[self.method].has_masks:
             parts.append(f"{self.dilation_width:02d}")
         if self.max_keypoints is not None:
             parts.append(str(self.max_keypoints))
@@ -91,19 +81,15 @@ class Job:
     @property
     def settings(self) -> OdometrySettings:
         """The thesis's settings of the odometry, with the changes that the job asks for."""
-        settings = replace(THESIS, estimator=self.estimator, fallback=self.method == "fallback")
-        if self.max_keypoints is not None:
-            settings = replace(settings, max_keypoints=self.max_keypoints)
-        if self.min_distance is not None:
-            settings = replace(settings, min_distance=self.min_distance)
-        if self.repetition:
-            settings = replace(settings, shuffle_seed=self.repetition)
-        return settings
-
-    @property
-    def mask_key(self) -> MaskKey:
-        """What decides the job's masks. Jobs of a sequence with the same key have the same ones."""
-        return MaskKey(self.method, self.dilation_width, self.source)
+        changes = {
+            "max_keypoints": self.max_keypoints,
+            "min_distance": self.min_distance,
+            "shuffle_seed": self.repetition or None,
+        }
+        given: dict[str, Any] = {
+            name: value for name, value in changes.items() if value is not None
+        }
+        return replace(THESIS, estimator=self.estimator, **given)
 
 
 def first_jobs(
@@ -124,53 +110,42 @@ def first_jobs(
     """
     jobs: list[Job] = []
     for sequence in sequences:
-        name = sequence.name
-        jobs += _repeated([Job(name, "baseline")], widths, repetitions)
+        jobs += _repeated([Job(sequence.name, "baseline")], widths, repetitions)
         for source in sources:
-            jobs += _masked_jobs(name, source, widths, tested, repetitions)
+            for width in _widths(source, widths, tested):
+                job = Job(sequence.name, "masked", width, source=source.name)
+                estimators_of_width = [
+                    estimator
+                    for estimator, requested in widths.items()
+                    if width in (None, tested) or width in requested
+                ]
+                jobs += _repeated([job], estimators_of_width, repetitions)
             if tested:
-                controls_of_source = _control_jobs(sequence, source, tested)
-                jobs += _repeated(controls_of_source, widths, repetitions)
+                jobs += _repeated(_control_jobs(sequence, source, tested), widths, repetitions)
     return jobs
 
 
-def _masked_jobs(
-    sequence: str,
-    source: Source,
-    widths: Mapping[str, Iterable[int]],
-    tested: int | None,
-    repetitions: int,
-) -> list[Job]:
-    """Return the jobs over a sequence with the masks of a source, of every width."""
+def _widths(
+    source: Source, widths: Mapping[str, Iterable[int]], tested: int | None
+) -> list[int] | list[None]:
+    """Return all dilation widths of a source's masks; ready-made masks have the width None."""
     if not source.has_label_maps:
-        return _repeated([Job(sequence, "masked", source=source.name)], widths, repetitions)
+        return [None]
     all_widths = set().union(*widths.values())
     if tested:
         all_widths.add(tested)
-    jobs = []
-    for width in sorted(all_widths):
-        estimators = [
-            estimator
-            for estimator, requested_widths in widths.items()
-            if width == tested or width in requested_widths
-        ]
-        job = Job(sequence, "masked", width, source=source.name)
-        jobs += _repeated([job], estimators, repetitions)
-    return jobs
+    return sorted(all_widths)
 
 
 def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
     """Return the controls that are masks, as far as a source and a sequence allow them."""
-    if not source.has_label_maps:
-        return [
-            Job(sequence.name, method, source=source.name)
-            for method in controls.MASK_CONTROLS
-            if method not in controls.OF_LABEL_MAPS
-        ]
-    methods = list(controls.MASK_CONTROLS)
+    methods, width = list(MASK_CONTROLS), tested
     if not controls.true_labels(sequence.root, sequence.name).is_dir():
         methods.remove("true-labels")
-    return [Job(sequence.name, method, tested, source=source.name) for method in methods]
+    if not source.has_label_maps:
+        methods = [name for name in methods if name not in OF_LABEL_MAPS]
+        width = None
+    return [Job(sequence.name, method, width, source=source.name) for method in methods]
 
 
 def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
@@ -186,7 +161,7 @@ def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
     """Return jobs that limit the detector to as many keypoints as the best masks leave.
 
     This is each sequence's mean number of keypoints at its best width (Figure 4.12). best: the
-    table of `thesis_tables.best_widths`.
+    table of `best_width.best_widths`.
     """
     jobs = []
     for name, number in best["mean_keypoints"].items():

@@ -8,11 +8,11 @@ from typing import TypeAlias
 
 from thesis_repro import masks
 from thesis_repro.data.cityscapes import read_label_map
-from thesis_repro.data.kitti import Sequence, check_size
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
 from thesis_repro.running import results
-from thesis_repro.running.files import glance, listed
+from thesis_repro.running.files import listed
 
 KINDS = {"labels": "label maps", "masks": "masks"}
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both have `paths`, the files that they read
@@ -120,37 +120,23 @@ def check(
     """Raise InputError, before anything runs, if a source lacks files or has files of a wrong kind.
 
     Each frame needs a file.
-    widths: pixels, for masks from label maps. Only the size of every mask and the first file of
-    each sequence are checked here. The runner reads all files, and a bad one stops only the runs
-    that need it.
+    widths: pixels, for masks from label maps. Only the first file of each sequence is read here.
+    The runner reads all files, and a bad one stops only the runs that need it.
     """
     for source in sources:
+        kind = KINDS[source.kind]
         if not source.folder.is_dir():
             raise InputError(
-                f"{source.folder}: no such folder; it must hold a folder of {KINDS[source.kind]} for "
-                "each sequence"
+                f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence"
             )
         for sequence in sequences:
-            _check_folder(source, sequence, len(sequences))
-            _check_masks(source, sequence, widths)
-
-
-def _check_folder(source: Source, sequence: Sequence, count: int) -> None:
-    """Raise InputError if a source holds the files of one sequence, but `count` are asked for."""
-    if count > 1 and source.sequence_folder(sequence.name) == source.folder:
-        raise InputError(
-            f"{source.folder}: holds the {KINDS[source.kind]} of one sequence, but {count} are asked "
-            f"for; put them into a folder for each, such as {source.folder / sequence.name}, or "
-            "name one with --sequences"
-        )
-
-
-def _check_masks(source: Source, sequence: Sequence, widths: Collection[int]) -> None:
-    """Raise InputError if the masks of a sequence, of any of the widths, cannot be made."""
-    # raises InputError for a width that is too large for the frames
-    for width in widths or (1,):
-        paths = source.masks(sequence, width).paths
-    if not source.has_label_maps:
-        for path in paths:
-            check_size(path, glance(path), sequence.size, "its frame")
-    source.check_file(paths[0], sequence.size)
+            if len(sequences) > 1 and source.sequence_folder(sequence.name) == source.folder:
+                raise InputError(
+                    f"{source.folder}: holds the {kind} of one sequence, but {len(sequences)} are "
+                    "asked for; put them into a folder for each, such as "
+                    f"{source.folder / sequence.name}, or name one with --sequences"
+                )
+            # raises InputError for a width that is too large for the frames
+            for width in widths or (1,):
+                paths = source.masks(sequence, width).paths
+            source.check_file(paths[0], sequence.size)

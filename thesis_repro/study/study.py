@@ -1,21 +1,16 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
-import os
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
-import pandas as pd
-
-from thesis_repro import checks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
+from thesis_repro.odometry import THESIS
 from thesis_repro.running import results
-from thesis_repro.running.settings import MOST_REPETITIONS
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
-LONGEST_NAME = 200  # bytes of a sequence's name, which results have in the names of their files
 RUNS = "runs"  # folder of the results of the runs
 
 
@@ -25,7 +20,7 @@ class Study:
 
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
-    of each sequence, None for all.
+    of each sequence, None for all. scale_gate: metres, see OdometrySettings.
     """
 
     kitti: Path
@@ -36,6 +31,7 @@ class Study:
     estimators: tuple[str, ...] = ("thesis",)
     repetitions: int = 1
     frames: int | None = None
+    scale_gate: float = THESIS.scale_gate
 
     @cached_property
     def opened(self) -> list[Sequence]:
@@ -44,10 +40,8 @@ class Study:
 
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
-        if not 1 <= self.repetitions <= MOST_REPETITIONS:
-            raise InputError(
-                f"--repetitions {self.repetitions}: must be 1 or more, and at most {MOST_REPETITIONS}"
-            )
+        if self.repetitions < 1:
+            raise InputError(f"--repetitions {self.repetitions}: must be 1 or more")
         if self.tested is not None and self.tested < 1:
             raise InputError(
                 f"--controls {self.tested}: must be a dilation width, 1 or more pixels"
@@ -61,11 +55,6 @@ class Study:
             if sequence.name in compare.COLUMNS:
                 raise InputError(
                     f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
-                )
-            if len(os.fsencode(sequence.name)) > LONGEST_NAME:
-                raise InputError(
-                    f"{sequence.folder}: its name is too long for names of files; make a link to it with "
-                    "a shorter one"
                 )
         widths = list(self.widths)
         if self.tested:
@@ -105,24 +94,6 @@ class Study:
             shown.append(jobs.Job(name, "masked", width, estimator=estimator, source=source.name))
         return shown
 
-    def run_warnings(self, runs: pd.DataFrame) -> list[str]:
-        """Return the warnings of `checks.of_run` about the first run of each sequence."""
-        unshuffled = runs[(runs["method"] == "baseline") & (runs["repetition"] == 0)]
-        warnings = []
-        for run in unshuffled.drop_duplicates("sequence").itertuples():
-            warnings += checks.of_run(run.sequence, run.frames, run.flagged)
-        return warnings
-
-    def first_jobs(self) -> list[jobs.Job]:
-        """Return the jobs that need no other results."""
-        return jobs.first_jobs(
-            self.opened,
-            dict.fromkeys(self.estimators, self.widths),
-            tested=self.tested,
-            sources=self.sources,
-            repetitions=self.repetitions,
-        )
-
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
         """Run the jobs whose results are not in the folder yet, see `runner.run_jobs`.
 
@@ -135,12 +106,22 @@ class Study:
             folder=folder / RUNS,
             processes=processes,
             scheduler=scheduler,
+            scale_gate=self.scale_gate,
         )
         with results.claimed(folder):
-            results.stage(folder, replace=False, frames=self.frames)
-            first_jobs = self.first_jobs()
+            results.stage(folder, replace=False, frames=self.frames, scale_gate=self.scale_gate)
+            first_jobs = jobs.first_jobs(
+                self.opened,
+                dict.fromkeys(self.estimators, self.widths),
+                tested=self.tested,
+                sources=self.sources,
+                repetitions=self.repetitions,
+            )
             first = run_jobs(first_jobs)
-            self._check_runs(first.table)
+            if not (first.table["method"] == "masked").any():
+                raise InputError(
+                    "every run with masks failed (see above), so there is nothing to compare"
+                )
             if not self.tested:
                 return first
             more_jobs = runner.keypoint_controls(
@@ -154,10 +135,3 @@ class Study:
             both = run_jobs(first_jobs + more_jobs)
         # the second call counts the runs of the first one as kept
         return replace(both, made=both.made + first.made, kept=both.kept - first.made)
-
-    def _check_runs(self, runs: pd.DataFrame) -> None:
-        """Raise InputError if the runs leave nothing to compare."""
-        if not (runs["method"] == "masked").any():
-            raise InputError(
-                "every run with masks failed (see above), so there is nothing to compare"
-            )

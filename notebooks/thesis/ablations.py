@@ -13,19 +13,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
+from thesis_repro.odometry.pose import normalise
 
 from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
-from thesis_repro.odometry.passes import Masks
-from thesis_repro.odometry.pose import normalise
+from thesis_repro.odometry.runs import Masks
+from thesis_repro.odometry.odometry import normalise
 from thesis_repro.running import results
 from thesis_repro.running.files import progress
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH
-from thesis_repro.study.runner import measures
+from thesis_repro.study.runner import CODE, measures
 
 Run = tuple[OdometrySettings, Masks | None]
 Runs = dict[tuple[str, str, int], Run]  # by method, estimator, repetition
@@ -95,14 +96,15 @@ def _measure(
     results.stage(
         folder,
         options=options,
-        code=results.digest_of_code("thesis_repro.study.ablations"),
+        code=results.digest_of_code(*CODE),
+        ablations=results.digest_of_file(__file__),
         **results.made_with("opencv", "numpy", "numba"),
         sequence=results.digest_of_files(sequence.files),
         labels=results.digest_of_files([labels / path.name for path in sequence.frame_paths]),
         model=results.made_from(labels),
     )
     path = folder / "runs.csv"
-    if not results.has_table(path):
+    if not path.is_file():
         cv2.setNumThreads(1)  # the processes already use every core
         runs = runs_of(sequence, labels, **options)
         run_results = odometry.run_many(

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgba_array
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from drawing.chapter2 import show_numbers
+from thesis.chapter2 import show_numbers
 from thesis_repro.report import style
 
 

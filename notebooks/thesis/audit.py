@@ -14,9 +14,10 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from thesis import thesis_tables
+from thesis.captions import REPORTED
 from thesis_repro.data.cityscapes import LABELS
-from thesis_repro.report.captions import REPORTED
-from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study import compare
 
 WORDS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))
 WIDTHS = range(9, 12)  # the dilation widths that the thesis calls best
@@ -242,7 +243,7 @@ def _of_changes(metric: str, key: str) -> list[dict[str, Any]]:
 def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
     """Return rows 2, 31, 35, 39 and those that audit.json lists, from the runs of notebook 08.
 
-    shuffled: its repetitions of all keypoints, see `thesis_tables.changes_if_masks_did_nothing`.
+    shuffled: its repetitions of all keypoints, see `thesis_tables.null_distribution`.
     """
     masked = compare.of_method(runs, "masked")
     baseline = compare.of_method(runs, "baseline")
@@ -264,7 +265,7 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
         share("2", "same best", stability["same_best"]),
     ]
     widths_run = masked["dilation_width"].nunique()
-    studies = thesis_tables.changes_if_masks_did_nothing(shuffled, widths_run, "rmse")
+    studies = thesis_tables.null_distribution(shuffled, widths_run, "rmse")
     for name in ("mean", "median"):
         values = studies.agg(name, axis=1)
         low, high = thesis_tables.middle(values)

@@ -15,7 +15,8 @@ import pandas as pd
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from drawing.flicker import View
+from thesis import thesis_tables
+from thesis.flicker import View
 from thesis_repro.data.cityscapes import colorize
 from thesis_repro.odometry import THESIS
 from thesis_repro.report import style, texts
@@ -29,7 +30,7 @@ from thesis_repro.report.style import (
     REDUCED,
     TRUTH,
 )
-from thesis_repro.study import compare, thesis_tables
+from thesis_repro.study import compare
 
 METHODS = {
     "baseline": ("all keypoints", BASELINE, "//"),

@@ -73,7 +73,7 @@ def time_runs(
 def _time_jobs(
     jobs: list[Job], sequence: Sequence, sources: dict[str, Source], path: Path
 ) -> pd.DataFrame:
-    if results.has_table(path):
+    if path.is_file():
         earlier = pd.read_csv(path, dtype={"sequence": str})
         if {job.name for job in jobs} <= set(earlier["run"]):
             return earlier

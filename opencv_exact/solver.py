@@ -39,14 +39,41 @@ class Solutions(NamedTuple):
     margins: np.ndarray  # (LANES, 10)
 
 
-def no_solutions() -> Solutions:
+@compiled
+def no_solutions():
     """Space for the solutions of LANES samples."""
     return Solutions(
-        np.zeros(LANES, bool),
+        np.zeros(LANES, np.bool_),
         np.zeros(LANES, np.int64),
         np.empty((LANES, 10, 9)),
         np.empty((LANES, 10)),
     )
+
+
+def solve_five_points(current: np.ndarray, previous: np.ndarray) -> Solutions:
+    """Essential matrices through K samples of five correspondences.
+
+    current, previous: (K, 5, 2), normalised coordinates, K > 0.
+    """
+    columns = np.concatenate([current, previous], axis=2).reshape(-1, 4).T.copy()
+    blocks = []
+    for start in range(0, len(current), LANES):
+        # the last sample fills the lanes that are left
+        samples = np.minimum(np.arange(start, start + LANES), len(current) - 1)
+        indices = SAMPLE_SIZE * samples[:, None] + np.arange(SAMPLE_SIZE)
+        blocks.append(solve(correspondences(columns, indices)))
+    return Solutions(*(np.concatenate(arrays)[: len(current)] for arrays in zip(*blocks)))
+
+
+@compiled
+def correspondences(columns, samples):
+    """Correspondences (5, 4, LANES) of samples (LANES, 5) among columns (4, N)."""
+    fives = np.empty((SAMPLE_SIZE, 4, LANES))
+    for lane in range(LANES):
+        for k in range(SAMPLE_SIZE):
+            for j in range(4):
+                fives[k, j, lane] = columns[j, samples[lane, k]]
+    return fives
 
 
 class _Steps(NamedTuple):
@@ -61,14 +88,15 @@ class _Steps(NamedTuple):
 
 
 @compiled
-def solve(fives, solutions):
-    """Solve LANES samples of five correspondences, and write their Solutions.
+def solve(fives):
+    """Solutions of LANES samples of five correspondences.
 
     fives: (5, 4, LANES), rows x, y in the current frame, u, v in the previous frame.
     """
     steps = _first_steps(fives)
     roots = real_roots(steps.polynomials)  # step 5
     work, errors = np.empty((4, 3, 3, LANES)), np.empty(LANES)
+    solutions = no_solutions()
     sure, counts = solutions.sure, solutions.counts
     for lane in range(LANES):
         # not solved if the equations were singular: the polynomial is not finite
@@ -90,6 +118,7 @@ def solve(fives, solutions):
                 sure[lane] &= margin < np.inf
     for lane in range(LANES):
         counts[lane] = roots.counts[lane] if sure[lane] else 0
+    return solutions
 
 
 @inlined

@@ -1,18 +1,13 @@
-"""The thesis's own comparison (Section 4.2): Equation 4.1 in percent, and the choice of a width.
+"""The dilation width that the thesis chooses for each sequence, and how stable this choice is.
 
-The choice is that behind Tables 4.1 to 4.3. All other comparisons are in `compare`. A change is
-Equation 4.1 of means over the repetitions; negative is better. `masked` and `baseline` are the runs
-with masks and with all keypoints, from `compare.of_method`.
+A change is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
+`baseline` are the runs with masks and with all keypoints, from `compare.of_method`.
 """
 
 from typing import Any
 
 import numpy as np
 import pandas as pd
-
-from thesis_repro.study.compare import LEVEL
-
-STUDIES = 4000  # simulated ones
 
 
 def percent_change(value: Any, benchmark: Any) -> Any:
@@ -57,58 +52,6 @@ def changes(rows: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> pd.Serie
     means = rows.groupby("sequence")[metric].mean()
     baseline_means = baseline.groupby("sequence")[metric].mean()
     return percent_change(means, baseline_means)
-
-
-def changes_of_repetition(
-    masked: pd.DataFrame, baseline: pd.DataFrame, metric: str, repetition: int = 0
-) -> pd.Series:
-    """Return the change (%) by the thesis's literal procedure, by sequence.
-
-    All keypoints and each width are run once: only the runs of one repetition are used, also to
-    choose the width.
-    """
-    best = of_chosen_width(masked[masked["repetition"] == repetition])
-    return changes(best, baseline[baseline["repetition"] == repetition], metric)
-
-
-def changes_if_masks_did_nothing(baseline: pd.DataFrame, widths: int, metric: str) -> pd.DataFrame:
-    """Simulate the changes (%) that the thesis's literal procedure reports if masks do nothing.
-
-    Then a run with masks is a run with all keypoints whose matched points are shuffled in another
-    way. For each sequence, one of its runs with all keypoints is drawn as the benchmark, and
-    another for each of `widths` widths, always with replacement. The one with the lowest RMSE is
-    the best width. Returns STUDIES rows, one column a sequence, without those that were run only
-    once. A sequence's own runs limit how good its best width can be, so few repetitions make the
-    simulated changes too small.
-    """
-    random = np.random.default_rng(0)
-    columns = {}
-    for name, runs in baseline.groupby("sequence"):
-        if len(runs) < 2:
-            continue
-        errors, rmse = runs[metric].to_numpy(), runs["rmse"].to_numpy()
-        drawn = random.integers(len(runs), size=(STUDIES, widths + 1))
-        benchmark, of_widths = drawn[:, 0], drawn[:, 1:]
-        best_column = rmse[of_widths].argmin(axis=1)
-        best = of_widths[np.arange(STUDIES), best_column]
-        columns[name] = percent_change(errors[best], errors[benchmark])
-    return pd.DataFrame(columns)
-
-
-def middle(values: pd.Series) -> tuple[float, float]:
-    """Return the ends of the middle LEVEL percent of a number of simulated studies."""
-    tail = (100 - LEVEL) / 200
-    return values.quantile(tail), values.quantile(1 - tail)
-
-
-def improved(changes: pd.Series, runs: pd.DataFrame) -> int:
-    """Return the number of sequences with a negative change (%) and no lost run.
-
-    changes: by sequence, of the runs. A lost run (see `metrics.step_errors`) may have a low error
-    by chance.
-    """
-    is_lost = runs.groupby("sequence")["lost"].any()
-    return int(((changes < 0) & ~is_lost.reindex(changes.index).astype(bool)).sum())
 
 
 def chosen_widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
@@ -166,16 +109,3 @@ def stability(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
         error_elsewhere = others[np.arange(count), best].mean()
         rows[name] = (same_best, error_elsewhere / baseline_errors.get(name, np.nan))
     return pd.DataFrame.from_dict(rows, orient="index", columns=["same_best", "elsewhere"])
-
-
-def time_savings(seconds: pd.DataFrame) -> pd.Series:
-    """Return the change of time (%) from all keypoints for each dilation width (Equation 4.2).
-
-    It is negative if time is saved. seconds: the table of `timing.time_runs`, whose seconds are
-    added over the sequences. As in the thesis, they include making the masks and not the
-    prediction.
-    """
-    baseline = seconds[seconds["method"] == "baseline"]
-    masked = seconds[seconds["method"] == "masked"]
-    masked_seconds = masked.groupby("dilation_width")["seconds"].sum()
-    return percent_change(masked_seconds, baseline["seconds"].sum())

@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.patches import Patch
 
+from thesis import thesis_tables
 from thesis_repro.data import cityscapes
 from thesis_repro.report import style
-from thesis_repro.study import thesis_tables
 
 
 def figure_3_02(

@@ -1,0 +1,30 @@
+"""The captions of all tables, figures and texts, and the numbers of the thesis.
+
+They stand in captions.json and reported.json. An artefact is a dict with kind ("figure", "table",
+"text"), name (of its files), title and caption; those that a study has, too, have the study's.
+Optional keys: constant: true if it shows no data. needs: the variable that a run on real frames
+must set to make it. thesis: what the thesis reports, a dict of data and two Jinja templates, text
+and here (for this run's numbers).
+"""
+
+import json
+from pathlib import Path
+
+from thesis_repro.report import page
+
+_HERE = Path(__file__).parent
+REPORTED = json.loads((_HERE / "reported.json").read_text(encoding="utf-8"))
+_CAPTIONS = json.loads((_HERE / "captions.json").read_text(encoding="utf-8"))
+# the 36 figures and 5 tables of the thesis in its order, {chapter: artefacts}
+CHAPTERS = _CAPTIONS["chapters"]
+_OF_STUDIES = {(artefact["kind"], artefact["name"]): artefact for artefact in page.ARTEFACTS}
+# artefacts that are not in the thesis
+ADDED = [
+    _OF_STUDIES.get((artefact["kind"], artefact["name"]), {}) | artefact
+    for artefact in _CAPTIONS["added"]
+]
+MADE_BY = _CAPTIONS["made_by"]  # {notebook: names of the artefacts that it writes}
+OF_THESIS = [artefact for artefacts in CHAPTERS.values() for artefact in artefacts]
+THESIS = [artefact["name"] for artefact in OF_THESIS]
+CONSTANT = [artefact["name"] for artefact in OF_THESIS if artefact.get("constant")]
+CARD = "thesis_repro/segmentation/weights/README.md"  # describes the model in the package

@@ -1,0 +1,281 @@
+"""The page with all tables and figures of a run: index.html beside them.
+
+It needs no network or server. README.md beside it is a gallery of the same, for reading in a
+repository.
+
+`python -m thesis.page`, with the folder notebooks in PYTHONPATH, copies the figures
+and tables of the current run to the folder in which they are read, writes the page and the gallery
+there, and converts executed notebooks to HTML.
+"""
+
+import itertools
+import os
+import re
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from markupsafe import Markup
+
+from thesis import captions, thesis_tables, trainings
+from thesis_repro.report import page, tables, texts
+from thesis_repro.running import messages, results
+from thesis_repro.running.files import atomic, listed, write_text
+from thesis_repro.running.settings import ROOT, Settings, read_settings
+
+GALLERY = "README.md"
+REAL = "kitti_excerpts"  # folder of the evidence on real frames (tools/evidence.py)
+REAL_CHAPTER = "Chapter 4 on real frames"
+# ids of the artefacts at the top of the page
+OPENING = ("findings", "figure_4_05", "figure-comparison")
+
+texts.LOADER.searchpath.append(str(Path(__file__).parent / "templates"))
+
+
+def update(settings: Settings, folder: Path) -> None:
+    """Write the page of a run into a folder, with its figures and tables.
+
+    Converts each executed notebook that is newer than its HTML. Deletes temporary files of killed
+    runs. Raises InputError if another run uses the folder.
+    """
+    with results.claimed(settings.build / "notebooks"):
+        results.sweep(settings.build)
+        if folder.is_dir():
+            results.sweep(folder)
+        _copy(settings, folder)
+        settings = replace(settings, figures=folder)
+        for path in _executed(settings):
+            html = path.with_suffix(".html")
+            if not html.is_file() or html.stat().st_mtime < path.stat().st_mtime:
+                write_text(html, notebook_html(path, folder / page.PAGE))
+        write_text(folder / page.PAGE, build(settings))
+        gallery = texts.render(
+            "gallery.md.j2", settings=settings, chapters=_chapters(settings), page=page.PAGE
+        )
+        write_text(folder / GALLERY, gallery)
+
+
+def _copy(settings: Settings, folder: Path) -> None:
+    """Copy what a run has drawn, and from the figures in git those that show no data."""
+    files = [path for path in listed(settings.figures, "*.*") if path.is_file()]
+    for name in captions.CONSTANT:
+        in_git = (ROOT / "figures").glob(f"{name}.*")
+        files += [path for path in in_git if not (settings.figures / path.name).exists()]
+    for path in files:
+        copy = folder / path.name
+        if not copy.is_file() or copy.read_bytes() != path.read_bytes():
+            with atomic(copy) as temporary:
+                shutil.copyfile(path, temporary)
+
+
+def _executed(settings: Settings) -> list[Path]:
+    return listed(settings.build / "notebooks", "*.ipynb")
+
+
+def notebook_html(path: Path, page_path: Path) -> str:
+    """Convert an executed notebook to HTML with a link to the page."""
+    import nbformat  # these are slow to import, and seldom needed
+    from latex2mathml.converter import convert
+    from nbconvert import HTMLExporter
+
+    def mathml(equation: re.Match) -> str:
+        return convert(equation[1], display="block")
+
+    notebook = nbformat.read(path, as_version=4)
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":  # browsers show MathML without scripts
+            cell.source = re.sub(r"\$\$(.+?)\$\$", mathml, cell.source, flags=re.DOTALL)
+    # nbconvert's complete pages load scripts from the network, but the basic template does not;
+    # without embed_images, which would take MathML apart; pictures of outputs are embedded anyway
+    exporter = HTMLExporter(
+        template_name="basic",
+        exclude_input_prompt=True,
+        exclude_output_prompt=True,
+        exclude_anchor_links=True,
+    )
+    content, resources = exporter.from_notebook_node(notebook)
+    return texts.render(
+        "notebook.html.j2",
+        title=path.stem,
+        content=Markup(content),
+        style=Markup("\n".join(resources["inlining"]["css"])),
+        page=os.path.relpath(page_path, path.parent),
+    )
+
+
+def _chapters(settings: Settings) -> dict[str, list[dict[str, Any]]]:
+    """Return the described artefacts of each chapter, {title: artefacts}.
+
+    The figures in git begin with chapter 4 on real frames.
+    """
+    chapters = {}
+    if settings.figures_in_git:
+        chapters[REAL_CHAPTER] = _of_real_frames(settings)
+    numbers = beside_the_thesis(settings)
+    for title, artefacts in (captions.CHAPTERS | {"Beyond the thesis": captions.ADDED}).items():
+        chapters[title] = [_describe(artefact, settings, numbers) for artefact in artefacts]
+    return chapters
+
+
+def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
+    """Return the described artefacts of the evidence on real frames that is in git."""
+    real = replace(settings, figures=settings.figures / REAL, kitti_is_embedded=False)
+    numbers = beside_the_thesis(real)
+    chapter = [
+        *captions.CHAPTERS["Chapter 4: results"],
+        *(artefact for artefact in captions.ADDED if artefact["name"] in ("comparison", "widths")),
+    ]
+    described = [_describe(artefact, real, numbers) for artefact in chapter]
+    for artefact in described:
+        artefact["id"] = f"real-{artefact['id']}"
+        artefact["files"] = [f"{REAL}/{name}" for name in artefact["files"]]
+        artefact["opens"] = False
+    return [artefact for artefact in described if artefact["there"]]
+
+
+def build(settings: Settings) -> str:
+    """Return the page of a run as HTML, made from the files in its folders."""
+    chapters = _chapters(settings)
+    of_run = [described for title, described in chapters.items() if title != REAL_CHAPTER]
+    artefacts = list(itertools.chain(*of_run))
+    of_thesis = [artefact for artefact in artefacts if artefact["number"] is not None]
+    missing = [
+        artefact for artefact in artefacts if not (artefact["there"] or artefact["left_out"])
+    ]
+    notebooks = {}
+    made = page.made_with()
+    if not settings.figures_in_git:  # a clone has no executed notebooks
+        made |= page.made_on()
+        executed = _executed(settings)
+        for path in executed:
+            notebooks[path.stem] = os.path.relpath(path.with_suffix(".html"), settings.figures)
+        if executed:
+            latest = max(path.stat().st_mtime for path in executed)
+            made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"
+    return texts.render(
+        "page.html.j2",
+        title=f"Keypoint masks, {settings.run}",
+        settings=settings,
+        network=trainings.network_note(settings),
+        chapters=chapters,
+        shown=sum(artefact["there"] for artefact in of_thesis),
+        of=len(captions.THESIS),
+        card=captions.CARD,
+        missing=missing,
+        documents=_documents(settings),
+        notebooks=notebooks,
+        folder=os.path.relpath(settings.build / "notebooks", settings.figures),
+        made=made,
+    )
+
+
+def _documents(settings: Settings) -> dict[str, page.Content]:
+    """Return the texts of the folder docs that a page has, if links from it reach the folder."""
+    names = []
+    if settings.figures_in_git:
+        names.append("answer")
+    if settings.figures.is_relative_to(ROOT):
+        names.append("own-masks")
+    documents = {}
+    for name in names:
+        text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+        # links are relative to docs
+        folder = quote(os.path.relpath(ROOT / "docs", settings.figures))
+        text = re.sub(r"\]\((?!\w+:|#)", f"]({folder}/", text)
+        _, _, without_title = text.partition("\n")
+        documents[name] = page.text_content(without_title)
+    return documents
+
+
+def _describe(
+    artefact: dict[str, Any], settings: Settings, numbers: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the values that a template needs to show an artefact of a run.
+
+    numbers: of the run, from `beside_the_thesis`.
+    """
+    name = artefact["name"]
+    described = page.describe(settings.figures, artefact)
+    if name in captions.THESIS:
+        # figure_4_07 is Figure 4.7, figure_a_01 is Figure A.1
+        _, chapter, count = name.split("_")
+        described["number"] = f"{artefact['kind'].capitalize()} {chapter.upper()}.{int(count)}"
+        described["id"] = name
+    described["opens"] = described["there"] and described["id"] in OPENING
+    described["makers"] = [
+        notebook for notebook, names in captions.MADE_BY.items() if name in names
+    ]
+    if described["thesis"]:
+        described["thesis"] = _of_thesis(described["thesis"], settings, numbers.get(name))
+    if not described["there"] and _is_left_out(artefact, settings):
+        described["left_out"] = artefact["needs"]
+    return described
+
+
+def _of_thesis(
+    thesis: dict[str, Any], settings: Settings, numbers: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return what the thesis reports beside an artefact and what this run gives, as texts.
+
+    thesis: the templates, see `captions`. numbers: of this run, or None if it has none.
+    """
+    fill = texts.TEMPLATES.from_string
+    here: Any = False
+    if numbers is not None:
+        here = fill(thesis["here"]).render(numbers)
+    is_embedded = {
+        "runs": settings.kitti_is_embedded,
+        "training": settings.cityscapes_is_embedded,
+    }
+    return thesis | {
+        "text": fill(thesis["text"]).render(captions.REPORTED),
+        "here": here,
+        "embedded": is_embedded.get(thesis["data"], False),
+    }
+
+
+def _is_left_out(artefact: dict[str, Any], settings: Settings) -> bool:
+    """Return whether a run does not make an artefact, since a variable that it needs is not set."""
+    needs = artefact.get("needs")
+    if not needs or not settings.uses_shipped_model:
+        return False
+    return needs != "KITTI_SEMANTIC" or not settings.kitti_semantic
+
+
+def beside_the_thesis(settings: Settings) -> dict[str, Any]:
+    """Return this run's numbers for artefacts whose numbers the thesis reports in its text.
+
+    Their form is {name of the artefact: numbers}. A name is missing if its file was not written.
+    """
+    numbers: dict[str, Any] = {}
+    history = tables.read(settings.build / "model" / "history.csv")
+    if len(history):
+        best = history.loc[history["val_loss"].idxmin()]
+        last = history.iloc[-1]
+        numbers["figure_4_01"] = {
+            "epochs": len(history),
+            "best": best.to_dict(),
+            "last": last.to_dict(),
+        }
+    chosen = tables.read(settings.figures / "table_4_1.csv")
+    if "mean keypoints" in chosen:
+        numbers["figure_4_07"] = {"keypoints": chosen["mean keypoints"].clip(lower=1)}
+    seconds = tables.read(settings.figures / "timings" / "seconds.csv")
+    if len(seconds):
+        numbers["figure_4_17"] = {"saved": 0 - thesis_tables.time_savings(seconds)}
+    return numbers
+
+
+def main() -> None:
+    """Write the page of the run of the current settings."""
+    settings = read_settings()
+    update(settings, settings.published)
+    if note := trainings.network_note(settings):
+        print(note)
+
+
+if __name__ == "__main__":
+    messages.run_main(main)

@@ -1,0 +1,194 @@
+"""Tables 4.1 to 4.3 and the time of a frame, with units and few digits.
+
+`runs` is the table of `runner.run_jobs`. Equation 4.1 and the choice of a width are in
+`thesis_tables`.
+"""
+
+from typing import Any
+
+import pandas as pd
+
+from thesis import thesis_tables
+from thesis.captions import REPORTED
+from thesis_repro.report.tables import IMPROVED, three_digits
+from thesis_repro.study import compare
+
+
+def table_4_1(runs: pd.DataFrame, reported_as: str) -> pd.DataFrame:
+    """Table 4.1: each sequence's best dilation width and mean number of keypoints.
+
+    The last columns have the thesis's numbers; reported_as: how to name them.
+    """
+    masked = compare.of_method(runs, "masked")
+    best = thesis_tables.best_widths(masked)
+    reported = pd.DataFrame(REPORTED["table_4_1"]).set_index("sequence")
+    reported = reported.reindex(best.index).astype("Int64")
+    table = pd.DataFrame(index=best.index)
+    table["frames"] = best["frames"]
+    table["dilation width (pixels)"] = best["dilation_width"]
+    table["mean keypoints"] = best["mean_keypoints"].round().astype(int)
+    table["lost runs"] = _lost_of(thesis_tables.of_chosen_width(masked))
+    table[f"width, {reported_as}"] = reported["dilation_width"]
+    table[f"mean keypoints, {reported_as}"] = reported["mean_keypoints"]
+    return table.reset_index()
+
+
+REPORTED_CHANGES = {
+    "rmse": "table_4_2_rmse_percent_change",
+    "mae": "table_4_3_mae_percent_change",
+}
+
+
+def table_of_change(
+    runs: pd.DataFrame, shuffled: pd.DataFrame, metric: str, reported_as: str
+) -> pd.DataFrame:
+    """Tables 4.2 and 4.3: a metric with all keypoints and with the best mask, and Equation 4.1.
+
+    The metric ("rmse" or "mae") is in metres, Equation 4.1 in percent. The column "one run each"
+    has the thesis's literal procedure: one run of all keypoints and of each width (repetition 0),
+    also for the choice of the width. Beside it stands what this procedure gives if masks do nothing
+    (`thesis_tables.null_distribution`), simulated from `shuffled`: runs with all
+    keypoints, many repetitions.
+    The last rows have the sum of the percentages (the thesis's "aggregate"), their mean with
+    Student's t interval, and their median. A lost run counts as not improved.
+    """
+    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    best = thesis_tables.of_chosen_width(masked)
+    single = masked[masked["repetition"] == 0]
+    first_best = thesis_tables.of_chosen_width(single)
+    widths = masked["dilation_width"].nunique()
+    studies = thesis_tables.null_distribution(shuffled, widths, metric)
+    columns = {
+        "change (%)": thesis_tables.changes(best, baseline, metric),
+        SINGLE: thesis_tables.changes_of_repetition(masked, baseline, metric),
+        NULL: studies.mean(),
+        f"change (%), {reported_as}": pd.Series(REPORTED[REPORTED_CHANGES[metric]]),
+    }
+    table = pd.DataFrame(index=sorted(baseline["sequence"].unique()))
+    for method, rows in {"all keypoints": baseline, "best mask": best}.items():
+        mean = rows.groupby("sequence")[metric].mean()
+        table[f"{metric.upper()}, {method} (m)"] = mean.map(three_digits)
+        table[f"lost runs, {method}"] = _lost_of(rows)
+    judged = {"change (%)": best, SINGLE: first_best}
+    summary = {}
+    for name, changes in columns.items():
+        table[name] = changes.reindex(table.index)
+        summary[name] = _summary(changes, judged.get(name))
+    if len(studies.columns):
+        summary[NULL] = _summary_of_studies(studies)
+    else:
+        del summary[NULL], table[NULL]
+    last_rows = pd.DataFrame(summary, dtype=float).reindex(columns=table.columns)
+    table = pd.concat([table.astype(object), last_rows.astype(object)])
+    table[list(summary)] = table[list(summary)].astype(float).round(2)
+    errors = [name for name in table if name.endswith("(m)")]
+    table[errors] = table[errors].astype(float)
+    return table.rename_axis("sequence").reset_index()
+
+
+SINGLE = "change (%), one run each"
+NULL = "change (%), one run each, if masks did nothing"
+
+
+def _lost_of(runs: pd.DataFrame) -> pd.Series:
+    """Return the lost runs of each sequence as a text, "2 of 5"."""
+    lost = {name: compare.lost(rows) for name, rows in runs.groupby("sequence")}
+    return pd.Series(lost, dtype=str)
+
+
+CI = f"mean, {compare.LEVEL} % CI over sequences"
+
+
+def _summary(changes: pd.Series, runs: pd.DataFrame | None = None) -> dict[str, float]:
+    """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%).
+
+    runs: those with masks behind the changes; None if only the changes are known.
+    """
+    low, high = compare.mean_interval(changes)
+    improved = (changes < 0).sum()
+    if runs is not None:
+        improved = thesis_tables.improved(changes, runs)
+    return {
+        "sum (the thesis's aggregate)": changes.sum(min_count=1),
+        "mean": changes.mean(),
+        f"{CI}, from": low,
+        f"{CI}, to": high,
+        "median": changes.median(),
+        IMPROVED: improved,
+    }
+
+
+def _summary_of_studies(studies: pd.DataFrame) -> dict[str, float]:
+    """Return the last rows for simulated studies (%), one row a study: means over the studies."""
+    means = studies.mean(axis=1)
+    low, high = thesis_tables.middle(means)
+    middle = f"mean, middle {compare.LEVEL} % of {len(studies)} simulated studies"
+    return {
+        "sum (the thesis's aggregate)": studies.sum(axis=1).mean(),
+        "mean": means.mean(),
+        f"{middle}, from": low,
+        f"{middle}, to": high,
+        "median": studies.median(axis=1).mean(),
+        IMPROVED: (studies < 0).sum(axis=1).mean(),
+    }
+
+
+def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return what the thesis's literal procedure gives (Tables 4.2 and 4.3), one dict a metric.
+
+    shuffled: runs with all keypoints, to simulate the procedure if masks did nothing.
+
+    Changes are in percent: mean, median, improved and lost (sequences) of repetition 0; lowest and
+    highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
+    nothing (`thesis_tables.null_distribution`).
+    """
+    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+    widths = masked["dilation_width"].nunique()
+    # the embedded world repeats only one width, and one width is no choice
+    widths_run = masked.groupby("repetition")["dilation_width"].nunique()
+    repetitions = sorted(widths_run.index[widths_run == widths])
+    rows = []
+    for metric in ("rmse", "mae"):
+        by_repetition = [
+            thesis_tables.changes_of_repetition(masked, baseline, metric, repetition)
+            for repetition in repetitions
+        ]
+        means = [changes.mean() for changes in by_repetition]
+        best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
+        studies = thesis_tables.null_distribution(shuffled, widths, metric)
+        null_means = studies.mean(axis=1)
+        null_low, null_high = thesis_tables.middle(null_means)
+        row = {
+            "name": compare.METRICS[metric],
+            "widths": widths,
+            "sequences": len(by_repetition[0]),
+            "mean": means[0],
+            "median": by_repetition[0].median(),
+            "improved": thesis_tables.improved(by_repetition[0], best),
+            "lost": int(best["lost"].sum()),
+            "lowest": min(means),
+            "highest": max(means),
+            "repetitions": len(means),
+            "studies": len(studies),
+            "null_mean": null_means.mean(),
+            "null_low": null_low,
+            "null_high": null_high,
+            "null_improved": (studies < 0).sum(axis=1).mean(),
+        }
+        rows.append(row)
+    return rows
+
+
+def table_budget(measured: pd.DataFrame) -> pd.DataFrame:
+    """Return the milliseconds of each stage for one frame, one column a method.
+
+    The last rows have their sum and the frames a second. measured: method, stage and milliseconds,
+    from `timing.measure`.
+    """
+    table = measured.pivot(index="stage", columns="method", values="milliseconds")
+    table = table.loc[measured["stage"].unique(), measured["method"].unique()]
+    total = table.sum()
+    summary = pd.DataFrame({"all stages (ms)": total, "frames a second": 1000 / total}).T
+    stages = table.round(2).rename("{} (ms)".format)
+    table = pd.concat([stages, summary.round(1)])
+    return table.rename_axis("stage", axis=0).rename_axis(None, axis=1).reset_index()

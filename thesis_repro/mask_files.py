@@ -1,0 +1,220 @@
+"""Masks of a sequence in files: made from label maps on access, or read from images."""
+
+import os
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from thesis_repro.data.cityscapes import read_label_map
+from thesis_repro.data.kitti import Sequence, check_size
+from thesis_repro.errors import InputError, need
+from thesis_repro.masks import (
+    THESIS_MASKS,
+    MaskSettings,
+    check_width,
+    edges,
+    finished,
+    forbidden,
+)
+from thesis_repro.running import results
+from thesis_repro.running.files import listed, numbers_of, progress, read_gray, write_png
+
+
+class LabelMasks:
+    """Masks of a sequence, made from label maps on access: masks[i] for frame i.
+
+    folder: holds one label map a frame, of any size, as a PNG with the frame's name, or a folder of
+    them for each sequence. settings: as in `keypoint_mask`.
+    Raises InputError if the folder or a frame's label map is missing.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        sequence: Sequence,
+        dilation_width: int,
+        settings: MaskSettings = THESIS_MASKS,
+    ) -> None:
+        need("settings", settings, MaskSettings)
+        self.paths = _paths_by_frame(folder, sequence, "label map")
+        self.frame_paths = sequence.frame_paths
+        self.size = sequence.size
+        self.dilation_width = dilation_width
+        self.settings = settings
+        check_width(dilation_width, self.size)
+        for name, pixels, limit in (
+            ("margin", settings.margin, (min(self.size) - 1) // 2),
+            ("movable", settings.movable or 0, max(self.size) - 1),
+        ):
+            if pixels > limit:
+                raise InputError(
+                    f"{name}={pixels}: leaves nothing of frames of {self.size[1]}x{self.size[0]}; give at "
+                    f"most {limit} pixels"
+                )
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        need("index", index, int | np.integer)
+        edge_image, forbidden_pixels = _undilated(
+            _version(self.paths[index]), self.size, self.settings
+        )
+        return finished(edge_image, forbidden_pixels, self.dilation_width, self.settings)
+
+
+def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
+    """Label map of frame `index`, in label ids."""
+    return read_label_map(masks.paths[index], masks.settings.ids == "train")
+
+
+# Masks of several widths share edges, and masks of several settings share label maps. A control
+# takes the label map of another frame. So the last few are kept, until a file changes.
+
+
+def _version(path: Path) -> tuple[Path, int, int]:
+    status = os.stat(path)
+    return path, status.st_mtime_ns, status.st_size
+
+
+@lru_cache(maxsize=8)
+def _undilated(
+    version: tuple[Path, int, int], size: tuple[int, int], settings: MaskSettings
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """The edges and the forbidden pixels of a label map's file."""
+    label_map = _read_once(version, settings.ids == "train")
+    return edges(label_map, size, settings), forbidden(label_map, size, settings)
+
+
+@lru_cache(maxsize=2)
+def _read_once(version: tuple[Path, int, int], train_ids: bool) -> np.ndarray:
+    return read_label_map(version[0], train_ids)
+
+
+def forget_edges() -> None:
+    """Clear what LabelMasks keeps, so that the time to make a mask can be measured."""
+    _undilated.cache_clear()
+    _read_once.cache_clear()
+
+
+def write_masks(masks: LabelMasks, folder: str | Path) -> None:
+    """Write the mask of every frame as a PNG with the frame's name (A.8). `MaskFolder` reads them.
+
+    The folder is a stage (see results): a stopped run resumes, and masks made from other label maps
+    or settings are moved aside.
+    """
+    with results.claimed(folder):
+        folder = results.stage(
+            folder,
+            labels=results.digest_of_files(masks.paths),
+            size=masks.size,
+            **asdict(masks.settings),
+            dilation_width=masks.dilation_width,
+            frames=results.digest_of_files(masks.frame_paths),
+            code=results.digest_of_code("thesis_repro.masks", "thesis_repro.data.cityscapes"),
+            **results.made_with("opencv"),
+        )
+        for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
+            if not (folder / path.name).is_file():
+                write_png(folder / path.name, masks[index])
+
+
+class MaskFolder:
+    """Masks of a sequence read from images with the frames' names: masks[i] for frame i.
+
+    One image is used for all frames if `folder` is a file, or holds a single file without the name
+    of a frame.
+    invert: keypoints are allowed where the image is 0. Raises InputError if the folder or a frame's
+    mask is missing, and as `read_mask` does.
+    """
+
+    def __init__(self, folder: str | Path, sequence: Sequence, invert: bool = False) -> None:
+        self.paths = _paths_by_frame(folder, sequence, "mask")
+        self.size = sequence.size
+        self.invert = invert
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        need("index", index, int | np.integer)
+        mask = read_mask(self.paths[index], self.size)
+        if self.invert:
+            return cv2.bitwise_not(mask)
+        return mask
+
+
+def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
+    """Read a mask for frames of (height, width).
+
+    It is uint8, 0 where keypoints are forbidden and 255 elsewhere; a file may have another value in
+    place of 255, such as 1. Raises InputError if the size differs or there are more than two
+    values, as in a label map.
+    """
+    mask = read_gray(path)
+    check_size(Path(path), mask.shape, size, "its frame")
+    if ((mask != 0) & (mask != mask.max())).any():
+        raise InputError(
+            f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps go "
+            "with --labels)"
+        )
+    return np.where(mask, np.uint8(255), np.uint8(0))
+
+
+def folder_of_sequence(folder: str | Path, sequence: str) -> Path:
+    """Folder with the label maps or masks of a sequence.
+
+    That is the folder of its name in `folder`, or `folder` itself if that holds files, as
+    `thesis-repro predict` and `masks` write them.
+    """
+    folder = Path(folder)
+    subfolder = folder / sequence
+    if not subfolder.is_dir() and any(folder.glob("[!.]*.png")):
+        return folder
+    return subfolder
+
+
+def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[Path]:
+    """One path a frame to its mask or label map. Raises InputError if one is missing."""
+    need("sequence", sequence, Sequence)
+    if kind == "mask" and Path(folder).is_file():
+        return [Path(folder)] * len(sequence)
+    folder = folder_of_sequence(folder, sequence.name)
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: no such folder; it must hold one {kind} for each frame of sequence "
+            f"{sequence.name}"
+        )
+    present = {path.name: path for path in listed(folder)}
+    if kind == "mask" and len(present) == 1:
+        single = next(iter(present.values()))
+        # a single mask named as frames are is the mask of one frame only
+        if not _is_named_as_a_frame(single, sequence):
+            return [single] * len(sequence)
+    paths: list[Path] = []
+    missing: list[str] = []
+    for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True):
+        # some tools append .png to the whole name
+        path = present.get(name) or present.get(f"{frame.name}.png")
+        if path is None:
+            missing.append(name)
+        else:
+            paths.append(path)
+    if missing:
+        raise InputError(
+            f"{folder / missing[0]}: no such {kind} ({len(missing)} of {len(sequence)} frames of sequence "
+            f"{sequence.name} have none); each frame needs one"
+        )
+    return paths
+
+
+def _is_named_as_a_frame(mask: Path, sequence: Sequence) -> bool:
+    """Whether a mask is that of one frame, by its name, with or without an appended .png."""
+    for frame in listed(sequence.frame_paths[0].parent, "*"):  # those outside of a subset, too
+        if mask.name in (f"{frame.stem}.png", f"{frame.name}.png"):
+            return True
+    stem = mask.name.removesuffix(".png").removesuffix(".png")
+    return numbers_of([*sequence.frame_paths, Path(stem)]) is not None

@@ -1,0 +1,125 @@
+"""The findings of a run, a study or the evidence on real frames, in words.
+
+They share one template (findings.md.j2). Its conditions depend only on what was run and on the
+verdicts.
+"""
+
+from typing import Any
+
+import pandas as pd
+
+from thesis_repro.report import texts
+from thesis_repro.study import best_width, compare
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
+
+# what the template of the findings says of every comparison, whatever was run
+OF_COMPARISONS = {
+    "estimators": ESTIMATORS,
+    "methods": compare.METHODS,
+    "metrics": compare.METRICS,
+    "deciding_metrics": list(compare.JUDGING_METRICS),
+    "too_few": compare.TOO_FEW,
+    "fewest": compare.MIN_SEQUENCES,
+    "least": compare.MIN_FOR_INTERVAL,
+    "level": compare.LEVEL,
+    "far": compare.FAR_OFF,
+    "thesis_width": CONTROL_WIDTH,
+}
+
+
+def text(
+    runs: pd.DataFrame,
+    table: pd.DataFrame,
+    data: str,
+    embedded: bool,
+    label_maps: list[dict[str, Any]] | tuple[()] = (),
+    trainings: list[dict[str, Any]] | tuple[()] = (),
+    procedure: list[dict[str, Any]] | tuple[()] = (),
+) -> str:
+    """Return the findings of a run, a study or the evidence as Markdown.
+
+    table: `compare.comparisons` of the runs. data: one line with the origin of the data.
+    embedded: whether the frames are those of the embedded world, which is no evidence about KITTI.
+    The reproduction of the thesis adds: label_maps, the quality of the label maps, one dict a
+    domain; trainings, what other trainings of the network give, one dict an estimator; procedure,
+    what the thesis's own procedure gives, one dict a metric (see the modules in notebooks/thesis).
+    """
+    baseline = runs[runs["method"] == "baseline"]
+    with_masks = set(runs.loc[runs["method"] == "masked", "source"])
+    sources = [
+        _source_values(runs, table, source)
+        for source in compare.sources(runs) or [""]
+        if source in with_masks
+    ]
+    measured = set(table["metric"])
+    deciding = [label for name, label in compare.JUDGING_METRICS.items() if name in measured]
+    return texts.render(
+        "findings.md.j2",
+        **OF_COMPARISONS,
+        data=data,
+        embedded=embedded,
+        label_maps=label_maps,
+        trainings=trainings,
+        frames=baseline.groupby("sequence")["frames"].first().to_dict(),
+        repetitions=baseline["repetition"].nunique(),
+        spread=_shuffle_spread(runs),
+        deciding=deciding,
+        estimators_run=set(table["estimator"]),
+        sources=sources,
+        procedure=procedure,
+        against_each_other=_sources_against_each_other(table),
+    )
+
+
+def _shuffle_spread(runs: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Return {estimator: {"median", "max"}} of the factors of `compare.shuffle_spread`."""
+    factors = compare.shuffle_spread(runs).groupby("estimator")["factor"]
+    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATORS)).dropna()
+    return spread.T.to_dict()
+
+
+def _sources_against_each_other(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of `table` that compare masks of two sources, each pair of sources once."""
+    both_masked = (table["method"] == "masked") & (table["reference"] == "masked")
+    once = table["source"] < table["reference_source"]
+    pairs = table[both_masked & once & _judging(table)]
+    return pairs.to_dict("records")
+
+
+def _judging(table: pd.DataFrame) -> pd.Series:
+    """Return for each row of `compare.comparisons` whether it may decide, bool."""
+    metric = table["metric"].isin(compare.JUDGING_METRICS)
+    return metric & (table["estimator"] == compare.judging_estimator(table))
+
+
+def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict[str, Any]:
+    """Return the values of one source of masks for the template."""
+    runs = compare.of_source(runs, source)
+    masked = compare.of_method(runs, "masked")
+    widths = masked["dilation_width"].nunique()
+    same_best, repeated = None, 0
+    if widths > 1:
+        stability = best_width.stability(masked, compare.of_method(runs, "baseline"))
+        mean = stability["same_best"].mean()
+        if not pd.isna(mean):
+            same_best, repeated = float(mean), int(stability["same_best"].count())
+    judged = compare.primary_comparison(table, source)
+    over_all = (table["source"] == source) & (table["reference"] == "baseline") & table["tested"]
+    of_masks = table[over_all & (table["method"] == "masked")]
+    of_corrected = table[over_all & (table["method"] == "corrected") & _judging(table)]
+    controls = compare.against(table, compare.SEGMENTATION_FREE_CONTROLS, source)
+    controls = controls[controls["reference_source"] == source]
+    verdicts = controls.groupby("reference", sort=False)["verdict"].agg(compare.overall)
+    return {
+        "name": source,
+        "judged": judged.to_dict("records"),
+        "verdict": compare.overall(judged["verdict"]),
+        "width": compare.tested_width(runs),
+        "masked": of_masks.to_dict("records"),
+        "lost": of_masks.drop_duplicates("estimator").to_dict("records"),
+        "corrected": of_corrected.to_dict("records"),
+        "controls": verdicts.to_dict(),
+        "widths": widths,
+        "same_best": same_best,
+        "repeated": repeated,
+    }
