@@ -166,17 +166,6 @@ def test_a_missing_frame_is_named_if_frames_are_counted_one_by_one(path, numbers
         assert counts and int(re.search(r"(\d+).png: ", str(error))[1]) == missing[0]
 
 
-@given(
-    st.binary(max_size=300)
-    | st.binary(max_size=300).map(lambda data: b"\x89PNG\r\n\x1a\n" + data)
-    | st.binary(max_size=300).map(lambda data: b"\xff\xd8\xff" + data)
-)
-def test_any_bytes_as_an_image(path, data):
-    for reader in (files.read_gray, files.read_ids):
-        image = read(reader, path, data)
-        assert image is None or image.ndim == 2
-
-
 PIXELS = np.random.default_rng(0).integers(0, 35, (20, 30), np.uint8)
 PICTURE = cv2.imencode(".png", PIXELS)[1].tobytes()
 
