@@ -20,6 +20,7 @@ def compiled(function: Callable, **options: Any) -> Callable:
     C-contiguous arrays of one type.
     """
     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
+    dispatcher: Any = None
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # Numba finds no folder that it may write its cache to

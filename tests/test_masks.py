@@ -229,6 +229,9 @@ def test_wrong_arguments_are_named(labelled):
             mask_files.LabelMasks(folder, sequence, width)
     with pytest.raises(InputError, match="sequence"):
         mask_files.LabelMasks(folder, "00", 4)
-    for several in (mask_files.LabelMasks(folder, sequence, 4), mask_files.MaskFolder(folder, sequence)):
+    for several in (
+        mask_files.LabelMasks(folder, sequence, 4),
+        mask_files.MaskFolder(folder, sequence),
+    ):
         with pytest.raises(InputError, match="index"):
             several[0:2]

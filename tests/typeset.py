@@ -10,7 +10,9 @@ MOST = 3  # points by which a line may be too wide
 
 def assert_fits(texts, columns, folder):
     """Typeset tables, {name: LaTeX}, in one document. No line or page may be too full."""
-    document = rf"\documentclass[{columns}]{{article}}\usepackage{{booktabs,graphicx}}\begin{{document}}"
+    document = (
+        rf"\documentclass[{columns}]{{article}}\usepackage{{booktabs,graphicx}}\begin{{document}}"
+    )
     for name, text in texts.items():
         (folder / f"{name}.tex").write_text(text)
         document += f"\nText.\n\n\\input{{{name}}}\n"

@@ -22,6 +22,9 @@ from thesis_repro.masks import (
 from thesis_repro.running import results
 from thesis_repro.running.files import listed, numbers_of, progress, read_gray, write_png
 
+ENDINGS = (".png", ".jpg", ".jpeg")  # of masks, in small or capital letters
+MAX_GRAY = 0.2  # share of a mask's pixels; label maps have more, edges of JPEG files less
+
 
 class LabelMasks:
     """Masks of a sequence, made from label maps on access: masks[i] for frame i.
@@ -147,21 +150,35 @@ class MaskFolder:
         return mask
 
 
-def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """Read a mask for frames of (height, width).
+def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a mask, (height, width) uint8: 0 where keypoints are forbidden, 255 elsewhere.
 
-    It is uint8, 0 where keypoints are forbidden and 255 elsewhere; a file may have another value in
-    place of 255, such as 1. Raises InputError if the size differs or there are more than two
-    values, as in a label map.
+    Masks of other tools are read, too: the alpha channel of an image of one colour; any other value
+    in place of 255; of gray edges, the nearer value. size: (height, width) of its frame.
+    Raises InputError for another size, for a picture with an alpha channel, and for more gray than
+    edges have, as in a label map.
     """
-    mask = read_gray(path)
-    check_size(Path(path), mask.shape, size, "its frame")
-    if ((mask != 0) & (mask != mask.max())).any():
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        return read_gray(path)  # raises the error that says why
+    mask = pixels
+    if pixels.ndim == 3:
+        mask = cv2.cvtColor(pixels[..., :3], cv2.COLOR_BGR2GRAY)
+        alpha = pixels[..., 3:]
+        if (alpha != alpha[:1, :1]).any():
+            if (mask != mask[0, 0]).any():
+                raise InputError(f"{path}: holds a picture and an alpha channel; save one of them")
+            mask = alpha[..., 0]
+    if size is not None:
+        check_size(Path(path), mask.shape, size, "its frame")
+    shares = mask / max(mask.max(), 1)
+    gray = np.mean((shares > 0.1) & (shares < 0.9))
+    if gray > MAX_GRAY:
         raise InputError(
-            f"{path}: holds {len(np.unique(mask))} different values; a mask has 0 and 255 (label maps go "
-            "with --labels)"
+            f"{path}: {gray:.0%} of its pixels are gray; a mask has 0 and 255 (label maps go with "
+            "--labels)"
         )
-    return np.where(mask, np.uint8(255), np.uint8(0))
+    return np.where(shares > 0.5, np.uint8(255), np.uint8(0))
 
 
 def folder_of_sequence(folder: str | Path, sequence: str) -> Path:
@@ -189,6 +206,8 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
             f"{sequence.name}"
         )
     present = {path.name: path for path in listed(folder)}
+    if kind == "mask":
+        present = _images_by_name(folder)
     if kind == "mask" and len(present) == 1:
         single = next(iter(present.values()))
         # a single mask named as frames are is the mask of one frame only
@@ -209,6 +228,12 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
             f"{sequence.name} have none); each frame needs one"
         )
     return paths
+
+
+def _images_by_name(folder: Path) -> dict[str, Path]:
+    """Return the masks of a folder by their names with the ending .png."""
+    paths = [path for path in listed(folder, "*") if path.suffix.lower() in ENDINGS]
+    return {f"{path.stem}.png": path for path in paths}
 
 
 def _is_named_as_a_frame(mask: Path, sequence: Sequence) -> bool:

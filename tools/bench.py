@@ -27,14 +27,14 @@ import numpy as np
 import pandas as pd
 import tensorflow as tf
 
-from thesis_repro import masks, odometry
+from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
 from thesis_repro.running import messages
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
-from thesis_repro.study import controls
+from thesis_repro.study import methods
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.sources import Source
 
@@ -136,17 +136,17 @@ def shared_cost(sequence):
 def mask_cost(sequence, labels):
     """Return CPU milliseconds a mask, for masks made together and one by one.
 
-    The masks are those of all widths and controls.
+    The masks are those of all widths and methods.
     """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        controls.masks_of_method(method, source, sequence, controls.LINE_WIDTH)
-        for method in controls.MASK_CONTROLS
+        methods.masks_of_method(method, source, sequence, methods.LINE_WIDTH)
+        for method in methods.MASK_CONTROLS
         if method != "true-labels"
     ]
     for index in range(len(sequence)):
-        for column, forget in enumerate((lambda: None, masks.forget_edges)):
-            masks.forget_edges()
+        for column, forget in enumerate((lambda: None, mask_files.forget_edges)):
+            mask_files.forget_edges()
             for kind in kinds:
                 forget()
                 costs[column] += seconds(lambda: kind[index], time.process_time)  # noqa: B023

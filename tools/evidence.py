@@ -15,7 +15,7 @@ import pandas as pd
 
 import failures
 import label_quality
-from thesis_repro import masks
+from thesis_repro import mask_files, masks
 from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
@@ -67,7 +67,7 @@ def write(settings, folder, others=()):
     runs = _read(settings, "runs")
     other_runs = _other_runs(settings, sequences, others)
     label_masks = [
-        masks.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH)
+        mask_files.LabelMasks(labels / sequence.name, sequence, jobs.CONTROL_WIDTH)
         for sequence in sequences
     ]
     steps = pd.concat(map(failures.measure, sequences, label_masks), ignore_index=True)

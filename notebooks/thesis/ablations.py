@@ -13,15 +13,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
-from thesis_repro.odometry.pose import normalise
 
-from thesis_repro import masks, odometry
+from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.masks import MaskSettings
-from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
+from thesis_repro.odometry import THESIS, OdometrySettings, estimators, metrics
+from thesis_repro.odometry.odometry import detect, normalise, track
 from thesis_repro.odometry.runs import Masks
-from thesis_repro.odometry.odometry import normalise
 from thesis_repro.running import results
 from thesis_repro.running.files import progress
 from thesis_repro.study import workers
@@ -50,7 +49,7 @@ def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.
 
     amount: their number (int), or their share of all keypoints (float).
     """
-    points = keypoints.detect(sequence.frame(index), THESIS).astype(int)
+    points = detect(sequence.frame(index), THESIS).astype(int)
     number = amount
     if isinstance(amount, float):
         number = round(amount * len(points))
@@ -162,8 +161,10 @@ def _methods(sequence: Sequence, labels: Path, dilation_width: int) -> dict[str,
         is_vegetation = np.isin(enlarged(index), VEGETATION)
         return np.where(is_vegetation, np.uint8(0), np.uint8(255))
 
-    thesis_masks = masks.LabelMasks(labels, sequence, dilation_width)
-    symmetric = masks.LabelMasks(labels, sequence, dilation_width, MaskSettings(symmetric=True))
+    thesis_masks = mask_files.LabelMasks(labels, sequence, dilation_width)
+    symmetric = mask_files.LabelMasks(
+        labels, sequence, dilation_width, MaskSettings(symmetric=True)
+    )
     number = _mean_number(sequence, thesis_masks)
     methods: dict[str, Run] = {
         "baseline": (THESIS, None),
@@ -187,7 +188,7 @@ def _mean_number(sequence: Sequence, frame_masks: Masks) -> int:
     """Return the mean number of keypoints that masks leave, from about eight frames."""
     numbers = []
     for index in range(0, len(sequence), max(1, len(sequence) // 8)):
-        points = keypoints.detect(sequence.frame(index), THESIS, frame_masks[index])
+        points = detect(sequence.frame(index), THESIS, frame_masks[index])
         numbers.append(len(points))
     return round(np.mean(numbers))
 
@@ -221,10 +222,10 @@ def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: in
             mask = None
             if frame_masks is not None:
                 mask = frame_masks[index]
-            points = keypoints.detect(before, THESIS, mask)
+            points = detect(before, THESIS, mask)
             if len(points) < 10:
                 continue
-            moved, tracked = keypoints.track(before, after, points)
+            moved, tracked = track(before, after, points)
             distances = sampson_distances(
                 points[tracked], moved[tracked], motion, sequence.intrinsics
             )

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from thesis_repro.odometry import metrics
-from thesis_repro.report import style
+from thesis_repro.report import paths, style
 from thesis_repro.report.style import BLUE, GREEN, KEYPOINT, ORANGE, RED, SKY
 
 
@@ -158,8 +158,16 @@ def figure_2_08(poses: np.ndarray, title: str) -> plt.Figure:
     positions, right, ahead = (poses[:, [0, 2], column] for column in (3, 0, 2))
     figure, axes = style.new_figure(height=3.8)
     axes.plot(*positions.T, "o", markersize=4, color="black")
-    look: dict[str, Any] = {"angles": "xy", "units": "height", "scale": 11, "width": 0.01}
-    axes.quiver(*positions.T, *ahead.T, color=BLUE, zorder=3, **look)
+    axes.quiver(
+        *positions.T,
+        *ahead.T,
+        color=BLUE,
+        zorder=3,
+        angles="xy",
+        units="height",
+        scale=11,
+        width=0.01,
+    )
     for index, position in enumerate(positions):
         axes.annotate(f"$C_{{{index}}}$", position, 16 * right[index], **FORMULA)
     for index in range(1, len(poses)):
@@ -200,8 +208,7 @@ def _draw_motion(axes: plt.Axes, poses: np.ndarray, index: int) -> None:
     formula = f"$T_{{{index},{index - 1}}}$"
     length = np.linalg.norm(motion[:3, 3])
     start, end = poses[index - 1 : index + 1, [0, 2], 3]
-    bent: dict[str, Any] = {"shrinkA": 3, "shrinkB": 3, "connectionstyle": "arc3,rad=-0.3"}
-    _arrow(axes, start, end, RED, **bent)
+    _arrow(axes, start, end, RED, shrinkA=3, shrinkB=3, connectionstyle="arc3,rad=-0.3")
     left = (end - start)[::-1] * (-1, 1)
     beside = (start + end) / 2 + 0.15 * left
     offset = 11 * left / max(length, 1e-9)
@@ -228,8 +235,9 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
     offset = (0, first.shape[0] + gap.shape[0])
     figure, (axes,) = style.frame_panels(both)
     figure.set_figheight(figure.get_figheight() + 0.55)  # of the colour scale
-    heading = f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
-    style.show_image(axes, both, heading)
+    style.show_image(
+        axes, both, f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
+    )
     ends = []
     for match in best:
         below = np.add(second_points[match.trainIdx].pt, offset)
@@ -237,9 +245,21 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
     distances = [match.distance for match in best]
     lines = LineCollection(ends, array=distances, cmap="plasma", linewidth=0.8)
     axes.add_collection(lines)
-    label = "descriptor bits that differ, of 256"
-    figure.colorbar(lines, ax=axes, location="bottom", shrink=0.5, aspect=40, pad=0.02, label=label)
+    figure.colorbar(
+        lines,
+        ax=axes,
+        location="bottom",
+        shrink=0.5,
+        aspect=40,
+        pad=0.02,
+        label="descriptor bits that differ, of 256",
+    )
     return figure
+
+
+def figure_2_10(estimates: dict[str, np.ndarray], true: np.ndarray, title: str) -> plt.Figure:
+    """Figure 2.10: estimated paths, {name: (n, 4, 4)}, and how far each drifts from the truth."""
+    return paths.figure(estimates, true, title)
 
 
 def figure_2_11(
@@ -261,10 +281,10 @@ def figure_2_11(
         style.show_image(panel, image, title)
         label = f"{len(points)} in both frames"
         panel.scatter(*points.T, s=5, color=GREEN, linewidths=0, label=label)
-    cross: dict[str, Any] = {"s": 9, "color": RED, "marker": "x", "linewidths": 0.8}
-    axes[0].scatter(*lost.T, **cross, label=f"{len(lost)} in the first frame only")
-    triangle: dict[str, Any] = {"s": 9, "color": ORANGE, "marker": "^", "linewidths": 0}
-    axes[1].scatter(*new.T, **triangle, label=f"{len(new)} in the second frame only")
+    only = f"{len(lost)} in the first frame only"
+    axes[0].scatter(*lost.T, s=9, color=RED, marker="x", linewidths=0.8, label=only)
+    only = f"{len(new)} in the second frame only"
+    axes[1].scatter(*new.T, s=9, color=ORANGE, marker="^", linewidths=0, label=only)
     style.legend_below(figure, axes, 3)
     return figure
 
@@ -283,8 +303,14 @@ def figure_2_12(
     axes[1].scatter(*frame_keypoints.T, **KEYPOINT)
     colors = style.label_colors(label_map, frame)
     style.show_image(axes[2], colors, f"(c) {len(label_keypoints)} keypoints on {titles[1]}")
-    look: dict[str, Any] = {"s": 7, "color": "white", "edgecolors": "black", "linewidths": 0.4}
-    dots = axes[2].scatter(*label_keypoints.T, **look, label="keypoint")
+    dots = axes[2].scatter(
+        *label_keypoints.T,
+        s=7,
+        color="white",
+        edgecolors="black",
+        linewidths=0.4,
+        label="keypoint",
+    )
     style.class_legend(figure, label_map, also=[dots])
     return figure
 

@@ -153,13 +153,27 @@ def figure_4_08(views: list[View], title: str) -> plt.Figure:
         # a circle at the border would widen the panel
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     edge_color = tuple(np.array(EDGE_COLOR) / 255)
-    circle: dict[str, Any] = {"linestyle": "none", "marker": "o"}
-    dot = circle | {"markersize": 4, "color": KEYPOINT["color"]}
-    ring = circle | {"markersize": 6, "markerfacecolor": "none", "color": PINK}
     handles = [
         Patch(color=edge_color, label="edges of the predicted label map"),
-        Line2D([], [], **dot, label="keypoints"),
-        Line2D([], [], **ring, label="where keypoints of the frame before are now"),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="o",
+            markersize=4,
+            color=KEYPOINT["color"],
+            label="keypoints",
+        ),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="o",
+            markersize=6,
+            markerfacecolor="none",
+            color=PINK,
+            label="where keypoints of the frame before are now",
+        ),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     figure.suptitle(title, fontsize=9)
@@ -331,10 +345,17 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
         of_sequence = masked[masked["sequence"] == name]
         _draw_repetitions(panel, of_sequence, metric)
         row = baseline.loc[name]
-        band: dict[str, Any] = {"color": BASELINE, "alpha": 0.2, "linewidth": 0}
-        panel.axhspan(row["lowest"], row["highest"], **band, label=f"all keypoints, {BAND}")
-        mean: dict[str, Any] = {"color": BASELINE, "linestyle": "--", "linewidth": 1.1}
-        panel.axhline(row["mean"], **mean, label="all keypoints, mean")
+        panel.axhspan(
+            row["lowest"],
+            row["highest"],
+            color=BASELINE,
+            alpha=0.2,
+            linewidth=0,
+            label=f"all keypoints, {BAND}",
+        )
+        panel.axhline(
+            row["mean"], color=BASELINE, linestyle="--", linewidth=1.1, label="all keypoints, mean"
+        )
         panel.set_ylim(0, None)
     below.supylabel(label, fontsize=8)
     style.legend_below(below, panels, 2)
@@ -344,11 +365,18 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
 def _draw_repetitions(panel: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
     """Draw the errors with masks of one sequence against dilation width."""
     errors = compare.spread(runs, metric, by="dilation_width")
-    bar: dict[str, Any] = {"color": MASKED, "alpha": 0.35, "linewidth": 4}
-    lowest, highest = errors["lowest"], errors["highest"]
-    panel.vlines(errors.index, lowest, highest, **bar, label=f"masked, {BAND}")
-    line: dict[str, Any] = {"color": MASKED, "marker": "o", "markersize": 2, "linewidth": 1.1}
-    panel.plot(errors.index, errors["mean"], **line, label="masked, mean")
+    panel.vlines(
+        errors.index,
+        errors["lowest"],
+        errors["highest"],
+        color=MASKED,
+        alpha=0.35,
+        linewidth=4,
+        label=f"masked, {BAND}",
+    )
+    panel.plot(
+        errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1, label="masked, mean"
+    )
     lost = errors["mean"][runs.groupby("dilation_width")["lost"].any()]
     if len(lost):
         panel.plot(lost.index, lost, **LOST)
@@ -415,7 +443,6 @@ def _name_lines(axes: plt.Axes, table: pd.DataFrame) -> None:
     for index in range(1, len(places)):
         places[index] = max(places[index], places[index - 1] + distance)
     highest = height + distance * np.arange(1 - len(places), 1)
-    leader: dict[str, Any] = {"arrowstyle": "-", "relpos": (0, 0.5), "shrinkA": 1, "shrinkB": 3}
     for (name, line), place in zip(lines.iterrows(), np.minimum(places, highest), strict=True):
         axes.annotate(
             str(name),
@@ -424,7 +451,13 @@ def _name_lines(axes: plt.Axes, table: pd.DataFrame) -> None:
             textcoords=axes.get_yaxis_transform(),
             va="center",
             fontsize=8,
-            arrowprops=leader | {"color": line["color"]},
+            arrowprops={
+                "arrowstyle": "-",
+                "relpos": (0, 0.5),
+                "shrinkA": 1,
+                "shrinkB": 3,
+                "color": line["color"],
+            },
         )
 
 
@@ -453,13 +486,22 @@ def _bar(
 ) -> None:
     """Draw bars at the means of a table, with error bars from lowest to highest repetition."""
     label, color, hatch = METHODS[method]
-    look: dict[str, Any] = {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0}
-    axes.bar(positions, table["mean"], width, label=label, **look)
+    axes.bar(
+        positions,
+        table["mean"],
+        width,
+        label=label,
+        color=color,
+        hatch=hatch,
+        edgecolor="white",
+        linewidth=0,
+    )
     lost = table["lost"].eq(True).to_numpy()
     if lost.any():
         axes.plot(np.array(positions)[lost], table["mean"][lost], **LOST)
     table = table.where(table["highest"] > table["lowest"])  # a single run has no error bar
     mean = table["mean"]
     errors = [mean - table["lowest"], table["highest"] - mean]
-    line: dict[str, Any] = {"fmt": "none", "ecolor": "black", "elinewidth": 0.9, "capsize": 2}
-    axes.errorbar(positions, mean, yerr=errors, **line)
+    axes.errorbar(
+        positions, mean, yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2
+    )

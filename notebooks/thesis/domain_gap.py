@@ -7,7 +7,7 @@ import pandas as pd
 
 from thesis_repro.data import cityscapes, kitti
 from thesis_repro.segmentation import prediction, quality
-from thesis_repro.study import controls
+from thesis_repro.study.methods import true_labels
 
 IMAGES = 100  # most images of a domain
 
@@ -55,7 +55,7 @@ def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
     """Return evenly spread frames of sequences with their exact label maps; none for real data."""
     pairs = []
     for drive in drives:
-        label_folder = controls.true_labels(drive.root, drive.name)
+        label_folder = true_labels(drive.root, drive.name)
         if not label_folder.is_dir():
             continue
         count = min(len(drive), max(1, IMAGES // len(drives)))

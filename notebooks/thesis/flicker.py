@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from thesis_repro import masks
-from thesis_repro.odometry import THESIS, keypoints
+from thesis_repro.odometry import THESIS
+from thesis_repro.odometry.odometry import detect, track
 
 SAME = 2.0  # pixels: a keypoint within this distance of a tracked keypoint is the same one
 
@@ -44,7 +45,7 @@ def follow_window(
     half = size.min() // 8
     edge_images = [masks.edges(label_map, frames[0].shape) for label_map in label_maps]
     points = [
-        keypoints.detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
+        detect(frame, THESIS, masks.dilate(edge_image, dilation_width))
         for frame, edge_image in zip(frames, edge_images, strict=True)
     ]
     center = size / 2
@@ -91,8 +92,8 @@ def _track(
     """
     if not len(corners):
         return corners, np.zeros(0, bool)
-    tracked, followed = keypoints.track(before, after, corners)
-    back, returned = keypoints.track(after, before, tracked)
+    tracked, followed = track(before, after, corners)
+    back, returned = track(after, before, tracked)
     agrees = np.linalg.norm(back - corners, axis=1) < SAME
     return tracked, followed & returned & agrees
 
@@ -122,8 +123,8 @@ def found_again(
     Lucas-Kanade tracks it to within SAME pixels of a keypoint of the second frame. The masks are
     for the detector, (height, width) uint8.
     """
-    before = keypoints.detect(first, THESIS, first_mask)
-    after = keypoints.detect(second, THESIS, second_mask)
+    before = detect(first, THESIS, first_mask)
+    after = detect(second, THESIS, second_mask)
     tracked, followed = _track(first, second, before)
     again = followed & ~_far(tracked, after)
     new = _far(after, tracked[again])

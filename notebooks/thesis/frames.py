@@ -1,7 +1,6 @@
 """Pictures of single frames for notebooks 6 and 7: masks, keypoints, tracks and lines."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -88,8 +87,7 @@ def lines(frame: np.ndarray, coefficients: np.ndarray, points: np.ndarray) -> pl
     width = frame.shape[1]
     for (a, b, c), point in zip(coefficients, points, strict=True):
         (line,) = axis.plot([0, width], [-c / b, -(c + a * width) / b], linewidth=0.8)
-        ring: dict[str, Any] = {"markersize": 4, "markerfacecolor": "none"}
-        axis.plot(*point, "o", color=line.get_color(), **ring)
+        axis.plot(*point, "o", color=line.get_color(), markersize=4, markerfacecolor="none")
     axis.set(xlim=(0, width), ylim=(frame.shape[0], 0))
     return figure
 

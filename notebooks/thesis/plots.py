@@ -1,7 +1,5 @@
 """Figures 3.2, 3.4, 3.5, 4.1 and 4.17: plots of one table or formula, for the notebooks' cells."""
 
-from typing import Any
-
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -32,9 +30,10 @@ def figure_3_02(
         style.show_image(axes[1, column], cityscapes.colorize(as_map[title]), "")
         label_maps.append(as_map[title][as_map[title] != outside])
     texts = "transformed as an image\n(the appendix)", "as a label map\n(for training)"
-    beside: dict[str, Any] = {"rotation": 90, "ha": "center", "va": "center"}
     for panel, text in zip(axes[:, 0], texts, strict=True):
-        panel.text(-0.12, 0.5, text, transform=panel.transAxes, **beside)
+        panel.text(
+            -0.12, 0.5, text, transform=panel.transAxes, rotation=90, ha="center", va="center"
+        )
     white = Patch(facecolor="white", edgecolor="black", label="id of no class here")
     black = Patch(color="black", label="outside the image")
     style.class_legend(figure, *label_maps, also=[white, black])

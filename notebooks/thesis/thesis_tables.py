@@ -1,7 +1,7 @@
 """What the thesis's own comparison gives (Section 4.2, Tables 4.1 to 4.3).
 
-The choice of a width is in `study.best_width`; all other comparisons are in `study.compare`. A change
-is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
+The choice of a width is in `study.best_width`; all other comparisons are in `study.compare`. A
+change is Equation 4.1 of means over the repetitions, in percent; negative is better. `masked` and
 `baseline` are the runs with masks and with all keypoints, from `compare.of_method`.
 """
 
@@ -17,6 +17,7 @@ from thesis_repro.study.best_width import (
     stability,
 )
 from thesis_repro.study.compare import LEVEL
+from thesis_repro.study.jobs import Job, repeated
 
 __all__ = [
     "best_widths",
@@ -28,10 +29,24 @@ __all__ = [
     "null_distribution",
     "of_chosen_width",
     "percent_change",
+    "reduced_jobs",
     "stability",
     "time_savings",
 ]
 STUDIES = 4000  # simulated ones
+
+
+def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
+    """Return jobs that limit the detector to as many keypoints as the best masks leave.
+
+    This is each sequence's mean number of keypoints at its best width (Figure 4.12). best: the
+    table of `best_widths`.
+    """
+    jobs = []
+    for name, number in best["mean_keypoints"].items():
+        limit = max(1, round(number))  # OpenCV takes 0 as "no limit"
+        jobs.append(Job(name, "reduced", max_keypoints=limit))
+    return repeated(jobs, ["thesis"], repetitions)
 
 
 def changes_of_repetition(

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import masks, odometry
+from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.running import results
@@ -85,7 +85,7 @@ def _time_jobs(
         for index in range(len(sequence)):
             frame = sequence.frame(index)
             for job, job_masks in masks_by_job.items():
-                masks.forget_edges()  # a separate run would have to find them
+                mask_files.forget_edges()  # a separate run would have to find them
                 mask, mask_seconds = None, 0.0
                 if job_masks is not None:
                     mask, mask_seconds = _timed(job_masks.__getitem__, index)

@@ -4,7 +4,7 @@ import os
 import re
 import subprocess
 
-from thesis_repro.running.settings import ROOT
+from thesis_repro.running.settings import PREFIX, ROOT
 
 FIGURES = [
     *(f"figure_2_{n:02d}" for n in range(1, 13)),
@@ -12,7 +12,8 @@ FIGURES = [
     *(f"figure_4_{n:02d}" for n in range(1, 18)),
     "figure_a_01",
 ]
-EXECUTED = re.compile(r"report\.execute notebooks/(\d\d)_")  # in the output of make
+# the number of a notebook in a command that executes it, in the output of make
+EXECUTED = re.compile(r"(?:nbconvert|report\.execute)[^\n]*? notebooks/(\d\d)_")
 
 
 def make_figures(tmp_path, *options, root=ROOT):
@@ -20,19 +21,11 @@ def make_figures(tmp_path, *options, root=ROOT):
     environment = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith(("MAKE", "MFLAGS", "THESIS_REPRO_"))
+        if not name.startswith(("MAKE", "MFLAGS", PREFIX))
     }
+    folders = f"BUILD={tmp_path / 'build'}", f"FIGURES={tmp_path / 'figures'}"
     return subprocess.run(
-        [
-            "make",
-            "figures",
-            "PROFILE=smoke",
-            f"BUILD={tmp_path / 'build'}",
-            f"FIGURES={tmp_path / 'figures'}",
-            "-o",
-            ".venv/ready",
-            *options,
-        ],
+        ["make", "figures", "PROFILE=smoke", *folders, "-o", ".venv/ready", *options],
         cwd=root,
         env=environment | {"PYTHONPATH": str(root)},
         capture_output=True,

@@ -5,10 +5,10 @@ import numba
 import numpy as np
 import pytest
 
+from opencv_exact import ransac, real_roots, rounding
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, pose
-from opencv_exact import ransac, real_roots, rounding
 
 
 def opencv(current, previous, threshold=THESIS.threshold, probability=pose.PROBABILITY):

@@ -9,12 +9,11 @@ import pandas as pd
 import pytest
 from drawn import problems
 
-from thesis import chapter4, tables
+from thesis import chapter4, tables, thesis_tables
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, findings, style, texts
 from thesis_repro.report import tables as report_tables
-from thesis import thesis_tables
 from thesis_repro.study import compare
 from thesis_repro.study.jobs import ESTIMATORS
 

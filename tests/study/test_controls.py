@@ -8,7 +8,7 @@ import pytest
 from street import Street, Stripes
 
 from thesis import ablations
-from thesis_repro import masks
+from thesis_repro import mask_files, masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
 from thesis_repro.study import compare, controls, runner, thesis_tables
@@ -27,7 +27,7 @@ def sequence(small_world):
 def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
     source = Source(small_labels)
-    by_method = {"masked": masks.LabelMasks(small_labels / "00", sequence, WIDTH)}
+    by_method = {"masked": mask_files.LabelMasks(small_labels / "00", sequence, WIDTH)}
     for method in controls.MASK_CONTROLS:
         by_method[method] = controls.masks_of_method(method, source, sequence, WIDTH)
     return by_method
@@ -86,7 +86,9 @@ def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
 @pytest.mark.parametrize("value", [0, 255])
 def test_controls_of_empty_and_full_masks(sequence, made, monkeypatch, value):
     monkeypatch.setattr(
-        masks.LabelMasks, "__getitem__", lambda self, index: np.full(self.size, value, np.uint8)
+        mask_files.LabelMasks,
+        "__getitem__",
+        lambda self, index: np.full(self.size, value, np.uint8),
     )
     lines = masks.coverage(made["random-lines"][0])
     edges = masks.coverage(made["image-edges"][0])
@@ -137,7 +139,7 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2)
     settings, thesis_masks = runs["masked", "thesis", 0]
     assert settings == THESIS
-    expected = masks.LabelMasks(small_labels / "00", sequence, 10)
+    expected = mask_files.LabelMasks(small_labels / "00", sequence, 10)
     assert np.array_equal(thesis_masks[0], expected[0])
     dropped, same = runs["filter", "thesis", 0]
     assert dropped.mask_mode == "filter" and same is thesis_masks

@@ -6,11 +6,10 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from functools import partial
 
 import pandas as pd
 import pytest
-from trials import ROOT, contents, wait_for
+from trials import ROOT, wait_for
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
@@ -193,26 +192,3 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(
     assert (
         elsewhere[jobs[0]] != older[jobs[0]] and not (tmp_path / "00" / "baseline-0.csv").exists()
     )
-
-
-def test_label_maps_of_workers_have_the_bits_of_one_process(
-    workers, scheduler, small_world, small_model, tmp_path, monkeypatch
-):
-    from thesis_repro.command.cli import main
-    from thesis_repro.segmentation import prediction
-
-    monkeypatch.setattr(prediction, "PART", 4)
-    monkeypatch.setattr(
-        prediction, "spread_label_maps", partial(prediction.spread_label_maps, batch_size=4)
-    )
-    monkeypatch.setattr(
-        prediction, "write_label_maps", partial(prediction.write_label_maps, batch_size=4)
-    )
-    command = ["predict", "--images", small_world / "kitti", "--model", small_model]  # 00 and 01
-    assert main([*map(str, command), "--output", str(tmp_path / "alone")]) == 0
-    assert (
-        main([*map(str, command), "--output", str(tmp_path / "spread"), "--dask", scheduler]) == 0
-    )
-
-    assert len(contents(tmp_path / "alone")) == 2 * (FRAMES + 1)
-    assert contents(tmp_path / "spread") == contents(tmp_path / "alone")

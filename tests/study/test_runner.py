@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from thesis import timing
-from thesis_repro import masks, odometry
+from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
@@ -41,7 +41,7 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     folder, _, summary = finished
     assert len(summary) == 10
     sequence = Sequence(small_world / "kitti", "01")
-    alone = odometry.run(sequence, masks=masks.LabelMasks(small_labels / "01", sequence, 15))
+    alone = odometry.run(sequence, masks=mask_files.LabelMasks(small_labels / "01", sequence, 15))
     row = summary.set_index(["sequence", "run"]).loc["01", "masked-15-0"]
     expected = metrics.errors(alone.poses, sequence.poses) | metrics.step_errors(
         alone.poses, sequence.poses
@@ -203,7 +203,7 @@ def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_
     few = keypoints(chosen)
     sequence = opened(small_world, 4)[0]
     alone = odometry.run(
-        sequence, masks=masks.LabelMasks(small_labels / "00", sequence, 10, chosen)
+        sequence, masks=mask_files.LabelMasks(small_labels / "00", sequence, 10, chosen)
     )
     assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
 
@@ -284,7 +284,7 @@ def test_timed_steps_equal_the_steps_of_a_run(sequence, model, tmp_path, monkeyp
     timing.measure(sequence, model, 5)
     short = sequence.subset(5)
     prediction.write_label_maps(model, short.frame_paths, tmp_path)
-    made = masks.LabelMasks(tmp_path, short, 5)
+    made = mask_files.LabelMasks(tmp_path, short, 5)
     for timed, expected in (
         (steps[:10:2], odometry.run(short)),
         (steps[1:10:2], odometry.run(short, masks=made)),

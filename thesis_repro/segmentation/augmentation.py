@@ -83,16 +83,16 @@ def augment(
     return augmented.reshape(image.shape), result["mask"]  # some drop a single channel
 
 
-def training_transforms(size: int) -> A.Compose:
+def training_augmenter(size: int) -> A.Compose:
     """Return the transforms of the training set, the appendix's list."""
     return A.Compose(transform_list(size))
 
 
-def validation_transforms() -> A.Compose:
+def validation_augmenter() -> A.Compose:
     """Return the transforms of the validation set: only a blur, by a mistake in the appendix.
 
     Between the two sets, A.3 draws Figure 3.1, which leaves `transform` set to the last one drawn,
-    the blur. Section 3.5.1 means `training_transforms`.
+    the blur. Section 3.5.1 means `training_augmenter`.
     """
     return A.Compose([A.Blur(blur_limit=3, p=1)])
 

@@ -1,9 +1,9 @@
 """The odometry runs of a study, as a list of jobs.
 
 Chapter 4 runs every sequence with all keypoints, with masks of each width and with a reduced number
-of keypoints. The controls test whether it is the segmentation that helps. `reduced_jobs` and
-`keypoint_control_jobs` need the number of keypoints that masks leave, so they are made once the
-masked runs are done.
+of keypoints. The controls test whether it is the segmentation that helps. Those without a mask need
+the number of keypoints that masks leave, so they are made once the masked runs are done
+(`runner.keypoint_controls`).
 """
 
 from collections.abc import Iterable, Mapping
@@ -12,12 +12,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators
-from thesis_repro.study import controls
-from thesis_repro.study.methods import MASK_CONTROLS, METHODS, OF_LABEL_MAPS
+from thesis_repro.study.methods import MASK_CONTROLS, METHODS, OF_LABEL_MAPS, true_labels
 from thesis_repro.study.sources import Source
 
 # Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It
@@ -110,7 +107,7 @@ def first_jobs(
     """
     jobs: list[Job] = []
     for sequence in sequences:
-        jobs += _repeated([Job(sequence.name, "baseline")], widths, repetitions)
+        jobs += repeated([Job(sequence.name, "baseline")], widths, repetitions)
         for source in sources:
             for width in _widths(source, widths, tested):
                 job = Job(sequence.name, "masked", width, source=source.name)
@@ -119,9 +116,9 @@ def first_jobs(
                     for estimator, requested in widths.items()
                     if width in (None, tested) or width in requested
                 ]
-                jobs += _repeated([job], estimators_of_width, repetitions)
+                jobs += repeated([job], estimators_of_width, repetitions)
             if tested:
-                jobs += _repeated(_control_jobs(sequence, source, tested), widths, repetitions)
+                jobs += repeated(_control_jobs(sequence, source, tested), widths, repetitions)
     return jobs
 
 
@@ -140,7 +137,7 @@ def _widths(
 def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
     """Return the controls that are masks, as far as a source and a sequence allow them."""
     methods, width = list(MASK_CONTROLS), tested
-    if not controls.true_labels(sequence.root, sequence.name).is_dir():
+    if not true_labels(sequence.root, sequence.name).is_dir():
         methods.remove("true-labels")
     if not source.has_label_maps:
         methods = [name for name in methods if name not in OF_LABEL_MAPS]
@@ -148,52 +145,14 @@ def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
     return [Job(sequence.name, method, width, source=source.name) for method in methods]
 
 
-def _repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
+def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
+    """Return jobs with each estimator and repetition."""
     return [
         replace(job, estimator=estimator, repetition=repetition)
         for job in jobs
         for estimator in estimators
         for repetition in range(repetitions)
     ]
-
-
-def reduced_jobs(best: pd.DataFrame, repetitions: int = 1) -> list[Job]:
-    """Return jobs that limit the detector to as many keypoints as the best masks leave.
-
-    This is each sequence's mean number of keypoints at its best width (Figure 4.12). best: the
-    table of `best_width.best_widths`.
-    """
-    jobs = []
-    for name, number in best["mean_keypoints"].items():
-        limit = max(1, round(number))  # OpenCV takes 0 as "no limit"
-        jobs.append(Job(name, "reduced", max_keypoints=limit))
-    return _repeated(jobs, ["thesis"], repetitions)
-
-
-def keypoint_control_jobs(
-    keypoints: Mapping[str, float],
-    sequences: Iterable[Sequence],
-    repetitions: int = 1,
-    estimators: Iterable[str] = tuple(ESTIMATORS),
-    source: str = "",
-    width: int | None = None,
-) -> list[Job]:
-    """Return jobs without a mask that keep as many keypoints as masks leave.
-
-    "fewer" keeps the strongest keypoints; "spread" keeps keypoints farther apart.
-    keypoints: {sequence: mean number that masks leave}. width: of these masks, pixels.
-    """
-    jobs: list[Job] = []
-    for sequence in sequences:
-        name = sequence.name
-        if name not in keypoints:  # its runs with masks failed
-            continue
-        limit = max(1, round(keypoints[name]))
-        fewer = Job(name, "fewer", width, max_keypoints=limit, source=source)
-        distance = controls.min_distance(sequence, keypoints[name])
-        spread = Job(name, "spread", width, min_distance=distance, source=source)
-        jobs += _repeated([fewer, spread], estimators, repetitions)
-    return jobs
 
 
 def in_passes(
@@ -210,20 +169,19 @@ def in_passes(
     unshared: dict[str, Any] = {"estimator": "", "repetition": 0}
     if len({replace(job, **unshared) for job in jobs}) < workers:
         unshared = {"estimator": ""}
-    groups: dict[str, dict[Job, list[Job]]] = {}
+    groups: dict[Job, list[Job]] = {}
     for job in jobs:
-        by_keypoints = groups.setdefault(job.sequence, {})
-        by_keypoints.setdefault(replace(job, **unshared), []).append(job)
+        groups.setdefault(replace(job, **unshared), []).append(job)
+    by_sequence: dict[str, list[list[Job]]] = {}
+    for key, group in groups.items():
+        by_sequence.setdefault(key.sequence, []).append(group)
     # work is measured in frames, of which a group of jobs reads each once
-    work = sum(len(by_keypoints) * len(sequences[name]) for name, by_keypoints in groups.items())
-    work_of_pass = work / (PIECES * workers)
-    passes = []
-    for name, by_keypoints in groups.items():
-        job_lists = list(by_keypoints.values())
-        size = len(job_lists)
+    work = sum(len(sequences[key.sequence]) for key in groups)
+    passes: list[list[Job]] = []
+    for name, groups_of_sequence in by_sequence.items():
+        size = len(groups_of_sequence)
         if workers > 1:
-            size = max(1, round(work_of_pass / len(sequences[name])))
-        for start in range(0, len(job_lists), size):
-            pass_jobs = chain.from_iterable(job_lists[start : start + size])
-            passes.append(list(pass_jobs))
+            size = max(1, round(work / (PIECES * workers) / len(sequences[name])))
+        starts = range(0, len(groups_of_sequence), size)
+        passes += [list(chain(*groups_of_sequence[start : start + size])) for start in starts]
     return passes

@@ -21,9 +21,15 @@ from thesis_repro.odometry import metrics
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import listed, progress, write_text
-from thesis_repro.study import compare, controls
-from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, keypoint_control_jobs
-from thesis_repro.study.methods import METHODS, masks_of_method
+from thesis_repro.study import compare
+from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, repeated
+from thesis_repro.study.methods import (
+    METHODS,
+    ControlMasks,
+    masks_of_method,
+    min_distance,
+    true_labels,
+)
 from thesis_repro.study.sources import Source, by_name
 from thesis_repro.study.workers import open_pool
 
@@ -128,17 +134,24 @@ def keypoint_controls(
     width: int,
     estimators: Iterable[str] = tuple(ESTIMATORS),
 ) -> list[Job]:
-    """Return the `keypoint_control_jobs` of each source, from runs with its masks.
+    """Return jobs without a mask that keep as many keypoints as the masks of each source leave.
 
-    width: pixels, of the masks from label maps that leave as many keypoints.
+    "fewer" keeps the strongest keypoints; "spread" keeps keypoints farther apart. runs: with the
+    masks. width: pixels, of the masks from label maps that leave as many keypoints.
     """
-    jobs = []
+    jobs: list[Job] = []
     for source in sources:
         keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
         width_of_source = width if source.has_label_maps else None
-        jobs += keypoint_control_jobs(
-            keypoints, sequences, repetitions, estimators, source.name, width_of_source
-        )
+        for sequence in sequences:
+            name = sequence.name
+            if name not in keypoints:  # its runs with masks failed
+                continue
+            limit = max(1, round(keypoints[name]))  # OpenCV takes 0 as "no limit"
+            distance = min_distance(sequence, keypoints[name])
+            job = Job(name, "fewer", width_of_source, max_keypoints=limit, source=source.name)
+            spread = replace(job, method="spread", max_keypoints=None, min_distance=distance)
+            jobs += repeated([job, spread], estimators, repetitions)
     return jobs
 
 
@@ -199,13 +212,13 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
             "errors to compare; leave it out (the odometry command runs it)"
         )
     folder /= sequence.name
-    true_labels = listed(controls.true_labels(sequence.root, sequence.name))
+    true_maps = listed(true_labels(sequence.root, sequence.name))
     records = {source.name: source.record(sequence.name) for source in sources.values()}
     results.stage(
         folder,
         **_versions(),
         sequence=results.digest_of_files(sequence.files),
-        true_labels=results.digest_of_files(true_labels),
+        true_labels=results.digest_of_files(true_maps),
         **records.pop("", {}),
     )
     for source, record in records.items():
@@ -221,7 +234,7 @@ def _versions() -> dict[str, Any]:
 
 def checked_masks(
     jobs: Iterable[Job], sequence: Sequence, sources: Mapping[str, Source]
-) -> tuple[dict[Job, controls.ControlMasks | None], dict[Job, str]]:
+) -> tuple[dict[Job, ControlMasks | None], dict[Job, str]]:
     """Return {job: masks} over a sequence, and {job: reason} for masks that cannot be made.
 
     The masks are None for jobs without masks. Every file is read here, because a bad file in the

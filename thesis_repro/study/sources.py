@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from thesis_repro import masks
+from thesis_repro import mask_files
 from thesis_repro.data.cityscapes import read_label_map
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.masks import LabelMasks, MaskFolder, MaskSettings, read_mask
+from thesis_repro.mask_files import LabelMasks, MaskFolder, read_mask
+from thesis_repro.masks import MaskSettings
 from thesis_repro.running import results
 from thesis_repro.running.files import listed
 
@@ -43,7 +44,7 @@ class Source:
 
     def sequence_folder(self, sequence: str) -> Path:
         """Return the folder with the files of one sequence."""
-        return masks.folder_of_sequence(self.folder, sequence)
+        return mask_files.folder_of_sequence(self.folder, sequence)
 
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
         """Return the masks of a sequence. dilation_width: pixels, for masks from label maps.

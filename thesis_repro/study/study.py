@@ -8,7 +8,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS
 from thesis_repro.running import results
-from thesis_repro.study import compare, jobs, runner, sources
+from thesis_repro.study import jobs, runner, sources
 from thesis_repro.study.sources import FileMasks, Source
 
 RUNS = "runs"  # folder of the results of the runs
@@ -51,10 +51,6 @@ class Study:
             if len(sequence) < 3:
                 raise InputError(
                     f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
-                )
-            if sequence.name in compare.COLUMNS:
-                raise InputError(
-                    f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
                 )
         widths = list(self.widths)
         if self.tested:

@@ -1,24 +1,21 @@
 """RANSAC among the motions near an expected motion.
 
-With few points or points far away, two motions may explain the correspondences almost equally well:
-a turn looks like a shift to the side. Which of them plain RANSAC returns is chance. This search
-ignores every essential matrix whose motion differs from the expected motion by more than given
-angles.
+With few points or points far away, two motions may explain the matches almost equally well: a turn
+looks like a shift to the side. Which of them plain RANSAC returns is chance. This search ignores
+every essential matrix whose motion differs from the expected motion by more than given angles.
 """
 
 import numpy as np
 
-from opencv_exact import epipolar
+from opencv_exact import MAX_SAMPLES, WELL_CONDITIONED, draw_samples, epipolar, solve_five_points
 from opencv_exact.compiling import compiled, inlined
-from opencv_exact.ransac import MAX_SAMPLES, draw, first_block
-from opencv_exact.real_roots import LANES
-from opencv_exact.rounding import WELL_CONDITIONED, solve
+from thesis_repro.odometry.refined import matrices
+from thesis_repro.odometry.refined.fit import columns, near_epipolar_lines
+from thesis_repro.odometry.types import Matches
 
 
 def ransac_with_prior(
-    current: np.ndarray,
-    previous: np.ndarray,
-    threshold: float,
+    matches: Matches,
     rotation: np.ndarray,
     translation: np.ndarray,
     max_rotation: float,
@@ -29,107 +26,96 @@ def ransac_with_prior(
     None if no motion is near it.
 
     A sample with a solution that rounding may change much is left out.
-    current, previous: normalised correspondences (N, 2), N >= 5. rotation, translation: the
-    expected motion.
+    matches: at least five. rotation, translation: the expected motion.
     max_rotation, max_heading: largest differences in degrees of the rotation and of the
     translation's direction, whose sign is ignored.
     """
-    columns = np.ascontiguousarray(np.hstack([current, previous]).T)
-    block = first_block()
-    kept_matrices = []
-    # in Python: `solve` within another compiled function would be compiled once more
-    for start in range(0, MAX_SAMPLES, LANES):
-        draw(columns, block)
-        solve(block.fives, block.solutions)
-        _, counts, matrices, margins = block.solutions
-        is_solution = np.arange(matrices.shape[1]) < counts[:, None]
-        is_bad = ((margins >= WELL_CONDITIONED) & is_solution).any(axis=1)
-        is_solution[is_bad] = False
-        is_solution[MAX_SAMPLES - start :] = False
-        kept_matrices.append(matrices[is_solution])
+    samples = draw_samples(len(matches.current), MAX_SAMPLES)
+    solutions = solve_five_points(matches.current[samples], matches.previous[samples])
+    is_solution = np.arange(10) < solutions.counts[:, None]
+    is_bad = ((solutions.margins >= WELL_CONDITIONED) & is_solution).any(axis=1)
+    is_solution[is_bad] = False
     most, best_rotation, best_translation = _best(
-        np.concatenate(kept_matrices),
-        columns,
-        threshold * threshold,
+        solutions.matrices[is_solution],
+        columns(matches),
+        matches.threshold,
         np.ascontiguousarray(rotation),
         np.ascontiguousarray(translation),
         np.cos(np.radians(min(max_rotation, 180.0))),
         np.cos(np.radians(min(max_heading, 90.0))),
     )
-    return (best_rotation, best_translation) if most else None
+    return (best_rotation.reshape(3, 3), best_translation) if most else None
 
 
 @compiled
 def _best(
-    solutions, columns, limit, rotation, translation, min_rotation_cosine, min_heading_cosine
+    solutions, points, threshold, rotation, translation, min_rotation_cosine, min_heading_cosine
 ):
     """Most inliers of any motion near the expected one, and that motion (rotation, translation)."""
-    r, t = np.empty((3, 3)), np.empty(3)
-    most, best_r, best_t = 0, np.empty((3, 3)), np.empty(3)
+    most, best_r, best_t = 0, np.empty(9), np.empty(3)
     for index in range(len(solutions)):
         e = epipolar.entries(solutions[index])
-        _translation(e, t)
-        cosine = t[0] * translation[0] + t[1] * translation[1] + t[2] * translation[2]
-        if abs(cosine) < min_heading_cosine:
+        t = _translation(e)
+        if abs(matrices.dot(t, translation)) < min_heading_cosine:
             continue
-        is_near = False
         for _ in range(2):  # t with one rotation, -t with the other
-            _rotation(e, t, r)
-            product = 0.0
-            for i in range(3):
-                for j in range(3):
-                    product += r[i, j] * rotation[i, j]
-            is_near = (product - 1) / 2 >= min_rotation_cosine
-            if is_near:
+            r = _rotation(e, t)
+            if _rotation_cosine(r, rotation) >= min_rotation_cosine:
+                inliers = near_epipolar_lines(e, points, threshold).sum()
+                if inliers > most:
+                    most, best_r, best_t = inliers, np.array(r), np.array(t)
                 break
-            t[0], t[1], t[2] = -t[0], -t[1], -t[2]
-        if not is_near:
-            continue
-        inliers = 0
-        for k in range(columns.shape[1]):
-            algebraic, l0, l1, m0, m1 = epipolar.sampson_terms(
-                e, columns[0, k], columns[1, k], columns[2, k], columns[3, k]
-            )
-            square = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
-            inliers += algebraic * algebraic <= limit * square
-        if inliers > most:
-            most, best_r, best_t = inliers, r.copy(), t.copy()
+            t = -t[0], -t[1], -t[2]
     return most, best_r, best_t
 
 
 @inlined
-def _translation(e, t):
-    """Write the unit translation of an essential matrix, with either sign.
-
-    It is normal to all columns.
-    """
-    largest = -1.0
-    for a in range(3):  # use the best conditioned pair of columns
-        b = (a + 1) % 3
-        c0 = e[3 + a] * e[6 + b] - e[6 + a] * e[3 + b]
-        c1 = e[6 + a] * e[b] - e[a] * e[6 + b]
-        c2 = e[a] * e[3 + b] - e[3 + a] * e[b]
-        size = c0 * c0 + c1 * c1 + c2 * c2
-        if size > largest:
-            largest, t[0], t[1], t[2] = size, c0, c1, c2
-    norm = np.sqrt(largest)
-    t[0], t[1], t[2] = t[0] / norm, t[1] / norm, t[2] / norm
+def _rotation_cosine(r, rotation):
+    """Cosine of the angle between two rotations, a tuple (9) and an array (3, 3)."""
+    product = 0.0
+    for i in range(3):
+        for j in range(3):
+            product += r[3 * i + j] * rotation[i, j]
+    return (product - 1) / 2
 
 
 @inlined
-def _rotation(e, t, r):
-    """Write the rotation R of an essential matrix [t]x R (unit norm) for one sign of t.
+def _translation(e):
+    """Unit translation of an essential matrix, with either sign. It is normal to all columns."""
+    columns = (e[0], e[3], e[6]), (e[1], e[4], e[7]), (e[2], e[5], e[8])
+    best, largest = (0.0, 0.0, 0.0), -1.0
+    for k in range(3):  # use the best conditioned pair of columns
+        normal = matrices.cross(columns[k], columns[(k + 1) % 3])
+        size = matrices.dot(normal, normal)
+        if size > largest:
+            best, largest = normal, size
+    return matrices.normalised(best)
+
+
+@inlined
+def _rotation(e, t):
+    """Rotation R of an essential matrix [t]x R (unit norm) for one sign of t, row by row.
 
     Horn (1990), Recovering baseline and orientation from essential matrix: R = cof(E) - [t]x E for
     unit t.
     """
     size = np.sqrt(2.0)  # the norm of [t]x R
-    for i in range(3):
-        p = (i + 1) % 3
-        q = (i + 2) % 3
-        for j in range(3):
-            m = (j + 1) % 3
-            n = (j + 2) % 3
-            cofactor = e[3 * p + m] * e[3 * q + n] - e[3 * p + n] * e[3 * q + m]
-            product = t[p] * e[3 * q + j] - t[q] * e[3 * p + j]  # of [t]x E
-            r[i, j] = size * size * cofactor - size * product
+    first, second, third = (e[0], e[1], e[2]), (e[3], e[4], e[5]), (e[6], e[7], e[8])
+    r0, r1, r2 = matrices.cross(second, third)  # a row of the cofactors
+    r3, r4, r5 = matrices.cross(third, first)
+    r6, r7, r8 = matrices.cross(first, second)
+    c0, c3, c6 = matrices.cross(t, (e[0], e[3], e[6]))  # a column of [t]x E
+    c1, c4, c7 = matrices.cross(t, (e[1], e[4], e[7]))
+    c2, c5, c8 = matrices.cross(t, (e[2], e[5], e[8]))
+    square = size * size
+    return (
+        square * r0 - size * c0,
+        square * r1 - size * c1,
+        square * r2 - size * c2,
+        square * r3 - size * c3,
+        square * r4 - size * c4,
+        square * r5 - size * c5,
+        square * r6 - size * c6,
+        square * r7 - size * c7,
+        square * r8 - size * c8,
+    )

@@ -59,10 +59,22 @@ def skew(v):
 
 
 @inlined
-def normalised(v0, v1, v2):
-    """Unit vector (3) in the direction of (v0, v1, v2)."""
-    norm = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-    return v0 / norm, v1 / norm, v2 / norm
+def cross(a, b):
+    """Cross product of two vectors (3)."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined
+def dot(a, b):
+    """Scalar product of two vectors (3)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def normalised(v):
+    """Unit vector (3) in the direction of v."""
+    norm = np.sqrt(dot(v, v))
+    return v[0] / norm, v[1] / norm, v[2] / norm
 
 
 @inlined
@@ -70,22 +82,9 @@ def tangents(t):
     """Two unit vectors that are perpendicular to the unit vector t and to each other."""
     # cross product with the axis that t is farthest from
     if abs(t[0]) <= abs(t[1]) and abs(t[0]) <= abs(t[2]):
-        x, y, z = 0.0, t[2], -t[1]
+        first = normalised((0.0, t[2], -t[1]))
     elif abs(t[1]) <= abs(t[2]):
-        x, y, z = -t[2], 0.0, t[0]
+        first = normalised((-t[2], 0.0, t[0]))
     else:
-        x, y, z = t[1], -t[0], 0.0
-    first = normalised(x, y, z)
-    second = (
-        t[1] * first[2] - t[2] * first[1],
-        t[2] * first[0] - t[0] * first[2],
-        t[0] * first[1] - t[1] * first[0],
-    )
-    return first, second
-
-
-@inlined
-def write(array, entries):
-    """Write the entries of a matrix to an array (9)."""
-    for k in range(9):
-        array[k] = entries[k]
+        first = normalised((t[1], -t[0], 0.0))
+    return first, cross(t, first)

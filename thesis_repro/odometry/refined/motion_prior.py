@@ -16,6 +16,7 @@ import numpy as np
 
 from thesis_repro.odometry.refined.fit import RefinedMotion, fit, near
 from thesis_repro.odometry.refined.guided import ransac_with_prior
+from thesis_repro.odometry.types import Matches
 
 MAX_ROTATION_CHANGE, MAX_HEADING_CHANGE = 1.5, 20.0  # degrees
 MAX_FIRST_ROTATION = 5.0  # degrees: KITTI's cars turn by up to 4.8 a frame
@@ -42,10 +43,6 @@ class MotionPrior(NamedTuple):
         """Expected motion before the first step."""
         return cls(np.eye(3), np.array([0.0, 0.0, 1.0]), 0.0)
 
-    def copy(self) -> "MotionPrior":
-        """Copy with arrays of its own."""
-        return MotionPrior(self.rotation.copy(), self.translation.copy(), self.scale)
-
     def expected_rotation(self, scale: float) -> np.ndarray:
         """Expected rotation (3x3) of a step of `scale` metres on the same curve."""
         if not self.scale:
@@ -56,18 +53,12 @@ class MotionPrior(NamedTuple):
 
 
 def check_consistency(
-    motion: RefinedMotion,
-    current: np.ndarray,
-    previous: np.ndarray,
-    scale: float,
-    threshold: float,
-    prior: MotionPrior,
+    motion: RefinedMotion, matches: Matches, scale: float, prior: MotionPrior
 ) -> tuple[RefinedMotion, MotionPrior, str]:
     """Return the motion to use, the prior of the next step, and a flag.
 
     The flag is "" if the refined `motion` is consistent.
 
-    current, previous: the step's normalised correspondences (N, 2) in the order of motion.inliers.
     scale: metres.
 
     A consistent motion (`is_consistent`) is fitted once more, starting from the expected motion.
@@ -84,15 +75,14 @@ def check_consistency(
     rotation, translation = prior.expected_rotation(scale), prior.translation
     flag = ""
     if is_consistent(motion, scale, prior):
-        near_prior = near(
-            rotation, translation, current, previous, PRIOR_FIT_THRESHOLDS * threshold
-        )
-        again = fit(rotation, translation, current, previous, near_prior, threshold)
+        limit = PRIOR_FIT_THRESHOLDS * matches.threshold
+        near_prior = near(rotation, translation, matches, limit)
+        again = fit(rotation, translation, replace(matches, inliers=near_prior))
         if is_consistent(again, scale, prior) and again.support >= SAME_SUPPORT * motion.support:
-            motion = replace(again, inliers=motion.inliers)
+            motion = again
     else:
         flag = AMBIGUOUS
-        other = _consistent_motion(current, previous, scale, threshold, prior)
+        other = _consistent_motion(matches, scale, prior)
         if other is not None:
             has_support = other.support >= MIN_SUPPORT * motion.support
             if has_support or not _is_determined(motion):
@@ -102,17 +92,14 @@ def check_consistency(
         return expected, prior, NOT_DETERMINED
     # a fitted motion has both
     assert motion.rotation is not None and motion.translation is not None
-    return motion, MotionPrior(motion.rotation, motion.translation, scale), flag
+    # copies, because the caller may change what a step returns
+    return motion, MotionPrior(motion.rotation.copy(), motion.translation.copy(), scale), flag
 
 
-def _consistent_motion(
-    current: np.ndarray, previous: np.ndarray, scale: float, threshold: float, prior: MotionPrior
-) -> RefinedMotion | None:
+def _consistent_motion(matches: Matches, scale: float, prior: MotionPrior) -> RefinedMotion | None:
     """The motion with most inliers that is consistent with the prior, or None if there is none."""
     start = ransac_with_prior(
-        current,
-        previous,
-        threshold,
+        matches,
         prior.expected_rotation(scale),
         prior.translation,
         _max_rotation(prior),
@@ -120,8 +107,8 @@ def _consistent_motion(
     )
     if start is None:
         return None
-    inliers = near(*start, current, previous, threshold)
-    motion = fit(*start, current, previous, inliers, threshold)
+    inliers = near(*start, matches, matches.threshold)
+    motion = fit(*start, replace(matches, inliers=inliers))
     return motion if is_consistent(motion, scale, prior) else None
 
 

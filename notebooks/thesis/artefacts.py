@@ -1,0 +1,57 @@
+"""Where a notebook finds the files of earlier ones, and where its figures and tables go."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import pandas as pd
+
+from thesis_repro.report import style
+from thesis_repro.running import files
+from thesis_repro.running.settings import Settings, read_settings
+
+
+def begin() -> Settings:
+    """Begin a notebook: set the style of the figures, and return the settings of the run."""
+    style.use()
+    settings = read_settings()
+    print(settings)
+    return settings
+
+
+def needed(name: str, notebook: str) -> Path:
+    """Return the path of a file or folder in the folder of the run.
+
+    notebook: writes it. Raises InputError with its name if the file does not exist.
+    """
+    return files.needed(read_settings().build / name, notebook)
+
+
+def read_json(name: str, notebook: str) -> dict[str, Any]:
+    """Return what `write_json` wrote in another notebook, which `needed` names."""
+    return json.loads(needed(name, notebook).read_text(encoding="utf-8"))
+
+
+def write_json(name: str, values: dict[str, Any]) -> Path:
+    """Write a dict into a file in the folder of the run; return its path."""
+    return write_text(name, json.dumps(values, indent=1) + "\n")
+
+
+def write_text(name: str, text: str) -> Path:
+    """Write a text into a file in the folder of the run; return its path."""
+    path = read_settings().build / name
+    files.write_text(path, text)
+    return path
+
+
+def save_figure(figure: plt.Figure, name: str) -> None:
+    """Save a figure of the thesis, with a note that names the data."""
+    settings = read_settings()
+    style.save_figure(figure, settings.figures, name, settings.data_note)
+
+
+def save_table(table: pd.DataFrame, name: str, folder: Path | None = None) -> None:
+    """Save a table as CSV and Markdown, by default in the folder of the figures."""
+    settings = read_settings()
+    style.save_table(table, folder or settings.figures, name, settings.data_note)

@@ -1,0 +1,42 @@
+"""The refined estimator as the odometry uses it: one object that remembers the step before."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from thesis_repro.odometry.refined.fit import fit, smaller_rotation
+from thesis_repro.odometry.refined.motion_prior import MotionPrior, check_consistency
+from thesis_repro.odometry.types import Matches, Motion
+
+
+class RefinedEstimator:
+    """The motion with the smaller rotation, fitted to all points near it and then checked."""
+
+    def __init__(self, calls: Any = None):
+        """Start before the first step. calls: not used, see odometry.Calls."""
+        self.prior = MotionPrior.straight_ahead()
+
+    def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
+        """Return the motion of a step (see odometry.Estimator), flagged if it is not consistent.
+
+        A step that does not move the pose is not compared with the step before, and the next one is
+        not compared with it.
+        """
+        # RANSAC's order: sums in another order have other last digits
+        motion = fit(*smaller_rotation(essential), _in_order_of_ransac(matches))
+        if not moves:
+            return motion
+        motion, self.prior, flag = check_consistency(motion, matches, scale, self.prior)
+        return replace(motion, flag=flag)
+
+
+def _in_order_of_ransac(matches: Matches) -> Matches:
+    assert matches.inliers is not None  # a step with an essential matrix has them
+    return replace(
+        matches,
+        current=matches.current[matches.order],
+        previous=matches.previous[matches.order],
+        inliers=matches.inliers[matches.order],
+        order=slice(None),
+    )
