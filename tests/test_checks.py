@@ -54,7 +54,7 @@ def test_sequences_without_ground_truth_need_no_poses(tiny_kitti):
     assert checks.check_kitti(tiny_kitti)[1] == []
     (tiny_kitti / "poses/00.txt").unlink()
     (tiny_kitti / "poses/11.txt").touch()
-    _, problems = checks.check_kitti(tiny_kitti)
+    problems = checks.check_kitti(tiny_kitti)[1]
     assert [line.split("poses/")[1][:6] for line in problems] == ["00.txt", "11.txt"]
 
 
