@@ -116,7 +116,6 @@ def test_of_two_motions_the_consistent_one_is_used_and_flagged():
     assert degrees_apart(turn(2), used.rotation) < 0.1 and used.translation[2] > 0.99
     near = refine.near(used.rotation, used.translation, matches, THESIS.threshold)
     assert near[:150].mean() > 0.9 and near[150:].mean() < 0.3
-    np.testing.assert_array_equal(prior.rotation, used.rotation)
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ def test_opencv_does_the_whole_search_if_the_bounds_were_wrong(monkeypatch):
     ids=["ahead", "flat", "hardly moving", "turning only"],
 )
 def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, most_unsure):
-    random, shares, ill_conditioned = np.random.default_rng(3), [], 0
+    random, shares = np.random.default_rng(3), []
     samples = [scene(random, 5, outliers=0.0, **options) for _ in range(19 * LANES)]
     solutions = solve_five_points(*(np.array(side) for side in zip(*samples)))
     unsure = 0
@@ -146,13 +146,11 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
         matrices = np.empty((0, 9)) if stack is None else stack.reshape(-1, 9)
         assert len(matrices) == count
         ours = solutions.matrices[k, :count]
-        ill_conditioned += (margins >= WELL_CONDITIONED).sum()
         for matrix in matrices:
             same_sign = np.linalg.norm(ours - matrix, axis=1)
             distances = np.minimum(same_sign, np.linalg.norm(ours + matrix, axis=1))
             shares.append((distances / margins).min())
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
-    assert ill_conditioned > 0  # these are among the shares
 
 
 def test_a_sample_has_the_same_solutions_in_every_lane_and_company():
