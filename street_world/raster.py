@@ -93,8 +93,9 @@ class Environment(NamedTuple):
 # How loops are compiled. Both kinds divide by zero as numpy does. Functions of the second kind are
 # inlined into those of the first, and Python cannot call them.
 OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+INLINED: Any = {"forceinline": True, "no_cpython_wrapper": True}
 compiled = numba.njit(cache=True, **OPTIONS)
-inlined = numba.njit(**(OPTIONS | {"forceinline": True, "no_cpython_wrapper": True}))
+inlined = numba.njit(**OPTIONS, **INLINED)
 
 
 # Textures

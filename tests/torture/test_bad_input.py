@@ -93,7 +93,7 @@ BROKEN = [
             "another size": picture(np.zeros((20, 20), np.uint8)),
         },
     ),
-    (ODOMETRY, f"{FRAMES}/000000.png", {"missing": None, "1x1": picture([[7]])}),
+    (ODOMETRY, f"{FRAMES}/000000.png", {"1x1": picture([[7]])}),
     (ODOMETRY, f"{FRAMES}/2.png", {"a number twice": picture(NOISE)}),
     (
         LABELLED,
@@ -105,11 +105,6 @@ BROKEN = [
         },
     ),
     (MASKED, MASK, {"missing": None, "a label map": picture(NOISE % 30)}),
-    (
-        "study --kitti kitti --masks masks --output out",
-        MASK,
-        {"another size": picture(np.zeros((9, 9), np.uint8))},
-    ),
     (
         ODOMETRY,
         CALIB,
