@@ -94,9 +94,9 @@ def test_a_worker_with_other_folders_or_other_code_is_reported(
     runner.run_jobs(jobs, [opened], small_labels, tmp_path)
     record = runner.results.record(tmp_path / "00")
     inputs = opened, by_name(small_labels)
-    _, elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record)
+    _, elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record, 0.1)
     (tmp_path / "00" / "baseline-0.csv").unlink()
     monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
-    _, older = runner._run_pass(jobs, *inputs, tmp_path, record)
+    _, older = runner._run_pass(jobs, *inputs, tmp_path, record, 0.1)
     assert elsewhere[jobs[0]] != older[jobs[0]]
     assert not (tmp_path / "00" / "baseline-0.csv").exists()

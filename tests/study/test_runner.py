@@ -16,6 +16,7 @@ from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
+from thesis_repro.odometry.types import ROTATION_COLUMNS
 from thesis_repro.running import messages
 from thesis_repro.segmentation import training
 from thesis_repro.study import compare, methods, runner, workers
@@ -71,7 +72,7 @@ def test_kittis_errors_need_paths_of_100_metres(frames, t_rel):
     true = np.tile(np.eye(4), (frames, 1, 1))
     true[:, 2, 3] = np.arange(frames)
     columns = np.c_[1.02 * true[:, :3, 3], true[:, :3, :3].reshape(-1, 9)]
-    table = pd.DataFrame(columns, columns=[*"xyz", *odometry.odometry.ROTATION_COLUMNS])
+    table = pd.DataFrame(columns, columns=[*"xyz", *ROTATION_COLUMNS])
     measured = runner.measures(table.assign(detected=9.0, flag=""), true)
     assert measured["t_rel"] == pytest.approx(t_rel, nan_ok=True)
     assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
