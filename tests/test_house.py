@@ -125,7 +125,11 @@ def test_imports_are_found():
         "report.style",
         "street_world.__init__",
     }
-    assert imports(tree, "study.runner") == {"study.runner", "report.style", "street_world.__init__"}
+    assert imports(tree, "study.runner") == {
+        "study.runner",
+        "report.style",
+        "street_world.__init__",
+    }
     assert list(tools(ast.parse("import evidence\nfrom bench import measure"))) == [
         "evidence",
         "bench",
