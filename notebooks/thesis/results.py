@@ -1,7 +1,7 @@
-"""Chapter 4 drawn from saved tables: figures, tables, the comparison and the findings.
+"""What chapter 4 is drawn from: its runs, their paths, and what figures say of the data.
 
-Notebook 8 shows them one by one and saves the tables of runs. `python -m thesis.results`, with the
-folder notebooks in PYTHONPATH, draws all of them again, so a change of a drawing needs no run.
+Notebook 8 makes the runs. Finished ones are only read, so after a change of a drawing it draws all
+figures again within seconds.
 """
 
 from typing import NamedTuple
@@ -10,23 +10,28 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from thesis import chapter4, gap, plots, tables, thesis_tables, timing, trainings
+from thesis import chapter4, gap, tables, thesis_tables, trainings
 from thesis_repro.data import kitti
-from thesis_repro.report import comparison, findings, style
-from thesis_repro.running import messages
-from thesis_repro.running.files import needed, write_text
-from thesis_repro.running.settings import Settings, read_settings
+from thesis_repro.masks import KEEP
+from thesis_repro.report import findings
+from thesis_repro.running.files import write_text
+from thesis_repro.running.settings import Settings
 from thesis_repro.study import compare, runner
+from thesis_repro.study.jobs import Job
 
-PATHS = {"figure_4_06": "baseline", "figure_4_11": "masked", "figure_4_12": "reduced"}
 
+def is_decisive(job: Job, tested: int) -> bool:
+    """Return whether a conclusion rests on a run, so that it is made also in the embedded world.
 
-def read_runs(settings: Settings, name: str = "runs") -> pd.DataFrame:
-    """Read a table of runs from the build folder: "runs" or "shuffled_runs", to the bit."""
-    path = needed(settings.build / f"{name}.csv", "08_results")
-    texts = {"sequence": str, "source": str}
-    runs = pd.read_csv(path, dtype=texts, float_precision="round_trip")
-    return runs.fillna({"source": ""})
+    Each job is run once. The refined estimator decides, and Section 4.2 compares all keypoints,
+    masks of the `tested` width and plainly reduced keypoints: these are repeated. The masks of
+    other systems are compared on real frames only.
+    """
+    if job.method in KEEP:
+        return False
+    is_tested = job.method == "masked" and job.dilation_width == tested
+    is_compared = job.method in ("baseline", "reduced") or is_tested
+    return job.repetition == 0 or job.estimator == "refined" or is_compared
 
 
 class Notes(NamedTuple):
@@ -36,13 +41,16 @@ class Notes(NamedTuple):
     reported_as: str  # how to name the thesis's numbers beside those of the run
 
 
-def notes(settings: Settings, runs: pd.DataFrame) -> Notes:
-    """Return the notes of a run."""
+def notes(settings: Settings, runs: pd.DataFrame, mask_settings: str = "") -> Notes:
+    """Return the notes of a run. mask_settings: those that are not the thesis's, as a text."""
+    note = settings.data_note
+    if mask_settings:
+        note += f"; masks: {mask_settings}"
     if settings.kitti_is_embedded:
-        return Notes(settings.data_note, "thesis, another data set")
+        return Notes(note, "thesis, another data set")
     frames = runs.groupby("sequence")["frames"].first()
     lengths = ", ".join(f"{name} ({count} frames)" for name, count in frames.items())
-    return Notes(f"{settings.data_note}; {lengths}", "thesis, complete KITTI sequences")
+    return Notes(f"{note}; {lengths}", "thesis, complete KITTI sequences")
 
 
 class Paths(NamedTuple):
@@ -72,68 +80,21 @@ def read_paths(settings: Settings, runs: pd.DataFrame) -> Paths:
     return Paths(truths, rows, {run: path[:, :3, 3] for run, path in poses.items()})
 
 
-def findings_text(settings: Settings, runs: pd.DataFrame, shuffled: pd.DataFrame) -> str:
-    """Return the findings of a run (see `findings.text`)."""
+def write_findings(
+    settings: Settings, runs: pd.DataFrame, shuffled: pd.DataFrame, note: str
+) -> str:
+    """Write the findings of a run (see `findings.text`) beside the figures, and return them."""
     other_trainings = []
     if settings.figures_in_git:
         other_trainings = trainings.summary()
-    return findings.text(
+    text = findings.text(
         runs,
         compare.comparisons(runs),
-        notes(settings, runs).note,
+        note,
         settings.kitti_is_embedded,
         gap.label_map_quality(settings.build),
         other_trainings,
         tables.procedure(runs, shuffled),
     )
-
-
-@style.applied()
-def write(settings: Settings) -> None:
-    """Write the figures and tables of chapter 4 and the findings of a finished run."""
-    runs, shuffled = read_runs(settings), read_runs(settings, "shuffled_runs")
-    note, reported_as = notes(settings, runs)
-    compared = compare.comparisons(runs)
-    figures = {
-        "figure_4_07": chapter4.figure_4_07(runs),
-        "figure_4_09": chapter4.figure_against_width(runs, "rmse"),
-        "figure_4_10": chapter4.figure_against_width(runs, "mae"),
-        "figure_4_13": chapter4.figure_of_methods(runs, "rmse"),
-        "figure_4_14": chapter4.figure_of_sequences(runs, "rmse"),
-        "figure_4_15": chapter4.figure_of_methods(runs, "mae"),
-        "figure_4_16": chapter4.figure_of_sequences(runs, "mae"),
-        "comparison": comparison.figure_comparison(compared),
-    }
-    paths = read_paths(settings, runs)
-    figures |= {name: paths.figure(method) for name, method in PATHS.items()}
-    numbers = {
-        "table_4_1": tables.table_4_1(runs, reported_as),
-        "table_4_2": tables.table_of_change(runs, shuffled, "rmse", reported_as),
-        "table_4_3": tables.table_of_change(runs, shuffled, "mae", reported_as),
-        "widths": comparison.table_widths(runs),
-        "comparison": comparison.table_comparison(compared),
-    }
-    style.save_all(figures, numbers, settings.figures, note)
-    text = findings_text(settings, runs, shuffled)
     write_text(settings.figures / "findings.md", text)
-    _write_timings(settings, note)
-    history = settings.build / "model" / "history.csv"
-    if history.is_file():  # a run with the model of the package has none
-        figure_4_01 = plots.figure_4_01(pd.read_csv(history))
-        style.save_all({"figure_4_01": figure_4_01}, {}, settings.figures, settings.data_note)
-
-
-def _write_timings(settings: Settings, note: str) -> None:
-    """Write Figure 4.17 and the table of the time of a frame, from the recorded times."""
-    timings = timing.folder(settings)
-    seconds = pd.read_csv(timings / "seconds.csv", dtype={"sequence": str})
-    measured = pd.read_csv(timings / "budget.csv")
-    timed_on = f"{note}; timed on {seconds['processor'].iloc[0]}"
-    style.save_all({"figure_4_17": plots.figure_4_17(seconds)}, {}, settings.figures, timed_on)
-    budget = tables.table_budget(measured)
-    timed_on = f"{note}; timed on {measured['processor'].iloc[0]}"
-    style.save_table(budget, settings.figures, "budget", timed_on)
-
-
-if __name__ == "__main__":
-    messages.run_main(lambda: write(read_settings()))
+    return text
