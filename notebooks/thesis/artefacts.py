@@ -51,9 +51,7 @@ def save_figure(figure: plt.Figure, name: str, note: str = "") -> None:
     style.save_figure(figure, settings.figures, name, note or settings.data_note)
 
 
-def save_table(
-    table: pd.DataFrame, name: str, folder: Path | None = None, note: str = ""
-) -> None:
+def save_table(table: pd.DataFrame, name: str, folder: Path | None = None, note: str = "") -> None:
     """Save a table as CSV and Markdown, by default in the folder of the figures. note: as above."""
     settings = read_settings()
     style.save_table(table, folder or settings.figures, name, note or settings.data_note)
