@@ -74,7 +74,7 @@ def printed(executed, name):
 
 
 def test_every_artefact_is_written_and_names_its_data(executed):
-    figures = executed / "figures" / "embedded-smoke"
+    figures = executed / "build" / "embedded-smoke" / "figures"
     written = {path.stem: path for path in figures.iterdir() if path.suffix in (".svg", ".webp")}
     assert set(FIGURES) <= written.keys() and len(FIGURES) == 36
     texts = [written[name] for name in FIGURES if name not in WITHOUT_DATA]
