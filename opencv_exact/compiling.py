@@ -20,22 +20,27 @@ def compiled(function: Callable, **options: Any) -> Callable:
     C-contiguous arrays of one type.
     """
     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
-    dispatcher: Any = None
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # Numba finds no folder that it may write its cache to
         return numba.njit(**options)(function)
     if is_jitted(dispatcher):  # NUMBA_DISABLE_JIT=1 returns the function as it is
-        folder = Path(function.__code__.co_filename).parent
-        # Numba compares date and size of the file that defines a function, so it misses changes of
-        # the functions that are called from other files. Instead it compares this digest.
-        dispatcher._cache._cache_file._source_stamp = _digest_of_modules(folder)
+        _notice_changes(dispatcher, Path(function.__code__.co_filename).parent)
     return dispatcher
 
 
 def inlined(function: Callable, **options: Any) -> Callable:
     """Compile a function that is inlined into compiled functions. Python cannot call it."""
     return compiled(function, forceinline=True, no_cpython_wrapper=True, **options)
+
+
+def _notice_changes(dispatcher: Any, folder: Path) -> None:
+    """Let Numba compile anew after a change of a module in a function's folder or this package.
+
+    Numba itself compares date and size of the one file that defines a function, so it misses a
+    change of a function that is called from another file.
+    """
+    dispatcher._cache._cache_file._source_stamp = _digest_of_modules(folder)
 
 
 @cache

@@ -26,7 +26,7 @@ from opencv_exact import epipolar
 from opencv_exact.compiling import compiled, inlined
 from opencv_exact.five_point import SAMPLE_SIZE
 from opencv_exact.real_roots import LANES
-from opencv_exact.solver import Solutions, correspondences, no_solutions, solve
+from opencv_exact.solver import Solutions, correspondences, solve
 
 MAX_SAMPLES = 1000
 MIN_FOR_SHORTCUT = 8  # correspondences; with fewer, OpenCV does the whole search
@@ -65,6 +65,19 @@ class _Progress(NamedTuple):
     best: _Candidate
 
 
+NO_SAMPLES = np.zeros((LANES, SAMPLE_SIZE), np.int64)
+NO_SOLUTIONS = Solutions(
+    np.zeros(LANES, bool),
+    np.zeros(LANES, np.int64),
+    np.zeros((LANES, 10, 9)),
+    np.zeros((LANES, 10)),
+)
+RANDOM_STATE = np.array([OPENCV_SEED], np.uint64)
+# as in OpenCV, a sample counts only if its own five correspondences are inliers
+NOBODY = _Candidate(NO_SAMPLES[0], SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
+START = _Progress(0, RANDOM_STATE, NO_SAMPLES, NO_SOLUTIONS, NOBODY)  # of every search
+
+
 class _Solution(NamedTuple):
     """OpenCV's best solution for a sample of five."""
 
@@ -99,7 +112,7 @@ def find_essential_matrix(
 
 def draw_samples(points: int, samples: int) -> np.ndarray:
     """Indices (samples, 5) of the first samples that OpenCV's RANSAC draws from so many points."""
-    indices, _ = _draw(_first_random_state(), points, samples)
+    indices, _ = _draw(RANDOM_STATE, points, samples)
     return indices
 
 
@@ -108,10 +121,7 @@ def _search(points: _Points) -> _Solution | None:
 
     None: no sample won, or the bounds were wrong.
     """
-    no_samples = np.zeros((LANES, SAMPLE_SIZE), np.int64)
-    # as in OpenCV, a sample counts only if its own five correspondences are inliers
-    best = _Candidate(no_samples[0], SAMPLE_SIZE - 1, SAMPLE_SIZE - 1)
-    progress = _Progress(0, _first_random_state(), no_samples, no_solutions(), best)
+    progress = START
     solution = None  # of the best sample, once OpenCV has computed it
     while True:
         progress, challenger = _next_doubtful(points, progress)
@@ -134,10 +144,6 @@ def _search(points: _Points) -> _Solution | None:
                 best = _Candidate(challenger.sample, other.inliers, other.inliers)
                 solution = other
         progress = progress._replace(best=best)
-
-
-def _first_random_state() -> np.ndarray:
-    return np.array([OPENCV_SEED], np.uint64)
 
 
 def _opencv(

@@ -14,13 +14,10 @@ from opencv_exact.compiling import inlined
 # Samples solved side by side, one in each lane. Loops over fewer than 16 are not vectorised; with
 # more, more samples are solved in vain when a search ends.
 LANES = 16
-# Rows of a search for one root of each lane. The coefficients of the polynomial come first, then
-# those of its derivative from SLOPES on. PLACE is where the search is; LEFT and RIGHT are the ends
-# of the interval; LAST_STEP is the size of the last step. RISES and GOES_ON are 1 or 0: whether the
-# polynomial rises at the root, and whether the lane goes on. They are rows of one array, so that
-# the compiler sees that they do not overlap.
-SLOPES = 11
-PLACE, LEFT, RIGHT, LAST_STEP, RISES, GOES_ON = range(22, 28)
+# Rows of a search in all lanes: the coefficients of the polynomial, those of its derivative from
+# SLOPES on, and a _Search from STATE on. They are rows of one array, so that the compiler sees that
+# they do not overlap.
+SLOPES, STATE, ROWS = 11, 22, 28
 
 
 class RealRoots(NamedTuple):
@@ -32,6 +29,17 @@ class RealRoots(NamedTuple):
     extremum_counts: np.ndarray  # (LANES,)
     extrema: np.ndarray  # (10, LANES), places
     heights: np.ndarray  # (10, LANES), values at the extrema
+
+
+class _Search(NamedTuple):
+    """How far the search for one root of one polynomial is. All are numbers, 1 or 0 for a truth."""
+
+    place: float
+    left: float  # ends of the interval
+    right: float
+    last_step: float  # its size
+    rises: float  # whether the polynomial rises at the root
+    goes_on: float
 
 
 @inlined
@@ -50,7 +58,7 @@ def real_roots(polynomials):
     # of the next polynomial and of its second derivative, at its extrema
     heights, bends = np.empty((10, LANES)), np.empty((10, LANES))
     first_heights, last_heights = np.empty(LANES), np.empty(LANES)  # at the bounds
-    search = np.zeros((GOES_ON + 1, LANES))
+    search = np.zeros((ROWS, LANES))
     for degree in range(1, 11):
         polynomial, slopes = derivatives[degree], derivatives[degree - 1]
         _values(polynomial, -bounds, first_heights)
@@ -79,10 +87,10 @@ def real_roots(polynomials):
         for k in range(most):
             _start_search(search, brackets[:, k], k, counts)
             for _ in range(100):
-                if not _newton_step(search, precision):
+                if not _search_step(search, precision):
                     break
             for lane in range(LANES):
-                roots[k, lane] = search[PLACE, lane]
+                roots[k, lane] = search[STATE, lane]
             _values(slopes, roots[k], bends[k])
             if degree < 10:
                 _values(derivatives[degree + 1], roots[k], heights[k])
@@ -190,41 +198,58 @@ def _values(polynomial, places, values):
 
 @inlined
 def _start_search(search, brackets, k, counts):
-    """Prepare the search for root k of each lane, see `_newton_step`."""
+    """Prepare the search for root k in each lane. brackets (4, LANES): see `real_roots`."""
     for lane in range(LANES):
         left, right = brackets[1, lane], brackets[2, lane]
-        search[PLACE, lane], search[LEFT, lane], search[RIGHT, lane] = (
-            brackets[0, lane],
-            left,
-            right,
-        )
-        search[LAST_STEP, lane], search[RISES, lane] = right - left, brackets[3, lane]
-        search[GOES_ON, lane] = 1.0 if k < counts[lane] else 0.0
+        goes_on = 1.0 if k < counts[lane] else 0.0
+        state = _Search(brackets[0, lane], left, right, right - left, brackets[3, lane], goes_on)
+        _store(search, lane, state)
 
 
 @inlined
-def _newton_step(search, precision):
-    """Make one step of Newton's method in each lane. Returns the number of lanes that go on.
-
-    Bisection replaces a step that leaves the interval or converges slowly.
-    search: (28, LANES), rows from PLACE on. Lanes that do not go on keep their places.
-    """
+def _search_step(search, precision):
+    """Make one step in each lane. Returns the number of lanes that go on."""
     going_on = 0
     for lane in range(LANES):
-        z = search[PLACE, lane]
-        height = value(search, z, lane)
-        step = height / value(search[SLOPES:], z, lane)
-        is_left = (height < 0) == (search[RISES, lane] > 0)
-        left = z if is_left else search[LEFT, lane]
-        right = search[RIGHT, lane] if is_left else z
-        is_inside = (left <= z - step) & (z - step <= right)
-        is_shorter = abs(step) <= 0.5 * search[LAST_STEP, lane]
-        step = step if is_inside & is_shorter else z - 0.5 * (left + right)
-        moved = z - step
-        goes_on = search[GOES_ON, lane]
-        search[PLACE, lane] = moved if goes_on > 0 else z
-        search[LEFT, lane], search[RIGHT, lane], search[LAST_STEP, lane] = left, right, abs(step)
-        goes_on = 0.0 if abs(step) <= precision * abs(moved) + 1e-300 else goes_on
-        search[GOES_ON, lane] = goes_on
-        going_on += 1 if goes_on > 0 else 0
+        state = _Search(
+            search[STATE, lane],
+            search[STATE + 1, lane],
+            search[STATE + 2, lane],
+            search[STATE + 3, lane],
+            search[STATE + 4, lane],
+            search[STATE + 5, lane],
+        )
+        height = value(search, state.place, lane)
+        slope = value(search[SLOPES:], state.place, lane)
+        state = _newton_step(state, height, slope, precision)
+        _store(search, lane, state)
+        going_on += 1 if state.goes_on > 0 else 0
     return going_on
+
+
+@inlined
+def _store(search, lane, state):
+    search[STATE, lane], search[STATE + 1, lane] = state.place, state.left
+    search[STATE + 2, lane], search[STATE + 3, lane] = state.right, state.last_step
+    search[STATE + 4, lane], search[STATE + 5, lane] = state.rises, state.goes_on
+
+
+@inlined
+def _newton_step(state, height, slope, precision):
+    """The state after one step of Newton's method, for a polynomial's value and slope at the place.
+
+    Bisection replaces a step that leaves the interval or converges slowly. A search that does not
+    go on keeps its place.
+    """
+    place = state.place
+    step = height / slope
+    is_left = (height < 0) == (state.rises > 0)
+    left = place if is_left else state.left
+    right = state.right if is_left else place
+    is_inside = (left <= place - step) & (place - step <= right)
+    is_shorter = abs(step) <= 0.5 * state.last_step
+    step = step if is_inside & is_shorter else place - 0.5 * (left + right)
+    moved = place - step
+    goes_on = 0.0 if abs(step) <= precision * abs(moved) + 1e-300 else state.goes_on
+    place = moved if state.goes_on > 0 else place
+    return _Search(place, left, right, abs(step), state.rises, goes_on)

@@ -39,17 +39,6 @@ class Solutions(NamedTuple):
     margins: np.ndarray  # (LANES, 10)
 
 
-@compiled
-def no_solutions():
-    """Space for the solutions of LANES samples."""
-    return Solutions(
-        np.zeros(LANES, np.bool_),
-        np.zeros(LANES, np.int64),
-        np.empty((LANES, 10, 9)),
-        np.empty((LANES, 10)),
-    )
-
-
 def solve_five_points(current: np.ndarray, previous: np.ndarray) -> Solutions:
     """Essential matrices through K samples of five correspondences.
 
@@ -96,7 +85,12 @@ def solve(fives):
     steps = _first_steps(fives)
     roots = real_roots(steps.polynomials)  # step 5
     work, errors = np.empty((4, 3, 3, LANES)), np.empty(LANES)
-    solutions = no_solutions()
+    solutions = Solutions(
+        np.zeros(LANES, np.bool_),
+        np.zeros(LANES, np.int64),
+        np.empty((LANES, 10, 9)),
+        np.empty((LANES, 10)),
+    )
     sure, counts = solutions.sure, solutions.counts
     for lane in range(LANES):
         # not solved if the equations were singular: the polynomial is not finite

@@ -22,7 +22,7 @@ reference, which costs more than the arithmetic.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -92,9 +92,10 @@ class Environment(NamedTuple):
 
 # How loops are compiled. Both kinds divide by zero as numpy does. Functions of the second kind are
 # inlined into those of the first, and Python cannot call them.
-OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+INLINED: Any = {"forceinline": True, "no_cpython_wrapper": True}
 compiled = numba.njit(cache=True, **OPTIONS)
-inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, **OPTIONS)
+inlined = numba.njit(**OPTIONS, **INLINED)
 
 
 # Textures

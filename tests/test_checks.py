@@ -54,7 +54,7 @@ def test_sequences_without_ground_truth_need_no_poses(tiny_kitti):
     assert checks.check_kitti(tiny_kitti)[1] == []
     (tiny_kitti / "poses/00.txt").unlink()
     (tiny_kitti / "poses/11.txt").touch()
-    _, problems = checks.check_kitti(tiny_kitti)
+    problems = checks.check_kitti(tiny_kitti)[1]
     assert [line.split("poses/")[1][:6] for line in problems] == ["00.txt", "11.txt"]
 
 
@@ -70,8 +70,7 @@ def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsy
 
 def test_a_centre_far_from_the_middle_and_steps_that_were_left_out(tiny_kitti):
     assert checks.of_sequence(Sequence(tiny_kitti, "00")) == []
-    calibration = tiny_kitti / "sequences/00/calib.txt"
-    calibration.write_text("P0: 50 0 37 0 0 50 24 0 0 0 1 0\n")
+    (tiny_kitti / "sequences/00/calib.txt").write_text("P0: 50 0 37 0 0 50 24 0 0 0 1 0\n")
     (line,) = checks.of_sequence(Sequence(tiny_kitti, "00"))
     assert line.startswith("sequence 00: calib.txt") and "37, 24" in line
     assert checks.of_run("00", frames=100, failed=50, dropped=9) == []

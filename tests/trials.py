@@ -2,6 +2,7 @@
 
 import fnmatch
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -137,7 +138,9 @@ def refused(result, named, code=1, left=()):
     assert result.returncode == code, output
     assert "Traceback" not in result.stdout + result.stderr, output
     lines = result.stderr.splitlines()
-    errors = [line for line in lines if line.startswith(("error: ", "wrong: "))]
+    errors = [
+        line for line in lines if re.match("(thesis-repro( [a-z-]+)?: )?(error|wrong): ", line)
+    ]
     assert len(errors) == 1, f"not one line: {output}"
     assert str(named) in errors[0], f"does not name {named}: {output}"
     expected = {path for pattern in left for path in fnmatch.filter(result.left, pattern)}

@@ -59,7 +59,12 @@ def check_kitti(root: Path) -> tuple[list[str], list[str]]:
     for name in kitti.with_frames(root):
         sequence = _attempt(problems, kitti.Sequence, root, name)
         if _attempt(problems, getattr, sequence, "size", None):
-            facts += [sequence.description, *of_sequence(sequence)]
+            height, width = sequence.size
+            facts.append(
+                f"sequence {name}: {len(sequence)} frames of {width}x{height}; with ground truth: "
+                f"{sequence.has_truth}; with times: {sequence.has_times}"
+            )
+            facts += of_sequence(sequence)
             if name in with_truth:
                 _attempt(problems, getattr, sequence, "poses")
             _attempt_each(problems, sequence.frame, range(len(sequence)), f"sequence {name}")
@@ -245,4 +250,4 @@ def _class_shares(source: LabelMasks) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    messages.run_main(lambda: sys.exit(main(Path(sys.argv[1]))))
+    messages.run_main(lambda: main(Path(sys.argv[1])))

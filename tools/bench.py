@@ -29,7 +29,8 @@ import tensorflow as tf
 
 from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.odometry import THESIS, Odometry, keypoints, pose
+from thesis_repro.odometry import THESIS, Odometry
+from thesis_repro.odometry import odometry as page
 from thesis_repro.running import messages
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
@@ -46,7 +47,7 @@ from thesis import timing
 FRAMES = 40  # from the sequence's start
 REPEATS = 3
 WIDTHS = range(1, 17)  # dilation widths in pixels; with all keypoints, 17 runs
-FIRST_USE = "from thesis_repro.odometry import odometry; odometry.warm_up(refined=True)"
+FIRST_USE = "import thesis_repro.odometry.refined, thesis_repro.odometry.sharing"
 
 
 def seconds(work, clock=time.perf_counter):
@@ -58,23 +59,15 @@ def seconds(work, clock=time.perf_counter):
 
 def bare_calls(previous, frame, points, intrinsics):
     """Return the OpenCV calls of one step of the thesis's odometry, functions without arguments."""
-    tracked, followed = keypoints.track(previous, frame, points)
-    old, new = (pose.normalise(corners[followed], intrinsics) for corners in (points, tracked))
-    camera = {"focal": 1.0, "pp": (0.0, 0.0)}
-    search = {"method": cv2.RANSAC, "prob": pose.PROBABILITY, "threshold": THESIS.threshold}
-    matrix, _ = cv2.findEssentialMat(new, old, **search, **camera)
-    corners = points.reshape(-1, 1, 2)
+    calls = page.OPENCV
+    tracked, followed = calls.track(previous, frame, points)
+    old, new = (page.normalise(corners[followed], intrinsics) for corners in (points, tracked))
+    matrix, _ = calls.find_essential_matrix(new, old, THESIS.threshold)
     return [
-        lambda: cv2.calcOpticalFlowPyrLK(previous, frame, corners, None, **keypoints.TRACKER),
-        lambda: cv2.findEssentialMat(new, old, **search, **camera),
-        lambda: cv2.recoverPose(matrix, new, old, **camera),
-        lambda: cv2.goodFeaturesToTrack(
-            frame,
-            THESIS.max_keypoints,
-            THESIS.quality,
-            THESIS.min_distance,
-            blockSize=THESIS.block_size,
-        ),
+        lambda: calls.track(previous, frame, points),
+        lambda: calls.find_essential_matrix(new, old, THESIS.threshold),
+        lambda: calls.recover_pose(matrix, new, old),
+        lambda: calls.detect(frame),
     ]
 
 

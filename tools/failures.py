@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from thesis_repro.odometry import THESIS, Odometry, metrics, pose, scales
+from thesis_repro.odometry import THESIS, Matches, Odometry, metrics, scales
 from thesis_repro.odometry.refined.fit import SUPPORT_THRESHOLDS, near, with_uncertainty
 from thesis_repro.report import style
 
@@ -49,27 +49,22 @@ def measure(sequence, masks):
             continue
         true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
         for kind, step in steps.items():
-            current, previous, agreeing = _agreeing(step, reference, sequence)
-            fit = with_uncertainty(
-                reference.rotation,
-                reference.translation,
-                current[agreeing],
-                previous[agreeing],
-                agreeing,
-                SETTINGS.threshold,
-            )
+            agreeing = _agreeing(step, reference)
+            current, previous = step.matches.current[agreeing], step.matches.previous[agreeing]
+            matches = Matches(current, previous, SETTINGS.threshold)
+            fit = with_uncertainty(reference.rotation, reference.translation, matches)
             cells = (step.previous // cell).astype(int)
             rows.append(
                 {
                     "sequence": sequence.name,
                     "frame": index,
                     "kind": kind,
-                    "tracked": len(current),
+                    "tracked": len(step.current),
                     "agreeing": int(agreeing.sum()),
                     "cells": len(np.unique(cells, axis=0)) / CELLS**2,
                     "spread_u": step.previous[:, 0].std(),
                     "spread_v": step.previous[:, 1].std(),
-                    "depth_spread": _depth_spread(current[agreeing], previous[agreeing], reference),
+                    "depth_spread": _depth_spread(current, previous, reference),
                     "condition": fit.condition,
                     "direction_std": fit.heading_std_deg,
                     "rotation_error": metrics.angles(true[:3, :3].T @ step.motion.rotation),
@@ -92,15 +87,10 @@ def _steps(sequence, masks, indices):
         yield index, steps
 
 
-def _agreeing(step, motion, sequence):
-    """Return a step's normalised matched points, current and previous, and which of them agree.
-
-    They agree with `motion` if they are near its epipolar lines.
-    """
-    current = pose.normalise(step.current, sequence.intrinsics)
-    previous = pose.normalise(step.previous, sequence.intrinsics)
+def _agreeing(step, motion):
+    """Return which of a step's matches are near the epipolar lines of a motion."""
     limit = SUPPORT_THRESHOLDS * SETTINGS.threshold
-    return current, previous, near(motion.rotation, motion.translation, current, previous, limit)
+    return near(motion.rotation, motion.translation, step.matches, limit)
 
 
 def _depth_spread(current, previous, motion):
@@ -199,7 +189,7 @@ def _draw(panel, sequence, masks, index):
     """Draw the keypoints before a step: dropped by the mask, or kept and agreeing or not."""
     _, (_, steps) = _steps(sequence, masks, (index - 1, index))
     motion, mask = steps["all"].motion, masks[index - 1]
-    _, _, agreeing = _agreeing(steps["masks"], motion, sequence)
+    agreeing = _agreeing(steps["masks"], motion)
     columns, rows = np.rint(steps["all"].previous).astype(int).T
     for points, color, size, label in (
         (steps["all"].previous[mask[rows, columns] == 0], "#bbbbbb", 2, "dropped by the mask"),

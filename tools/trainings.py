@@ -24,13 +24,13 @@ from thesis_repro.running import files, messages, results
 from thesis_repro.running.settings import ROOT, read_settings
 from thesis_repro.segmentation import prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
-from thesis_repro.study import compare, jobs, runner, thesis_tables, workers
+from thesis_repro.study import compare, jobs, runner, workers
 from thesis_repro.study.sources import Source
 
 sys.path.append(str(ROOT / "notebooks"))
 
 # isort: split
-from thesis import domain_gap
+from thesis import domain_gap, thesis_tables
 from thesis.trainings import TABLE
 
 SEEDS = range(10)  # the first one is the default run's
@@ -97,9 +97,7 @@ def all_label_maps(settings):
     """Return `label_maps` of each of SEEDS, in order; a training uses one core, so several run."""
     calls = [(settings, seed) for seed in SEEDS]
     with workers.open_pool(settings.jobs) as pool:
-        results_by_index = pool.run(label_maps, calls)
-        trained = dict(files.progress(results_by_index, "trainings", len(calls), "network"))
-    return [trained[index] for index in range(len(calls))]
+        return list(files.progress(pool.run(label_maps, calls), "trainings", len(calls), "network"))
 
 
 def opened(settings):

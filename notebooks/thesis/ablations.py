@@ -22,7 +22,7 @@ from thesis_repro.odometry import THESIS, OdometrySettings, estimators, metrics
 from thesis_repro.odometry.odometry import detect, normalise, track
 from thesis_repro.odometry.runs import Masks
 from thesis_repro.running import results
-from thesis_repro.running.files import progress
+from thesis_repro.running.files import progress, write_text
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import CODE, measures
@@ -85,8 +85,8 @@ def measure(
     ]
     with workers.open_pool(processes) as pool:
         measured = pool.run(_measure, calls)
-        tables = dict(progress(measured, "ablations", total=len(calls), unit="sequence"))
-    return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
+        tables = list(progress(measured, "ablations", total=len(calls), unit="sequence"))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _measure(
@@ -117,7 +117,7 @@ def _measure(
             row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]
             rows.append(row)
         table = pd.DataFrame(rows).assign(sequence=sequence.name)
-        results.write_table(path, table)
+        write_text(path, table.to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 

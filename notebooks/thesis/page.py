@@ -60,12 +60,12 @@ def update(settings: Settings, folder: Path) -> None:
 
 def _copy(settings: Settings, folder: Path) -> None:
     """Copy what a run has drawn, and from the figures in git those that show no data."""
-    files = [path for path in listed(settings.figures, "*.*") if path.is_file()]
+    files = {path.relative_to(settings.figures): path for path in settings.figures.rglob("*.*")}
     for name in captions.CONSTANT:
-        in_git = (ROOT / "figures").glob(f"{name}.*")
-        files += [path for path in in_git if not (settings.figures / path.name).exists()]
-    for path in files:
-        copy = folder / path.name
+        for path in (ROOT / "figures").glob(f"{name}.*"):
+            files.setdefault(Path(path.name), path)
+    for name, path in files.items():
+        copy = folder / name
         if not copy.is_file() or copy.read_bytes() != path.read_bytes():
             with atomic(copy) as temporary:
                 shutil.copyfile(path, temporary)

@@ -1,7 +1,7 @@
 """Chapter 4 drawn from saved tables: figures, tables, the comparison and the findings.
 
-Notebook 8 shows them one by one and saves the tables of runs. `write` draws all of them again, so
-a change of a drawing needs no run.
+Notebook 8 shows them one by one and saves the tables of runs. `python -m thesis.results`, with the
+folder notebooks in PYTHONPATH, draws all of them again, so a change of a drawing needs no run.
 """
 
 from typing import NamedTuple
@@ -10,11 +10,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from thesis import chapter4, gap, plots, tables, thesis_tables, trainings
+from thesis import chapter4, gap, plots, tables, thesis_tables, timing, trainings
 from thesis_repro.data import kitti
 from thesis_repro.report import comparison, findings, style
+from thesis_repro.running import messages
 from thesis_repro.running.files import needed, write_text
-from thesis_repro.running.settings import Settings
+from thesis_repro.running.settings import Settings, read_settings
 from thesis_repro.study import compare, runner
 
 PATHS = {"figure_4_06": "baseline", "figure_4_11": "masked", "figure_4_12": "reduced"}
@@ -116,15 +117,15 @@ def write(settings: Settings) -> None:
     text = findings_text(settings, runs, shuffled)
     write_text(settings.figures / "findings.md", text)
     _write_timings(settings, note)
-    history = pd.read_csv(settings.build / "model" / "history.csv")
-    style.save_all(
-        {"figure_4_01": plots.figure_4_01(history)}, {}, settings.figures, settings.data_note
-    )
+    history = settings.build / "model" / "history.csv"
+    if history.is_file():  # a run with the model of the package has none
+        figure_4_01 = plots.figure_4_01(pd.read_csv(history))
+        style.save_all({"figure_4_01": figure_4_01}, {}, settings.figures, settings.data_note)
 
 
 def _write_timings(settings: Settings, note: str) -> None:
     """Write Figure 4.17 and the table of the time of a frame, from the recorded times."""
-    timings = settings.figures / "timings"
+    timings = timing.folder(settings)
     seconds = pd.read_csv(timings / "seconds.csv", dtype={"sequence": str})
     measured = pd.read_csv(timings / "budget.csv")
     timed_on = f"{note}; timed on {seconds['processor'].iloc[0]}"
@@ -132,3 +133,7 @@ def _write_timings(settings: Settings, note: str) -> None:
     budget = tables.table_budget(measured)
     timed_on = f"{note}; timed on {measured['processor'].iloc[0]}"
     style.save_table(budget, settings.figures, "budget", timed_on)
+
+
+if __name__ == "__main__":
+    messages.run_main(lambda: write(read_settings()))

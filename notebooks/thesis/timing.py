@@ -18,10 +18,8 @@ import pandas as pd
 
 from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.errors import InputError
-from thesis_repro.running import results
 from thesis_repro.running.files import progress, write_text
-from thesis_repro.running.settings import cores
+from thesis_repro.running.settings import Settings, cores
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
 from thesis_repro.study.runner import checked_masks
@@ -66,8 +64,8 @@ def time_runs(
         calls.append((sequence_jobs, sequence, sources, path))
     with workers.open_pool(processes) as pool:
         timed = pool.run(_time_jobs, calls)
-        tables = dict(progress(timed, "timing", total=len(calls), unit="sequence"))
-    return pd.concat([tables[index] for index in range(len(calls))], ignore_index=True)
+        tables = list(progress(timed, "timing", total=len(calls), unit="sequence"))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _time_jobs(
@@ -103,7 +101,7 @@ def _time_jobs(
         }
         for job, job_seconds in seconds.items()
     ]
-    results.write_table(path, pd.DataFrame(rows))
+    write_text(path, pd.DataFrame(rows).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
@@ -115,13 +113,8 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
     every pixel), mask (label map to 320x320, edges, dilation), detection, tracking, pose (essential
     matrix, then rotation and translation). model: a Keras model of `segmentation`. width: of the
     masks, pixels. The methods take turns.
-    Raises InputError for a sequence with too few frames.
     """
     sequence = sequence.subset(FRAMES + WARM_UP)
-    if len(sequence) < WARM_UP + 2:
-        raise InputError(
-            f"sequence {sequence.name}: {len(sequence)} frames; timing needs {WARM_UP + 2} or more"
-        )
     scales = odometry.scales(sequence)
     unmasked_odometry = odometry.Odometry(sequence.intrinsics)
     masked_odometry = odometry.Odometry(sequence.intrinsics)
@@ -153,6 +146,16 @@ def _stages_of(step: odometry.Step) -> dict[str, float]:
         "tracking": step.seconds["track"],
         "pose": step.seconds["essential"] + step.seconds["pose"],
     }
+
+
+def folder(settings: Settings) -> Path:
+    """Return the folder of the timings that are drawn.
+
+    For the figures in git it holds those that were recorded on one machine, else those of the run.
+    """
+    if settings.figures_in_git:
+        return settings.published / "timings"
+    return settings.figures / "timings"
 
 
 def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:

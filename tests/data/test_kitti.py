@@ -79,17 +79,6 @@ def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
     assert sequence.label_names == [f"{index:06d}.png" for index in range(4)]
 
 
-def test_the_camera_can_be_chosen(tiny_kitti):
-    folder = tiny_kitti / "sequences/00"
-    shutil.copytree(folder / "image_0", folder / "image_2")
-    assert kitti.Sequence(tiny_kitti, "00").frame_paths[0].parent.name == "image_0"
-    with pytest.raises(InputError, match="calib.txt"):
-        kitti.Sequence(tiny_kitti, "00", camera="image_2")
-    (folder / "calib.txt").write_text("P2: 60 0 30 5 0 60 20 0 0 0 1 0\n")
-    colour = kitti.Sequence(tiny_kitti, "00", camera="image_2")
-    assert colour.frame_paths[0].parent.name == "image_2" and colour.intrinsics[0, 0] == 60
-
-
 def test_frames_are_ordered_by_number_and_a_missing_one_is_named(tiny_kitti):
     images = tiny_kitti / "sequences/00/image_0"
     for index, path in enumerate(sorted(images.glob("*.png"))):

@@ -4,17 +4,11 @@ The cells concerned run in this process, on the small world.
 """
 
 import json
-from dataclasses import replace
 
-import cv2
-import numpy as np
 import pytest
 from cells import cells, named
 
-from thesis_repro import odometry
-from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import THESIS
 from thesis_repro.running.settings import PREFIX, read_settings
 
 # the cells that an edit goes through, without those that only show something
@@ -99,28 +93,3 @@ def test_an_edit_of_the_loop_shows_in_the_last_table_of_its_notebook(build, caps
     edited = table("07", LOOP, double)
     assert edited[0].equals(thesis) and edited[1][TEXT] > 10 * thesis[TEXT]
     assert "EDITED" in capsys.readouterr().out
-
-
-class SparseMasks:
-    """Edges of a sequence's frames as masks; some are all zero, and some have a few pixels."""
-
-    def __init__(self, sequence):
-        self.sequence = sequence
-
-    def __getitem__(self, index):
-        mask = cv2.Canny(self.sequence.frame(index), 200, 600)
-        if index % 4 == 3:
-            mask[:, 100 if index % 8 == 7 else 0 :] = 0
-        return mask
-
-
-def test_the_loop_by_hand_keeps_the_pose_where_the_package_does(build):
-    run("06", MASKS)
-    path_by_hand = run("07", LOOP[:-2])["path_by_hand"]
-    sequence = Sequence(read_settings().kitti, "00")
-    for masks in (None, SparseMasks(sequence)):
-        poses, keypoints = path_by_hand(sequence, masks)
-        result = odometry.run(sequence, replace(THESIS), masks)
-        assert np.array_equal(poses, result.poses)
-        assert keypoints == result.frames["detected"].mean()
-    assert result.failed_steps > 1

@@ -4,7 +4,7 @@ import shutil
 
 import nbformat
 import pytest
-from making import EXECUTED, FIGURES, make_figures
+from making import EXECUTED, make_figures
 
 from thesis_repro.running.settings import ROOT
 
@@ -29,10 +29,9 @@ def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
     failed = make_figures(tmp_path, root=root)
     assert failed.returncode != 0 and "labels: missing" in failed.stderr
     assert (tmp_path / "figures" / "embedded-smoke" / "index.html").is_file()
-    results = tmp_path / "build" / "embedded-smoke" / "notebooks"
-    assert "raise ValueError" in (results / "02_two.log").read_text()
     # hidden ones included
-    assert sorted(path.name for path in results.glob("*.ipynb")) == ["01_one.ipynb"]
+    written = (tmp_path / "build" / "embedded-smoke" / "notebooks").glob("*.ipynb")
+    assert sorted(path.name for path in written) == ["01_one.ipynb"]
 
 
 @pytest.mark.notebooks
@@ -47,25 +46,6 @@ def test_real_frames_alone_need_no_training(tmp_path, tiny_kitti):
         "08",
         "09",
     ]
-
-
-@pytest.mark.torture
-def test_real_frames_alone_train_and_render_nothing(tmp_path, small_world):
-    """On frames of the small world, given as if they were real."""
-    done = make_figures(tmp_path, f"KITTI={small_world / 'kitti'}", "WIDTHS=5,10", "REPETITIONS=1")
-    assert done.returncode == 0, done.stdout + done.stderr
-    # no world is rendered
-    (build,) = (path for path in (tmp_path / "build").iterdir() if path.is_dir())
-    assert (
-        build.name.endswith("-smoke-widths-5_10-repetitions-1") and not (build / "model").exists()
-    )
-    figures = {
-        path.stem
-        for path in (tmp_path / "figures" / build.name).iterdir()
-        if path.suffix in (".svg", ".webp")
-    }
-    left_out = {"figure_4_01", "figure_4_02", *(f"figure_3_{n:02d}" for n in (1, 2, 3, 5))}
-    assert set(FIGURES) - figures == left_out
 
 
 @pytest.mark.notebooks

@@ -1,4 +1,4 @@
-"""Importing a module changes nothing in the process, and a script keeps its own settings."""
+"""Importing a module changes nothing in the process."""
 
 import ast
 import json
@@ -9,7 +9,7 @@ from trials import succeed
 
 from thesis_repro.running.settings import ROOT
 
-OURS = ("thesis_repro", "street_world")
+OURS = ("thesis_repro", "street_world", "opencv_exact")
 PATHS = [
     path.relative_to(ROOT)
     for folder in OURS
@@ -82,47 +82,3 @@ def test_no_module_changes_anything_by_its_import(tmp_path):
         HOME=tmp_path,
     )
     assert [line for line in done.stdout.splitlines() if line.startswith("changed by")] == []
-
-
-def test_a_script_keeps_its_logging_and_its_style(tmp_path):
-    (tmp_path / "script.py").write_text(
-        "import io, logging, matplotlib\n"
-        "matplotlib.rcParams['font.size'] = 33\n"
-        "stream = io.StringIO()\n"
-        "logging.basicConfig(stream=stream, level='INFO', format='%(name)s %(message)s')\n"
-        "from thesis_repro.report import comparison, paths, style, video\n"
-        "from thesis_repro.running import results\n"
-        "with style.applied():\n"
-        "    style.write_figure(style.new_figure()[0], 'figure.svg')\n"
-        "for size in (1, 2):\n"
-        "    (results.stage('out', size=size) / 'result').touch()\n"
-        "print(matplotlib.rcParams['font.size'])\n"
-        "print(stream.getvalue())\n"
-    )
-    done = succeed([sys.executable, "script.py"], tmp_path)
-    assert done.stdout.startswith("33.0") and "\nthesis_repro out: " in done.stdout
-    assert done.stderr == ""
-
-
-def test_settings_of_the_user_do_not_change_figures(tmp_path):
-    (tmp_path / "script.py").write_text(
-        "import pathlib\n"
-        "from thesis_repro.report import style\n"
-        "def draw(name):\n"
-        "    figure, axes = style.new_figure()\n"
-        "    axes.plot([1, 3, 2])\n"
-        "    style.save_figure(figure, pathlib.Path(), name, 'note')\n"
-        "draw('by_default')\n"
-        "style.use()\n"
-        "draw('in_style')\n"
-    )
-    written = {"by_default": [], "in_style": []}
-    for settings in ("", "font.size: 20\naxes.facecolor: red\n"):
-        (tmp_path / "matplotlibrc").write_text(settings)  # read from the working folder
-        succeed([sys.executable, "script.py"], tmp_path, MPLBACKEND="agg")
-        for name, files in written.items():
-            files.append((tmp_path / f"{name}.svg").read_bytes())
-    plain, own = written["in_style"]
-    assert plain == own
-    plain, own = written["by_default"]
-    assert plain != own

@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 from scipy.stats import ttest_1samp
 
-from thesis_repro.study import compare, thesis_tables
+from thesis import thesis_tables
+from thesis_repro.study import compare
 
 EIGHT = [f"{number:02d}" for number in range(8)]
 
@@ -33,10 +34,6 @@ def arms(runs, *methods):
 
 def ratio_of(rows, reference):
     return compare.geometric_mean(compare.ratios(rows, reference, "rmse"))
-
-
-def test_a_change_in_percent_is_negative_if_the_value_is_smaller():
-    assert thesis_tables.percent_change(3.0, 4.0) == -25.0
 
 
 def test_known_ratios_are_found_and_inverted_by_swapping():
@@ -93,18 +90,14 @@ def test_intervals_that_exclude_the_true_mean_by_chance():
         return random.normal(0, 0.1, shape) + 2.5 * (random.random(shape) < 1 / 6)
 
     percent = pd.DataFrame(index=[6, 8, 11])
-    ranks = percent.copy()
     for name, draw in draws.items():
         for count in percent.index:
             studies = draw((2000, count))
             intervals = np.array([compare.mean_interval(row) for row in studies])
             low, high = intervals.T
             percent.loc[count, name] = 100 * ((low > 0) | (high < 0)).mean()
-            p_values = np.array([compare.rank_test(row) for row in studies[:500]])
-            ranks.loc[count, name] = 100 * (p_values < 0.05).mean()
-    print(percent.T, "rank test", ranks.T, sep="\n")
+    print(percent.T)
     assert percent["normal"].between(4, 6).all() and (percent["heavy tails"] < 5).all()
-    assert (ranks[["normal", "heavy tails", "either lost"]] < 7.5).all(axis=None)
 
 
 def test_the_rank_test_sees_a_small_loss_everywhere_that_one_lost_sequence_hides():
@@ -235,16 +228,6 @@ def test_leaving_one_out_shows_that_the_best_width_is_chance():
         assert (changes < 0).sum() == better
 
 
-def test_leaving_one_out_ignores_the_errors_of_that_sequence():
-    masked, baseline = parts_of(separate_optimum, noise=0.3)
-    chosen = thesis_tables.chosen_widths(masked, baseline)["left_out"]
-    changed, left_out = masked.copy(), masked["sequence"] == "04"
-    changed.loc[left_out, "rmse"] = np.random.default_rng(5).uniform(0.01, 50, left_out.sum())
-    assert thesis_tables.chosen_widths(changed, baseline)["left_out"]["04"] == chosen["04"]
-    without = thesis_tables.chosen_widths(masked[~left_out], baseline[baseline["sequence"] != "04"])
-    assert without["fixed"].iloc[0] == chosen["04"]
-
-
 def test_a_width_that_failed_in_one_sequence_is_not_chosen_for_all():
     masked, baseline = parts_of(
         lambda name, width: 0.1 if width == 15 else 1.0, ["00", "01", "02"], (5, 10, 15)
@@ -277,18 +260,18 @@ def test_the_literal_procedure_uses_one_repetition_alone():
 
 def test_the_best_of_many_widths_looks_better_if_masks_do_nothing():
     _, baseline = parts_of(lambda *_: 1.0, repetitions=400, noise=0.2)
-    studies = thesis_tables.changes_if_masks_did_nothing(baseline, 15, "rmse")
+    studies = thesis_tables.null_distribution(baseline, 15, "rmse")
     assert studies.shape == (thesis_tables.STUDIES, 11)
     # a standard normal's least of 15 is -1.736 on average, its median 0
     expected = 100 * (np.exp(-1.736 * 0.2) - 1)
     assert studies.median(axis=1).mean() == pytest.approx(expected, abs=2.5)
-    single = thesis_tables.changes_if_masks_did_nothing(baseline, 1, "rmse")
+    single = thesis_tables.null_distribution(baseline, 1, "rmse")
     assert single.median(axis=1).mean() == pytest.approx(0, abs=2)
     # the width is chosen by the RMSE, and another error judges it
     other = baseline.assign(mae=1 / baseline["rmse"])
-    assert (thesis_tables.changes_if_masks_did_nothing(other, 15, "mae").mean() > 0).all()
+    assert (thesis_tables.null_distribution(other, 15, "mae").mean() > 0).all()
     once = baseline[baseline["repetition"] == 0]
-    assert thesis_tables.changes_if_masks_did_nothing(once, 15, "rmse").empty
+    assert thesis_tables.null_distribution(once, 15, "rmse").empty
 
 
 def test_time_savings_are_negative_percentages_over_all_sequences():

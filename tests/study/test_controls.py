@@ -5,14 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from street import Street, Stripes
 
-from thesis import ablations
+from thesis import ablations, thesis_tables
 from thesis_repro import mask_files, masks
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, keypoints
-from thesis_repro.study import compare, controls, runner, thesis_tables
-from thesis_repro.study.jobs import first_jobs, keypoint_control_jobs, reduced_jobs
+from thesis_repro.study import compare, methods, runner
+from thesis_repro.study.jobs import first_jobs
 from thesis_repro.study.sources import Source
 
 WIDTH = 10
@@ -28,8 +27,8 @@ def made(sequence, small_labels):
     """Masks of every control and of the thesis, by method."""
     source = Source(small_labels)
     by_method = {"masked": mask_files.LabelMasks(small_labels / "00", sequence, WIDTH)}
-    for method in controls.MASK_CONTROLS:
-        by_method[method] = controls.masks_of_method(method, source, sequence, WIDTH)
+    for method in methods.MASK_CONTROLS:
+        by_method[method] = methods.masks_of_method(method, source, sequence, WIDTH)
     return by_method
 
 
@@ -43,7 +42,7 @@ def test_masks_of_controls_are_valid_and_repeatable(sequence, made):
         source[7]
         assert np.array_equal(source[3], mask), method
         is_thesis_mask = np.array_equal(mask, made["masked"][3])
-        assert is_thesis_mask == (method in ("masked", "fallback")), method
+        assert is_thesis_mask == (method == "masked"), method
 
 
 def test_controls_use_the_frame_and_settings_of_their_name(
@@ -101,12 +100,12 @@ def test_controls_of_empty_and_full_masks(sequence, made, monkeypatch, value):
 def test_spread_keypoints_have_the_asked_number(sequence):
     counts = [len(keypoints.detect(frame, THESIS)) for frame in sequence.frames()]
     target = np.mean(counts) / 2
-    distance = controls.min_distance(sequence, target)
+    distance = methods.min_distance(sequence, target)
     assert distance > THESIS.min_distance and distance == round(distance, 1)
     spread = replace(THESIS, min_distance=distance)
     left = np.mean([len(keypoints.detect(frame, spread)) for frame in sequence.frames()])
     assert left == pytest.approx(target, rel=0.03)
-    assert controls.min_distance(sequence, max(counts)) == THESIS.min_distance
+    assert methods.min_distance(sequence, max(counts)) == THESIS.min_distance
 
 
 def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
@@ -114,12 +113,12 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 ):
     opened = [Sequence(small_world / "kitti", "00").subset(5)]
     jobs = first_jobs(opened, {"thesis": (5, WIDTH), "refined": ()}, tested=5)
-    assert {job.dilation_width for job in jobs if job.method in controls.MASK_CONTROLS} == {5}
+    assert {job.dilation_width for job in jobs if job.method in methods.MASK_CONTROLS} == {5}
     runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table
     left = compare.keypoints_left(runs)
     masked = compare.of_method(runs, "masked")
-    jobs += reduced_jobs(thesis_tables.best_widths(masked))
-    jobs += keypoint_control_jobs(left, opened, width=5)
+    jobs += thesis_tables.reduced_jobs(thesis_tables.best_widths(masked))
+    jobs += runner.keypoint_controls(runs, opened, [Source(small_labels)], 1, 5)
     assert len({job.name for job in jobs}) == len(jobs)
     runs = runner.run_jobs(jobs, opened, small_labels, tmp_path).table.set_index("run")
     assert list(runs.index) == [job.name for job in jobs] and compare.tested_width(runs) == 5
@@ -156,31 +155,6 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     enlarged = cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
     _, method_masks = runs["no-vegetation", "thesis", 0]
     assert np.array_equal(method_masks[0] == 0, np.isin(enlarged, (21, 22)))
-
-
-@pytest.mark.parametrize("amount, low, high", [(300, 280, 300), (0.5, 0.48, 0.5)])
-def test_random_keypoints_are_a_subset_of_the_asked_size(small_world, amount, low, high):
-    sequence = Sequence(small_world / "kitti", "00").subset(2)
-    drawn = ablations.random_keypoints(sequence, amount, 0)
-    points = keypoints.detect(sequence.frame(0), THESIS, drawn)
-    detected = keypoints.detect(sequence.frame(0), THESIS)
-    count = len(points)
-    if isinstance(amount, float):
-        count /= len(detected)
-    assert low <= count <= high
-    assert set(map(tuple, points.astype(int))) <= set(map(tuple, detected.astype(int)))
-    assert np.array_equal(drawn, ablations.random_keypoints(sequence, amount, 0))
-
-
-def test_tracks_of_a_known_motion_have_small_residuals_and_cover_fields():
-    street = Street(3)
-    corner = np.zeros(street.size, np.uint8)
-    corner[60:100, 380:440] = 255
-    masks_by_name = {"all": None, "stripes": Stripes(40), "corner": [corner] * 3}
-    table = ablations.tracks(street, masks_by_name, pairs=2)
-    means = table.groupby("method")[["residual", "fields"]].mean()
-    assert (means["residual"] < 1).all()
-    assert means.loc["corner", "fields"] < means.loc["all", "fields"]
 
 
 def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pandas as pd
 import pytest
 from evo.tools import file_interface
 from typeset import PDFLATEX, assert_fits
@@ -16,9 +15,9 @@ from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, write_masks
+from thesis_repro.masks import MaskSettings
 from thesis_repro.report import study as report
-from thesis_repro.report import tables
-from thesis_repro.study import compare, runner
+from thesis_repro.study import compare, runner, sources
 from thesis_repro.study.sources import Source
 from thesis_repro.study.study import Study
 
@@ -140,7 +139,7 @@ def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
         patch.setattr(runner.odometry, "run_many", None)  # would fail
         again = study.run(folder)
     assert again.table.equals(runs)
-    assert (again.made, again.kept, again.failed) == (0, len(runs), 0)
+    assert (again.made, again.kept, again.failed_jobs) == (0, len(runs), 0)
     other = tmp_path / "other"
     shutil.copytree(small_labels, other)
     for path in other.rglob("*.png"):
@@ -256,36 +255,13 @@ def test_bad_input_is_one_line_before_anything_runs(
     )
 
 
-def test_each_source_has_the_name_before_its_folder(
-    small_world, small_labels, masks, tmp_path, monkeypatch
-):
-    shutil.copytree(small_labels, tmp_path / "lr=0.1")
-    monkeypatch.chdir(tmp_path)
-    sources = ["--masks", f"by hand={masks}", "--labels", f"my net={small_labels}"]
-    sources += ["--labels", "lr=0.1"]  # a folder that has no name
-    command = ["study", "--kitti", str(small_world / "kitti"), "--sequences", "00", *sources]
-    command += ["--widths", "5", "--repetitions", "1", "--frames", "5", "--output", "out"]
-    assert main(command) == 0
-    runs = tables.read(tmp_path / "out" / "runs.csv")
-    masked = runs[runs["method"] == "masked"].set_index("source")
-    widths = masked["dilation_width"].fillna(0)
-    assert widths.to_dict() == {"by hand": 0, "my net": 5, "lr-0-1": 5}
-    names = pd.read_csv(tmp_path / "out" / "summary.csv")["masks"]
-    assert set(names) == set(widths.index)
-    assert "my net" in (tmp_path / "out" / "index.html").read_text()
-
-
-def test_the_old_option_for_names_shows_the_new_form(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["study", "--kitti", "kitti", "--labels", "mine", "--name", "net", "--output", "out"])
-    error = capsys.readouterr().err
-    assert end.value.code == 2 and error.count("\n") == 1 and "--labels net=" in error
-
-
-def test_a_sequence_named_like_a_column_is_refused(tiny_kitti):
-    (tiny_kitti / "sequences" / "00").rename(tiny_kitti / "sequences" / "low")
-    with pytest.raises(InputError, match="sequences/low: "):
-        Study(tiny_kitti, ("low",), (), ()).check()
+def test_each_source_has_the_name_before_its_folder(tmp_path):
+    folders = [("masks", "by hand", tmp_path), ("labels", None, tmp_path / "lr=0.1")]
+    made = sources.named(folders, MaskSettings())
+    assert [(source.name, source.kind) for source in made] == [
+        ("by hand", "masks"),
+        ("lr-0-1", "labels"),
+    ]
 
 
 def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_labels, tmp_path):

@@ -19,11 +19,10 @@ sys.path[:0] = {[str(ROOT / "tests/segmentation"), str(ROOT / "tools")]!r}
 from thesis_repro.running import messages, results
 from thesis_repro.segmentation import training
 import test_training
-try:
+def main():
     folder = results.stage(sys.argv[1], **training.made_from(*test_training.prepared()))
     test_training.train(folder, 3, pause=0.1)
-except Exception as error:
-    sys.exit(messages.report_error(error))
+messages.run_main(main)
 """
 
 

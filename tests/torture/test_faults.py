@@ -1,13 +1,8 @@
-"""Faults of the machine: killed commands and workers, full and read-only disks, little memory.
-
-Odd names, no network and a read-only cache must work.
-"""
+"""Faults of the machine: killed commands and workers, full and read-only disks, odd names."""
 
 import ctypes
 import os
 import random
-import resource
-import shlex
 import shutil
 import signal
 import subprocess
@@ -17,9 +12,7 @@ from functools import partial
 import psutil
 import pytest
 from trials import (
-    ROOT,
     contents,
-    environment,
     finish,
     kill,
     no_temporary_files,
@@ -80,75 +73,37 @@ def test_a_read_only_disk_and_a_full_one(words, disk, tmp_path, name, kilobytes)
     resumes(words, name, tmp_path, "disk/out")
 
 
-@pytest.mark.parametrize(
-    "name, limit, megabytes, named",
-    [
-        ("odometry.txt", resource.RLIMIT_AS, 300, "memory"),
-        long("synthesize", resource.RLIMIT_AS, 700, "memory"),
-        long("predict", resource.RLIMIT_AS, 3080, "memory"),
-        long("study", resource.RLIMIT_AS, 2000, "memory"),
-        long("odometry.png", resource.RLIMIT_FSIZE, 1 / 256, "out.png"),
-    ],
-)
-def test_limits_of_memory_and_of_file_size(words, tmp_path, name, limit, megabytes, named):
-    set_limit = partial(resource.setrlimit, limit, (int(megabytes * 2**20),) * 2)
-    refused(run(words(name), tmp_path, before=set_limit), named, left=["out", "out/*"])
+@pytest.mark.torture
+def test_a_killed_worker(words, tmp_path):
+    process = start(words("study"), tmp_path)
+    wait_for(lambda: process.poll() is not None or workers_of(process))
+    workers_of(process)[0].kill()
+    refused(finish(process), "process was", left=["out", "out/*"])
+    resumes(words, "study", tmp_path)
+
+
+def workers_of(process):
+    children = psutil.Process(process.pid).children(recursive=True)
+    return [child for child in children if "popen_loky" in " ".join(child.cmdline())]
 
 
 @pytest.mark.torture
-@pytest.mark.parametrize("name", ["synthesize", "study"])
-def test_a_killed_worker(words, tmp_path, name):
-    def workers():
-        return [
-            child
-            for child in psutil.Process(process.pid).children()
-            if "popen_loky" in " ".join(child.cmdline())
-        ]
-
-    process = start(words(name), tmp_path)
-    wait_for(lambda: process.poll() is not None or workers())
-    time.sleep(0.5)
-    assert process.poll() is None, "it ended before a worker could be killed"
-    workers()[0].kill()
-    refused(finish(process), "a process was killed")
-    resumes(words, name, tmp_path)
-
-
-@pytest.mark.torture
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_a_terminated_study_ends_its_workers(words, tmp_path, number):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_a_stopped_study_ends_its_workers_and_resumes(words, tmp_path, number):
     heed = None
     if number != signal.SIGKILL:  # which nobody can ignore, nor ask for
         # whoever started the tests may ignore the signal, as nohup does
         heed = partial(signal.signal, number, signal.SIG_DFL)
     process = start(words("study"), tmp_path, before=heed)
-    wait_for(
-        lambda: (
-            list((tmp_path / "out").rglob("pass-*"))
-            or process.poll() is not None
-            or len(psutil.Process(process.pid).children()) > 2
-        )
-    )
-    workers = psutil.Process(process.pid).children(recursive=True)
+    wait_for(lambda: process.poll() is not None or workers_of(process))
+    workers = workers_of(process)
     process.send_signal(number)
-    process.communicate(timeout=60)
-    assert process.returncode in (128 + number, -signal.SIGKILL) and workers
-    assert psutil.wait_procs(workers, 20)[1] == []
+    _, stderr = process.communicate(timeout=60)
+    if number != signal.SIGKILL:
+        assert process.returncode == 128 + number and stderr.count("stopped") == 1, stderr
+        assert "Traceback" not in stderr
+    assert workers and psutil.wait_procs(workers, 20)[1] == []
     resumes(words, "study", tmp_path)
-
-
-@pytest.mark.parametrize("around", ["{} | head -1", "{} >&-", "{} >&- 2>&-"])
-def test_closed_streams_are_no_error(words, tmp_path, around):
-    command = shlex.join(map(str, words("odometry.txt")))
-    result = run(["bash", "-c", around.format(command)], tmp_path)
-    assert result.returncode == 0 and "Traceback" not in result.stderr
-    assert (tmp_path / "out.txt").exists()
-
-
-def test_a_deleted_working_folder(words, tmp_path):
-    command = shlex.join(map(str, words("odometry.txt")))
-    lines = f"mkdir gone; cd gone; rmdir ../gone; {command}"
-    refused(run(["bash", "-c", lines], tmp_path), "working folder")
 
 
 @pytest.mark.torture
@@ -201,13 +156,6 @@ def without_network():
     """Take the network from a process, which only root may do."""
     if os.geteuid() == 0:
         ctypes.CDLL(None).unshare(0x40000000)  # CLONE_NEWNET
-
-
-def without_root_privileges():
-    """Drop the capabilities of root that ignore permissions of files."""
-    if os.geteuid() == 0:
-        for capability in (1, 2, 3):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAP_FOWNER
-            ctypes.CDLL(None).prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
 
 
 @pytest.mark.torture
@@ -288,7 +236,6 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
         "masks\n&",
         "q<script>.txt",
         "$_$.png",
-        "both.svg",
         "study",
         "labels {2}",
         "world",
@@ -296,68 +243,3 @@ def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
     page = (out / "study" / "index.html").read_text()
     assert "&lt;b&gt;&amp;" in page and "&lt;i&gt;&amp;" in page
     assert not any(tag in page for tag in ("<script", "<b>", "<i>", 'src="http'))
-
-
-@pytest.mark.torture
-def test_make_takes_odd_folders_and_refuses_unknown_settings(tiny_kitti, tmp_path):
-    # make expands $ and ends at a line break
-    odd = tmp_path / ODD.replace("$x$_", "").replace("\n", " ")
-    tiny_kitti.rename(odd)
-
-    def make(*words):
-        return subprocess.run(
-            ["make", "-C", ROOT, "-o", ".venv/ready", *words],
-            capture_output=True,
-            text=True,
-            env=environment(),
-        )
-
-    assert make("check-data", f"KITTI={odd}").returncode == 0
-    planned = make("-n", "figures", "PROFILE=smoke", f"KITTI={odd}", f"BUILD={tmp_path / 'build'}")
-    assert (
-        planned.returncode == 0 and f"{tmp_path / 'build'}/kitti-it-s-50-script-" in planned.stdout
-    ), planned
-    for target, word, named in (
-        ("figures", "EPOCHS=0", "EPOCHS=0: "),
-        ("figures", "EPOCH=3", "EPOCH: "),
-        ("figures", "KITTI=", "KITTI"),
-        ("figures", "GPU=no", "GPU=no"),
-        ("figures", "PYTHON=none", "none is no Python"),
-        ("figures", "FIGURES=a b", "FIGURES"),
-        ("figures", "DASK_SCHEDULER=mine", "mine"),
-        ("weights", f"CAMVID={odd}", "KITTI_SEMANTIC"),
-        ("weights", f"KITTI_SEMANTIC={odd}", "CAMVID"),
-    ):
-        answer = make(target, word, f"BUILD={tmp_path / 'other'}")
-        assert answer.returncode != 0 and not (tmp_path / "other").exists(), answer
-        assert named in answer.stderr and "Traceback" not in answer.stderr, answer
-
-
-@pytest.mark.torture
-def test_caches_that_cannot_be_written(tmp_path, tiny_kitti):
-    package, home = tmp_path / "package" / "thesis_repro", tmp_path / "home"
-    shutil.copytree(ROOT / "thesis_repro", package, ignore=shutil.ignore_patterns("__pycache__"))
-    home.mkdir()
-    folders = [home, package.parent, package, *package.rglob("*/")]
-    for folder in folders:
-        folder.chmod(0o555)
-    no_caches = dict.fromkeys(
-        ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "NUMBA_CACHE_DIR", "KERAS_HOME")
-    )
-    for words, output in (
-        ("odometry --kitti kitti --sequence 00 --plot path.png", "path.png"),
-        ("predict --images kitti/sequences/00 --output out", "out"),
-    ):
-        result = succeed(
-            thesis(*words.split()),
-            tmp_path,
-            before=without_root_privileges,
-            PYTHONPATH=package.parent,
-            HOME=home,
-            **no_caches,
-        )
-        assert {path.split("/")[0] for path in result.left} == {
-            output
-        } and "Traceback" not in result.stderr
-    for folder in folders:
-        folder.chmod(0o755)

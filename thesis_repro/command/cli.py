@@ -355,10 +355,6 @@ def _mask_settings(options: Any, has_labels: bool = True) -> Any:
         raise InputError(
             f"{', '.join(MASK_OPTIONS)}: need --labels DIR, label maps to make masks from"
         )
-    for name in ("boundaries", "symmetric", "classes", "dilation", "widths"):
-        value = vars(options).get(name)
-        if settings.keep == "static" and value not in (None, [], vars(MaskSettings).get(name)):
-            raise InputError(f"--{name}: --keep static uses no boundaries; leave it out")
     return settings
 
 
@@ -369,6 +365,8 @@ def _masks(options: Any, sequence: Any) -> Any:
     settings = _mask_settings(options, options.labels)
     if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
         raise InputError("--labels DIR, --dilation W: give both or neither")
+    if options.labels and options.masks:
+        raise InputError("--labels DIR, --masks DIR: give only one of them")
     if options.invert and not options.masks:
         raise InputError("--invert: needs --masks DIR")
     if options.labels:

@@ -296,7 +296,7 @@ def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
         for option, arguments in COMMANDS[name].items():
-            group = sub
+            group: Any = sub
             if option in MASK_OPTIONS:
                 group = mask_options
             group.add_argument(option, **arguments)

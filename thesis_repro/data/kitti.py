@@ -47,6 +47,9 @@ KNOWN_SIZES = {
 
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
+# names of cameras' lines in the calibration
+CALIBRATION_KEYS = {name: f"P{name[-1]}" for name in IMAGE_FOLDERS}
+CALIBRATION_KEYS |= {name: f"P_rect_{name[-2:]}" for name in kitti_raw.IMAGE_FOLDERS}
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
@@ -153,18 +156,12 @@ def _say_once(line: str) -> None:
     messages.log.info(line)
 
 
-def camera_of(frame_folder: Path) -> str:
-    """Name of the camera that took the frames in a folder, such as "image_0" or "image_02"."""
-    if frame_folder.name == kitti_raw.FRAMES:
-        return frame_folder.parent.name
-    return frame_folder.name
-
-
-def texts_of(folder: Path, frame_folder: Path) -> tuple[Path, Path]:
-    """Files of the calibration and of the times of a sequence, given the folder of its frames."""
+def texts_of(folder: Path, frame_folder: Path) -> tuple[Path, str, Path]:
+    """Files of a sequence's calibration, with its camera ("image_0", "image_02"), and of times."""
     if kitti_raw.is_drive(folder):
-        return kitti_raw.calibration(folder), frame_folder.parent / kitti_raw.TIMES
-    return folder / "calib.txt", folder / "times.txt"
+        camera = frame_folder.parent
+        return kitti_raw.calibration(folder), camera.name, camera / kitti_raw.TIMES
+    return folder / "calib.txt", frame_folder.name, folder / "times.txt"
 
 
 class Sequence:
@@ -211,15 +208,16 @@ class Sequence:
         if not self.frame_paths:
             raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
         check_numbering(self.frame_paths)
-        self.calibration_path, times_path = texts_of(self.folder, frame_folder)
+        texts = texts_of(self.folder, frame_folder)
+        self.calibration_path, camera_name, self.times_path = texts
         self.distortion = np.empty(0)
         if calibration is not None:
             self.calibration_path = Path(calibration)
             self.intrinsics, self.distortion = cameras.read_camera(calibration)
         else:
-            self.intrinsics = read_intrinsics(self.calibration_path, camera_of(frame_folder))
-        self.has_times = times_path.exists()
-        self.times = self._read_times(times_path, fps)
+            self.intrinsics = read_intrinsics(self.calibration_path, camera_name)
+        self.has_times = self.times_path.exists()
+        self.times = self._read_times(self.times_path, fps)
         self.has_truth = truth is not None or self.poses_path.exists()
         if self.has_truth:
             self._read_truth(self.poses_path)
@@ -301,8 +299,7 @@ class Sequence:
 
         Frames and calibration, and the files of times and poses if they exist.
         """
-        _, times_path = texts_of(self.folder, self.frame_paths[0].parent)
-        texts = self.calibration_path, times_path, self.poses_path
+        texts = self.calibration_path, self.times_path, self.poses_path
         paths = [*self.frame_paths, *filter(Path.is_file, texts)]
         if kitti_raw.is_drive(self.folder):
             paths += kitti_raw.files(self.folder)
@@ -315,14 +312,6 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.frame_paths)
-
-    @property
-    def description(self) -> str:
-        """One line that says what the sequence holds, and what is assumed for what it lacks."""
-        line = f"sequence {self.name}: {len(self)} frames of {self.size[1]}x{self.size[0]}"
-        if not self.has_truth:
-            line += "; no ground truth, so step lengths follow from --speed, or are 1 m"
-        return line
 
     def __repr__(self) -> str:
         return f"Sequence({str(self.root)!r}, {self.name!r}): {len(self)} frames"
@@ -466,11 +455,7 @@ def read_intrinsics(path: str | Path, camera: str = "image_0") -> np.ndarray:
     camera, of P_rect_00 to P_rect_03. Raises InputError if the line is missing, or if the camera
     has distortion or skew.
     """
-    key = "P0"
-    if camera in IMAGE_FOLDERS:
-        key = f"P{camera[-1]}"
-    elif camera in kitti_raw.IMAGE_FOLDERS:
-        key = f"P_rect_{camera[-2:]}"
+    key = CALIBRATION_KEYS.get(camera, "P0")
     form = f"must hold a line '{key}: f 0 u 0 0 f v 0 0 0 1 0' of a camera without distortion"
     try:
         lines = [line for line in text_of(path).splitlines() if line.startswith(f"{key}:")]

@@ -16,6 +16,7 @@ from thesis_repro.data.trajectories import text_of
 from thesis_repro.errors import InputError
 
 COLORS = "colors"
+NOT_NAMED = 255  # no label id
 
 
 def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
@@ -63,10 +64,11 @@ def read(path: str | Path, ids: str | Path) -> np.ndarray:
         raise InputError(f"{path}: cannot be read as PNG: {error}") from None
     if pixels.ndim == 3:
         raise InputError(f"{path}: holds colours, but {ids} names ids")
-    present, places = np.unique(pixels, return_inverse=True)
-    unknown = [value for value in present.tolist() if value not in table]
+    labels_by_value = np.full(1 << 24 if has_colors else 1 << 16, NOT_NAMED, np.uint8)
+    labels_by_value[list(table)] = list(table.values())
+    labels = labels_by_value[pixels]
+    unknown = np.unique(pixels[labels == NOT_NAMED])[:10].tolist()
     if unknown:
-        values = ", ".join(f"#{value:06x}" if has_colors else str(value) for value in unknown[:10])
+        values = ", ".join(f"#{value:06x}" if has_colors else str(value) for value in unknown)
         raise InputError(f"{path}: holds {values}, which {ids} does not name")
-    labels = np.array([table[value] for value in present.tolist()], np.uint8)
-    return labels[places].reshape(pixels.shape)
+    return labels

@@ -201,7 +201,14 @@ def _strongest(
 
 
 @compiled
-def _apart(strength, ranked, limit, mask, max_keypoints, min_distance):
+def _apart(
+    strength: np.ndarray,
+    ranked: np.ndarray,
+    limit: np.float32,
+    mask: np.ndarray,
+    max_keypoints: int,
+    min_distance: float,
+) -> np.ndarray:
     """Strongest corners above `limit` that are at least `min_distance` apart.
 
     They lie inside the mask (height, width), unless it is empty, (0, 0). max_keypoints: 0 for no

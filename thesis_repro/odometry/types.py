@@ -29,7 +29,7 @@ class Matches:
     current: np.ndarray
     previous: np.ndarray
     threshold: float
-    inliers: np.ndarray | None = None
+    inliers: Any = None
     order: np.ndarray | slice = field(default_factory=lambda: slice(None))
 
     def agree_by_chance(self) -> bool:
@@ -51,8 +51,8 @@ class Motion:
     flag: what is doubtful about the motion.
     """
 
-    rotation: np.ndarray | None = None  # 3x3
-    translation: np.ndarray | None = None  # 3, unit length
+    rotation: Any = None  # 3x3
+    translation: Any = None  # 3, unit length
     pose_inliers: int = 0  # matches in front of both cameras and not too far away
     flag: str = ""
 

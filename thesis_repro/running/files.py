@@ -19,6 +19,7 @@ from thesis_repro.running import messages
 
 # matches the names that `temporary_path` returns
 TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\..*)?")
+DELAY = 1  # seconds before a progress bar appears
 
 
 def read_gray(path: str | Path) -> np.ndarray:
@@ -197,7 +198,12 @@ def progress(
     THESIS_REPRO_PROGRESS may name another file: `make figures` names its terminal, for the bars
     inside notebooks. Ctrl-C waits for the end of a step of the loop.
     """
-    options: dict[str, Any] = {"file": sys.stderr, "mininterval": 0.2, "leave": False, "delay": 1}
+    options: dict[str, Any] = {
+        "file": sys.stderr,
+        "mininterval": 0.2,
+        "leave": False,
+        "delay": DELAY,
+    }
     other = os.environ.get("THESIS_REPRO_PROGRESS")
     if other:
         options["file"] = _opened(other)

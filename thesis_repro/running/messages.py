@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 
+from tqdm import tqdm
+
 from thesis_repro.errors import InputError, one_line
 
 LOG = "log.txt"  # in a folder of results, see `logged`
@@ -25,7 +27,7 @@ class _Printer(logging.Handler):
         prefix = ""
         if record.levelno == logging.WARNING:
             prefix = "warning: "
-        print(prefix + one_line(record.getMessage()), file=sys.stderr, flush=True)
+        tqdm.write(prefix + one_line(record.getMessage()), file=sys.stderr)  # above a progress bar
 
 
 def print_messages() -> None:

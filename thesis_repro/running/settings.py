@@ -337,6 +337,7 @@ def _changed_sizes(profile: str, sizes: Profile) -> dict[str, str]:
 
 if __name__ == "__main__":  # the Makefile asks for the folder of the run, below its own
     try:
-        print(os.path.relpath(read_settings().build, ROOT))
+        build = read_settings().build
+        print(build.relative_to(ROOT) if build.is_relative_to(ROOT) else build)
     except InputError as error:
         raise SystemExit(f"error: {error}") from None

@@ -154,12 +154,8 @@ def ratios(rows: pd.DataFrame, reference: pd.DataFrame, metric: str) -> pd.Serie
 
     metric: the column of the error. Sequences without a positive error in both tables are left out.
     """
-    return _ratios(_mean_logarithms(rows, metric), _mean_logarithms(reference, metric))
-
-
-def _ratios(logarithms: pd.Series, of_reference: pd.Series) -> pd.Series:
-    """Return `ratios` of the mean logarithms of two tables."""
-    return np.exp((logarithms - of_reference).dropna())
+    logarithms = _mean_logarithms(rows, metric) - _mean_logarithms(reference, metric)
+    return np.exp(logarithms.dropna())
 
 
 def _mean_logarithms(runs: pd.DataFrame, metric: str) -> pd.Series:
@@ -201,8 +197,8 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
             if not _is_compared(variant, reference):
                 continue
             for metric in metrics:
-                logarithms, of_reference = variant.logarithms, reference.logarithms
-                by_sequence = _ratios(logarithms[metric], of_reference[metric])
+                logarithms = variant.logarithms[metric] - reference.logarithms[metric]
+                by_sequence = np.exp(logarithms.dropna())
                 if by_sequence.empty:
                     continue
                 row = {

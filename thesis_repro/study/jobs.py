@@ -136,7 +136,8 @@ def _widths(
 
 def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
     """Return the controls that are masks, as far as a source and a sequence allow them."""
-    methods, width = list(MASK_CONTROLS), tested
+    methods = list(MASK_CONTROLS)
+    width: int | None = tested
     if not true_labels(sequence.root, sequence.name).is_dir():
         methods.remove("true-labels")
     if not source.has_label_maps:

@@ -4,6 +4,7 @@ They run here or on a cluster. Each finished run is one CSV file with one row a 
 run again.
 """
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -38,10 +39,10 @@ CODE = (
     "opencv_exact",
     "thesis_repro.odometry",
     "thesis_repro.masks",
+    "thesis_repro.mask_files",
     "thesis_repro.data",
     "thesis_repro.study.jobs",
     "thesis_repro.study.methods",
-    "thesis_repro.study.controls",
     "thesis_repro.study.sources",
 )
 
@@ -192,9 +193,7 @@ def _report(reasons: Mapping[Job, str]) -> list[str]:
         by_reason.setdefault((job.sequence, reason), []).append(job.name)
     lines = []
     for (name, reason), runs in by_reason.items():
-        shown = ", ".join(runs[:3])
-        if len(runs) > 3:
-            shown += f" and {len(runs) - 3} more"
+        shown = textwrap.shorten(", ".join(runs), 80, placeholder=", ...")
         lines.append(f"sequence {name}, {shown}: failed: {reason}")
         messages.log.warning(lines[-1])
     return lines

@@ -1,0 +1,81 @@
+"""Pairs of images and label maps."""
+
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro.data import cityscapes
+from thesis_repro.errors import InputError
+
+
+def test_the_class_weights_are_those_of_table_3_2():
+    # the column of Table 3.2 adds up to 69.2; "background" (0.5) has no output
+    assert cityscapes.CLASS_WEIGHTS.sum() == pytest.approx(68.7)
+
+
+def test_both_layouts_give_the_same_pairs(tiny_cityscapes, tmp_path):
+    flat = cityscapes.pairs(tiny_cityscapes, "train")
+    official = tmp_path / "official"
+    for pair in flat:
+        for source, folder, end in (
+            (pair.image, "leftImg8bit", "leftImg8bit"),
+            (pair.label, "gtFine", "gtFine_labelIds"),
+        ):
+            target = official / folder / "train" / "town" / f"{pair.name}_{end}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(source.read_bytes())
+    pairs = cityscapes.pairs(official, "train")
+    assert (
+        [pair.name for pair in pairs]
+        == [pair.name for pair in flat]
+        == [f"street_{i}" for i in range(4)]
+    )
+    np.testing.assert_equal(cityscapes.load(flat, 16), cityscapes.load(pairs, 16))
+    assert [pair.name for pair in cityscapes.pairs(official, "train", limit=2)] == [
+        "street_0",
+        "street_2",
+    ]
+    assert len(cityscapes.pairs(official, "train", limit=99)) == 4
+
+
+def test_images_are_read_in_colour_or_gray(tiny_cityscapes):
+    pairs = cityscapes.pairs(tiny_cityscapes, "train")
+    cv2.imwrite(str(pairs[0].image), np.full((16, 32, 3), (10, 100, 200), np.uint8))
+    images, labels = cityscapes.load(pairs, 16, channels=3)
+    assert images.shape == (4, 16, 16, 3) and images[0, 5, 5].tolist() == [200, 100, 10]
+    gray, same_labels = cityscapes.load(pairs, 16)
+    assert gray.shape == (4, 16, 16, 1) and np.array_equal(labels, same_labels)
+    assert set(np.unique(cityscapes.load(pairs, 48)[1])) == {7, 11, 23}  # resizing invents no label
+    assert np.array_equal(images[1, ..., :1], gray[1])  # a gray file has three equal channels
+
+
+def test_faults_are_named(tiny_cityscapes):
+    cv2.imwrite(
+        str(tiny_cityscapes / "trainannot" / "street_0.png"), np.full((16, 32), 35, np.uint8)
+    )
+    with pytest.raises(InputError, match="trainannot/street_0.png: label id 35"):
+        cityscapes.load(cityscapes.pairs(tiny_cityscapes, "train"), 16)
+    (tiny_cityscapes / "trainannot" / "street_2.png").unlink()
+    for path in (tiny_cityscapes / "val").iterdir():
+        path.unlink()
+    for root, split, named in (
+        (tiny_cityscapes / "nowhere", "train", "nowhere"),
+        (tiny_cityscapes, "test", "test"),
+        (tiny_cityscapes, "train", "train/street_2.png"),
+        (tiny_cityscapes, "val", "val"),
+    ):
+        with pytest.raises(InputError, match=named):
+            cityscapes.pairs(root, split)
+
+
+def test_train_ids_become_label_ids(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[*range(19), 255]], np.uint8))
+    names = [
+        cityscapes.LABELS[label].name
+        for label in cityscapes.read_label_map(tmp_path / "a.png", True)[0]
+    ]
+    assert names == [*cityscapes.TRAINED, "unlabeled"]
+    for train_ids, value in ((True, 19), (False, 255)):
+        cv2.imwrite(str(tmp_path / "a.png"), np.array([[value]], np.uint8))
+        with pytest.raises(InputError, match="a.png: .*--ids"):
+            cityscapes.read_label_map(tmp_path / "a.png", train_ids)
