@@ -40,22 +40,20 @@ def mask_and_keypoints(
     frame: np.ndarray, edge_image: np.ndarray, mask: np.ndarray, keypoints: np.ndarray, title: str
 ) -> plt.Figure:
     """Draw the edges, the mask and the keypoints (n, 2) of a frame. title: of the edges."""
-    figure, axes = style.frame_panels(frame, rows=3)
-    style.show_image(axes[0], dilate(edge_image, 5), f"{title}, drawn wider")
-    style.show_image(axes[1], mask, f"mask: {100 * (mask > 0).mean():.1f} % of the frame")
-    style.show_image(axes[2], frame, f"{len(keypoints)} keypoints on the mask")
-    axes[2].scatter(*keypoints.T, **style.KEYPOINT)
-    return figure
+    kept = f"{len(keypoints)} keypoints on the mask"
+    pictures = {
+        f"{title}, drawn wider": dilate(edge_image, 5),
+        f"mask: {100 * (mask > 0).mean():.1f} % of the frame": mask,
+        kept: frame,
+    }
+    return style.pictures(frame, pictures, {kept: keypoints})
 
 
 def corners(frame: np.ndarray, strength: np.ndarray, points: np.ndarray, title: str) -> plt.Figure:
     """Draw the strength of a corner at each pixel (h, w), and the keypoints (n, 2)."""
-    figure, axes = style.frame_panels(frame, rows=2)
     logarithm = np.log(strength + strength.max() / 1e4)
-    style.show_image(axes[0], logarithm, "R of every pixel (logarithm)")
-    style.show_image(axes[1], frame, title)
-    axes[1].scatter(*points.T, **style.KEYPOINT)
-    return figure
+    pictures = {"R of every pixel (logarithm)": logarithm, title: frame}
+    return style.pictures(frame, pictures, {title: points})
 
 
 def tracks(

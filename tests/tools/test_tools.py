@@ -29,16 +29,6 @@ def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypat
     assert table.to_json(orient="records").count('"ratio"') == 5
 
 
-def test_muon_treats_convolutions_as_matrices():
-    kernel = keras.Variable(np.zeros((3, 3, 8, 4), np.float32))
-    slope = np.random.default_rng(0).normal(size=kernel.shape)
-    optimizer = train_shipped.Muon(1.0, weight_decay=None, adam_weight_decay=None)
-    optimizer.build([kernel])
-    optimizer.apply_gradients([(keras.ops.convert_to_tensor(slope, "float32"), kernel)])
-    step = kernel.numpy().reshape(72, 4) / (0.2 * 72**0.5)
-    assert np.linalg.svd(step, compute_uv=False) == pytest.approx(1, abs=0.35)  # nearly orthogonal
-
-
 def test_a_view_looks_like_that_of_another_camera():
     label = np.zeros((188, 620), np.uint8)
     label[94 - 18 : 94 + 18, 310 - 18 : 310 + 18] = 1  # a square in KITTI's frame
