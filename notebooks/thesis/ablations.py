@@ -114,7 +114,7 @@ def _measure(
             method, estimator, repetition = key
             row = {"method": method, "estimator": estimator, "repetition": repetition}
             row |= measures(result.frames, sequence.poses)
-            row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]
+            row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")
             rows.append(row)
         table = pd.DataFrame(rows).assign(sequence=sequence.name)
         write_text(path, table.to_csv(index=False))

@@ -235,7 +235,7 @@ def test_the_figure_of_paths_shows_repetitions_and_their_errors():
         (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
         for row in runs.itertuples()
     }
-    figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths, "baseline")
+    figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths)
     true, *lines = figure.axes[0].lines
     assert len(lines) == 3 and len(figure.axes) == 4
     assert all(lines[0].get_linewidth() > line.get_linewidth() for line in lines[1:])
@@ -253,7 +253,7 @@ def test_a_lost_run_is_marked_where_runs_are_drawn(lost):
     paths = {(row.sequence, row.run): AHEAD for row in of_all.itertuples()}
     truths = {"00": AHEAD, "05": AHEAD}
     for figure in (
-        chapter4.figure_paths(truths, of_all, paths, "baseline"),
+        chapter4.figure_paths(truths, of_all, paths),
         chapter4.figure_of_methods(runs, "rmse"),
         chapter4.figure_of_sequences(runs, "mae"),
         chapter4.figure_against_width(runs, "rmse"),
