@@ -132,13 +132,17 @@ def is_needed(job):
 def rows(runs, comparison, source, facts):
     """Yield one row for each estimator, for one training."""
     own = compare.of_source(runs, source.name)
-    table = comparison[(comparison["source"] == source.name) & comparison["tested"]]
-    table = table[table["method"] == "masked"]
+    is_masked = (comparison["source"] == source.name) & (comparison["method"] == "masked")
+    table = comparison[is_masked & comparison["tested"]]
     for estimator in jobs.ESTIMATORS:
         pairs = table[table["estimator"] == estimator]
         ratios = pairs[pairs["reference"] == "baseline"].set_index("metric")
-        row = {"training": source.name, **facts, "estimator": estimator}
-        row["keypoints"] = ratios["keypoints"].iloc[0]
+        row = {
+            "training": source.name,
+            **facts,
+            "estimator": estimator,
+            "keypoints": ratios["keypoints"].iloc[0],
+        }
         for metric in METRICS:
             for end in ("ratio", "low", "high"):
                 row[f"{metric}_{end}"] = ratios.loc[metric, end]
