@@ -30,15 +30,6 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
     )
 
 
-def test_the_interval_of_a_share_holds_no_impossible_share():
-    low, high = [1.0, 2.0, 60.0], [40.0, 98.0, 99.0]
-    assert (
-        audit.measurement("86", "sky", low, "%")["low"] < 0 == audit.share("86", "sky", low)["low"]
-    )
-    assert audit.measurement("65", "sky", high, "%")["high"] > 100
-    assert audit.share("65", "sky", high)["high"] == 100
-
-
 @pytest.mark.parametrize(
     "row, quantity, metric, value",
     [
@@ -241,12 +232,3 @@ def test_the_networks_are_compared(tmp_path, network, in_git, named):
     note = trainings.network_note(SimpleNamespace(build=tmp_path, figures_in_git=in_git))
     assert bool(note) == bool(named) and all(name in note for name in named)
     assert ("XLA_FLAGS" in note) == (len(named) > 1)
-
-
-def test_the_summary_spans_all_trainings():
-    for training in trainings.summary():
-        rows = trainings.read().query("estimator == @training['estimator']")
-        low, middle, high = training["ranges"]["se3_ratio"]
-        assert training["count"] == sum(training["verdicts"].values()) == len(rows) > 1
-        assert rows["se3_ratio"].between(low, high).all() and {low, high} <= set(rows["se3_ratio"])
-        assert (rows["se3_ratio"] <= middle).sum() == (rows["se3_ratio"] >= middle).sum()
