@@ -110,7 +110,7 @@ def _measure(
         for key, result in zip(runs, odometry.run_many(sequence, by_name).values(), strict=True):
             row: dict[str, Any] = dict(zip(("method", "estimator", "repetition"), key, strict=True))
             row |= measures(result.frames, sequence.poses)
-            row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")["rmse"]
+            row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")
             rows.append({**row, "sequence": sequence.name})
         write_text(path, pd.DataFrame(rows).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})

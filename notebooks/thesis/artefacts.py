@@ -45,13 +45,13 @@ def write_text(name: str, text: str) -> Path:
     return path
 
 
-def save_figure(figure: plt.Figure, name: str) -> None:
-    """Save a figure of the thesis, with a note that names the data."""
+def save_figure(figure: plt.Figure, name: str, note: str = "") -> None:
+    """Save a figure of the thesis. note: names its data; by default that of the run."""
     settings = read_settings()
-    style.save_figure(figure, settings.figures, name, settings.data_note)
+    style.save_figure(figure, settings.figures, name, note or settings.data_note)
 
 
-def save_table(table: pd.DataFrame, name: str, folder: Path | None = None) -> None:
-    """Save a table as CSV and Markdown, by default in the folder of the figures."""
+def save_table(table: pd.DataFrame, name: str, folder: Path | None = None, note: str = "") -> None:
+    """Save a table as CSV and Markdown, by default in the folder of the figures. note: as above."""
     settings = read_settings()
-    style.save_table(table, folder or settings.figures, name, settings.data_note)
+    style.save_table(table, folder or settings.figures, name, note or settings.data_note)

@@ -44,7 +44,6 @@ def measure(
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
     tracks = [ablations.tracks(drive, masks_by_name(drive, labels), pairs) for drive in drives]
     measurements = [
-        *audit.of_tables(),
         *audit.measured(boundaries(drives, labels, pairs), "boundaries"),
         *audit.of_ablations(ablated),
         *audit.measured(pd.concat(tracks, ignore_index=True), "tracks"),

@@ -7,6 +7,7 @@ only run.
 Bands and error bars go from the lowest to the highest repetition.
 """
 
+from functools import partial
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -153,22 +154,11 @@ def figure_4_08(views: list[View], title: str) -> plt.Figure:
         # a circle at the border would widen the panel
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     edge_color = tuple(np.array(EDGE_COLOR) / 255)
+    dot = partial(Line2D, [], [], linestyle="none", marker="o")
     handles = [
         Patch(color=edge_color, label="edges of the predicted label map"),
-        Line2D(
-            [],
-            [],
-            linestyle="none",
-            marker="o",
-            markersize=4,
-            color=KEYPOINT["color"],
-            label="keypoints",
-        ),
-        Line2D(
-            [],
-            [],
-            linestyle="none",
-            marker="o",
+        dot(markersize=4, color=KEYPOINT["color"], label="keypoints"),
+        dot(
             markersize=6,
             markerfacecolor="none",
             color=PINK,
@@ -188,7 +178,6 @@ def figure_paths(
     truths: dict[str, np.ndarray],
     rows: pd.DataFrame,
     paths: dict[tuple[str, str], np.ndarray],
-    method: str,
 ) -> plt.Figure:
     """Figures 4.6, 4.11, 4.12: the paths from above, and below each its distance to the truth.
 
@@ -461,20 +450,24 @@ def _name_lines(axes: plt.Axes, table: pd.DataFrame) -> None:
         )
 
 
+def runs_of_methods(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the runs of each of METHODS, with masks those of each sequence's best width."""
+    rows = {method: compare.of_method(runs, method) for method in METHODS}
+    rows["masked"] = thesis_tables.of_chosen_width(rows["masked"])
+    return rows
+
+
 def _spread_by_method(runs: pd.DataFrame, metric: str) -> tuple[list[str], dict[str, pd.DataFrame]]:
-    """Return the sequences and a table for each method of the thesis.
+    """Return the sequences and a table for each of METHODS.
 
     A table has one row a sequence: mean, lowest, highest, and whether a run is lost.
     """
+    names = sorted(compare.of_method(runs, "baseline")["sequence"].unique())
     tables = {}
-    for method in METHODS:
-        rows = compare.of_method(runs, method)
-        if method == "masked":
-            rows = thesis_tables.of_chosen_width(rows)
+    for method, rows in runs_of_methods(runs).items():
         lost = rows.groupby("sequence")["lost"].any()
-        tables[method] = compare.spread(rows, metric).assign(lost=lost)
-    names = sorted(tables["baseline"].index)
-    return names, {method: table.reindex(names) for method, table in tables.items()}
+        tables[method] = compare.spread(rows, metric).assign(lost=lost).reindex(names)
+    return names, tables
 
 
 def _bar(

@@ -1,6 +1,6 @@
 """Pictures of single frames for notebooks 6 and 7: masks, keypoints, tracks and lines."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -89,13 +89,4 @@ def lines(frame: np.ndarray, coefficients: np.ndarray, points: np.ndarray) -> pl
         (line,) = axis.plot([0, width], [-c / b, -(c + a * width) / b], linewidth=0.8)
         axis.plot(*point, "o", color=line.get_color(), markersize=4, markerfacecolor="none")
     axis.set(xlim=(0, width), ylim=(frame.shape[0], 0))
-    return figure
-
-
-def patches(pictures: Iterable[tuple[np.ndarray, str]], title: str) -> plt.Figure:
-    """Draw two patches (63, 63), with their titles, beside each other."""
-    figure, axes = style.new_figure(1, 2, height=2.4, width=4.8)
-    for axis, (patch, text) in zip(axes, pictures, strict=True):
-        style.show_image(axis, patch, text)
-    figure.suptitle(title, fontsize=9)
     return figure

@@ -1,139 +1,84 @@
-"""Chapter 4 drawn from saved tables: figures, tables, the comparison and the findings.
+"""What chapter 4 is drawn from: its runs, their paths, and what figures say of the data.
 
-Notebook 8 shows them one by one and saves the tables of runs. `python -m thesis.results`, with the
-folder notebooks in PYTHONPATH, draws all of them again, so a change of a drawing needs no run.
+Notebook 8 makes the runs. Finished ones are only read, so after a change of a drawing it draws all
+figures again within seconds.
 """
 
-from typing import NamedTuple
+from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pandas as pd
 
-from thesis import chapter4, gap, plots, tables, thesis_tables, timing, trainings
+from thesis import chapter4, gap, tables, trainings
 from thesis_repro.data import kitti
-from thesis_repro.report import comparison, findings, style
-from thesis_repro.running import messages
-from thesis_repro.running.files import needed, write_text
-from thesis_repro.running.settings import Settings, read_settings
+from thesis_repro.masks import KEEP
+from thesis_repro.report import findings
+from thesis_repro.running.files import write_text
+from thesis_repro.running.settings import Settings
 from thesis_repro.study import compare, runner
-
-PATHS = {"figure_4_06": "baseline", "figure_4_11": "masked", "figure_4_12": "reduced"}
-
-
-def read_runs(settings: Settings, name: str = "runs") -> pd.DataFrame:
-    """Read a table of runs from the build folder: "runs" or "shuffled_runs", to the bit."""
-    path = needed(settings.build / f"{name}.csv", "08_results")
-    texts = {"sequence": str, "source": str}
-    runs = pd.read_csv(path, dtype=texts, float_precision="round_trip")
-    return runs.fillna({"source": ""})
+from thesis_repro.study.jobs import Job
 
 
-class Notes(NamedTuple):
-    """What figures and tables say about their data."""
+def is_decisive(job: Job, tested: int) -> bool:
+    """Return whether a run is made in the embedded world, where no conclusion rests on the others.
 
-    note: str  # at the foot of each
-    reported_as: str  # how to name the thesis's numbers beside those of the run
+    Each job is run once. The refined estimator decides, and Section 4.2 compares all keypoints,
+    masks of the `tested` width and plainly reduced keypoints: these are repeated. The masks that
+    published systems use (`masks.KEEP`) are compared on real frames only.
+    """
+    if job.method in KEEP:
+        return False
+    is_tested = job.method == "masked" and job.dilation_width == tested
+    is_compared = job.method in ("baseline", "reduced") or is_tested
+    return job.repetition == 0 or job.estimator == "refined" or is_compared
 
 
-def notes(settings: Settings, runs: pd.DataFrame) -> Notes:
-    """Return the notes of a run."""
+def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:
+    """Return what stands at the foot of figures and tables, and how to name the thesis's numbers.
+
+    mask_settings: those that are not the thesis's.
+    """
+    note = settings.data_note
+    if mask_settings:
+        changed = ", ".join(f"{name} {value}" for name, value in mask_settings.items())
+        note += f"; masks: {changed}"
     if settings.kitti_is_embedded:
-        return Notes(settings.data_note, "thesis, another data set")
+        return note, "thesis, another data set"
     frames = runs.groupby("sequence")["frames"].first()
     lengths = ", ".join(f"{name} ({count} frames)" for name, count in frames.items())
-    return Notes(f"{settings.data_note}; {lengths}", "thesis, complete KITTI sequences")
+    return f"{note}; {lengths}", "thesis, complete KITTI sequences"
 
 
-class Paths(NamedTuple):
-    """What `chapter4.figure_paths` draws: see there."""
-
-    truths: dict[str, np.ndarray]
-    rows: dict[str, pd.DataFrame]  # {method: runs}
-    positions: dict[tuple[str, str], np.ndarray]
-
-    def figure(self, method: str) -> plt.Figure:
-        """Draw the paths of one method."""
-        return chapter4.figure_paths(self.truths, self.rows[method], self.positions, method)
-
-
-def read_paths(settings: Settings, runs: pd.DataFrame) -> Paths:
-    """Read the paths of Figures 4.6, 4.11 and 4.12 from the folder of the odometry's results.
+def figure_paths(settings: Settings, runs: pd.DataFrame, method: str) -> plt.Figure:
+    """Figures 4.6, 4.11, 4.12: the paths of one method, read from the odometry's results.
 
     Those of all three methods are read for each figure, so that errors are enlarged alike.
     """
-    rows = {method: compare.of_method(runs, method) for method in chapter4.METHODS}
-    rows["masked"] = thesis_tables.of_chosen_width(rows["masked"])
+    rows = chapter4.runs_of_methods(runs)
     poses = runner.run_poses(pd.concat(rows.values()), settings.build / "odometry")
     truths = {}
     for name, frames in runs.groupby("sequence")["frames"].first().items():
         sequence = kitti.Sequence(settings.kitti, str(name)).subset(int(frames))
         truths[str(name)] = sequence.poses[:, :3, 3]
-    return Paths(truths, rows, {run: path[:, :3, 3] for run, path in poses.items()})
+    positions = {run: path[:, :3, 3] for run, path in poses.items()}
+    return chapter4.figure_paths(truths, rows[method], positions)
 
 
-def findings_text(settings: Settings, runs: pd.DataFrame, shuffled: pd.DataFrame) -> str:
-    """Return the findings of a run (see `findings.text`)."""
+def write_findings(
+    settings: Settings, runs: pd.DataFrame, shuffled: pd.DataFrame, note: str
+) -> str:
+    """Write the findings of a run (see `findings.text`) beside the figures, and return them."""
     other_trainings = []
     if settings.figures_in_git:
         other_trainings = trainings.summary()
-    return findings.text(
+    text = findings.text(
         runs,
         compare.comparisons(runs),
-        notes(settings, runs).note,
+        note,
         settings.kitti_is_embedded,
         gap.label_map_quality(settings.build),
         other_trainings,
         tables.procedure(runs, shuffled),
     )
-
-
-@style.applied()
-def write(settings: Settings) -> None:
-    """Write the figures and tables of chapter 4 and the findings of a finished run."""
-    runs, shuffled = read_runs(settings), read_runs(settings, "shuffled_runs")
-    note, reported_as = notes(settings, runs)
-    compared = compare.comparisons(runs)
-    figures = {
-        "figure_4_07": chapter4.figure_4_07(runs),
-        "figure_4_09": chapter4.figure_against_width(runs, "rmse"),
-        "figure_4_10": chapter4.figure_against_width(runs, "mae"),
-        "figure_4_13": chapter4.figure_of_methods(runs, "rmse"),
-        "figure_4_14": chapter4.figure_of_sequences(runs, "rmse"),
-        "figure_4_15": chapter4.figure_of_methods(runs, "mae"),
-        "figure_4_16": chapter4.figure_of_sequences(runs, "mae"),
-        "comparison": comparison.figure_comparison(compared),
-    }
-    paths = read_paths(settings, runs)
-    figures |= {name: paths.figure(method) for name, method in PATHS.items()}
-    numbers = {
-        "table_4_1": tables.table_4_1(runs, reported_as),
-        "table_4_2": tables.table_of_change(runs, shuffled, "rmse", reported_as),
-        "table_4_3": tables.table_of_change(runs, shuffled, "mae", reported_as),
-        "widths": comparison.table_widths(runs),
-        "comparison": comparison.table_comparison(compared),
-    }
-    style.save_all(figures, numbers, settings.figures, note)
-    text = findings_text(settings, runs, shuffled)
     write_text(settings.figures / "findings.md", text)
-    _write_timings(settings, note)
-    history = settings.build / "model" / "history.csv"
-    if history.is_file():  # a run with the model of the package has none
-        figure_4_01 = plots.figure_4_01(pd.read_csv(history))
-        style.save_all({"figure_4_01": figure_4_01}, {}, settings.figures, settings.data_note)
-
-
-def _write_timings(settings: Settings, note: str) -> None:
-    """Write Figure 4.17 and the table of the time of a frame, from the recorded times."""
-    timings = timing.folder(settings)
-    seconds = pd.read_csv(timings / "seconds.csv", dtype={"sequence": str})
-    measured = pd.read_csv(timings / "budget.csv")
-    timed_on = f"{note}; timed on {seconds['processor'].iloc[0]}"
-    style.save_all({"figure_4_17": plots.figure_4_17(seconds)}, {}, settings.figures, timed_on)
-    budget = tables.table_budget(measured)
-    timed_on = f"{note}; timed on {measured['processor'].iloc[0]}"
-    style.save_table(budget, settings.figures, "budget", timed_on)
-
-
-if __name__ == "__main__":
-    messages.run_main(lambda: write(read_settings()))
+    return text

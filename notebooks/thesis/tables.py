@@ -37,6 +37,8 @@ REPORTED_CHANGES = {
     "rmse": "table_4_2_rmse_percent_change",
     "mae": "table_4_3_mae_percent_change",
 }
+SINGLE = "change (%), one run each"
+NULL = "change (%), one run each, if masks did nothing"
 
 
 def table_of_change(
@@ -54,40 +56,26 @@ def table_of_change(
     """
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     best = thesis_tables.of_chosen_width(masked)
-    single = masked[masked["repetition"] == 0]
-    first_best = thesis_tables.of_chosen_width(single)
-    widths = masked["dilation_width"].nunique()
-    studies = thesis_tables.null_distribution(shuffled, widths, metric)
-    columns = {
-        "change (%)": thesis_tables.changes(best, baseline, metric),
-        SINGLE: thesis_tables.changes_of_repetition(masked, baseline, metric),
-        NULL: studies.mean(),
-        f"change (%), {reported_as}": pd.Series(REPORTED[REPORTED_CHANGES[metric]]),
-    }
-    table = pd.DataFrame(index=sorted(baseline["sequence"].unique()))
+    first_best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
+    change = thesis_tables.changes(best, baseline, metric)
+    single = thesis_tables.changes_of_repetition(masked, baseline, metric)
+    studies = thesis_tables.null_distribution(shuffled, masked["dilation_width"].nunique(), metric)
+    reported = pd.Series(REPORTED[REPORTED_CHANGES[metric]])
+    columns = {"change (%)": (change, _summary(change, best))}
+    columns[SINGLE] = single, _summary(single, first_best)
+    if len(studies.columns):
+        columns[NULL] = studies.mean(), _summary_of_studies(studies)
+    columns[f"change (%), {reported_as}"] = reported, _summary(reported)
+    errors = pd.DataFrame(index=sorted(baseline["sequence"].unique()))
     for method, rows in {"all keypoints": baseline, "best mask": best}.items():
         mean = rows.groupby("sequence")[metric].mean()
-        table[f"{metric.upper()}, {method} (m)"] = mean.map(three_digits)
-        table[f"lost runs, {method}"] = _lost_of(rows)
-    judged = {"change (%)": best, SINGLE: first_best}
-    summary = {}
-    for name, changes in columns.items():
-        table[name] = changes.reindex(table.index)
-        summary[name] = _summary(changes, judged.get(name))
-    if len(studies.columns):
-        summary[NULL] = _summary_of_studies(studies)
-    else:
-        del summary[NULL], table[NULL]
-    last_rows = pd.DataFrame(summary, dtype=float).reindex(columns=table.columns)
-    table = pd.concat([table.astype(object), last_rows.astype(object)])
-    table[list(summary)] = table[list(summary)].astype(float).round(2)
-    errors = [name for name in table if name.endswith("(m)")]
-    table[errors] = table[errors].astype(float)
+        errors[f"{metric.upper()}, {method} (m)"] = mean.map(three_digits)
+        errors[f"lost runs, {method}"] = _lost_of(rows)
+    by_sequence = pd.DataFrame({name: changes for name, (changes, _) in columns.items()})
+    last_rows = pd.DataFrame({name: summary for name, (_, summary) in columns.items()}, dtype=float)
+    changes = pd.concat([by_sequence.reindex(errors.index), last_rows]).round(2)
+    table = errors.reindex(changes.index).join(changes)
     return table.rename_axis("sequence").reset_index()
-
-
-SINGLE = "change (%), one run each"
-NULL = "change (%), one run each, if masks did nothing"
 
 
 def _lost_of(runs: pd.DataFrame) -> pd.Series:
@@ -147,6 +135,7 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
     # the embedded world repeats only one width, and one width is no choice
     widths_run = masked.groupby("repetition")["dilation_width"].nunique()
     repetitions = sorted(widths_run.index[widths_run == widths])
+    best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
     rows = []
     for metric in ("rmse", "mae"):
         by_repetition = [
@@ -154,10 +143,8 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
             for repetition in repetitions
         ]
         means = [changes.mean() for changes in by_repetition]
-        best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
         studies = thesis_tables.null_distribution(shuffled, widths, metric)
-        null_means = studies.mean(axis=1)
-        null_low, null_high = thesis_tables.middle(null_means)
+        null_low, null_high = thesis_tables.middle(studies.mean(axis=1))
         row = {
             "name": compare.METRICS[metric],
             "widths": widths,
@@ -170,7 +157,7 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
             "highest": max(means),
             "repetitions": len(means),
             "studies": len(studies),
-            "null_mean": null_means.mean(),
+            "null_mean": studies.mean(axis=1).mean(),
             "null_low": null_low,
             "null_high": null_high,
             "null_improved": (studies < 0).sum(axis=1).mean(),

@@ -18,7 +18,7 @@ import pandas as pd
 
 from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
-from thesis_repro.running.files import progress, write_text
+from thesis_repro.running.files import needed, progress, write_text
 from thesis_repro.running.settings import Settings, cores
 from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, Job
@@ -97,7 +97,7 @@ def _time_jobs(
             "run": job.name,
             "method": job.method,
             "dilation_width": job.dilation_width,
-            "seconds": job_seconds,
+            "seconds": round(job_seconds, 4),
         }
         for job, job_seconds in seconds.items()
     ]
@@ -116,27 +116,34 @@ def measure(sequence: Sequence, model: Any, width: int = CONTROL_WIDTH) -> pd.Da
     """
     sequence = sequence.subset(FRAMES + WARM_UP)
     scales = odometry.scales(sequence)
-    unmasked_odometry = odometry.Odometry(sequence.intrinsics)
-    masked_odometry = odometry.Odometry(sequence.intrinsics)
+    methods = "all keypoints", f"masked, width {width}"
+    odometries = {method: odometry.Odometry(sequence.intrinsics) for method in methods}
     rows: list[dict[str, Any]] = []
     with opencv_threads(-1):
         for index in progress(range(len(sequence)), "timing"):
             frame, read = _timed(sequence.frame, index)
             label_map, segmentation = _timed(_segment, model, frame)
             mask, masking = _timed(_mask, label_map, frame.shape, width)
-            unmasked = unmasked_odometry.step(frame, scales[index], None)
-            masked = masked_odometry.step(frame, scales[index], mask)
-            if index < WARM_UP:
-                continue
             network = {"segmentation": segmentation, "mask": masking}
-            rows += [
-                {"method": "all keypoints", "read": read, **_stages_of(unmasked)},
-                {"method": f"masked, width {width}", "read": read, **network, **_stages_of(masked)},
-            ]
+            for method, method_mask, stages in zip(methods, (None, mask), ({}, network)):
+                step = odometries[method].step(frame, scales[index], method_mask)
+                if index >= WARM_UP:
+                    rows.append({"method": method, "read": read, **stages, **_stages_of(step)})
     by_method = pd.DataFrame(rows).groupby("method", sort=False)
     medians = 1000 * by_method[list(STAGES)].median()
     table = medians.melt(ignore_index=False, var_name="stage", value_name="milliseconds")
     return table.dropna().reset_index()
+
+
+def used_model(settings: Settings) -> Any:
+    """Load the model that made the label maps of a run, chosen as in notebook 5."""
+    from thesis_repro.segmentation import quietly
+
+    with quietly():
+        from thesis_repro.segmentation import prediction, training
+    if settings.uses_shipped_model:
+        return training.load_model(prediction.SHIPPED)
+    return training.load_model(needed(settings.build / "model" / "model.keras", "04_training"))
 
 
 def _stages_of(step: odometry.Step) -> dict[str, float]:
@@ -158,13 +165,14 @@ def folder(settings: Settings) -> Path:
     return settings.figures / "timings"
 
 
-def recorded(measured: pd.DataFrame, path: Path, keep: bool) -> pd.DataFrame:
-    """Write measured timings to a file and return them, with a column for the processor.
+def recorded(settings: Settings, name: str, measured: pd.DataFrame) -> pd.DataFrame:
+    """Write measured timings into `folder` and return them, with a column for the processor.
 
-    keep: return the timings of an existing file instead. Figures in git keep their timings, which
-    would otherwise change with every machine and every run.
+    Figures in git keep their timings, which would otherwise change with every machine and every
+    run: then the timings of the existing file are returned.
     """
-    if not (keep and path.is_file()):
+    path = folder(settings) / f"{name}.csv"
+    if not (settings.figures_in_git and path.is_file()):
         write_text(path, measured.assign(processor=processor()).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 

@@ -74,7 +74,7 @@ def printed(executed, name):
 
 
 def test_every_artefact_is_written_and_names_its_data(executed):
-    figures = executed / "figures" / "embedded-smoke"
+    figures = executed / "build" / "embedded-smoke" / "figures"
     written = {path.stem: path for path in figures.iterdir() if path.suffix in (".svg", ".webp")}
     assert set(FIGURES) <= written.keys() and len(FIGURES) == 36
     texts = [written[name] for name in FIGURES if name not in WITHOUT_DATA]
@@ -87,10 +87,10 @@ def test_every_artefact_is_written_and_names_its_data(executed):
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_every_cell_shows_the_figures_that_it_saves(executed, name):
-    for cell in code_cells(executed, name):
-        shown = sum("image/png" in output.get("data", ()) for output in cell.outputs)
-        assert shown >= len(SAVED.findall(cell.source)), cell.source
+def test_a_notebook_shows_the_figures_that_it_saves(executed, name):
+    run = code_cells(executed, name)
+    shown = sum("image/png" in output.get("data", ()) for cell in run for output in cell.outputs)
+    assert shown >= sum(len(SAVED.findall(cell.source)) for cell in run)
 
 
 def test_cells_and_package_agree_to_the_bit(executed):

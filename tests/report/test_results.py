@@ -235,7 +235,7 @@ def test_the_figure_of_paths_shows_repetitions_and_their_errors():
         (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [row.repetition, 0, 0], [3, 4, 0]]
         for row in runs.itertuples()
     }
-    figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths, "baseline")
+    figure = chapter4.figure_paths({"00": AHEAD, "05": AHEAD}, runs[::-1], paths)
     true, *lines = figure.axes[0].lines
     assert len(lines) == 3 and len(figure.axes) == 4
     assert all(lines[0].get_linewidth() > line.get_linewidth() for line in lines[1:])
@@ -255,8 +255,8 @@ def test_errors_of_all_methods_are_enlarged_alike():
     }
     truths = {"00": AHEAD, "drive0005": AHEAD}
     limits = set()
-    for method, rows in chosen.items():
-        figure = chapter4.figure_paths(truths, rows, paths, method)
+    for rows in chosen.values():
+        figure = chapter4.figure_paths(truths, rows, paths)
         limits.add(figure.axes[0].dataLim.bounds)
         assert "x2 " in figure.axes[0].get_title() and problems(figure) == []
     assert len(limits) == 1
@@ -272,7 +272,7 @@ def test_a_lost_run_is_marked_where_runs_are_drawn(lost):
     paths = {(row.sequence, row.run): AHEAD for row in of_all.itertuples()}
     truths = {"00": AHEAD, "05": AHEAD}
     for figure in (
-        chapter4.figure_paths(truths, of_all, paths, "baseline"),
+        chapter4.figure_paths(truths, of_all, paths),
         chapter4.figure_of_methods(runs, "rmse"),
         chapter4.figure_of_sequences(runs, "mae"),
         chapter4.figure_against_width(runs, "rmse"),

@@ -6,9 +6,7 @@ import evo
 import numpy as np
 from evo.core.metrics import PoseRelation
 from evo.core.trajectory import PosePath3D
-from evo.core.units import Unit
 from evo.main_ape import ape
-from evo.main_rpe import rpe as evo_rpe
 from scipy.spatial.transform import Rotation
 
 from thesis_repro.errors import InputError
@@ -59,64 +57,25 @@ def _as_paths(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.n
 
 # Other common measures
 
-ALIGNMENTS = ("none", "se3", "sim3", "scale")
-STATISTICS = ("rmse", "mean", "median", "max")
+ALIGNMENTS = ("none", "se3", "sim3")
 
 
-def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> dict[str, Any]:
-    """Absolute trajectory error, metres, over all frames: {rmse, mean, median, max, scale, note}.
+def ate(estimated: np.ndarray, true: np.ndarray, alignment: str = "none") -> float:
+    """Absolute trajectory error: root mean square distance over all frames, metres.
 
-    estimated, true: (n, 4, 4) poses. alignment: see `align`, which also determines the scale. A
-    straight or motionless path does not determine the alignment. Then the numbers are NaN and
-    `note` says so.
-    """
-    try:
-        estimated, scale = align(estimated, true, alignment)
-    except evo.EvoException:
-        unknown = dict.fromkeys((*STATISTICS, "scale"), np.nan)
-        return unknown | {
-            "note": f"no {alignment} alignment: the path is straight or does not move"
-        }
-    result = ape(*_evo_paths(estimated, true), PoseRelation.translation_part)
-    errors: dict[str, Any] = {name: float(result.stats[name]) for name in STATISTICS}
-    return errors | {"scale": float(scale), "note": ""}
-
-
-def align(estimated: np.ndarray, true: np.ndarray, alignment: str) -> tuple[np.ndarray, float]:
-    """Align the estimated path (n, 4, 4) with the true path. Returns the aligned path and scale.
-
-    alignment: "none", "se3" (the best rotation and shift, by Umeyama's method), "sim3" (also the
-    best scale) or "scale" (only the scale of "sim3"). Raises InputError for another alignment, and
-    evo.EvoException if a straight or motionless path does not determine the alignment.
+    estimated, true: (n, 4, 4) poses. alignment of the estimate: "none", "se3" (the best rotation
+    and shift, by Umeyama's method) or "sim3" (also the best scale). NaN if a straight or motionless
+    path does not determine the alignment. Raises InputError for another alignment.
     """
     if alignment not in ALIGNMENTS:
         raise InputError(f"alignment={alignment!r}: unknown; choose one of {', '.join(ALIGNMENTS)}")
-    if alignment == "none":
-        return np.asarray(estimated), 1.0
     reference, estimate = _evo_paths(estimated, true)
-    _, _, scale = estimate.align(
-        reference, correct_scale=alignment == "sim3", correct_only_scale=alignment == "scale"
-    )
-    return np.array(estimate.poses_se3), float(scale)
-
-
-def rpe(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Relative pose error from frame to frame.
-
-    Returns translation_rmse, _mean, _median, _max in metres, and the same of rotation in degrees.
-    """
-    relations = {
-        "translation": PoseRelation.translation_part,
-        "rotation": PoseRelation.rotation_angle_deg,
-    }
-    errors = {}
-    for name, relation in relations.items():
-        result = evo_rpe(
-            *_evo_paths(estimated, true), relation, delta=1, delta_unit=Unit.frames, all_pairs=True
-        )
-        for statistic in STATISTICS:
-            errors[f"{name}_{statistic}"] = float(result.stats[statistic])
-    return errors
+    if alignment != "none":
+        try:
+            estimate.align(reference, correct_scale=alignment == "sim3")
+        except evo.EvoException:
+            return np.nan
+    return float(ape(reference, estimate, PoseRelation.translation_part).stats["rmse"])
 
 
 def _evo_paths(estimated: np.ndarray, true: np.ndarray) -> tuple[PosePath3D, PosePath3D]:
@@ -137,13 +96,13 @@ def relative_errors(
 ) -> dict[str, Any]:
     """Mean errors over segments of one length.
 
-    Returns {translation_percent, rotation_deg_per_100m, segments, note}. These are not the errors
-    of the KITTI benchmark (`kitti_errors`). A segment goes from each frame to the first frame that
+    Returns {translation_percent, rotation_deg_per_100m, segments}. These are not the errors of the
+    KITTI benchmark (`kitti_errors`). A segment goes from each frame to the first frame that
     is `length` metres of true path away. Each estimated motion M is rotated to B M B^T and compared
     with the true motion. The rotation B is common to all segments and fits best: Kabsch's solution
     for the translations and rotation vectors. So neither a constant rotation between camera and
     ground truth nor the start of the path changes the errors. (The KITTI benchmark's errors contain
-    that rotation.) The errors are NaN, with a note, if the path is shorter than `length`.
+    that rotation.) The errors are NaN if the path is shorter than `length`.
     """
     estimated, true = _as_paths(estimated, true)
     along = travelled(true)
@@ -154,7 +113,6 @@ def relative_errors(
             "translation_percent": np.nan,
             "rotation_deg_per_100m": np.nan,
             "segments": 0,
-            "note": f"too short: {along[-1]:.1f} m, segments of {length:g} m are compared",
         }
     motion = np.linalg.inv(estimated[first]) @ estimated[last[first]]
     true_motion = np.linalg.inv(true[first]) @ true[last[first]]
@@ -173,7 +131,6 @@ def relative_errors(
         "translation_percent": float(offsets.mean() / length * 100),
         "rotation_deg_per_100m": float(np.degrees(angle.mean()) / length * 100),
         "segments": len(first),
-        "note": "",
     }
 
 
@@ -201,7 +158,7 @@ def errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     return {
         "rmse": rmse(estimated, true),
         "mae": mae(estimated, true),
-        "se3": ate(estimated, true, "se3")["rmse"],
+        "se3": ate(estimated, true, "se3"),
         "translation_percent": relative["translation_percent"],
         "rotation_deg_per_100m": relative["rotation_deg_per_100m"],
     }
@@ -284,12 +241,12 @@ KITTI_EVERY = 10  # frames between the starts of segments
 
 
 def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """Errors of the KITTI odometry benchmark: {t_rel, r_rel, segments, note}.
+    """Errors of the KITTI odometry benchmark: {t_rel, r_rel, segments}.
 
     t_rel: translation error, percent. r_rel: rotation error, degrees per 100 m. The errors are
     means over segments. At every tenth frame, one segment for each of KITTI_LENGTHS starts. It ends
-    at the first frame that is more than this length of true path away. NaN, with a note, if the
-    path is too short.
+    at the first frame that is more than this length of true path away. NaN if the path is too
+    short.
     """
     estimated, true = _as_paths(estimated, true)
     along = travelled(true)
@@ -304,7 +261,6 @@ def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
             "t_rel": np.nan,
             "r_rel": np.nan,
             "segments": 0,
-            "note": f"too short: {along[-1]:.1f} m, the shortest segment is {min(KITTI_LENGTHS)} m",
         }
     motion = np.linalg.inv(estimated[first]) @ estimated[last]
     true_motion = np.linalg.inv(true[first]) @ true[last]
@@ -314,5 +270,4 @@ def kitti_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, Any]:
         "t_rel": float(100 * shares.mean()),
         "r_rel": float(100 * (angles(error) / length).mean()),
         "segments": len(first),
-        "note": "",
     }

@@ -120,9 +120,9 @@ def run(
 
 def run_many(
     sequence: Sequence,
-    runs: Mapping[str, tuple[OdometrySettings, Masks | None]],
+    runs: Mapping[Any, tuple[OdometrySettings, Masks | None]],
     description: str | None = None,
-) -> dict[str, Result]:
+) -> dict[Any, Result]:
     """Make many runs, {name: (settings, masks)}, over one sequence. Returns {name: Result}.
 
     The results equal those of separate runs. What several runs ask for is done once: frames are
@@ -155,7 +155,7 @@ def run_many(
 
 
 def _masks_of_frame(
-    runs: Mapping[str, tuple[OdometrySettings, Masks | None]], index: int
+    runs: Mapping[Any, tuple[OdometrySettings, Masks | None]], index: int
 ) -> dict[int, tuple[np.ndarray | None, float]]:
     """The mask of a frame and the seconds to make it, by the identity of the masks object."""
     masks_of_frame: dict[int, tuple[np.ndarray | None, float]] = {id(None): (None, 0.0)}

@@ -248,9 +248,7 @@ def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
     """
     positive = np.asarray(values, float)
     positive = positive[np.isfinite(positive) & (positive > 0)]
-    low, high = 1.0, 1.0
-    if len(positive):
-        low, high = positive.min(), positive.max()
+    low, high = positive.min(), positive.max()
     least_margin = 1.1 if high < 1.1 * low else 1
     margin = max((high / low) ** 0.05, least_margin)
     low, high = low / margin, high * margin
@@ -322,9 +320,8 @@ def same_on_all_processors(svg: str) -> str:
     decimals in place of six. Matplotlib names clip paths by a digest of their coordinates; they are
     numbered here.
     """
-    numbers: dict[str, int] = {}
-    for name in re.findall(r'id="([a-z][0-9a-f]{10})"', svg):
-        numbers.setdefault(name, len(numbers) + 1)
+    names = dict.fromkeys(re.findall(r'id="([a-z][0-9a-f]{10})"', svg))
+    numbers = {name: number for number, name in enumerate(names, 1)}
 
     def in_tag(tag: re.Match) -> str:
         rounded = re.sub(r"(?<![\w.#-])(-?\d+\.\d{4,}|-0(?![\w.]))", _rounded, tag[0])

@@ -1,0 +1,226 @@
+"""Which few hundred keypoints? Errors against the number of keypoints, by how they are chosen.
+
+How it is decided. These rules were fixed before the runs that the tables show, but when a
+prototype's results on the same streets were known:
+
+1. A choice is compared with all keypoints, with the same estimator. The errors are the aligned ATE
+   and the rotation error a frame, as they are for every run, lost or not.
+2. The ratio is formed as in `study.compare`: geometric means over the shuffles and the streets,
+   with Student's t on the streets' logarithms.
+3. Runs that failed are counted beside it, not mixed in: those with a step that fails or a turn that
+   no car makes (`metrics.step_errors`).
+4. "As good as all keypoints" is said only if the 90 % interval (two one-sided tests at 5 %) lies
+   within MARGINS, for both errors and both estimators, and no more runs failed than with all.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.special import stdtrit
+
+from thesis.ablations import FunctionMasks, random_keypoints
+from thesis_repro import odometry
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.mask_files import LabelMasks
+from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.report import style
+from thesis_repro.running import results
+from thesis_repro.study import compare, workers
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
+from thesis_repro.study.runner import CODE
+
+NUMBERS = (50, 100, 200, 400, 800)
+FILL = 5  # keypoints in each of 16 x 5 fields of the frame
+SEEDS = (None, 1, 2, 3)  # of the shuffles
+LABELS = {
+    "all": "all keypoints",
+    "strongest": "the strongest",
+    "random": "random ones",
+    "spread": "spread over the frame",
+    "mask": "the strongest on the mask",
+    "filled": f"mask, filled to {FILL} a field",
+}
+ERRORS = {"se3": "aligned ATE", "rotation": "rotation error a frame"}
+MARGINS = {"se3": 1.25, "rotation": 1.1}  # a ratio between 1 / margin and margin is "as good"
+
+
+def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
+    """Return {(choice, number of keypoints asked for, 0 for no limit): (settings, masks)}."""
+    masks = LabelMasks(labels, sequence, CONTROL_WIDTH)
+    chosen: dict[tuple[str, int], tuple] = {
+        ("all", 0): (THESIS, None),
+        ("mask", 0): (THESIS, masks),
+        ("filled", 0): (replace(THESIS, fill=FILL), masks),
+    }
+    for number in NUMBERS:
+        few = replace(THESIS, max_keypoints=number)
+        drawn = FunctionMasks(partial(random_keypoints, sequence, number))
+        chosen["strongest", number] = few, None
+        chosen["random", number] = THESIS, drawn
+        chosen["spread", number] = replace(few, choice="spread"), None
+        chosen["mask", number] = few, masks
+    return chosen
+
+
+def measure(
+    sequences: Iterable[Sequence], labels: Path, folder: Path, processes: int = 1
+) -> pd.DataFrame:
+    """Run all choices on sequences. Returns one row a run; finished sequences are not repeated.
+
+    labels: a folder with one folder of label maps a sequence. folder: of the results.
+    """
+    opened = list(sequences)
+    files = {}
+    for sequence in opened:
+        inputs = {
+            "frames": results.digest_of_files(sequence.frame_paths),
+            "labels": results.digest_of_files(sorted((labels / sequence.name).glob("*.png"))),
+            "code": results.digest_of_code(*CODE),
+        }
+        files[sequence.name] = results.stage(folder / sequence.name, **inputs) / "runs.csv"
+    calls = [
+        (sequence, labels, files[sequence.name])
+        for sequence in opened
+        if not files[sequence.name].is_file()
+    ]
+    with workers.open_pool(processes) as pool:
+        for _ in pool.run(_measure_one, calls):
+            pass
+    tables = [pd.read_csv(file, dtype={"sequence": str}) for file in files.values()]
+    return pd.concat(tables, ignore_index=True)
+
+
+def _measure_one(sequence: Sequence, labels: Path, file: Path) -> None:
+    """Run all choices on one sequence, and write the table of its runs."""
+    runs = {}
+    for (choice, number), (settings, masks) in choices(sequence, labels).items():
+        for estimator in ESTIMATORS:
+            for seed in SEEDS:
+                changed = replace(settings, estimator=estimator, shuffle_seed=seed)
+                runs[choice, number, estimator, seed or 0] = changed, masks
+    rows = []
+    for (choice, number, estimator, seed), result in odometry.run_many(sequence, runs).items():
+        errors = metrics.errors(result.poses, sequence.poses)
+        steps = metrics.step_errors(result.poses, sequence.poses)
+        row = {
+            "sequence": sequence.name,
+            "choice": choice,
+            "number": number,
+            "estimator": estimator,
+            "repetition": seed,
+            "keypoints": result.frames["detected"].mean(),
+            "se3": errors["se3"],
+            "rotation": steps["rotation"],
+            "failed": int(steps["failed"] > 0 or steps["lost"] > 0),
+        }
+        rows.append(row)
+    results.write_table(file, pd.DataFrame(rows))
+
+
+def table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return one row a choice, number, estimator and error: its ratio to all keypoints.
+
+    runs: of `measure`. low, high: 95 %. as_good: whether the 90 % interval is within MARGINS.
+    """
+    rows = []
+    for estimator in ESTIMATORS:
+        of_estimator = runs[runs["estimator"] == estimator]
+        reference = of_estimator[of_estimator["choice"] == "all"]
+        for (choice, number), chosen in of_estimator.groupby(["choice", "number"], sort=False):
+            for error, margin in MARGINS.items():
+                ratios = compare.ratios(chosen, reference, error)
+                numbers = compare.geometric_mean(ratios)
+                row = {
+                    "choice": choice,
+                    "number": number,
+                    "keypoints": chosen["keypoints"].mean(),
+                    "estimator": estimator,
+                    "error": error,
+                    **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
+                    "failed": int(chosen["failed"].sum()),
+                    "runs": len(chosen),
+                    "as_good": _is_within(ratios, margin),
+                }
+                rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _is_within(ratios: pd.Series, margin: float) -> bool:
+    """Say whether two one-sided t-tests at 5 % place the mean ratio within the margin."""
+    logarithms = np.log(ratios)
+    n = len(logarithms)
+    if n < compare.MIN_SEQUENCES:
+        return False
+    reach = stdtrit(n - 1, 0.95) * logarithms.std(ddof=1) / np.sqrt(n)
+    return bool(abs(logarithms.mean()) + reach < np.log(margin))
+
+
+def summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one row a choice and number, for readers. rows: of `table`."""
+    lines = []
+    for (choice, number), chosen in rows.groupby(["choice", "number"], sort=False):
+        line: dict[str, Any] = {
+            "keypoints": f"{chosen['keypoints'].iloc[0]:.0f}",
+            "how chosen": LABELS[choice],
+        }
+        for row in chosen.itertuples():
+            name = f"{ERRORS[row.error]}, {ESTIMATORS[row.estimator]}"
+            line[name] = f"{row.ratio:.2f} ({row.low:.2f}-{row.high:.2f}), {row.above} of {row.n}"
+        for estimator, of_estimator in chosen.groupby("estimator", sort=False):
+            failed, runs = of_estimator[["failed", "runs"]].iloc[0]
+            line[f"failed, {ESTIMATORS[estimator]}"] = f"{failed} of {runs}"
+        line["as good as all"] = "yes" if is_as_good(rows, choice, number) else ""
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def is_as_good(rows: pd.DataFrame, choice: str, number: int) -> bool:
+    """Say whether rule 4 (see above) calls a choice as good as all keypoints."""
+    chosen = rows[(rows["choice"] == choice) & (rows["number"] == number)]
+    reference = rows[rows["choice"] == "all"].set_index(["estimator", "error"])["failed"]
+    failed = chosen.set_index(["estimator", "error"])["failed"]
+    return bool(chosen["as_good"].all() and (failed <= reference).all())
+
+
+def figure(rows: pd.DataFrame) -> Figure:
+    """Draw the ratios of both errors against the number of keypoints. rows: of `table`."""
+    drawing, panels = plt.subplots(
+        len(ERRORS), len(ESTIMATORS), figsize=(style.PAGE_WIDTH, 5.4), sharex=True, sharey="row"
+    )
+    for panel_row, error in zip(panels, ERRORS, strict=True):
+        for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
+            shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
+            _draw_curves(panel, shown)
+            panel.set_title(f"{ERRORS[error]}, {ESTIMATORS[estimator]}", fontsize=9)
+        panel_row[0].set_ylabel("ratio to all keypoints")
+    for panel in panels[-1]:
+        panel.set_xlabel("keypoints a frame")
+    style.legend_below(drawing, panels.ravel()[:1], 3)
+    return drawing
+
+
+def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
+    panel.axhline(1, color=style.GRAY, linewidth=0.8)
+    for index, (choice, label) in enumerate(LABELS.items()):
+        of_choice = rows[rows["choice"] == choice].sort_values("keypoints")
+        if choice == "all":
+            continue
+        look = style.line_style(index)
+        position = of_choice["keypoints"] * 1.03 ** (index - 3)  # side by side
+        panel.plot(position, of_choice["ratio"], marker="o", markersize=4, label=label, **look)
+        panel.vlines(
+            position, of_choice["low"], of_choice["high"], color=look["color"], linewidth=0.9
+        )
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.set_xticks([50, 100, 200, 400, 800], ["50", "100", "200", "400", "800"])
+    panel.set_yticks([0.5, 1, 2, 5, 10], ["0.5", "1", "2", "5", "10"])
+    panel.minorticks_off()
+    panel.set_ylim(0.45, 25)
