@@ -25,6 +25,7 @@ CHANGES = {  # in percent, in reported.json
     "MAE": "table_4_3_mae_percent_change",
 }
 WIDTHS = range(9, 12)  # the dilation widths that the thesis calls best
+EVERY_ROW = "index >= 0"  # as a query
 TEXTS = ["quantity", "metric", "estimator", "unit", "data"]
 NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
 
@@ -129,17 +130,18 @@ def measured(table: pd.DataFrame, kind: str, **names: Any) -> list[dict[str, Any
             continue
         for metric, estimator in product(spec["metrics"], spec.get("estimators", [""])):
             if metric in table:
-                measurements.append(_measure(spec, table, metric, estimator, names))
+                names["estimator"] = estimator
+                measurements.append(_measure(spec, table, metric, names))
     return _with_frames(measurements, table)
 
 
 def _measure(
-    spec: dict[str, Any], table: pd.DataFrame, metric: str, estimator: str, names: dict[str, Any]
+    spec: dict[str, Any], table: pd.DataFrame, metric: str, names: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the measurement of one metric and estimator that an entry of audit.json describes."""
-    rows = _select(table, spec.get("rows"), estimator, names)
+    rows = table.query(spec.get("rows", EVERY_ROW), local_dict=names)
     label = spec.get("label", WORDS["metrics"].get(metric, ""))
-    texts = {"metric": label, "estimator": estimator}
+    texts = {"metric": label, "estimator": names["estimator"]}
     if "unit" in spec:
         means = rows.groupby("sequence")[metric].mean()
         if spec["unit"] == "%":
@@ -148,21 +150,9 @@ def _measure(
     if "over" in spec:
         reference = rows.assign(**{metric: rows[spec["over"]]})
     else:
-        reference_estimator = spec.get("reference_estimator", estimator)
-        reference = _select(table, spec["reference"], reference_estimator, names)
+        reference = table.query(spec["reference"], local_dict=names)
     ratios = compare.ratios(rows, reference, metric)
     return ratio(spec["row"], spec["quantity"], ratios, **texts)
-
-
-def _select(
-    table: pd.DataFrame, query: str | None, estimator: str, names: dict[str, Any]
-) -> pd.DataFrame:
-    """Select the rows of an estimator that a query describes; None or "" selects all."""
-    if estimator:
-        table = table[table["estimator"] == estimator]
-    if query:
-        table = table.query(query, local_dict=names)
-    return table
 
 
 def _with_frames(measurements: list[dict[str, Any]], table: pd.DataFrame) -> list[dict[str, Any]]:
