@@ -194,13 +194,13 @@ def stems(folder: Path) -> list[str]:
 
 def transformed_alike(image: np.ndarray, label_map: np.ndarray, seed: int) -> bool:
     """Return whether a one-hot mask and an integer label map are transformed alike."""
-    transforms = augmentation.training_augmenter(len(image))
-    moved = augmentation.augment(transforms, image, label_map, seed)[1]
-    compose = A.Compose(augmentation.transform_list(len(image), fill_mask=0))
-    compose.set_random_seed(seed)
-    one_hot = augmentation.one_hot(label_map, cityscapes.N_CLASSES)
-    mask = compose(image=image, mask=one_hot)["mask"]
-    return np.array_equal(mask, augmentation.one_hot(moved, cityscapes.N_CLASSES))
+    size, classes = len(image), cityscapes.N_CLASSES
+    integers = augmentation.training_augmenter(size)
+    floats = A.Compose(augmentation.transform_list(size, fill_mask=0))
+    _, ids = augmentation.augment(integers, image, label_map, seed)
+    encoded = augmentation.one_hot(label_map, classes)
+    _, one_hot = augmentation.augment(floats, image, encoded, seed)
+    return np.array_equal(one_hot, augmentation.one_hot(ids, classes))
 
 
 def validation_losses(
