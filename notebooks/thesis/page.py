@@ -65,10 +65,8 @@ def _copy(settings: Settings, folder: Path) -> None:
         for path in (ROOT / "figures").glob(f"{name}.*"):
             files.setdefault(Path(path.name), path)
     for name, path in files.items():
-        copy = folder / name
-        if not copy.is_file() or copy.read_bytes() != path.read_bytes():
-            with atomic(copy) as temporary:
-                shutil.copyfile(path, temporary)
+        with atomic(folder / name) as temporary:
+            shutil.copyfile(path, temporary)
 
 
 def _executed(settings: Settings) -> list[Path]:

@@ -1,8 +1,7 @@
-"""The ways in: the command line, the public names, the example and the numbers of the README."""
+"""The ways in: the command line and the public names."""
 
 import json
 import os
-import re
 import shlex
 import subprocess
 import sys
@@ -18,7 +17,6 @@ import thesis_repro as tr
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
 from thesis_repro.data.trajectories import read_poses
-from thesis_repro.running.settings import ROOT
 
 
 def run(command, *options):
@@ -190,18 +188,6 @@ def test_tensorflow_is_loaded_on_first_use():
 
 def test_bad_input_is_one_line_in_a_notebook():
     assert tr.InputError("frames: none")._render_traceback_() == ["InputError: frames: none"]
-
-
-def test_the_example_of_the_readme_runs(small_world, tmp_path, monkeypatch, capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    (tmp_path / "world").symlink_to(small_world)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "labels").symlink_to(small_world / "kitti/sequences/00/labels_0")
-    names = {}
-    exec(example, names)
-    assert len(names["baseline"].poses) == len(names["masked"].poses) == 12
-    assert names["masked"].frames["detected"].mean() < names["baseline"].frames["detected"].mean()
-    assert len(example.splitlines()) <= 14 and capsys.readouterr().out
 
 
 CAMERA = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])

@@ -208,18 +208,6 @@ def test_counts_are_whole_and_the_digits_of_a_column_are_equal():
     ]
 
 
-def test_an_update_renders_changed_notebooks_only(run):
-    html = run.executed.with_suffix(".html")
-    read(run)
-    first = html.stat().st_mtime_ns
-    (run.settings.figures / "figure_4_06.svg").unlink()
-    assert "40 of 41" in read(run).text and html.stat().st_mtime_ns == first
-    run.executed.write_text(run.executed.read_text().replace("a number: 42", "a number: 43"))
-    os.utime(run.executed, ns=(first + 10**9,) * 2)
-    read(run)
-    assert "a number: 43" in html.read_text()
-
-
 def test_the_page_in_git_does_not_depend_on_the_machine_or_day(run):
     figures = ROOT / "figures"  # read, not written
     in_git = replace(run.settings, figures=figures, published=figures)

@@ -209,7 +209,7 @@ def study(options: Any) -> int:
 
     with messages.logged(folder, options.command_line) as run, results.claimed(folder):
         warnings = []
-        for sequence, masks in planned.shown_masks():
+        for sequence, masks in study.shown_masks(planned):
             warnings += _check_masks(sequence, masks)
         warnings = _warn(warnings)
         outcome = planned.run(folder, options.jobs, options.dask)

@@ -17,6 +17,8 @@ from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import ESTIMATORS
 
 SHOWN = (*compare.JUDGING_METRICS, "rmse")
+# columns of the lost runs of a method and of its reference, "2 of 40"
+LOST = {"lost runs": "lost", "lost runs of the reference": "reference_lost"}
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
 
 
@@ -58,13 +60,15 @@ def _draw_ratios(panel: Axes, rows: pd.DataFrame, order: list[str], sequences: l
         if row["method"] == "masked":
             color = MASKED
         values = row[sequences].dropna().astype(float)
-        dots: dict[str, Any] = {
-            "color": "#555555",
-            "alpha": 0.45,
-            "markersize": 3,
-            "markeredgewidth": 0,
-        }
-        panel.plot(values, [y - 0.22] * len(values), "o", **dots)
+        panel.plot(
+            values,
+            [y - 0.22] * len(values),
+            "o",
+            color="#555555",
+            alpha=0.45,
+            markersize=3,
+            markeredgewidth=0,
+        )
         interval = [row["low"], row["high"]]
         panel.plot(interval, [y + 0.15] * 2, **style.interval_style(color, "|"))
         panel.plot(row["ratio"], y + 0.15, "D", color=color, markersize=4, markeredgewidth=0)
@@ -125,11 +129,14 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     controls = controls[controls["metric"] == first_metric]
     rows = []
     for source, pair in judged.groupby("source", sort=False):
-        keypoints = pair["keypoints"].iloc[0]
-        row = {"masks": source, "keypoints": f"{keypoints:.0f} instead of {total:.0f}"}
-        row |= _ratios(pair)
-        row["verdict"] = compare.overall(pair["verdict"])
-        row |= _lost(pair.iloc[0])
+        first = pair.iloc[0]
+        row = {
+            "masks": source,
+            "keypoints": f"{first['keypoints']:.0f} instead of {total:.0f}",
+            **{compare.METRICS[line["metric"]]: _short(line) for _, line in pair.iterrows()},
+            "verdict": compare.overall(pair["verdict"]),
+            **{name: first[column] for name, column in LOST.items()},
+        }
         of_source = controls[controls["source"] == source]
         for _, best in of_source.nsmallest(1, "ratio").iterrows():
             row["best control"] = f"{compare.METHODS[best['method']]} {texts.number(best['ratio'])}"
@@ -155,10 +162,7 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
         over = compare.METHODS[first["reference"]]
         if first["reference_source"] not in ("", first["source"]):
             over = f"{first['reference_source']}: {over}"
-        verdict = pd.NA
         judging = pair[pair["metric"].isin(compare.JUDGING_METRICS)]
-        if len(judging):
-            verdict = compare.overall(judging["verdict"])
         by_sequence = first[sequences].dropna().map(texts.number)
         lines.append(
             {
@@ -168,8 +172,8 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
                 "over": over,
                 "sequences": pair["n"].max(),
                 **_ratios_and_counts(pair),
-                "verdict": verdict,
-                **_lost(first),
+                "verdict": compare.overall(judging["verdict"]),
+                **{name: first[column] for name, column in LOST.items()},
                 **by_sequence.add_prefix("sequence "),
             }
         )
@@ -179,13 +183,11 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     return shown.reindex(columns=[*others, *last])
 
 
-def _ratios(pair: pd.DataFrame) -> dict[str, Any]:
-    """Return {name of the metric: ratio as a text} for two methods, which have one row a metric."""
-    return {compare.METRICS[row["metric"]]: _short(row) for _, row in pair.iterrows()}
-
-
 def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
-    """Return `_ratios`; behind a judging metric stand "6 of 8" above 1 and the rank test's p."""
+    """Return {name of the metric: ratio as a text} for two methods, which have one row a metric.
+
+    Behind a judging metric stand "6 of 8" above 1 and the rank test's p.
+    """
     cells: dict[str, Any] = {}
     for _, row in pair.iterrows():
         name = compare.METRICS[row["metric"]]
@@ -196,18 +198,7 @@ def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
     return cells
 
 
-# columns of the lost runs of a method and of its reference
-LOST = {"lost runs": "lost", "lost runs of the reference": "reference_lost"}
-
-
-def _lost(row: pd.Series) -> dict[str, str]:
-    """Return the lost runs of a comparison, "2 of 40", by the names of their columns."""
-    return {name: row[column] for name, column in LOST.items()}
-
-
-def _short(row: dict[str, Any] | pd.Series) -> Any:
-    if pd.isna(row["ratio"]):
-        return pd.NA
+def _short(row: dict[str, Any] | pd.Series) -> str:
     return texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
 
 
@@ -224,11 +215,9 @@ def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
         masked = compare.of_method(of_source, "masked")
         if masked["dilation_width"].nunique() > 1:
             tables[source] = _widths(masked, compare.of_method(of_source, "baseline"))
-    if not tables:
-        return pd.DataFrame()
-    if len(compare.sources(runs)) > 1:
+    if len(compare.sources(runs)) > 1 and tables:
         return pd.concat(tables, names=["masks"]).reset_index("masks")
-    return next(iter(tables.values()))
+    return next(iter(tables.values()), pd.DataFrame())
 
 
 def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:

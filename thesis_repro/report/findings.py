@@ -45,14 +45,13 @@ def text(
     what the thesis's own procedure gives, one dict a metric (see the modules in notebooks/thesis).
     """
     baseline = runs[runs["method"] == "baseline"]
-    with_masks = set(runs.loc[runs["method"] == "masked", "source"])
-    sources = [
-        _source_values(runs, table, source)
-        for source in compare.sources(runs) or [""]
-        if source in with_masks
-    ]
+    with_masks = runs.loc[runs["method"] == "masked", "source"].unique()
+    factors = compare.shuffle_spread(runs).groupby("estimator")["factor"]
+    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATORS)).dropna()
     measured = set(table["metric"])
     deciding = [label for name, label in compare.JUDGING_METRICS.items() if name in measured]
+    both_masked = (table["method"] == "masked") & (table["reference"] == "masked")
+    once = table["source"] < table["reference_source"]  # each pair of sources
     return texts.render(
         "findings.md.j2",
         **OF_COMPARISONS,
@@ -62,28 +61,13 @@ def text(
         trainings=trainings,
         frames=baseline.groupby("sequence")["frames"].first().to_dict(),
         repetitions=baseline["repetition"].nunique(),
-        spread=_shuffle_spread(runs),
+        spread=spread.T.to_dict(),
         deciding=deciding,
         estimators_run=set(table["estimator"]),
-        sources=sources,
+        sources=[_source_values(runs, table, source) for source in with_masks],
         procedure=procedure,
-        against_each_other=_sources_against_each_other(table),
+        against_each_other=table[both_masked & once & _judging(table)].to_dict("records"),
     )
-
-
-def _shuffle_spread(runs: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Return {estimator: {"median", "max"}} of the factors of `compare.shuffle_spread`."""
-    factors = compare.shuffle_spread(runs).groupby("estimator")["factor"]
-    spread = factors.agg(["median", "max"]).reindex(list(ESTIMATORS)).dropna()
-    return spread.T.to_dict()
-
-
-def _sources_against_each_other(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows of `table` that compare masks of two sources, each pair of sources once."""
-    both_masked = (table["method"] == "masked") & (table["reference"] == "masked")
-    once = table["source"] < table["reference_source"]
-    pairs = table[both_masked & once & _judging(table)]
-    return pairs.to_dict("records")
 
 
 def _judging(table: pd.DataFrame) -> pd.Series:
@@ -96,13 +80,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
     """Return the values of one source of masks for the template."""
     runs = compare.of_source(runs, source)
     masked = compare.of_method(runs, "masked")
-    widths = masked["dilation_width"].nunique()
-    same_best, repeated = None, 0
-    if widths > 1:
-        stability = best_width.stability(masked, compare.of_method(runs, "baseline"))
-        mean = stability["same_best"].mean()
-        if not pd.isna(mean):
-            same_best, repeated = float(mean), int(stability["same_best"].count())
+    stability = best_width.stability(masked, compare.of_method(runs, "baseline"))
     judged = compare.primary_comparison(table, source)
     over_all = (table["source"] == source) & (table["reference"] == "baseline") & table["tested"]
     of_masks = table[over_all & (table["method"] == "masked")]
@@ -119,7 +97,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
         "lost": of_masks.drop_duplicates("estimator").to_dict("records"),
         "corrected": of_corrected.to_dict("records"),
         "controls": verdicts.to_dict(),
-        "widths": widths,
-        "same_best": same_best,
-        "repeated": repeated,
+        "widths": masked["dilation_width"].nunique(),
+        "same_best": stability["same_best"].mean(),
+        "repeated": stability["same_best"].count(),
     }

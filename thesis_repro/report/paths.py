@@ -19,10 +19,7 @@ def figure(paths: dict[str, np.ndarray], true: np.ndarray | None, title: str) ->
     drawing, panels = new_figure(1, columns, height=3.4, squeeze=False)
     above = panels[0, 0]
     for index, (name, poses) in enumerate(paths.items()):
-        label = one_line(name)
-        if label.startswith("_"):
-            label = f" {label}"  # matplotlib leaves others out of a legend
-        above.plot(poses[:, 0, 3], poses[:, 2, 3], label=label, **line_style(index))
+        above.plot(poses[:, 0, 3], poses[:, 2, 3], label=one_line(name), **line_style(index))
     if true is not None:
         above.plot(
             true[:, 0, 3],

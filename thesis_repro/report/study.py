@@ -4,23 +4,24 @@ Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
 
 from collections.abc import Collection
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from thesis_repro.data.trajectories import read_poses, write_kitti_poses, write_tum
-from thesis_repro.errors import InputError, one_line
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.trajectories import write_kitti_poses, write_tum
+from thesis_repro.errors import one_line
 from thesis_repro.mask_files import LabelMasks, label_map_of
+from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.report import comparison, findings, page, paths, style, tables
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, methods, runner
 from thesis_repro.study.jobs import ESTIMATORS
-from thesis_repro.study.sources import KINDS, Source
+from thesis_repro.study.sources import KINDS, FileMasks, Source
 from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
@@ -44,15 +45,14 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     ]
     note = one_line(f"odometry: {data}; masks: {', '.join(masks)}")
     write_paths(study, runs, folder)
+    figures = {"sources": figure_sources(study, runs)}
+    for sequence in study.opened:
+        figures[f"paths-{sequence.name}"] = figure_paths(study, runs, sequence, folder)
     # for texts and tables
     runs = runs.assign(sequence=runs["sequence"].map(one_line))
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", findings.text(runs, table, note, embedded))
-    figures = {
-        "comparison": comparison.figure_comparison(table),
-        "sources": figure_sources(study),
-    }
-    figures |= {f"paths-{name}": figure_paths(study, name, folder) for name in study.sequences}
+    figures = {"comparison": comparison.figure_comparison(table), **figures}
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf")
     numbers = {
@@ -108,51 +108,73 @@ def latex(table: pd.DataFrame) -> str:
     return f"\\resizebox{{\\linewidth}}{{!}}{{%\n{text}}}\n"
 
 
-def figure_sources(study: Study) -> Figure:
-    """Draw the middle frame of the first readable sequence, one row a source.
+def shown_width(study: Study) -> int | None:
+    """Return the dilation width (pixels) of the masks in figures.
+
+    It is the tested width, or else the middle one; None for only ready-made masks.
+    """
+    if study.tested or not study.widths:
+        return study.tested
+    return study.widths[len(study.widths) // 2]
+
+
+def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
+    """Return each sequence with the masks of each source, at the `shown_width`."""
+    return [
+        (sequence, [source.masks(sequence, shown_width(study)) for source in study.sources])
+        for sequence in study.opened
+    ]
+
+
+def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
+    """Draw the middle frame of the first sequence that has runs with masks, one row a source.
 
     A row shows the source's label map (or the frame, if there is none), its mask and the kept
-    keypoints, so that a person sees which masks are inverted or lie elsewhere.
+    keypoints, so that a person sees which masks are inverted or lie elsewhere. Sources whose runs
+    failed are left out.
     """
-    for sequence, sequence_masks in study.shown_masks():
-        index = len(sequence) // 2
-        with suppress(InputError):  # if a frame cannot be read, only the runs of its sequence fail
-            frame, masks_by_source = sequence.frame(index), sequence_masks
-            break
+    masked = runs[runs["method"] == "masked"]
+    name = masked["sequence"].iloc[0]
+    with_runs = set(masked.loc[masked["sequence"] == name, "source"])
+    sources = [source for source in study.sources if source.name in with_runs]
+    (sequence,) = (sequence for sequence in study.opened if sequence.name == name)
+    index = len(sequence) // 2
+    frame = sequence.frame(index)
     label_maps = []
-    figure, axes = style.frame_panels(frame, len(masks_by_source), 3, 1.5 * style.PAGE_WIDTH)
-    rows = np.reshape(axes, (-1, 3))
-    for (first, second, third), source, masks in zip(rows, study.sources, masks_by_source):
+    figure, axes = style.frame_panels(frame, len(sources), 3, 1.5 * style.PAGE_WIDTH)
+    for (first, second, third), source in zip(np.reshape(axes, (-1, 3)), sources, strict=True):
+        masks = source.masks(sequence, shown_width(study))
         style.show_image(first, frame, f"{source.name}: frame {index}")
-        style.show_image(second, np.zeros_like(frame), f"{source.name}: no mask")
-        style.show_image(third, frame, "")
-        with suppress(InputError):  # the runs report a file that cannot be read
-            mask = masks[index]
-            if isinstance(masks, LabelMasks):
-                label_map = label_map_of(masks, index)
-                label_maps.append(label_map)
-                colors = style.label_colors(label_map, frame)
-                style.show_image(first, colors, f"{source.name}: label map")
-            points = keypoints.detect(frame, THESIS, mask)
-            style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
-            third.set_title(f"{source.name}: {len(points)} keypoints")
-            third.scatter(*points.T, **style.KEYPOINT)
+        if isinstance(masks, LabelMasks):
+            label_maps.append(label_map_of(masks, index))
+            colors = style.label_colors(label_maps[-1], frame)
+            style.show_image(first, colors, f"{source.name}: label map")
+        mask = masks[index]
+        style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
+        points = keypoints.detect(frame, THESIS, mask)
+        style.show_image(third, frame, f"{source.name}: {len(points)} keypoints")
+        third.scatter(*points.T, **style.KEYPOINT)
     if label_maps:
         style.class_legend(figure, *label_maps)
     return figure
 
 
-def figure_paths(study: Study, name: str, folder: Path) -> Figure:
+def figure_paths(study: Study, runs: pd.DataFrame, sequence: Sequence, folder: Path) -> Figure:
     """Draw a path with all keypoints and one with each source's masks, shifted as for the RMSE."""
-    (true,) = (sequence.poses for sequence in study.opened if sequence.name == name)
-    poses_folder = folder / PATHS / "kitti" / name
+    widths = runs["dilation_width"]
+    rows = runs[
+        (runs["sequence"] == sequence.name)
+        & (runs["repetition"] == 0)
+        & (runs["estimator"] == compare.judging_estimator(runs))
+        & runs["method"].isin(["baseline", "masked"])
+        & (widths.isna() | (widths == shown_width(study)))
+    ]
     shown = {}
-    for job in study.shown_jobs(name):
-        label = job.source or compare.METHODS[job.method]
-        file = poses_folder / f"{job.name}.txt"
-        if file.is_file():
-            shown[label] = metrics.shifted(read_poses(file), true)
-    return paths.figure(shown, true, f"sequence {name}")
+    poses = runner.run_poses(rows, folder / RUNS)
+    for row in rows.itertuples():
+        label = row.source or compare.METHODS[row.method]
+        shown[label] = metrics.shifted(poses[sequence.name, row.run], sequence.poses)
+    return paths.figure(shown, sequence.poses, f"sequence {sequence.name}")
 
 
 def _changed(source: Source) -> str:
@@ -160,12 +182,8 @@ def _changed(source: Source) -> str:
 
     Such as "; margin 10".
     """
-    if source.kind != "labels":
+    if not source.has_label_maps:
         return ""
-    default = vars(type(source.settings)())
-    changed = [
-        f"{name} {value}" for name, value in vars(source.settings).items() if value != default[name]
-    ]
-    if not changed:
-        return ""
-    return f"; {', '.join(changed)}"
+    default = vars(MaskSettings())
+    settings = vars(source.settings).items()
+    return "".join(f"; {name} {value}" for name, value in settings if value != default[name])

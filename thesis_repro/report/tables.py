@@ -7,6 +7,7 @@ from markupsafe import Markup
 
 from thesis_repro.study import compare
 from thesis_repro.study.jobs import ESTIMATORS
+from thesis_repro.study.methods import ERRORS
 
 IMPROVED = "sequences improved"  # a row of counts, and of a mean of counts
 
@@ -35,7 +36,7 @@ def table_errors(runs: pd.DataFrame) -> pd.DataFrame:
     table["frames"] = means["frames"].astype(int)
     table["number"] = means["mean_keypoints"].round().astype(int)
     for name in metrics:
-        label = f"{compare.METRICS[name]} ({compare.UNITS[name]})"
+        label = f"{compare.METRICS[name]} ({ERRORS[name].unit})"
         table[label] = means[name].map(three_digits)
     table["flagged frames"] = means["flagged"].round(1)
     groups = rows.groupby(keys, dropna=False)

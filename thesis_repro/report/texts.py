@@ -91,13 +91,15 @@ def in_url(name: str) -> str:
     return quote(os.fsencode(name))
 
 
-TEMPLATES.filters["in_markdown"] = in_markdown
-TEMPLATES.filters["in_shell"] = shlex.quote
-TEMPLATES.filters["one_line"] = one_line
-TEMPLATES.filters["urlencode"] = in_url
-TEMPLATES.filters["ratio"] = ratio_and_far_off
-TEMPLATES.filters["number"] = number
-TEMPLATES.filters["two_digits"] = two_digits
+TEMPLATES.filters |= {
+    "in_markdown": in_markdown,
+    "in_shell": shlex.quote,
+    "one_line": one_line,
+    "urlencode": in_url,
+    "ratio": ratio_and_far_off,
+    "number": number,
+    "two_digits": two_digits,
+}
 
 
 class _Renderer(mistune.HTMLRenderer):

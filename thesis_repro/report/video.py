@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from thesis_repro.data.kitti import FRAME_TIME, Sequence
+from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import (
     THESIS,
@@ -78,7 +78,6 @@ def pictures(
     axes = figure.add_axes((0.08, 0.2, 0.6, 0.75), xlabel="x (m)", ylabel="z (m)")
     axes.set_aspect("equal", adjustable="datalim")
     metres = scales(sequence)
-    true = None
     # both paths start at the same point here; for the RMSE they meet at frame 1
     if sequence.has_truth:
         true = sequence.poses[:, :3, 3] + odometry.pose[:3, 3] - sequence.poses[0, :3, 3]
@@ -97,7 +96,7 @@ def pictures(
         path.set_data(*np.transpose(positions))
         axes.relim()
         axes.autoscale_view()
-        description.set_text(_describe(step, true, mask is not None))
+        description.set_text(_describe(step))
         canvas.draw()
         drawn = draw_frame(frame, step, settings, mask)
         below = np.asarray(canvas.buffer_rgba())[..., 2::-1]
@@ -106,19 +105,14 @@ def pictures(
         yield picture[: len(picture) // 2 * 2, : width // 2 * 2]
 
 
-def _describe(step: Step, true: np.ndarray | None, masked: bool) -> str:
+def _describe(step: Step) -> str:
     """Describe a step in lines of text that name the colours in the frame."""
-    row = step.row()
-    lines = [f"frame {step.frame}"]
-    if true is not None:
-        distance = np.linalg.norm(step.pose[:3, 3] - true[step.frame])
-        lines.append(f"{distance:.2f} m from the truth")
-    if step.detected is not None:
-        lines.append(f"{step.detected} keypoints (blue)")
-    if masked:
-        lines.append("discarded by the mask: red")
-    if row["tracked"] is not None:
-        lines.append(f"{row['inliers']} of {row['tracked']} tracks agree (green)")
+    lines = [
+        f"frame {step.frame}",
+        f"{len(step.keypoints)} keypoints (blue)",
+        "discarded by a mask: red",
+        f"{step.inliers.sum()} of {len(step.inliers)} tracks agree (green)",
+    ]
     return "\n".join([*lines, *step.flags])
 
 
@@ -131,9 +125,7 @@ def write_video(
     Every browser plays VP8. OpenCV takes four times as long for VP9. Raises InputError if the video
     was not written whole.
     """
-    frame_time = FRAME_TIME
-    if len(sequence) > 1:
-        frame_time = np.median(np.diff(sequence.times))
+    frame_time = np.median(np.diff(sequence.times))
     writer = cv2.VideoWriter()
     with atomic(path) as temporary:
         for picture in pictures(sequence, settings, masks):

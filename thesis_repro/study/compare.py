@@ -27,7 +27,7 @@ Both were added when the results were known. They decide nothing.
 
 from collections.abc import Iterable
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,7 +44,6 @@ METHODS = {name: method.title for name, method in methods.METHODS.items() if met
 SEGMENTATION_FREE_CONTROLS = [name for name, method in methods.METHODS.items() if method.is_control]
 METRICS = {name: error.title for name, error in ERRORS.items()}
 JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}
-UNITS = {name: error.unit for name, error in ERRORS.items()}
 
 # of `comparisons`, before those of the sequences
 COLUMNS = (
@@ -193,23 +192,21 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for estimator in ESTIMATORS:
         variants = _variants(runs[runs["estimator"] == estimator], metrics)
-        for variant, reference in product(variants, variants):
+        for (variant, errors), (reference, reference_errors) in product(variants, variants):
             if not _is_compared(variant, reference):
                 continue
             for metric in metrics:
-                logarithms = variant.logarithms[metric] - reference.logarithms[metric]
-                by_sequence = np.exp(logarithms.dropna())
+                by_sequence = np.exp((errors[metric] - reference_errors[metric]).dropna())
                 if by_sequence.empty:
                     continue
                 row = {
-                    **variant.columns,
-                    "reference_source": reference.source,
-                    "reference": reference.method,
+                    **variant,
+                    "reference_source": reference["source"],
+                    "reference": reference["method"],
+                    "reference_lost": reference["lost"],
                     "estimator": estimator,
                     "metric": metric,
                     "far_off": far_off(by_sequence),
-                    "lost": variant.lost,
-                    "reference_lost": reference.lost,
                     **geometric_mean(by_sequence),
                     **by_sequence,
                 }
@@ -222,18 +219,14 @@ def lost(runs: pd.DataFrame) -> str:
     return f"{runs['lost'].sum()} of {len(runs)}"
 
 
-class _Variant(NamedTuple):
-    """The runs of one method with the masks of one source and width."""
+def _variants(
+    runs: pd.DataFrame, metrics: list[str]
+) -> list[tuple[dict[str, Any], dict[str, pd.Series]]]:
+    """Split the runs by method, source and width.
 
-    source: str
-    method: str
-    columns: dict[str, Any]  # of `comparisons`, about this variant
-    logarithms: dict[str, pd.Series]  # by metric: mean logarithm of the errors, by sequence
-    lost: str  # see `lost`
-
-
-def _variants(runs: pd.DataFrame, metrics: list[str]) -> list[_Variant]:
-    """Split the runs by method, source and width."""
+    Returns for each part its columns of `comparisons`, and by metric the mean logarithms of its
+    errors, which are then found only once.
+    """
     variants = []
     for method in METHODS:
         by_width = runs[runs["method"] == method].groupby(
@@ -247,25 +240,22 @@ def _variants(runs: pd.DataFrame, metrics: list[str]) -> list[_Variant]:
                 "dilation_width": width,
                 "keypoints": rows.groupby("sequence")["mean_keypoints"].mean().mean(),
                 "tested": bool(tested),
+                "lost": lost(rows),
             }
-            # once for all comparisons with this variant
             logarithms = {metric: _mean_logarithms(rows, metric) for metric in metrics}
-            variants.append(_Variant(source, method, columns, logarithms, lost(rows)))
+            variants.append((columns, logarithms))
     return variants
 
 
-def _is_compared(variant: _Variant, reference: _Variant) -> bool:
-    """Return whether `comparisons` compares a variant with a reference.
-
-    The reference is another variant or the same one.
-    """
-    if reference.method == "baseline":
+def _is_compared(variant: dict[str, Any], reference: dict[str, Any]) -> bool:
+    """Return whether `comparisons` compares a variant with a reference, which may be itself."""
+    if reference["method"] == "baseline":
         return True
-    if variant is reference or variant.method != "masked":
+    if variant is reference or variant["method"] != "masked":
         return False
-    if not (variant.columns["tested"] and reference.columns["tested"]):
+    if not (variant["tested"] and reference["tested"]):
         return False
-    return variant.source == reference.source or reference.method == "masked"
+    return variant["source"] == reference["source"] or reference["method"] == "masked"
 
 
 def primary_comparison(table: pd.DataFrame, source: str | None = None) -> pd.DataFrame:

@@ -63,10 +63,8 @@ class Job:
         parts = [self.method]
         if self.dilation_width is not None and METHODS[self.method].has_masks:
             parts.append(f"{self.dilation_width:02d}")
-        if self.max_keypoints is not None:
-            parts.append(str(self.max_keypoints))
-        if self.min_distance is not None:
-            parts.append(f"{self.min_distance:g}")
+        limits = (self.max_keypoints, self.min_distance)
+        parts += [f"{limit:g}" for limit in limits if limit is not None]
         if self.estimator != "thesis":
             parts.append(self.estimator)
         parts.append(str(self.repetition))
@@ -78,15 +76,15 @@ class Job:
     @property
     def settings(self) -> OdometrySettings:
         """The thesis's settings of the odometry, with the changes that the job asks for."""
-        changes = {
+        changes: dict[str, Any] = {
+            "estimator": self.estimator,
             "max_keypoints": self.max_keypoints,
             "min_distance": self.min_distance,
             "shuffle_seed": self.repetition or None,
         }
-        given: dict[str, Any] = {
-            name: value for name, value in changes.items() if value is not None
-        }
-        return replace(THESIS, estimator=self.estimator, **given)
+        return replace(
+            THESIS, **{name: value for name, value in changes.items() if value is not None}
+        )
 
 
 def first_jobs(
@@ -105,11 +103,17 @@ def first_jobs(
     estimator.
     sources: of masks. All keypoints are run once for all sources.
     """
+    all_widths = set(chain(*widths.values()))
+    if tested:
+        all_widths.add(tested)
     jobs: list[Job] = []
     for sequence in sequences:
         jobs += repeated([Job(sequence.name, "baseline")], widths, repetitions)
         for source in sources:
-            for width in _widths(source, widths, tested):
+            widths_of_source: list[Any] = [None]  # of ready-made masks
+            if source.has_label_maps:
+                widths_of_source = sorted(all_widths)
+            for width in widths_of_source:
                 job = Job(sequence.name, "masked", width, source=source.name)
                 estimators_of_width = [
                     estimator
@@ -122,28 +126,19 @@ def first_jobs(
     return jobs
 
 
-def _widths(
-    source: Source, widths: Mapping[str, Iterable[int]], tested: int | None
-) -> list[int] | list[None]:
-    """Return all dilation widths of a source's masks; ready-made masks have the width None."""
-    if not source.has_label_maps:
-        return [None]
-    all_widths = set().union(*widths.values())
-    if tested:
-        all_widths.add(tested)
-    return sorted(all_widths)
-
-
 def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
     """Return the controls that are masks, as far as a source and a sequence allow them."""
-    methods = list(MASK_CONTROLS)
+    left_out: tuple[str, ...] = ()
     width: int | None = tested
-    if not true_labels(sequence.root, sequence.name).is_dir():
-        methods.remove("true-labels")
     if not source.has_label_maps:
-        methods = [name for name in methods if name not in OF_LABEL_MAPS]
-        width = None
-    return [Job(sequence.name, method, width, source=source.name) for method in methods]
+        left_out, width = OF_LABEL_MAPS, None
+    elif not true_labels(sequence.root, sequence.name).is_dir():
+        left_out = ("true-labels",)
+    return [
+        Job(sequence.name, method, width, source=source.name)
+        for method in MASK_CONTROLS
+        if method not in left_out
+    ]
 
 
 def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:
@@ -162,27 +157,21 @@ def in_passes(
     """Divide jobs into lists, each for one pass over a sequence. sequences: by name.
 
     Each of several workers gets about PIECES passes, so that all end at about the same time. Jobs
-    with the same keypoints stay in one pass, where they share most of their work, unless that would
-    leave workers without one. A single worker gets one pass a sequence.
+    with the same keypoints stay in one pass, where they share most of their work. A single worker
+    gets one pass a sequence.
     """
-    jobs = list(jobs)
-    # jobs that are equal without these fields have the same keypoints
-    unshared: dict[str, Any] = {"estimator": "", "repetition": 0}
-    if len({replace(job, **unshared) for job in jobs}) < workers:
-        unshared = {"estimator": ""}
     groups: dict[Job, list[Job]] = {}
     for job in jobs:
-        groups.setdefault(replace(job, **unshared), []).append(job)
-    by_sequence: dict[str, list[list[Job]]] = {}
-    for key, group in groups.items():
-        by_sequence.setdefault(key.sequence, []).append(group)
+        same_keypoints = replace(job, estimator="", repetition=0)
+        groups.setdefault(same_keypoints, []).append(job)
     # work is measured in frames, of which a group of jobs reads each once
     work = sum(len(sequences[key.sequence]) for key in groups)
     passes: list[list[Job]] = []
-    for name, groups_of_sequence in by_sequence.items():
-        size = len(groups_of_sequence)
+    for name, sequence in sequences.items():
+        groups_of_sequence = [group for key, group in groups.items() if key.sequence == name]
+        size = len(groups) or 1
         if workers > 1:
-            size = max(1, round(work / (PIECES * workers) / len(sequences[name])))
+            size = max(1, round(work / (PIECES * workers) / len(sequence)))
         starts = range(0, len(groups_of_sequence), size)
         passes += [list(chain(*groups_of_sequence[start : start + size])) for start in starts]
     return passes

@@ -50,7 +50,6 @@ LARGEST_GRADIENT = 8 * 255  # |dx| + |dy| of 3x3 Sobel operators
 COVERAGE_TOLERANCE = 0.002  # of the frame
 SAMPLE = 12  # frames on which the distance between keypoints is chosen
 STEP = 0.1  # pixels between the distances that are tried
-SEED = 0  # of the random lines
 # All corrections together. No error was used to choose them: a label map of 320 columns places a
 # boundary within about 2 pixels of the frame, and within 10 pixels of its border the Lucas-Kanade
 # window of 21 pixels is cut off.
@@ -116,7 +115,7 @@ class RandomLines(OtherFrame):
 
         The index is `number` if none does.
         """
-        random = np.random.default_rng((SEED, index))
+        random = np.random.default_rng((0, index))
         height, width = shape
         start_x, start_y, angle, length = random.uniform(size=(number, 4)).T
         length = length * height / 2
@@ -185,27 +184,21 @@ class Method(NamedTuple):
     is_compared: bool = True
 
 
-def _corrected(settings: MaskSettings) -> MaskSettings:
-    return replace(CORRECTED, ids=settings.ids)
-
-
-def _keeping(keep: str) -> Callable[[MaskSettings], MaskSettings]:
-    return partial(replace, keep=keep)
-
-
 METHODS = {  # in the order in which they are shown
     "baseline": Method("all keypoints", has_masks=False),
     "masked": Method("masks"),
     "exact-boundaries": Method(
         "exact class boundaries", settings=partial(replace, boundaries="exact")
     ),
-    "corrected": Method("corrected mask", settings=_corrected),
+    "corrected": Method(
+        "corrected mask", settings=lambda settings: replace(CORRECTED, ids=settings.ids)
+    ),
     # as SLAM systems use a segmentation, see masks.KEEP
     "static-boundaries": Method(
-        "boundaries of static things", settings=_keeping("static-boundaries")
+        "boundaries of static things", settings=partial(replace, keep="static-boundaries")
     ),
-    "static": Method("all but movable things", settings=_keeping("static")),
-    "inverse": Method("all but the boundaries", settings=_keeping("inverse")),
+    "static": Method("all but movable things", settings=partial(replace, keep="static")),
+    "inverse": Method("all but the boundaries", settings=partial(replace, keep="inverse")),
     "true-labels": Method("true label maps", settings=partial(replace, ids="labels")),
     "other-frame": Method("mask of another frame", OtherFrame, is_control=True),
     "mirrored": Method("mirrored mask", Mirrored, is_control=True),
@@ -247,22 +240,19 @@ def min_distance(sequence: Sequence, number: float) -> float:
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
     frames = [sequence.frame(index) for index in sample]
 
-    def distance(steps: int) -> float:
-        return round(THESIS.min_distance + steps * STEP, 6)
-
-    def mean_number(steps: int) -> float:
-        settings = replace(THESIS, min_distance=distance(steps))
-        numbers = [len(detect(frame, settings)) for frame in frames]
-        return float(np.mean(numbers))
+    def mean_number(distance: float) -> float:
+        settings = replace(THESIS, min_distance=distance)
+        return float(np.mean([len(detect(frame, settings)) for frame in frames]))
 
     low, high = 0, round(min(sequence.size) / STEP)
-    counts = {low: mean_number(low)}
+    distances = [round(THESIS.min_distance + step * STEP, 6) for step in range(high)]
+    numbers = {distances[0]: mean_number(distances[0])}
     while high - low > 1:
         middle = (low + high) // 2
-        counts[middle] = mean_number(middle)
-        if counts[middle] > number:
+        distance = distances[middle]
+        numbers[distance] = mean_number(distance)
+        if numbers[distance] > number:
             low = middle
         else:
             high = middle
-    nearest = min(counts, key=lambda steps: abs(counts[steps] - number))
-    return distance(nearest)
+    return min(numbers, key=lambda distance: abs(numbers[distance] - number))

@@ -40,6 +40,7 @@ CODE = (
     "thesis_repro.odometry",
     "thesis_repro.masks",
     "thesis_repro.mask_files",
+    "thesis_repro.running.files",  # reads images
     "thesis_repro.data",
     "thesis_repro.study.jobs",
     "thesis_repro.study.methods",
@@ -114,8 +115,7 @@ def run_jobs(
         first = next(iter(reasons.values()))
         raise InputError(f"all {len(jobs)} odometry runs failed; the first: {first}")
     kept = len(jobs) - len(waiting)
-    failed = len(jobs) - len(rows)
-    return Outcome(pd.DataFrame(rows), len(rows) - kept, kept, failed, warnings)
+    return Outcome(pd.DataFrame(rows), len(rows) - kept, kept, len(jobs) - len(rows), warnings)
 
 
 @cache  # a study calls `run_jobs` again, with more jobs
@@ -145,14 +145,15 @@ def keypoint_controls(
         keypoints = compare.keypoints_left(compare.of_source(runs, source.name))
         width_of_source = width if source.has_label_maps else None
         for sequence in sequences:
-            name = sequence.name
-            if name not in keypoints:  # its runs with masks failed
+            if sequence.name not in keypoints:  # its runs with masks failed
                 continue
-            limit = max(1, round(keypoints[name]))  # OpenCV takes 0 as "no limit"
-            distance = min_distance(sequence, keypoints[name])
-            job = Job(name, "fewer", width_of_source, max_keypoints=limit, source=source.name)
-            spread = replace(job, method="spread", max_keypoints=None, min_distance=distance)
-            jobs += repeated([job, spread], estimators, repetitions)
+            number = keypoints[sequence.name]
+            job = Job(sequence.name, "fewer", width_of_source, source=source.name)
+            fewer = replace(
+                job, max_keypoints=max(1, round(number))
+            )  # OpenCV takes 0 as "no limit"
+            spread = replace(job, method="spread", min_distance=min_distance(sequence, number))
+            jobs += repeated([fewer, spread], estimators, repetitions)
     return jobs
 
 
@@ -172,10 +173,8 @@ def _run_passes(
 
     reasons: dict[Job, str] = {}
     with open_pool(processes, scheduler) as pool:
-        passes = in_passes(jobs, sequences, pool.size)
         calls = []
-        # the longest first, so that all workers end at about the same time
-        for pass_jobs in sorted(passes, key=frames, reverse=True):
+        for pass_jobs in in_passes(jobs, sequences, pool.size):
             sequence = sequences[pass_jobs[0].sequence]
             record = results.record(folder / sequence.name)
             calls.append((pass_jobs, sequence, sources, folder, record, scale_gate))
@@ -240,31 +239,25 @@ def checked_masks(
     middle of a pass would stop the whole pass. Jobs with the same masks get the same object, by
     which `run_many` recognises that they share work.
     """
+    check = cache(Source.check_file)  # several masks are made from one file
 
     @cache
-    def check(source: Source, path: Path) -> None:
-        source.check_file(path, sequence.size)
-
-    @cache
-    def masks_or_reason(method: str, source_name: str, width: int | None) -> Any:
-        source = sources[source_name]
-        try:
-            masks = masks_of_method(method, source, sequence, width)
-            for path in masks.paths:
-                check(source, path)
-        except InputError as error:
-            return str(error)
+    def checked(method: str, source_name: str, width: int | None) -> ControlMasks:
+        masks = masks_of_method(method, sources[source_name], sequence, width)
+        for path in masks.paths:
+            check(sources[source_name], path, sequence.size)
         return masks
 
-    masks_by_job, reasons = {}, {}
+    masks_by_job: dict[Job, ControlMasks | None] = {}
+    reasons = {}
     for job in jobs:
-        masks = None
-        if METHODS[job.method].has_masks:
-            masks = masks_or_reason(job.method, job.source, job.dilation_width)
-        if isinstance(masks, str):
-            reasons[job] = masks
-        else:
-            masks_by_job[job] = masks
+        try:
+            masks_by_job[job] = None
+            if METHODS[job.method].has_masks:
+                masks_by_job[job] = checked(job.method, job.source, job.dilation_width)
+        except InputError as error:
+            del masks_by_job[job]
+            reasons[job] = str(error)
     return masks_by_job, reasons
 
 
@@ -286,9 +279,10 @@ def _run_pass(
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
         masks_by_job, reasons = checked_masks(_unfinished(jobs, folder), sequence, sources)
-        runs = {}
-        for job, masks in masks_by_job.items():
-            runs[job.name] = replace(job.settings, scale_gate=scale_gate), masks
+        runs = {
+            job.name: (replace(job.settings, scale_gate=scale_gate), masks)
+            for job, masks in masks_by_job.items()
+        }
         run_results = odometry.run_many(sequence, runs)
         for job in masks_by_job:
             frames = run_results[job.name].frames
@@ -342,7 +336,7 @@ def path_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
     """Return {(sequence, run): estimated poses (n, 4, 4)} for each row of a table of runs."""
-    paths = {}
-    for name, run in zip(runs["sequence"], runs["run"], strict=True):
-        paths[name, run] = poses_of(pd.read_csv(folder / name / f"{run}.csv"))
-    return paths
+    return {
+        (name, run): poses_of(pd.read_csv(folder / name / f"{run}.csv"))
+        for name, run in zip(runs["sequence"], runs["run"], strict=True)
+    }

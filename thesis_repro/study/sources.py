@@ -63,20 +63,12 @@ class Source:
         else:
             read_mask(path, size)
 
-    def record(self, sequence: str) -> dict[str, str | None]:
+    def record(self, sequence: str) -> dict[str, str]:
         """Return the digests and settings that the results of a sequence depend on."""
-        folder = self.sequence_folder(sequence)
-        record: dict[str, str | None] = {
-            self.kind: results.digest_of_files(listed(folder)),
-            "made_from": None,
-        }
-        if results.record(folder) is not None:
-            record["made_from"] = results.made_from(folder)
+        digest = results.digest_of_files(listed(self.sequence_folder(sequence)))
         if self.has_label_maps:
-            record["settings"] = str(self.settings)
-        else:
-            record["invert"] = str(self.invert)
-        return record
+            return {self.kind: digest, "settings": str(self.settings)}
+        return {self.kind: digest, "invert": str(self.invert)}
 
 
 def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:

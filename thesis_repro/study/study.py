@@ -8,8 +8,8 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS
 from thesis_repro.running import results
-from thesis_repro.study import jobs, runner, sources
-from thesis_repro.study.sources import FileMasks, Source
+from thesis_repro.study import compare, jobs, runner, sources
+from thesis_repro.study.sources import Source
 
 RUNS = "runs"  # folder of the results of the runs
 
@@ -42,53 +42,19 @@ class Study:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
         if self.repetitions < 1:
             raise InputError(f"--repetitions {self.repetitions}: must be 1 or more")
-        if self.tested is not None and self.tested < 1:
-            raise InputError(
-                f"--controls {self.tested}: must be a dilation width, 1 or more pixels"
-            )
-        sequences = self.opened
-        for sequence in sequences:
+        for sequence in self.opened:
             if len(sequence) < 3:
                 raise InputError(
                     f"{sequence.folder}: {len(sequence)} frames; a study needs 3 or more"
                 )
+            if sequence.name in compare.COLUMNS:
+                raise InputError(
+                    f"{sequence.folder}: has the name of a column of the tables; rename the sequence"
+                )
         widths = list(self.widths)
-        if self.tested:
+        if self.tested is not None:
             widths.append(self.tested)
-        sources.check(self.sources, sequences, widths)
-
-    @property
-    def shown_width(self) -> int | None:
-        """The dilation width (pixels) of the masks in figures.
-
-        It is the tested width, or else the middle one; None for only ready-made masks.
-        """
-        if self.tested:
-            return self.tested
-        if not self.widths:
-            return None
-        return self.widths[len(self.widths) // 2]
-
-    def shown_masks(self) -> list[tuple[Sequence, list[FileMasks]]]:
-        """Return each sequence with the masks of each source, at the `shown_width`."""
-        return [
-            (sequence, [source.masks(sequence, self.shown_width) for source in self.sources])
-            for sequence in self.opened
-        ]
-
-    def shown_jobs(self, name: str) -> list[jobs.Job]:
-        """Return the runs of a sequence whose paths are drawn.
-
-        They are all keypoints and the masks of each source.
-        """
-        estimator = "thesis"
-        if "refined" in self.estimators:
-            estimator = "refined"
-        shown = [jobs.Job(name, "baseline", estimator=estimator)]
-        for source in self.sources:
-            width = self.shown_width if source.has_label_maps else None
-            shown.append(jobs.Job(name, "masked", width, estimator=estimator, source=source.name))
-        return shown
+        sources.check(self.sources, self.opened, widths)
 
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
         """Run the jobs whose results are not in the folder yet, see `runner.run_jobs`.

@@ -1,0 +1,78 @@
+"""The commands and Python examples of the README and of docs run."""
+
+import re
+import shlex
+
+import cv2
+import numpy as np
+import pytest
+
+from thesis_repro.command import cli
+from thesis_repro.command.options import build_parser
+from thesis_repro.running.settings import ROOT
+
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(path, language):
+    return re.findall(rf"```{language}\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
+def test_commands_in_texts_have_their_options(path):
+    parser = build_parser(cli.COMMANDS)
+    for block in blocks(path, "sh"):
+        for line in block.replace("\\\n", " ").splitlines():
+            program, *words = shlex.split(line, comments=True) or [""]
+            if program.endswith("thesis-repro"):
+                assert parser.parse_args(words).command
+
+
+def test_the_example_of_the_readme_compares_three_paths(small_world, tmp_path, monkeypatch, capsys):
+    (example,) = blocks(ROOT / "README.md", "python")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "world").symlink_to(small_world)
+    (tmp_path / "labels").symlink_to(small_world / "kitti/sequences/00/labels_0")
+    names = {}
+    exec(example, names)
+    paths = names["baseline"], names["masked"], names["few"]
+    assert [len(path.poses) for path in paths] == [12, 12, 12]
+    every, masked, few = [path.frames["detected"].mean() for path in paths]
+    assert few == 200 and 200 < masked < every
+    assert len(capsys.readouterr().out.splitlines()) == 3
+
+
+@pytest.fixture
+def examples(small_world, tmp_path, monkeypatch):
+    """The Python examples on own masks, run in a folder with frames and a video of a drive."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames").symlink_to(small_world / "kitti/sequences/00/image_0")
+    images = [cv2.imread(str(path)) for path in sorted((tmp_path / "frames").iterdir())]
+    height, width = images[0].shape[:2]
+    video = cv2.VideoWriter("drive.mp4", cv2.VideoWriter_fourcc(*"mp4v"), 25, (width, height))
+    for image in images:
+        video.write(image)
+    video.release()
+    results = []
+    for example in blocks(ROOT / "docs/own-masks.md", "python"):
+        names = {}
+        exec(example, names)
+        results.append(names)
+    return images, results
+
+
+def test_the_examples_on_own_masks_run(examples, tmp_path):
+    images, (masks, calls, _) = examples
+    step, mask = masks["step"], masks["mask_of"](images[-1][..., 0])
+    u, v = step.keypoints.astype(int).T
+    assert len(u) > 100 and mask[v, u].all()
+    assert step.previous.shape == step.current.shape == (len(step.inliers), 2)
+    assert 10 < np.linalg.norm(step.pose[:3, 3]) < 11.1  # eleven steps of a metre
+    picture = cv2.imread("keypoints.png")
+    assert np.count_nonzero((picture != picture[..., :1]).any(axis=2)) > 1000
+    for image in images[:3]:
+        step = calls["odometry"].step(image[..., 0], 1.0)
+    assert step.updated and step.inliers.sum() > 50
+    first = cv2.imread("my-drive/000000.png", cv2.IMREAD_UNCHANGED)
+    assert len(list((tmp_path / "my-drive").iterdir())) == len(images)
+    assert first.ndim == 2 and first.dtype == np.uint8
