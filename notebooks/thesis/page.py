@@ -123,6 +123,7 @@ def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
     real = replace(settings, figures=settings.figures / REAL, kitti_is_embedded=False)
     numbers = beside_the_thesis(real)
     chapter = [
+        *captions.EVIDENCE,
         *captions.CHAPTERS["Chapter 4: results"],
         *(artefact for artefact in captions.ADDED if artefact["name"] in ("comparison", "widths")),
     ]
