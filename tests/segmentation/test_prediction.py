@@ -1,6 +1,5 @@
 """Predicted label maps, model files, and the quality of label maps."""
 
-
 import cv2
 import h5py
 import keras
