@@ -178,9 +178,9 @@ def main():
     folders = [("labels", None, Path(path)) for path in sys.argv[1:]]
     others = named(folders, masks.MaskSettings())
     folder = settings.build / "evidence"
-    with results.claimed(folder), messages.logged(folder, "tables, plots and findings") as run:
+    with results.claimed(folder):
         write(settings, FOLDER, others)
-        run.end(f"tables, plots and findings: {FOLDER}")
+        messages.summary(f"tables, plots and findings: {FOLDER}")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,9 @@ from thesis_repro.study.methods import masks_of_method, true_labels
 from thesis_repro.study.sources import Source
 
 SMALL = [ID[name] for name in ("pole", "traffic light", "traffic sign", "person")]
-SHADOW = 0.7  # of the median road of a frame: in the embedded world nearly all darker pixels are
+SHADOW = (
+    0.7  # of the median road of a frame; darker road counts as shadow, in rendered frames rightly
+)
 UNMASKED = "all keypoints"  # in the table of times
 FRAMES = 12  # of each sequence whose label maps are compared with the exact ones
 

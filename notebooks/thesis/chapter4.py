@@ -77,10 +77,8 @@ def figure_4_03(
     label_maps = {"prediction": prediction}
     if label_map is not None:
         label_maps["true label map"] = label_map
-    pictures = {title: frame}
-    for name, classes in label_maps.items():
-        pictures[name] = style.label_colors(classes, frame)
-    return frames.pictures(frame, pictures, label_maps=label_maps.values())
+    colored = {name: style.label_colors(ids, frame) for name, ids in label_maps.items()}
+    return frames.pictures(frame, {title: frame, **colored}, label_maps=label_maps.values())
 
 
 def figure_4_04(
