@@ -103,18 +103,19 @@ def begin(command, where, number):
 def stop(process, number):
     """Send a signal: Ctrl-C to all processes, as a terminal does, others to the first one.
 
+    SIGKILL stops all of make's, as a crash would: make alone could not tell those that it started.
     All its processes must end, and unless it is killed it must say so in one line.
     """
-    processes = family(process)
-    if number == signal.SIGINT:
+    processes, is_make = family(process), "make" in process.args
+    if number == signal.SIGINT or is_make and number == signal.SIGKILL:
         os.killpg(process.pid, number)
     else:
         process.send_signal(number)
     stdout, stderr = process.communicate(timeout=60)
     assert psutil.wait_procs(processes, 20)[1] == []
     assert process.returncode != 0 and "Traceback" not in stderr, stderr
-    is_told = "make" not in process.args and number != signal.SIGKILL
-    if is_told and not stdout:  # the summary of a whole run
+    # what a whole run prints is its summary
+    if number != signal.SIGKILL and not is_make and not stdout:
         assert process.returncode == 128 + number and stderr.count("stopped") == 1, stderr
 
 
