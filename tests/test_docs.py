@@ -75,4 +75,4 @@ def test_the_examples_on_own_masks_run(examples, tmp_path):
     assert step.updated and step.inliers.sum() > 50
     first = cv2.imread("my-drive/000000.png", cv2.IMREAD_UNCHANGED)
     assert len(list((tmp_path / "my-drive").iterdir())) == len(images)
-    assert first.shape == images[0].shape[:2]
+    assert first.ndim == 2 and first.dtype == np.uint8

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import pandas as pd
 
 from thesis_repro.running import files
-from thesis_repro.running.messages import LOG
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import ARITHMETIC
 
@@ -101,19 +100,18 @@ def kill(process):
 
 
 def snapshot(where):
-    """{path: (size, date)} of all files below a folder but logs; True for folders.
+    """{path: (size, date)} of all files below a folder; True for folders.
 
     Files may vanish meanwhile.
     """
     versions = {}
     for folder, folders, names in os.walk(where):
         for name in (*folders, *names):
-            if name != LOG:
-                path = Path(folder, name)
-                with suppress(FileNotFoundError):
-                    status = path.lstat()
-                    version = name in folders or (status.st_size, status.st_mtime_ns)
-                    versions[path.relative_to(where)] = version
+            path = Path(folder, name)
+            with suppress(FileNotFoundError):
+                status = path.lstat()
+                version = name in folders or (status.st_size, status.st_mtime_ns)
+                versions[path.relative_to(where)] = version
     return versions
 
 
@@ -142,14 +140,14 @@ def refused(result, named, code=1, left=()):
 
 
 def contents(folder):
-    """{path: digest} of all files below a folder but logs.
+    """{path: digest} of all files below a folder.
 
     Times in tables, which differ between runs, are left out.
     """
     return {
         str(path.relative_to(folder)): sha256(_content(path)).hexdigest()
         for path in Path(folder).rglob("*")
-        if path.is_file() and path.name != LOG
+        if path.is_file()
     }
 
 

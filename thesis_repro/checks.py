@@ -5,9 +5,10 @@ can only be guessed is not checked: the figures of a study show frames, masks an
 """
 
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from thesis_repro.data import cityscapes, kitti
 from thesis_repro.errors import InputError, one_line
 from thesis_repro.mask_files import LabelMasks, MaskFolder, label_map_of
 from thesis_repro.masks import coverage
-from thesis_repro.running import files, messages, results
+from thesis_repro.running import files, messages
 from thesis_repro.running.settings import read_settings
 
 # Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
@@ -30,66 +31,65 @@ MAX_DROPPED = 0.1  # share of a run's steps
 # Problems of folders
 
 
-def _attempt(problems: list[str], function: Callable, *arguments: Any) -> Any:
-    """Return the result of a function; an InputError becomes one of the problems instead."""
-    try:
-        return function(*arguments)
-    except InputError as error:
-        problems.append(str(error))
+def _damaged(read: Callable, items: Collection, description: str) -> list[str]:
+    """Read every item in threads, because decoding releases Python's lock; return the problems."""
 
+    def problem(item: Any) -> list[str]:
+        try:
+            read(item)
+        except InputError as error:
+            return [str(error)]
+        return []
 
-def _attempt_each(
-    problems: list[str], function: Callable, items: Collection, description: str
-) -> None:
-    """Call a function for every item in threads; reading and decoding release Python's lock."""
     with ThreadPoolExecutor() as threads:
-        done = threads.map(partial(_attempt, problems, function), items)
-        list(files.progress(done, description, total=len(items), unit="file"))
+        done = threads.map(problem, items)
+        return list(chain(*files.progress(done, description, total=len(items), unit="file")))
 
 
-def check_kitti(root: Path) -> tuple[list[str], list[str]]:
-    """Check all sequences below an odometry root, and decode every frame.
+def check_kitti(root: Path) -> list[str]:
+    """Check all sequences below an odometry root, decode every frame, and print what there is.
 
-    Returns (lines that describe the sequences, problems). Of each sequence, this names the first
-    problem with its names, calibration, times and poses, or else all frames that are damaged.
+    Returns problems: of each sequence the first one with its names, calibration, times and poses,
+    or else all frames that are damaged.
+    Raises InputError for a folder of another layout, and if no sequence has ground truth.
     """
-    facts: list[str] = []
     problems: list[str] = []
-    with_truth = _attempt(problems, kitti.sequences, root) or []
+    with_truth = kitti.sequences(root)
     for name in kitti.with_frames(root):
-        sequence = _attempt(problems, kitti.Sequence, root, name)
-        if _attempt(problems, getattr, sequence, "size", None):
+        try:
+            sequence = kitti.Sequence(root, name)
             height, width = sequence.size
-            facts.append(
-                f"sequence {name}: {len(sequence)} frames of {width}x{height}; with ground truth: "
-                f"{sequence.has_truth}; with times: {sequence.has_times}"
-            )
-            facts += of_sequence(sequence)
             if name in with_truth:
-                _attempt(problems, getattr, sequence, "poses")
-            _attempt_each(problems, sequence.frame, range(len(sequence)), f"sequence {name}")
-    return facts, sorted(problems)
+                sequence.poses  # noqa: B018  raises InputError if there are none
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        fact = (
+            f"sequence {name}: {len(sequence)} frames of {width}x{height}; with ground truth: "
+            f"{sequence.has_truth}; with times: {sequence.has_times}"
+        )
+        print("\n".join(f"  {one_line(line)}" for line in [fact, *of_sequence(sequence)]))
+        problems += _damaged(sequence.frame, range(len(sequence)), f"sequence {name}")
+    return sorted(problems)
 
 
-def check_cityscapes(
-    root: Path, splits: Iterable[str] = ("train", "val")
-) -> tuple[list[str], list[str]]:
-    """Check the training and validation split, and decode every image and label map.
-
-    Returns (lines that describe the splits, problems).
-    """
-    facts: list[str] = []
+def check_cityscapes(root: Path, splits: Iterable[str] = ("train", "val")) -> list[str]:
+    """Check the splits, decode every image and label map, and return problems."""
     problems: list[str] = []
 
-    def check_pair(pair: cityscapes.Pair) -> None:
+    def read_pair(pair: cityscapes.Pair) -> None:
         size = files.read_gray(pair.image).shape
         kitti.check_size(pair.label, cityscapes.read_label_map(pair.label).shape, size, "its image")
 
     for split in splits:
-        pairs = _attempt(problems, cityscapes.pairs, root, split) or []
-        facts.append(f"split {split}: {len(pairs)} images with label maps")
-        _attempt_each(problems, check_pair, pairs, f"split {split}")
-    return facts, sorted(problems)
+        try:
+            pairs = cityscapes.pairs(root, split)
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        print(f"  split {split}: {len(pairs)} images with label maps")
+        problems += _damaged(read_pair, pairs, f"split {split}")
+    return sorted(problems)
 
 
 def report(
@@ -108,9 +108,8 @@ def report(
         (kitti_semantic, partial(check_cityscapes, splits=["train"])),
     ):
         if root:
-            facts, problems_of_root = check(root)
-            print("\n  ".join(map(one_line, [root, *facts])))
-            problems += problems_of_root
+            print(one_line(root))
+            problems += check(root)
     for problem in problems:
         print(f"wrong: {one_line(problem)}", file=sys.stderr)
     return not problems
@@ -119,36 +118,29 @@ def report(
 def main(path: Path) -> int:
     """Check the data that the environment's settings name, unless it was checked before.
 
-    path: file with the digest of the files that were checked; it is written after a check without
-    problems. Returns the exit code. Raises InputError if a file is missing.
+    path: file with the names, sizes and times of the files that were checked; it is written after a
+    check without problems. Returns the exit code. Raises InputError if a file is missing.
     """
     settings = read_settings()
-    roots = [settings.kitti, settings.cityscapes, settings.kitti_semantic]
-    if settings.kitti_is_embedded:
-        roots[0] = None
-    if settings.cityscapes_is_embedded:
-        roots[1] = None
-    digest = results.digest_of_files(_used_files(roots, settings.sizes.frames))
-    if path.is_file() and path.read_text(encoding="utf-8") == digest:
+    roots: list[Path | None] = [None, None, settings.kitti_semantic]
+    used: list[Path] = []
+    if not settings.kitti_is_embedded:
+        roots[0] = settings.kitti
+        for name in kitti.sequences(settings.kitti):
+            used += kitti.Sequence(settings.kitti, name).subset(settings.sizes.frames).files
+    if not settings.cityscapes_is_embedded:
+        roots[1] = settings.cityscapes
+    for root, split in ((roots[1], "train"), (roots[1], "val"), (roots[2], "train")):
+        if root:
+            used += chain(*[pair[1:] for pair in cityscapes.pairs(root, split)])
+    lines = [f"{file} {file.stat().st_size} {file.stat().st_mtime_ns}\n" for file in used]
+    checked = ascii("".join(lines))  # names may hold any bytes
+    if path.is_file() and path.read_text(encoding="utf-8") == checked:
         return 0
     if not report(*roots):
         return 1
-    files.write_text(path, digest)
+    files.write_text(path, checked)
     return 0
-
-
-def _used_files(roots: list[Path | None], frames: int | None) -> Iterator[Path]:
-    """Yield the user's files that a run reads. Raises InputError for the first problem.
-
-    roots: folders of KITTI, Cityscapes and KITTI's street scenes; None for no such folder.
-    """
-    if roots[0]:
-        for name in kitti.sequences(roots[0]):
-            yield from kitti.Sequence(roots[0], name).subset(frames).files
-    for root, split in ((roots[1], "train"), (roots[1], "val"), (roots[2], "train")):
-        if root:
-            for pair in cityscapes.pairs(root, split):
-                yield from pair[1:]
 
 
 # Warnings, one line each: "place: what is wrong"
@@ -189,12 +181,13 @@ def of_run(
     return warnings
 
 
-def of_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) -> list[str]:
-    """Warn of what is certainly wrong with the masks of a sequence, seen on MASK_SAMPLES of them.
+def of_masks(source: LabelMasks | MaskFolder) -> list[str]:
+    """Warn of what is certainly wrong with masks, seen on MASK_SAMPLES of them.
 
     Raises InputError if one of them cannot be read.
     """
-    folder, shares = source.paths[0].parent, _shares_kept(source)
+    folder = source.paths[0].parent
+    shares = [coverage(source[index]) for index in _sampled(source)]
     if isinstance(source, LabelMasks) and source.settings.ids == "labels":
         ids = np.flatnonzero(_class_shares(source))
         if ids.max() < len(cityscapes.TRAINED):
@@ -212,29 +205,18 @@ def of_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) -> list[
             f"{folder}: masks keep {min(shares):.1%} to {max(shares):.1%} of the frames; --invert "
             "inverts ready-made masks"
         ]
-    made_from = (results.record(folder) or {}).get("frames")
-    frames = kitti.frames_in(sequence.frame_paths[0].parent)
-    # a study may use only the first frames
-    used = sequence.frame_paths, frames, frames[: len(files.listed(folder))]
-    if made_from and made_from not in map(results.digest_of_files, used):
-        return [f"{folder}: was made from other frames"]
     return []
 
 
 def describe_masks(source: LabelMasks | MaskFolder, sequence: kitti.Sequence) -> str:
     """Return one line that says what masks of a sequence keep, and what label maps hold."""
-    share = np.mean(_shares_kept(source))
+    share = np.mean([coverage(source[index]) for index in _sampled(source)])
     line = f"{source.paths[0].parent}: masks keep {share:.1%} of {sequence.name}"
     if isinstance(source, LabelMasks):
         shares = zip(cityscapes.LABELS, _class_shares(source), strict=False)
         held = [f"{label.name} {share:.0%}" for label, share in shares if share >= MIN_SHARE]
         line += f" (width {source.dilation_width}); label maps hold {', '.join(held)}"
     return line
-
-
-def _shares_kept(source: LabelMasks | MaskFolder) -> list[float]:
-    """Return the share of the frame that each sampled mask keeps."""
-    return [coverage(source[index]) for index in _sampled(source)]
 
 
 def _sampled(source: LabelMasks | MaskFolder) -> list[int]:

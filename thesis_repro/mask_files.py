@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thesis_repro.data.cityscapes import read_label_map
+from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence, check_size
-from thesis_repro.errors import InputError, need
+from thesis_repro.errors import InputError
 from thesis_repro.masks import (
     THESIS_MASKS,
     MaskSettings,
@@ -20,7 +20,7 @@ from thesis_repro.masks import (
     forbidden,
 )
 from thesis_repro.running import results
-from thesis_repro.running.files import listed, numbers_of, progress, read_gray, write_png
+from thesis_repro.running.files import listed, progress, read_gray, write_png
 
 ENDINGS = (".png", ".jpg", ".jpeg")  # of masks, in small or capital letters
 MAX_GRAY = 0.2  # share of a mask's pixels; label maps have more, edges of JPEG files less
@@ -41,28 +41,17 @@ class LabelMasks:
         dilation_width: int,
         settings: MaskSettings = THESIS_MASKS,
     ) -> None:
-        need("settings", settings, MaskSettings)
         self.paths = _paths_by_frame(folder, sequence, "label map")
         self.frame_paths = sequence.frame_paths
         self.size = sequence.size
         self.dilation_width = dilation_width
         self.settings = settings
         check_width(dilation_width, self.size)
-        for name, pixels, limit in (
-            ("margin", settings.margin, (min(self.size) - 1) // 2),
-            ("movable", settings.movable or 0, max(self.size) - 1),
-        ):
-            if pixels > limit:
-                raise InputError(
-                    f"{name}={pixels}: leaves nothing of frames of {self.size[1]}x{self.size[0]}; give at "
-                    f"most {limit} pixels"
-                )
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        need("index", index, int | np.integer)
         edge_image, forbidden_pixels = _undilated(
             _version(self.paths[index]), self.size, self.settings
         )
@@ -71,7 +60,7 @@ class LabelMasks:
 
 def label_map_of(masks: LabelMasks, index: int) -> np.ndarray:
     """Label map of frame `index`, in label ids."""
-    return read_label_map(masks.paths[index], masks.settings.ids == "train")
+    return label_ids.read(masks.paths[index], masks.settings.ids)
 
 
 # Masks of several widths share edges, and masks of several settings share label maps. A control
@@ -88,13 +77,13 @@ def _undilated(
     version: tuple[Path, int, int], size: tuple[int, int], settings: MaskSettings
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """The edges and the forbidden pixels of a label map's file."""
-    label_map = _read_once(version, settings.ids == "train")
+    label_map = _read_once(version, settings.ids)
     return edges(label_map, size, settings), forbidden(label_map, size, settings)
 
 
 @lru_cache(maxsize=2)
-def _read_once(version: tuple[Path, int, int], train_ids: bool) -> np.ndarray:
-    return read_label_map(version[0], train_ids)
+def _read_once(version: tuple[Path, int, int], ids: str) -> np.ndarray:
+    return label_ids.read(version[0], ids)
 
 
 def forget_edges() -> None:
@@ -115,9 +104,10 @@ def write_masks(masks: LabelMasks, folder: str | Path) -> None:
             labels=results.digest_of_files(masks.paths),
             size=masks.size,
             **asdict(masks.settings),
+            **label_ids.record(masks.settings.ids),
             dilation_width=masks.dilation_width,
             frames=results.digest_of_files(masks.frame_paths),
-            code=results.digest_of_code("thesis_repro.masks", "thesis_repro.data.cityscapes"),
+            code=results.digest_of_code("thesis_repro.masks", "thesis_repro.data"),
             **results.made_with("opencv"),
         )
         for index, path in enumerate(progress(masks.paths, f"masks, width {masks.dilation_width}")):
@@ -143,7 +133,6 @@ class MaskFolder:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        need("index", index, int | np.integer)
         mask = read_mask(self.paths[index], self.size)
         if self.invert:
             return cv2.bitwise_not(mask)
@@ -189,16 +178,20 @@ def folder_of_sequence(folder: str | Path, sequence: str) -> Path:
     """
     folder = Path(folder)
     subfolder = folder / sequence
-    if not subfolder.is_dir() and any(folder.glob("[!.]*.png")):
+    if not subfolder.is_dir() and _images_by_name(folder):
         return folder
     return subfolder
 
 
 def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[Path]:
     """One path a frame to its mask or label map. Raises InputError if one is missing."""
-    need("sequence", sequence, Sequence)
     if kind == "mask" and Path(folder).is_file():
         return [Path(folder)] * len(sequence)
+    if sequence.distortion.any():
+        raise InputError(
+            f"{folder}: {kind}s of raw frames do not fit frames without distortion; undistort the frames "
+            "before their label maps are made, and leave out --calibration"
+        )
     folder = folder_of_sequence(folder, sequence.name)
     if not folder.is_dir():
         raise InputError(
@@ -210,36 +203,23 @@ def _paths_by_frame(folder: str | Path, sequence: Sequence, kind: str) -> list[P
         present = _images_by_name(folder)
     if kind == "mask" and len(present) == 1:
         single = next(iter(present.values()))
-        # a single mask named as frames are is the mask of one frame only
-        if not _is_named_as_a_frame(single, sequence):
+        # a single mask with the name of a frame, also outside of a subset, is that frame's
+        frames = listed(sequence.frame_paths[0].parent, "*")
+        if single.stem not in {name for path in frames for name in (path.stem, path.name)}:
             return [single] * len(sequence)
-    paths: list[Path] = []
-    missing: list[str] = []
-    for name, frame in zip(sequence.label_names, sequence.frame_paths, strict=True):
-        # some tools append .png to the whole name
-        path = present.get(name) or present.get(f"{frame.name}.png")
-        if path is None:
-            missing.append(name)
-        else:
-            paths.append(path)
+    # some tools append .png to the whole name
+    appended = {f"{frame.name}.png": f"{frame.stem}.png" for frame in sequence.frame_paths}
+    present = {appended.get(name, name): path for name, path in present.items()}
+    missing = [name for name in sequence.label_names if name not in present]
     if missing:
         raise InputError(
             f"{folder / missing[0]}: no such {kind} ({len(missing)} of {len(sequence)} frames of sequence "
             f"{sequence.name} have none); each frame needs one"
         )
-    return paths
+    return [present[name] for name in sequence.label_names]
 
 
 def _images_by_name(folder: Path) -> dict[str, Path]:
     """Return the masks of a folder by their names with the ending .png."""
     paths = [path for path in listed(folder, "*") if path.suffix.lower() in ENDINGS]
     return {f"{path.stem}.png": path for path in paths}
-
-
-def _is_named_as_a_frame(mask: Path, sequence: Sequence) -> bool:
-    """Whether a mask is that of one frame, by its name, with or without an appended .png."""
-    for frame in listed(sequence.frame_paths[0].parent, "*"):  # those outside of a subset, too
-        if mask.name in (f"{frame.stem}.png", f"{frame.name}.png"):
-            return True
-    stem = mask.name.removesuffix(".png").removesuffix(".png")
-    return numbers_of([*sequence.frame_paths, Path(stem)]) is not None

@@ -5,13 +5,13 @@ where it is 0.
 """
 
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Integral
 
 import cv2
 import numpy as np
 
 from thesis_repro.data.cityscapes import ID, N_CLASSES
-from thesis_repro.errors import InputError, need
+from thesis_repro.errors import InputError
 
 CANNY = (5, 15)  # both thresholds (Section 3.6)
 
@@ -52,8 +52,7 @@ def dilate(edge_image: np.ndarray, dilation_width: int, symmetric: bool = False)
 def check_width(dilation_width: int, size: tuple[int, int]) -> None:
     """Raise InputError if a dilation width is not possible for frames of (height, width)."""
     limit = 2 * max(size)  # a wider square always covers the whole frame
-    is_whole_number = isinstance(dilation_width, Integral) and not isinstance(dilation_width, bool)
-    if not is_whole_number or not 1 <= dilation_width <= limit:
+    if not isinstance(dilation_width, Integral) or not 1 <= dilation_width <= limit:
         raise InputError(
             f"dilation width {dilation_width!r}: must be a whole number from 1 to {limit} pixels for "
             f"frames of {size[1]}x{size[0]}"
@@ -62,13 +61,13 @@ def check_width(dilation_width: int, size: tuple[int, int]) -> None:
 
 # Other kinds of masks. MaskSettings chooses among them; its defaults are the thesis's.
 
-BOUNDARIES, IDS = ("canny", "exact"), ("labels", "train")
+BOUNDARIES = ("canny", "exact")
 CLASS_EDGE_WINDOW = 5  # side in pixels: a Canny edge belongs to a boundary up to two pixels away
 MOVABLE = tuple(range(ID["person"], ID["license plate"] + 1))  # people and vehicles, parked or not
 # Where keypoints are allowed: on boundaries, as in the thesis, or as in published SLAM systems with
 # segmentation.
 KEEP = ("boundaries", "static", "inverse", "static-boundaries")
-CHOICES = {"boundaries": BOUNDARIES, "keep": KEEP, "ids": IDS, "symmetric": (False, True)}
+CHOICES = {"boundaries": BOUNDARIES, "keep": KEEP}
 # pixels around movable objects that DynaSLAM excludes as well (in its Frame.cc)
 DYNASLAM_MARGIN = 15
 
@@ -91,8 +90,9 @@ class MaskSettings:
     keypoints are allowed there, except with "static".
     margin: no keypoints within this many pixels of the frame's border. Points there are lost in the
     next frame, and networks that pad with zeros predict false boundaries there.
-    ids: ids in the files, Cityscapes' "labels" or its "train" ids (`cityscapes.TRAINED`).
-    Raises InputError for an unknown name, a bad number, or no tuple where one belongs.
+    ids: what the files hold: Cityscapes' ids ("labels"), its "train" ids or its "colors", or else
+    what the table of this file names, see data/label_ids.
+    Raises InputError for an unknown name or a bad number of pixels.
     """
 
     boundaries: str = "canny"
@@ -105,14 +105,8 @@ class MaskSettings:
     canny: tuple[float, float] = CANNY
 
     def __post_init__(self) -> None:
-        for name, example in (("classes", '("sky",)'), ("canny", "(5, 15)")):
-            values = getattr(self, name)
-            if not isinstance(values, (tuple, list)):  # a list, if read from JSON
-                raise InputError(f"{name}={values!r}: must be a tuple, such as {example}")
-            object.__setattr__(self, name, tuple(values))
-        thresholds = [value for value in self.canny if isinstance(value, Real) and value >= 0]
-        if len(self.canny) != 2 or len(thresholds) != 2:
-            raise InputError(f"canny={self.canny}: must be two numbers from 0 on, such as (5, 15)")
+        for name in ("classes", "canny"):  # they are lists, if read from JSON
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, choices in CHOICES.items():
             value = getattr(self, name)
             if value not in choices:
@@ -139,11 +133,9 @@ def keypoint_mask(
     """Keypoint mask of one frame from its label map, (height, width) uint8.
 
     Edges are dilated, inverted if `keep` says so, and the forbidden pixels are taken out.
-    Raises InputError unless the label map is (h, w) uint8 label ids, and for another kind of size
-    or settings.
+    Raises InputError unless the label map is (h, w) label ids.
     """
-    need("settings", settings, MaskSettings)
-    label_map = _checked(label_map, size)
+    label_map = _checked(label_map)
     if settings == THESIS_MASKS:
         return thesis_mask(label_map, size, dilation_width)
     edge_image = edges(label_map, size, settings)
@@ -232,10 +224,8 @@ def forbidden(
     return is_forbidden
 
 
-def _checked(label_map: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a label map as an array, or raise InputError for another kind of map or size."""
-    if np.shape(size) != (2,) or not all(isinstance(side, Integral) and side > 0 for side in size):
-        raise InputError(f"size: must be (height, width) of the frame in pixels, not {size}")
+def _checked(label_map: np.ndarray) -> np.ndarray:
+    """Return a label map as an array, or raise InputError for another kind of map."""
     label_map = np.asarray(label_map)
     if label_map.ndim != 2 or not label_map.size or label_map.dtype.kind not in "ui":
         raise InputError(

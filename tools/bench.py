@@ -1,4 +1,4 @@
-"""Measure what odometry and segmentation cost on this machine, as ratios.
+"""Measure what odometry and masks cost on this machine, as ratios.
 
 Usage: python tools/bench.py --kitti ROOT.
 
@@ -7,13 +7,11 @@ counts. Prints a table and writes it as JSON. A slow machine is no error.
 """
 
 import argparse
-import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -25,7 +23,6 @@ from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads 
 import cv2
 import numpy as np
 import pandas as pd
-import tensorflow as tf
 
 from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
@@ -36,13 +33,7 @@ from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import ROOT
 from thesis_repro.segmentation import prediction
 from thesis_repro.study import methods
-from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.sources import Source
-
-sys.path.append(str(ROOT / "notebooks"))
-
-# isort: split
-from thesis import timing
 
 FRAMES = 40  # from the sequence's start
 REPEATS = 3
@@ -113,14 +104,13 @@ def shared_cost(sequence):
         f"{width}": (THESIS, [masks.dilate(edges, width) for edges in contours]) for width in WIDTHS
     }
     together, alone = {}, {}
+
+    def one_by_one():
+        alone.update({name: odometry.run(sequence, *run) for name, run in runs.items()})
+
     costs = [
         seconds(lambda: together.update(odometry.run_many(sequence, runs)), time.process_time),
-        seconds(
-            lambda: alone.update(
-                {name: odometry.run(sequence, *run) for name, run in runs.items()}
-            ),
-            time.process_time,
-        ),
+        seconds(one_by_one, time.process_time),
     ]
     same = all(np.array_equal(together[name].poses, alone[name].poses) for name in runs)
     return *(1e3 * cost / len(sequence) for cost in costs), same
@@ -146,52 +136,6 @@ def mask_cost(sequence, labels):
     return 1e3 * costs / len(sequence) / len(kinds)
 
 
-def chain_cost(sequence):
-    """Return CPU milliseconds a frame from image file to masked pose, and the least possible ones.
-
-    Two threads read and segment frames while the odometry works. They take several frames at once:
-    for a single one, TensorFlow chooses a convolution that takes twice as long. The least possible
-    time has the network's multiply-adds at the speed of a matrix product.
-    """
-    model, metres = prediction.load_shipped(), odometry.scales(sequence)
-
-    def images(frames):
-        size = model.input_shape[1:3]
-        return np.stack([cv2.resize(frame, size) for frame in frames])[..., None]
-
-    def prepare(start):
-        stop = min(start + prediction.CALL, len(sequence))
-        frames = [sequence.frame(index) for index in range(start, stop)]
-        label_maps = prediction.predict(model, images(frames))
-        return [
-            (frame, masks.keypoint_mask(label_map, frame.shape, CONTROL_WIDTH))
-            for frame, label_map in zip(frames, label_maps, strict=True)
-        ]
-
-    def drive():
-        follower = Odometry(sequence.intrinsics)
-        with ThreadPoolExecutor(2) as pool:
-            for batch in pool.map(prepare, range(0, len(sequence), prediction.CALL)):
-                for frame, mask in batch:
-                    follower.step(frame, metres[follower.count], mask)
-
-    all_images = images(list(sequence.frames()))
-    matrix = tf.random.normal((2048, 2048))
-    product = tf.function(lambda: matrix @ matrix)
-    calls = drive, lambda: prediction.predict(model, all_images), product
-    costs = np.full(len(calls), np.inf)
-    for _ in range(REPEATS):
-        costs = np.minimum(costs, [seconds(call, time.process_time) for call in calls])
-    chain, network, multiplying = costs
-    multiply_adds = sum(
-        math.prod(layer.input.shape[1:3]) * math.prod(layer.kernel.shape)
-        for layer in model.layers
-        if hasattr(layer, "kernel")
-    )
-    least_network = len(sequence) * multiply_adds * multiplying / 2048**3
-    return 1e3 * np.array([chain, chain - network + least_network]) / len(sequence)
-
-
 def compile_cost():
     """Return the CPU seconds until the refined odometry is ready.
 
@@ -215,14 +159,13 @@ def measure(sequence):
     """Return a table with a row for each measurement, its reference and their ratio."""
     # loads compiled code
     odometry.run_many(sequence.subset(2), {"": (replace(THESIS, estimator="refined"), None)})
-    with timing.opencv_threads(1):
-        step, refined, bare = step_cost(sequence)
-        together, alone, same = shared_cost(sequence.subset(12))
-        with tempfile.TemporaryDirectory() as labels:
-            prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, labels)
-            shared_masks, single_masks = mask_cost(sequence, Path(labels))
-        chain, least_chain = chain_cost(sequence)
-    first, second = compile_cost()
+    cv2.setNumThreads(1)  # one thread makes times comparable
+    step, refined, bare = step_cost(sequence)
+    together, alone, same = shared_cost(sequence.subset(12))
+    with tempfile.TemporaryDirectory() as labels:
+        prediction.write_label_maps(prediction.load_shipped(), sequence.frame_paths, labels)
+        shared_masks, single_masks = mask_cost(sequence, Path(labels))
+        first, second = compile_cost()
     in_one_pass = f"{1 + len(WIDTHS)} runs in one pass, {'the' if same else 'NOT THE'} same bits"
     table = pd.DataFrame(
         [
@@ -236,7 +179,6 @@ def measure(sequence):
                 "one by one",
                 single_masks,
             ),
-            ("from file to masked pose", "CPU ms a frame", chain, "its limit", least_chain),
             ("first use, compiling", "s", first, "second use", second),
         ],
         columns=["what", "unit", "measured", "against", "reference"],

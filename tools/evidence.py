@@ -15,6 +15,7 @@ import pandas as pd
 
 import failures
 import label_quality
+from thesis import few_keypoints
 from thesis_repro import mask_files, masks
 from thesis_repro.data import kitti
 from thesis_repro.errors import InputError
@@ -74,6 +75,10 @@ def write(settings, folder, others=()):
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     qualities = label_quality.table(runs, other_runs)
+    few_runs = few_keypoints.measure(
+        sequences, labels, settings.build / "few_keypoints", settings.jobs
+    )
+    few = few_keypoints.table(few_runs)
     streets = _streets(sequences)
     results.sweep(folder)
     for name in KEPT:
@@ -81,14 +86,20 @@ def write(settings, folder, others=()):
     style.save_all(
         {
             "failures": failures.figure(steps, sequences, label_masks),
+            "few_keypoints": few_keypoints.figure(few),
             "label_quality": label_quality.figure(qualities),
         },
-        {"failures": failures.table(steps), "streets": streets, "label_quality": qualities},
+        {
+            "failures": failures.table(steps),
+            "streets": streets,
+            "label_quality": qualities,
+            "few_keypoints": few_keypoints.summary(few),
+        },
         folder,
         note,
     )
-    for name in RUNS:
-        rows = _read(settings, name)
+    tables = {name: _read(settings, name) for name in RUNS} | {"few_keypoints_runs": few_runs}
+    for name, rows in tables.items():
         # six digits are enough: shuffling the matched points changes more
         text = rows.to_csv(index=False, lineterminator="\n", float_format="%.6g")
         write_text(folder / f"{name}.csv", text)
@@ -167,9 +178,9 @@ def main():
     folders = [("labels", None, Path(path)) for path in sys.argv[1:]]
     others = named(folders, masks.MaskSettings())
     folder = settings.build / "evidence"
-    with results.claimed(folder), messages.logged(folder, "tables, plots and findings") as run:
+    with results.claimed(folder):
         write(settings, FOLDER, others)
-        run.end(f"tables, plots and findings: {FOLDER}")
+        messages.summary(f"tables, plots and findings: {FOLDER}")
 
 
 if __name__ == "__main__":

@@ -118,12 +118,8 @@ def table(steps):
             for kind, (label, _) in KINDS.items():
                 row[f"{column}, {label}"] = float(f"{group[column, kind].median():.3g}")
         worse = group["rotation_error", "masks"] - group["rotation_error", "all"]
-        much_worse, much_better = (
-            (worse > CLEAR_DIFFERENCE).sum(),
-            (worse < -CLEAR_DIFFERENCE).sum(),
-        )
-        row[f"masks worse by {CLEAR_DIFFERENCE} degrees"] = int(much_worse)
-        row[f"masks better by {CLEAR_DIFFERENCE} degrees"] = int(much_better)
+        row[f"masks worse by {CLEAR_DIFFERENCE} degrees"] = int((worse > CLEAR_DIFFERENCE).sum())
+        row[f"masks better by {CLEAR_DIFFERENCE} degrees"] = int((worse < -CLEAR_DIFFERENCE).sum())
         row["flagged, masks"] = int((group["flag", "masks"] != "").sum())
         rows.append(row)
     return pd.DataFrame(rows)

@@ -54,11 +54,10 @@ def table(runs, other_runs):
 
 
 def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
-    ratios = {}
-    for metric, label in compare.JUDGING_METRICS.items():
-        if metric in rows and metric in reference:
-            mean = compare.geometric_mean(compare.ratios(rows, reference, metric))
-            ratios[label] = texts.ratio(mean)
+    ratios = {
+        label: texts.ratio(compare.geometric_mean(compare.ratios(rows, reference, metric)))
+        for metric, label in compare.JUDGING_METRICS.items()
+    }
     mean_iou, where = quality.get(name, (float("nan"), "not known"))
     return {
         "label maps": NAMES.get(name, name),
@@ -102,7 +101,7 @@ def _of_embedded_world():
             "odometry": RENDERED,
             "sequences": f"{row['sequences']} drives",
             "over": ALL_KEYPOINTS,
-            **{label: row[label] for label in compare.JUDGING_METRICS.values() if label in row},
+            **{label: row[label] for label in compare.JUDGING_METRICS.values()},
             "lost runs": row["lost runs"],
         }
         for name, (mean_iou, where, row) in sources.items()
@@ -116,7 +115,7 @@ def figure(table):
     """
     rows = table[(table["over"] == ALL_KEYPOINTS) & table["mean IoU"].notna()]
     same_quality = rows.groupby("mean IoU").cumcount()
-    labels = [label for label in compare.JUDGING_METRICS.values() if label in rows]
+    labels = list(compare.JUDGING_METRICS.values())
     drawing, panels = style.new_figure(1, len(labels), height=3.6, squeeze=False)
     for panel, label in zip(panels[0], labels):
         numbers = rows[label].str.extract(RATIO).astype(float)

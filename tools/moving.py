@@ -89,11 +89,7 @@ def table(root, labels, build, repetitions=REPETITIONS, frames=None):
     outcome = runner.run_jobs(planned, sequences, [Source(labels)], build, processes=cores())
     runs = outcome.table
     by_method = [runs[runs["method"] == method] for method in ("static", "baseline")]
-    ratios = {
-        metric: compare.ratios(*by_method, metric)
-        for metric in compare.JUDGING_METRICS
-        if metric in runs
-    }
+    ratios = {metric: compare.ratios(*by_method, metric) for metric in compare.JUDGING_METRICS}
     rows = []
     for sequence in sequences:
         name = sequence.name

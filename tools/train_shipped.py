@@ -23,7 +23,6 @@ from keras import ops
 
 from street_world import dataset as world
 from thesis_repro.data import cityscapes
-from thesis_repro.errors import InputError
 from thesis_repro.running import files, messages, results
 from thesis_repro.segmentation import augmentation, prediction, quality, training
 from thesis_repro.segmentation.unet import build_unet
@@ -197,10 +196,6 @@ def train(camvid, kitti_semantic, pseudo, folder):
         for name, root in (("camvid", camvid), ("kitti", kitti_semantic), ("pseudo", pseudo))
     }
     pairs = sets["kitti"]
-    if len(pairs) <= len(HELD_OUT):
-        raise InputError(
-            f"{kitti_semantic}: {len(pairs)} training pairs; more than {len(HELD_OUT)} are needed"
-        )
     held_out = [pairs[index] for index in HELD_OUT]
     world_images = [world.render_image("train", index, 0.5) for index in range(WORLD_IMAGES)]
     all_sources = {name: _read(pairs) for name, pairs in sets.items()} | {"world": world_images}

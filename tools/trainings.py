@@ -93,13 +93,6 @@ def label_maps(settings, seed):
     return Source(folder, name=f"seed {seed}"), facts
 
 
-def all_label_maps(settings):
-    """Return `label_maps` of each of SEEDS, in order; a training uses one core, so several run."""
-    calls = [(settings, seed) for seed in SEEDS]
-    with workers.open_pool(settings.jobs) as pool:
-        return list(files.progress(pool.run(label_maps, calls), "trainings", len(calls), "network"))
-
-
 def opened(settings):
     """Return the drives of the embedded world, shortened as for notebook 8."""
     return [
@@ -139,13 +132,17 @@ def is_needed(job):
 def rows(runs, comparison, source, facts):
     """Yield one row for each estimator, for one training."""
     own = compare.of_source(runs, source.name)
-    table = comparison[(comparison["source"] == source.name) & comparison["tested"]]
-    table = table[table["method"] == "masked"]
+    is_masked = (comparison["source"] == source.name) & (comparison["method"] == "masked")
+    table = comparison[is_masked & comparison["tested"]]
     for estimator in jobs.ESTIMATORS:
         pairs = table[table["estimator"] == estimator]
         ratios = pairs[pairs["reference"] == "baseline"].set_index("metric")
-        row = {"training": source.name, **facts, "estimator": estimator}
-        row["keypoints"] = ratios["keypoints"].iloc[0]
+        row = {
+            "training": source.name,
+            **facts,
+            "estimator": estimator,
+            "keypoints": ratios["keypoints"].iloc[0],
+        }
         for metric in METRICS:
             for end in ("ratio", "low", "high"):
                 row[f"{metric}_{end}"] = ratios.loc[metric, end]
@@ -166,7 +163,10 @@ def rows(runs, comparison, source, facts):
 def main():
     """Write TABLE; the settings are those of the default run."""
     settings = read_settings()
-    trained = all_label_maps(settings)
+    calls = [(settings, seed) for seed in SEEDS]
+    with workers.open_pool(settings.jobs) as pool:  # a training uses one core, so several run
+        made = pool.run(label_maps, calls)
+        trained = list(files.progress(made, "trainings", len(calls), "network"))
     runs = run(settings, [source for source, _ in trained])
     comparison = compare.comparisons(runs)
     table = pd.DataFrame(

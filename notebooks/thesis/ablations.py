@@ -7,6 +7,7 @@ needs.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from thesis_repro import mask_files, masks, odometry
+from thesis_repro import masks, odometry
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
+from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators, metrics
 from thesis_repro.odometry.odometry import detect, normalise, track
@@ -27,8 +29,6 @@ from thesis_repro.study import workers
 from thesis_repro.study.jobs import CONTROL_WIDTH
 from thesis_repro.study.runner import CODE, measures
 
-Run = tuple[OdometrySettings, Masks | None]
-Runs = dict[tuple[str, str, int], Run]  # by method, estimator, repetition
 ESTIMATORS = tuple(estimators.ESTIMATORS)
 VEGETATION = (ID["vegetation"], ID["terrain"])
 FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesis's 2000
@@ -50,11 +50,10 @@ def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.
     amount: their number (int), or their share of all keypoints (float).
     """
     points = detect(sequence.frame(index), THESIS).astype(int)
-    number = amount
     if isinstance(amount, float):
-        number = round(amount * len(points))
+        amount = round(amount * len(points))
     shuffled = np.random.default_rng((0, index)).permutation(points)
-    columns, rows = shuffled[:number].T
+    columns, rows = shuffled[:amount].T
     mask = np.zeros(sequence.size, np.uint8)
     mask[rows, columns] = 255
     return mask
@@ -69,32 +68,32 @@ def measure(
     folder: Path,
     *,
     processes: int = 1,
-    **options: Any,
+    repetitions: int = 1,
+    dilation_width: int = CONTROL_WIDTH,
 ) -> pd.DataFrame:
     """Run every ablation on every sequence; returns a table with one row a run.
 
     labels: a folder with one folder of label maps a sequence. folder: for the results; finished
-    sequences in it are not run again. options: those of `runs_of`.
+    sequences in it are not run again. repetitions, dilation_width: see `runs_of`.
 
     Columns: sequence, method, estimator, repetition, those of `runner.measures`, and sim3 (RMSE in
     metres after an alignment with scale).
     """
     calls = [
-        (sequence, labels / sequence.name, folder / sequence.name, options)
+        (sequence, labels / sequence.name, folder / sequence.name, repetitions, dilation_width)
         for sequence in sequences
     ]
     with workers.open_pool(processes) as pool:
-        measured = pool.run(_measure, calls)
-        tables = list(progress(measured, "ablations", total=len(calls), unit="sequence"))
+        tables = list(progress(pool.run(_measure, calls), "ablations", len(calls), "sequence"))
     return pd.concat(tables, ignore_index=True)
 
 
 def _measure(
-    sequence: Sequence, labels: Path, folder: Path, options: dict[str, Any]
+    sequence: Sequence, labels: Path, folder: Path, repetitions: int, dilation_width: int
 ) -> pd.DataFrame:
     results.stage(
         folder,
-        options=options,
+        options={"repetitions": repetitions, "dilation_width": dilation_width},
         code=results.digest_of_code(*CODE),
         ablations=results.digest_of_file(__file__),
         **results.made_with("opencv", "numpy", "numba"),
@@ -105,48 +104,41 @@ def _measure(
     path = folder / "runs.csv"
     if not path.is_file():
         cv2.setNumThreads(1)  # the processes already use every core
-        runs = runs_of(sequence, labels, **options)
-        run_results = odometry.run_many(
-            sequence, {" ".join(map(str, key)): run for key, run in runs.items()}
-        )
+        runs = runs_of(sequence, labels, repetitions, dilation_width)
+        by_name = {" ".join(map(str, key)): run for key, run in runs.items()}
         rows = []
-        for key, result in zip(runs, run_results.values(), strict=True):
-            method, estimator, repetition = key
-            row = {"method": method, "estimator": estimator, "repetition": repetition}
+        for key, result in zip(runs, odometry.run_many(sequence, by_name).values(), strict=True):
+            row: dict[str, Any] = dict(zip(("method", "estimator", "repetition"), key, strict=True))
             row |= measures(result.frames, sequence.poses)
             row["sim3"] = metrics.ate(result.poses, sequence.poses, "sim3")
-            rows.append(row)
-        table = pd.DataFrame(rows).assign(sequence=sequence.name)
-        write_text(path, table.to_csv(index=False))
+            rows.append({**row, "sequence": sequence.name})
+        write_text(path, pd.DataFrame(rows).to_csv(index=False))
     return pd.read_csv(path, dtype={"sequence": str})
 
 
 def runs_of(
-    sequence: Sequence,
-    labels: Path,
-    *,
-    repetitions: int = 1,
-    dilation_width: int = CONTROL_WIDTH,
-) -> Runs:
+    sequence: Sequence, labels: Path, repetitions: int = 1, dilation_width: int = CONTROL_WIDTH
+) -> dict[tuple[str, str, int], tuple[OdometrySettings, Masks | None]]:
     """Return the runs over one sequence: {(method, estimator, repetition): (settings, masks)}.
 
     labels: folder of the sequence's label maps. "baseline" (all keypoints) and "masked" use each of
     ESTIMATORS, other methods the thesis's and the refined one. A repetition other than 0 is the
     seed that shuffles the matched points.
     """
-    runs: Runs = {}
-    for method, (settings, method_masks) in _methods(sequence, labels, dilation_width).items():
-        estimators: tuple[str, ...] = ("thesis", "refined")
-        if method in ("baseline", "masked"):
-            estimators = ESTIMATORS
-        for estimator in estimators:
-            for repetition in range(repetitions):
-                seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
-                runs[method, estimator, repetition] = seeded, method_masks
+    methods = _methods(sequence, labels, dilation_width)
+    runs = {}
+    for method, estimator, repetition in product(methods, ESTIMATORS, range(repetitions)):
+        if estimator == "inliers" and method not in ("baseline", "masked"):
+            continue
+        settings, method_masks = methods[method]
+        seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
+        runs[method, estimator, repetition] = seeded, method_masks
     return runs
 
 
-def _methods(sequence: Sequence, labels: Path, dilation_width: int) -> dict[str, Run]:
+def _methods(
+    sequence: Sequence, labels: Path, dilation_width: int
+) -> dict[str, tuple[OdometrySettings, Masks | None]]:
     """Return the ablations over one sequence: {method: (settings, masks)}."""
 
     def enlarged(index: int) -> np.ndarray:
@@ -154,19 +146,17 @@ def _methods(sequence: Sequence, labels: Path, dilation_width: int) -> dict[str,
         return cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
 
     def nearest(index: int) -> np.ndarray:
-        edges = cv2.Canny(enlarged(index), *MaskSettings().canny)
-        return masks.dilate(edges, dilation_width)
+        return masks.dilate(cv2.Canny(enlarged(index), *masks.CANNY), dilation_width)
 
     def without_vegetation(index: int) -> np.ndarray:
-        is_vegetation = np.isin(enlarged(index), VEGETATION)
-        return np.where(is_vegetation, np.uint8(0), np.uint8(255))
+        return np.where(np.isin(enlarged(index), VEGETATION), np.uint8(0), np.uint8(255))
 
-    thesis_masks = mask_files.LabelMasks(labels, sequence, dilation_width)
-    symmetric = mask_files.LabelMasks(
-        labels, sequence, dilation_width, MaskSettings(symmetric=True)
-    )
-    number = _mean_number(sequence, thesis_masks)
-    methods: dict[str, Run] = {
+    thesis_masks = LabelMasks(labels, sequence, dilation_width)
+    symmetric = LabelMasks(labels, sequence, dilation_width, MaskSettings(symmetric=True))
+    some_frames = range(0, len(sequence), max(1, len(sequence) // 8))
+    numbers = [len(detect(sequence.frame(i), THESIS, thesis_masks[i])) for i in some_frames]
+    number = round(np.mean(numbers))  # that masks leave
+    methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
         "baseline": (THESIS, None),
         "masked": (THESIS, thesis_masks),
         "filter": (replace(THESIS, mask_mode="filter"), thesis_masks),
@@ -180,34 +170,26 @@ def _methods(sequence: Sequence, labels: Path, dilation_width: int) -> dict[str,
     }
     for few in FEW_KEYPOINTS:
         methods[f"strongest-{few}"] = replace(THESIS, max_keypoints=few), None
-    methods["orb"] = replace(THESIS, detector="orb"), None
-    return methods
-
-
-def _mean_number(sequence: Sequence, frame_masks: Masks) -> int:
-    """Return the mean number of keypoints that masks leave, from about eight frames."""
-    numbers = []
-    for index in range(0, len(sequence), max(1, len(sequence) // 8)):
-        points = detect(sequence.frame(index), THESIS, frame_masks[index])
-        numbers.append(len(points))
-    return round(np.mean(numbers))
+    return methods | {"orb": (replace(THESIS, detector="orb"), None)}
 
 
 # Keypoints and boundaries one by one
 
 FIELDS = (16, 5)  # of a frame, across and down
+EXACT = MaskSettings("exact")
+THIN = MaskSettings("exact", classes=("pole", "traffic sign"))
 NEAR = 2  # pixels: a boundary with an edge within this distance counts as found
 PAIRS = (("road", "sidewalk"), ("vegetation", "sky"), ("building", "fence"))
 
 
-def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: int) -> pd.DataFrame:
+def tracks(sequence: Sequence, masks_by_name: dict[str, Any], pairs: int) -> pd.DataFrame:
     """Measure how well keypoints can be tracked and how they are spread.
 
-    masks_by_name: None for all keypoints. pairs: number of evenly spread frames that are tracked to
-    the next frame. Returns one row for each mask and pair of frames. Columns: sequence, frame,
-    method (the name), keypoints; residual, the median distance (pixels) of tracked points from the
-    epipolar lines of the true motion; outliers, the percentage of points beyond PySLAM's threshold;
-    fields, the percentage of the frame's 16 x 5 fields with a keypoint.
+    masks_by_name: a mask a frame, None for all keypoints. pairs: number of evenly spread frames
+    that are tracked to the next frame. Returns one row for each mask and pair of frames. Columns:
+    sequence, frame, method (the name), keypoints; residual, the median distance (pixels) of tracked
+    points from the epipolar lines of the true motion; outliers, the percentage of points beyond
+    PySLAM's threshold; fields, the percentage of the frame's 16 x 5 fields with a keypoint.
     """
     rows = []
     height, width = sequence.size
@@ -219,16 +201,12 @@ def tracks(sequence: Sequence, masks_by_name: dict[str, Masks | None], pairs: in
         if np.linalg.norm(motion[:3, 3]) < metrics.MIN_DIRECTED_STEP:
             continue
         for name, frame_masks in masks_by_name.items():
-            mask = None
-            if frame_masks is not None:
-                mask = frame_masks[index]
-            points = detect(before, THESIS, mask)
+            points = detect(before, THESIS, frame_masks[index])
             if len(points) < 10:
                 continue
             moved, tracked = track(before, after, points)
-            distances = sampson_distances(
-                points[tracked], moved[tracked], motion, sequence.intrinsics
-            )
+            matches = points[tracked], moved[tracked]
+            distances = sampson_distances(*matches, motion, sequence.intrinsics)
             fields = np.unique((points // field_size).astype(int), axis=0)
             row = {
                 "sequence": sequence.name,
@@ -264,17 +242,21 @@ def sampson_distances(
 def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]:
     """Measure what Canny on enlarged ids does to the boundaries of a label map, in percent.
 
-    (Audit rows 10 and 11.) size: (height, width) of the enlargement.
+    (Audit rows 10, 11, 71 and 72.) size: (height, width) of the enlargement.
     lost: boundary pixels of the map, enlarged by nearest neighbour, without an edge within NEAR
     pixels. The same for each of PAIRS of classes ("road/sidewalk"), NaN for fewer than 20 boundary
     pixels. invented: pixels of the bilinear enlargement whose id no pixel within NEAR pixels has.
+    L2, Gaussian: edge pixels, of either kind, that change with the root of squares (Equation 3.11)
+    and after a Gaussian.
     """
     nearest = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
-    exact = masks.edges(label_map, size, MaskSettings("exact")) > 0
-    missed = masks.dilate(masks.edges(label_map, size), 2 * NEAR + 1) == 0
+    bilinear = cv2.resize(label_map, size[::-1])
+    exact = masks.edges(label_map, size, EXACT) > 0
+    edges = masks.edges(label_map, size)
+    missed = masks.dilate(edges, 2 * NEAR + 1) == 0
     shares = {
-        "lost": _percent_missed(missed, exact, least=1),
-        "invented": _percent_invented(label_map, nearest),
+        "lost": _percent(missed, exact, least=1),
+        "invented": _percent_invented(bilinear, nearest),
     }
     # across a boundary: the pixel to the right or, if that has the same id, the one below
     right, below = np.roll(nearest, -1, axis=1), np.roll(nearest, -1, axis=0)
@@ -282,28 +264,47 @@ def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]
     for pair in PAIRS:
         ids = [ID[name] for name in pair]
         pair_boundary = exact & np.isin(nearest, ids) & np.isin(neighbour, ids)
-        shares["/".join(pair)] = _percent_missed(missed, pair_boundary, least=20)
+        shares["/".join(pair)] = _percent(missed, pair_boundary, least=20)
+    for name, other in (
+        ("L2", cv2.Canny(bilinear, *masks.CANNY, L2gradient=True)),
+        ("Gaussian", cv2.Canny(cv2.GaussianBlur(bilinear, (5, 5), 0), *masks.CANNY)),
+    ):
+        shares[name] = 100 * (edges != other).sum() / max(np.count_nonzero(edges | other), 1)
     return shares
 
 
-def _percent_missed(missed: np.ndarray, boundary: np.ndarray, least: int) -> float:
-    """Return the percentage of a boundary's pixels that are missed; NaN for fewer than `least`."""
+def thin_boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]:
+    """Return the shares (%) of the boundaries of thin objects that are near an edge.
+
+    (Audit rows 81 and 87.) By the thresholds of Canny ("thin 5/15"), and by the size of the label
+    map whose exact boundaries are taken ("thin at 320"). NaN without thin objects.
+    """
+    edges_by_name = {}
+    for low, high in ((5, 15), (20, 60), (40, 120)):
+        canny = MaskSettings(canny=(low, high))
+        edges_by_name[f"thin {low}/{high}"] = masks.edges(label_map, size, canny)
+    for side in (320, 160):
+        small = cv2.resize(label_map, (side, side), interpolation=cv2.INTER_NEAREST)
+        edges_by_name[f"thin at {side}"] = masks.edges(small, size, EXACT)
+    thin = masks.edges(label_map, size, THIN) > 0
+    return {
+        name: _percent(masks.dilate(edges, 2 * NEAR + 1) > 0, thin, least=1)
+        for name, edges in edges_by_name.items()
+    }
+
+
+def _percent(marked: np.ndarray, boundary: np.ndarray, least: int) -> float:
+    """Return the percentage of a boundary's pixels that are marked; NaN for fewer than `least`."""
     if boundary.sum() < least:
         return np.nan
-    return 100 * missed[boundary].mean()
+    return 100 * marked[boundary].mean()
 
 
-def _percent_invented(label_map: np.ndarray, nearest: np.ndarray) -> float:
-    """Return the percentage of pixels with an invented id, see `boundaries`.
-
-    nearest: the label map, enlarged by nearest neighbour.
-    """
-    height, width = nearest.shape
-    bilinear = cv2.resize(label_map, (width, height))
+def _percent_invented(bilinear: np.ndarray, nearest: np.ndarray) -> float:
+    """Return the percentage of pixels with an invented id, see `boundaries`."""
     around = np.ones((2 * NEAR + 1, 2 * NEAR + 1), np.uint8)
     is_real = np.zeros(nearest.shape, bool)
     for number in np.unique(bilinear):
-        has_number = (nearest == number).astype(np.uint8)
-        is_near = cv2.dilate(has_number, around) > 0
+        is_near = cv2.dilate((nearest == number).astype(np.uint8), around) > 0
         is_real |= (bilinear == number) & is_near
     return 100 * float((~is_real).mean())

@@ -1,12 +1,12 @@
 """The audit: where the thesis contradicts itself, its code or its libraries, and what that does.
 
-audit.json holds the rows and lists which columns are measured for them. `table` joins the
-measurements to the rows. Ratios come from `study.compare`. Intervals are those of Student's t over
-`n` values: sequences unless said otherwise.
+audit.json holds the rows and lists which columns are measured for them. Notebook 09 and
+`audit_rest` measure; `table` joins the measurements to the rows. Ratios come from `study.compare`.
+Intervals are those of Student's t over `n` values: sequences unless said otherwise.
 """
 
 import json
-from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,12 @@ from thesis_repro.data.cityscapes import LABELS
 from thesis_repro.study import compare
 
 WORDS = json.loads((Path(__file__).parent / "audit.json").read_text(encoding="utf-8"))
+CHANGES = {  # in percent, in reported.json
+    "RMSE": "table_4_2_rmse_percent_change",
+    "MAE": "table_4_3_mae_percent_change",
+}
 WIDTHS = range(9, 12)  # the dilation widths that the thesis calls best
+EVERY_ROW = "index >= 0"  # as a query
 TEXTS = ["quantity", "metric", "estimator", "unit", "data"]
 NUMBERS = ["quantity", "metric", "estimator", "value", "unit", "low", "high", "n", "frames", "data"]
 
@@ -73,16 +78,12 @@ def table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.Data
     """Return the audit as a table with one line a measurement.
 
     The first line of each row has the row's texts. data: the origin of measurements that name none.
-    Numbers are rounded (see `rounded`). Raises ValueError if a measurement's row is not in
-    audit.json.
+    Numbers are rounded (see `rounded`).
     """
     headings = {"does": "the thesis or its code", "right": "what would be right"}
     words = pd.DataFrame(WORDS["rows"]).rename(columns=headings)
     numbers = pd.DataFrame(measurements).reindex(columns=["row", *NUMBERS])
     numbers = numbers.astype(dict.fromkeys(TEXTS, object)).fillna({"data": data})
-    unknown = sorted(set(numbers["row"]) - set(words["row"]))
-    if unknown:
-        raise ValueError(f"audit.json has no rows for these measurements: {', '.join(unknown)}")
     lines = words.merge(numbers, on="row", how="left").fillna(dict.fromkeys(TEXTS, ""))
     repeated = lines["row"].duplicated()
     lines.loc[repeated, words.columns.drop("row")] = ""
@@ -102,96 +103,64 @@ def rounded(value: float) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def measured(table: pd.DataFrame, kind: str) -> list[dict[str, Any]]:
+def clear_effects(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the lines of the table with a ratio of errors whose interval excludes 1.
+
+    Row 14, a largest over a smallest error, cannot be below 1 and is left out.
+    """
+    no_errors = ["", "keypoints", WORDS["metrics"]["fields"]]
+    ratios = table[(table["unit"] == "ratio") & ~table["metric"].isin(no_errors)]
+    return ratios[((ratios["low"] > 1) | (ratios["high"] < 1)) & (ratios["row"] != "14")]
+
+
+def measured(table: pd.DataFrame, kind: str, **names: Any) -> list[dict[str, Any]]:
     """Return the measurements that audit.json lists for one kind of table.
 
-    Where audit.json gives a unit, they are means over sequences; "%" is a share. Otherwise they are
-    ratios to a reference method, or to another column ("over") of the same rows.
-    kind: "ablations" (`ablations.measure`), "study" (`runner.run_jobs`), "tracks" and "boundaries"
-    (as in `ablations`), "shares" (of pixels, one row a frame).
+    Each entry of audit.json selects rows, and reference rows, by a query of pandas. Where it gives
+    a unit, the measurements are means over sequences; "%" is a share. Otherwise they are ratios to
+    the reference, or to another column ("over") of the same rows.
+    kind: "ablations" (`ablations.measure`), "study" (`runner.run_jobs`), "tracks", "boundaries" or
+    "shares" (as in `audit_rest`). names: values that the queries use.
     """
-    measurements = []
+    measurements: list[dict[str, Any]] = []
+    if table.empty:  # real frames have no exact label maps
+        return measurements
     for spec in WORDS["measured"]:
         if spec["runs"] != kind:
             continue
-        for metric in spec["metrics"]:
-            if metric not in table:
-                continue
-            pairs = _estimator_pairs(spec, table, metric)
-            measurements += [_measure(spec, table, metric, *pair) for pair in pairs]
+        for metric, estimator in product(spec["metrics"], spec.get("estimators", [""])):
+            if metric in table:
+                names["estimator"] = estimator
+                measurements.append(_measure(spec, table, metric, names))
     return _with_frames(measurements, table)
 
 
-def _estimator_pairs(
-    spec: dict[str, Any], table: pd.DataFrame, metric: str
-) -> Iterable[tuple[str, str]]:
-    """Return the estimators to measure, each with that of the reference.
-
-    It is ("", "") where the estimator makes no difference.
-    """
-    if "estimators" in spec:
-        return spec["estimators"]
-    if "estimator" in table and metric != "mean_keypoints":
-        return [(name, name) for name in compare.ESTIMATORS]
-    return [("", "")]
-
-
 def _measure(
-    spec: dict[str, Any],
-    table: pd.DataFrame,
-    metric: str,
-    estimator: str,
-    reference_estimator: str,
+    spec: dict[str, Any], table: pd.DataFrame, metric: str, names: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the measurement of one metric and estimator that an entry of audit.json describes."""
-    rows = _select(table, estimator, spec.get("method"), spec.get("widths"))
+    rows = table.query(spec.get("rows", EVERY_ROW), local_dict=names)
     label = spec.get("label", WORDS["metrics"].get(metric, ""))
-    names = {"metric": label, "estimator": estimator}
+    texts = {"metric": label, "estimator": names["estimator"]}
     if "unit" in spec:
         means = rows.groupby("sequence")[metric].mean()
         if spec["unit"] == "%":
-            return share(spec["row"], spec["quantity"], means, **names)
-        return measurement(spec["row"], spec["quantity"], means, spec["unit"], **names)
+            return share(spec["row"], spec["quantity"], means, **texts)
+        return measurement(spec["row"], spec["quantity"], means, spec["unit"], **texts)
     if "over" in spec:
         reference = rows.assign(**{metric: rows[spec["over"]]})
     else:
-        widths = spec.get("reference_widths")
-        reference = _select(table, reference_estimator, spec.get("reference"), widths)
+        reference = table.query(spec["reference"], local_dict=names)
     ratios = compare.ratios(rows, reference, metric)
-    return ratio(spec["row"], spec["quantity"], ratios, **names)
-
-
-def _select(
-    table: pd.DataFrame, estimator: str, method: str | None, widths: str | list | None
-) -> pd.DataFrame:
-    """Select the rows of an estimator, a method and some widths.
-
-    An empty estimator, or None, selects all. widths: a list, "tested" (`compare.tested_width`) or
-    "best" (each sequence's best width, of masks).
-    """
-    if estimator and "estimator" in table:
-        table = table[table["estimator"] == estimator]
-    if widths == "best":
-        return thesis_tables.of_chosen_width(compare.of_method(table, "masked"))
-    if widths == "tested":
-        widths = [compare.tested_width(table)]
-    if widths is not None:
-        table = table[table["dilation_width"].isin(widths)]
-    if method is not None:
-        table = table[table["method"] == method]
-    return table
+    return ratio(spec["row"], spec["quantity"], ratios, **texts)
 
 
 def _with_frames(measurements: list[dict[str, Any]], table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the measurements that have values, with the number of frames.
-
-    It is the table's mean number of frames a sequence, if known.
-    """
-    frames = np.nan
+    """Return the measurements that have values, with the table's mean number of frames."""
     sequences = table.groupby("sequence")
     if "frames" in table:
         frames = round(sequences["frames"].first().mean())
-    elif "frame" in table:
+    else:
         frames = round(sequences["frame"].nunique().mean())
     return [{**measurement, "frames": frames} for measurement in measurements if measurement["n"]]
 
@@ -201,8 +170,7 @@ def of_tables() -> list[dict[str, Any]]:
 
     They are rows 1, 3, 4, 9, 18, 35, 41, 45, 60, 66, 69, 78 and 89.
     """
-    measurements = _of_changes("RMSE", "table_4_2_rmse_percent_change")
-    measurements += _of_changes("MAE", "table_4_3_mae_percent_change")
+    measurements = _of_changes("RMSE") + _of_changes("MAE")
     best = pd.DataFrame(REPORTED["table_4_1"])
     keypoints = best["mean_keypoints"]
     factors = 2000 / keypoints
@@ -223,9 +191,9 @@ def of_tables() -> list[dict[str, Any]]:
     return [{**measurement, "data": "the thesis's numbers"} for measurement in measurements]
 
 
-def _of_changes(metric: str, key: str) -> list[dict[str, Any]]:
-    """Return rows 1, 4 and 41 for one metric. key: of its changes in percent in reported.json."""
-    change = pd.Series(REPORTED[key])
+def _of_changes(metric: str) -> list[dict[str, Any]]:
+    """Return rows 1, 4 and 41 for one metric."""
+    change = pd.Series(REPORTED[CHANGES[metric]])
     improved = int((change < 0).sum())
     sign_test = binomtest(improved, len(change), alternative="greater").pvalue
     larger = (change > 0).sum()
@@ -248,13 +216,12 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
     masked = compare.of_method(runs, "masked")
     baseline = compare.of_method(runs, "baseline")
     best = thesis_tables.of_chosen_width(masked)
+    best_ratios = compare.ratios(best, baseline, "rmse")
     stability = thesis_tables.stability(masked, baseline)
     by_width = masked.groupby(["sequence", "dilation_width"])[["rmse", "mae"]].mean()
     by_rmse = by_width["rmse"].groupby("sequence").idxmin()
     by_mae = by_width["mae"].groupby("sequence").idxmin()
-    rmse = by_width["rmse"]
-    rmse_ratios = rmse.loc[by_mae].to_numpy() / rmse.loc[by_rmse].to_numpy()
-    best_ratios = compare.ratios(best, baseline, "rmse")
+    rmse_ratios = by_width["rmse"][by_mae].to_numpy() / by_width["rmse"][by_rmse].to_numpy()
     widths = thesis_tables.best_widths(masked)["dilation_width"]
     measurements = [
         ratio("2", "best same", best_ratios, metric="RMSE"),
@@ -263,26 +230,32 @@ def of_study(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]]
         measurement("35", "widths", widths.isin(WIDTHS).sum(), "sequences"),
         ratio("2", "best other", stability["elsewhere"], metric="RMSE"),
         share("2", "same best", stability["same_best"]),
+        *_of_null_distribution(shuffled, masked["dilation_width"].nunique()),
     ]
-    widths_run = masked["dilation_width"].nunique()
-    studies = thesis_tables.null_distribution(shuffled, widths_run, "rmse")
+    tested = compare.tested_width(runs)
+    listed = measured(runs, "study", tested=tested, best=best.index)
+    return _with_frames(measurements, runs) + listed
+
+
+def _of_null_distribution(shuffled: pd.DataFrame, widths: int) -> list[dict[str, Any]]:
+    """Return row 39."""
+    studies = thesis_tables.null_distribution(shuffled, widths, "rmse")
+    measurements = []
     for name in ("mean", "median"):
         values = studies.agg(name, axis=1)
         low, high = thesis_tables.middle(values)
-        interval = {"low": low, "high": high, "n": len(studies)}
-        measurements.append(
-            measurement("39", f"null {name}", values.mean(), "%", metric="RMSE", **interval)
-        )
-    reported = pd.Series(REPORTED["table_4_2_rmse_percent_change"]).mean()
+        row = measurement("39", f"null {name}", values.mean(), "%", metric="RMSE")
+        measurements.append({**row, "low": low, "high": high, "n": len(studies)})
+    reported = pd.Series(REPORTED[CHANGES["RMSE"]]).mean()
     as_low = 100 * (studies.mean(axis=1) <= reported).mean()
-    measurements.append(measurement("39", "as low", as_low, "%", metric="RMSE"))
-    return _with_frames(measurements, runs) + measured(runs, "study")
+    return [*measurements, measurement("39", "as low", as_low, "%", metric="RMSE")]
 
 
 def of_ablations(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Return row 14 and those that audit.json lists, from the runs of `ablations.measure`."""
-    measurements = []
     spread = compare.shuffle_spread(runs[runs["estimator"].isin(compare.ESTIMATORS)])
-    for estimator, factors in spread.groupby("estimator")["factor"]:
-        measurements.append(ratio("14", "spread", factors, metric="RMSE", estimator=estimator))
+    measurements = [
+        ratio("14", "spread", factors, metric="RMSE", estimator=estimator)
+        for estimator, factors in spread.groupby("estimator")["factor"]
+    ]
     return _with_frames(measurements, runs) + measured(runs, "ablations")

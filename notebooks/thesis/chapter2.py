@@ -225,10 +225,8 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
     orb = cv2.ORB_create(1000)
     points, descriptors = orb.detectAndCompute(first, None)
     second_points, second_descriptors = orb.detectAndCompute(second, None)
-    matches = []
-    if points and second_points:
-        matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
-        matches = matcher.match(descriptors, second_descriptors)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    matches = matcher.match(descriptors, second_descriptors)
     best = sorted(matches, key=lambda match: match.distance)[:60]
     gap = np.full((first.shape[0] // 25, first.shape[1]), 255, np.uint8)
     both = np.vstack([first, gap, second])
@@ -238,10 +236,10 @@ def figure_2_09(first: np.ndarray, second: np.ndarray, title: str) -> plt.Figure
     style.show_image(
         axes, both, f"{title}: the {len(best)} most similar of {len(matches)} ORB matches"
     )
-    ends = []
-    for match in best:
-        below = np.add(second_points[match.trainIdx].pt, offset)
-        ends.append((points[match.queryIdx].pt, below))
+    ends = [
+        (points[match.queryIdx].pt, np.add(second_points[match.trainIdx].pt, offset))
+        for match in best
+    ]
     distances = [match.distance for match in best]
     lines = LineCollection(ends, array=distances, cmap="plasma", linewidth=0.8)
     axes.add_collection(lines)

@@ -5,6 +5,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from thesis import frames
 from thesis_repro.data.cityscapes import Label
 from thesis_repro.masks import dilate
 from thesis_repro.report import style
@@ -69,7 +70,7 @@ def figure_3_06(
         "edges of the label map, drawn wider": dilate(edge_image, 5),
         f"edges dilated by {dilation_width}x{dilation_width}": mask,
     }
-    return style.pictures(frame, pictures, columns=2, label_maps=[label_map])
+    return frames.pictures(frame, pictures, columns=2, label_maps=[label_map])
 
 
 def figure_masks(
@@ -90,5 +91,5 @@ def figure_masks(
     pictures = {}
     for title, mask in masks.items():
         shaded = np.where(mask > 0, frame // 2 + 127, frame // 3)
-        pictures[title] = style.with_edges(shaded, edges)
-    return style.pictures(frame, pictures, keypoints, columns=2)
+        pictures[title] = frames.with_edges(shaded, edges)
+    return frames.pictures(frame, pictures, keypoints, columns=2)

@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from thesis import thesis_tables
+from thesis import frames, thesis_tables
 from thesis.flicker import View
 from thesis_repro.data.cityscapes import colorize
 from thesis_repro.odometry import THESIS
@@ -77,10 +77,8 @@ def figure_4_03(
     label_maps = {"prediction": prediction}
     if label_map is not None:
         label_maps["true label map"] = label_map
-    pictures = {title: frame}
-    for name, classes in label_maps.items():
-        pictures[name] = style.label_colors(classes, frame)
-    return style.pictures(frame, pictures, label_maps=label_maps.values())
+    colored = {name: style.label_colors(ids, frame) for name, ids in label_maps.items()}
+    return frames.pictures(frame, {title: frame, **colored}, label_maps=label_maps.values())
 
 
 def figure_4_04(
@@ -90,7 +88,7 @@ def figure_4_04(
     figure, (axes,) = style.frame_panels(frame)
     bright = max(np.percentile(frame, 98), 1)
     brighter = np.clip(230 * (frame / bright) ** 0.6, 0, 255).astype(np.uint8)
-    style.show_image(axes, style.with_edges(brighter, edge_image), title)
+    style.show_image(axes, frames.with_edges(brighter, edge_image), title)
     axes.scatter(*keypoints.T, s=9, color=KEYPOINT["color"], edgecolors="black", linewidths=0.4)
     return figure
 
@@ -118,7 +116,7 @@ def figure_4_05(
         kept_title: frame,
     }
     keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
-    return style.pictures(frame, pictures, keypoints, label_maps=[prediction])
+    return frames.pictures(frame, pictures, keypoints, label_maps=[prediction])
 
 
 def figure_overview(
@@ -129,7 +127,7 @@ def figure_overview(
     kept_title = f"the {len(kept_keypoints)} keypoints on the mask (light)"
     dimmed = np.where(mask > 0, frame, frame // 3)
     keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
-    return style.pictures(frame, {all_title: frame, kept_title: dimmed}, keypoints, columns=2)
+    return frames.pictures(frame, {all_title: frame, kept_title: dimmed}, keypoints, columns=2)
 
 
 MARKERS = "os^Dv"  # of lines, beside their colours and dashes
@@ -149,7 +147,7 @@ def figure_4_08(views: list[View], title: str) -> plt.Figure:
         if view.expected is not None:
             text += f";\n{view.jumped} of {len(view.expected)} rings without a keypoint"
             panel.scatter(*view.expected.T, **RING)
-        style.show_image(panel, style.with_edges(view.crop, view.edges), text)
+        style.show_image(panel, frames.with_edges(view.crop, view.edges), text)
         panel.scatter(*view.keypoints.T, **{**KEYPOINT, "s": 12})
         # a circle at the border would widen the panel
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
@@ -329,7 +327,7 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
         ylabel=label,
         title=f"{metric.upper()} against dilation width, by sequence",
     )
-    _, panels = style.small_panels(names, "width (pixels)", below)
+    _, panels = frames.small_panels(names, "width (pixels)", below)
     for panel, name in zip(panels, names, strict=True):
         of_sequence = masked[masked["sequence"] == name]
         _draw_repetitions(panel, of_sequence, metric)
@@ -394,7 +392,7 @@ def figure_of_sequences(runs: pd.DataFrame, metric: str) -> plt.Figure:
     Each panel has a scale of its own.
     """
     names, tables = _spread_by_method(runs, metric)
-    figure, panels = style.small_panels(names)
+    figure, panels = frames.small_panels(names)
     for panel, name in zip(panels, names, strict=True):
         for offset, (method, table) in enumerate(tables.items()):
             _bar(panel, [offset], table.loc[[name]], 0.8, method)

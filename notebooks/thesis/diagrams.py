@@ -172,8 +172,32 @@ def figure_2_06(surface: Callable[..., np.ndarray], path: np.ndarray) -> plt.Fig
     return figure
 
 
+def summary_rows(model: Any) -> list[dict[str, Any]]:
+    """Return a model's rows in the format of Figure A.1.
+
+    A row is a dict of layer, output_shape, params and connected_to.
+    """
+    rows = []
+    for layer in model.layers:
+        tensors = layer._inbound_nodes[0].input_tensors
+        shape = f"{tuple(layer.output.shape)}"
+        if not tensors:
+            shape = f"[{shape}]"
+        kind = type(layer).__name__.replace("BatchNormalization", "BatchNormal")
+        sources = [f"{tensor._keras_history.operation.name}[0][0]" for tensor in tensors]
+        rows.append(
+            {
+                "layer": f"{layer.name} ({kind})",
+                "output_shape": shape,
+                "params": layer.count_params(),
+                "connected_to": " ".join(sources),
+            }
+        )
+    return rows
+
+
 def figure_a_01(model: Any, rows: list[dict[str, Any]]) -> plt.Figure:
-    """Figure A.1: the summary of a Keras model, as a table. rows: `unet.summary_rows`."""
+    """Figure A.1: the summary of a Keras model, as a table. rows: `summary_rows`."""
     trainable = sum(weights.numpy().size for weights in model.trainable_weights)
     total = model.count_params()
     lines = [

@@ -1,5 +1,6 @@
 """The gap between domains (Section 4.1): the quality of label maps, by class."""
 
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,25 +30,21 @@ def measure(models: dict[str, Any], domains: dict[str, list[cityscapes.Pair]]) -
     images.
     """
     scores, classes = [], []
-    for model_name, model in models.items():
-        for domain, pairs in domains.items():
-            images, true = cityscapes.load(pairs, *model.input_shape[2:])
-            predicted = prediction.predict(model, images)
-            confusion = quality.confusion_matrix(true, predicted)
-            mean_iou, accuracy, table = quality.cityscapes_scores(confusion)
-            names = {"model": model_name, "domain": domain}
-            scores.append(
-                {
-                    **names,
-                    "images": len(pairs),
-                    "classes": len(table),
-                    "mean_iou": mean_iou,
-                    "accuracy": accuracy,
-                    "sky_recall": table["recall"].get("sky", np.nan),
-                }
-            )
-            share = (table["pixels"] / table["pixels"].sum()).to_numpy()
-            classes.append(table.reset_index().assign(**names, share=share))
+    for (model_name, model), (domain, pairs) in product(models.items(), domains.items()):
+        images, true = cityscapes.load(pairs, *model.input_shape[2:])
+        confusion = quality.confusion_matrix(true, prediction.predict(model, images))
+        mean_iou, accuracy, table = quality.cityscapes_scores(confusion)
+        names = {"model": model_name, "domain": domain}
+        numbers = {
+            "images": len(pairs),
+            "classes": len(table),
+            "mean_iou": mean_iou,
+            "accuracy": accuracy,
+            "sky_recall": table["recall"].get("sky", np.nan),
+        }
+        scores.append(names | numbers)
+        share = (table["pixels"] / table["pixels"].sum()).to_numpy()
+        classes.append(table.reset_index().assign(**names, share=share))
     return Gap(pd.DataFrame(scores), pd.concat(classes, ignore_index=True))
 
 
@@ -56,12 +53,12 @@ def labelled_frames(drives: list[kitti.Sequence]) -> list[cityscapes.Pair]:
     pairs = []
     for drive in drives:
         label_folder = true_labels(drive.root, drive.name)
-        if not label_folder.is_dir():
-            continue
-        count = min(len(drive), max(1, IMAGES // len(drives)))
-        middles = (np.arange(count) + 0.5) * len(drive) / count  # of equal parts of the drive
-        for index in middles.astype(int):
-            path = drive.frame_paths[index]
-            name = f"{drive.name}_{path.stem}"
-            pairs.append(cityscapes.Pair(name, path, label_folder / path.name))
+        if label_folder.is_dir():
+            count = min(len(drive), max(1, IMAGES // len(drives)))
+            middles = (np.arange(count) + 0.5) * len(drive) / count  # of equal parts of the drive
+            paths = [drive.frame_paths[index] for index in middles.astype(int)]
+            pairs += [
+                cityscapes.Pair(f"{drive.name}_{path.stem}", path, label_folder / path.name)
+                for path in paths
+            ]
     return pairs

@@ -1,13 +1,70 @@
-"""Pictures of single frames for notebooks 6 and 7: masks, keypoints, tracks and lines."""
+"""Pictures of frames: masks, keypoints, tracks and lines, and the panels that show them."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from thesis_repro.masks import dilate
 from thesis_repro.report import style
 from thesis_repro.report.style import GREEN, RED
+
+
+def pictures(
+    frame: np.ndarray,
+    pictures: dict[str, np.ndarray],
+    keypoints: dict[str, np.ndarray] | None = None,
+    columns: int = 1,
+    label_maps: Collection[np.ndarray] = (),
+) -> plt.Figure:
+    """Show pictures {title: picture} of a frame's shape.
+
+    keypoints: {title: (n, 2)}, shown on the picture. label_maps: of the classes in a legend.
+    """
+    figure, axes = style.frame_panels(frame, -(-len(pictures) // columns), columns)
+    for panel, (title, picture) in zip(axes, pictures.items()):
+        style.show_image(panel, picture, title)
+        if keypoints and title in keypoints:
+            panel.scatter(*keypoints[title].T, **style.KEYPOINT)
+    for panel in axes[len(pictures) :]:
+        panel.set_axis_off()
+    if label_maps:
+        style.class_legend(figure, *label_maps)
+    return figure
+
+
+def with_edges(frame: np.ndarray, edge_image: np.ndarray) -> np.ndarray:
+    """Return a gray frame as red, green, blue, with edges marked where `edge_image` is not 0."""
+    picture = np.dstack([frame] * 3)
+    picture[edge_image > 0] = style.EDGE_COLOR
+    return picture
+
+
+def small_panels(
+    names: list[str], xlabel: str = "", figure: Any = None
+) -> tuple[Any, list[plt.Axes]]:
+    """Return (figure, panels), one small panel for each name, at most four in a row.
+
+    xlabel: label of the lowest panel of each column. figure: a subfigure for the panels, or None
+    for a new figure.
+    """
+    columns = min(4, len(names))
+    rows = -(-len(names) // columns)
+    if figure is None:
+        figure = plt.figure(figsize=(style.PAGE_WIDTH, rows * 1.65 + 0.6), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for panel in panels[len(names) :]:
+        panel.remove()
+    for panel, name in zip(panels, names, strict=False):
+        panel.set_title(name, fontsize=8, pad=3)
+        panel.tick_params(labelsize=7)
+        panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    panels = panels[: len(names)]
+    for panel in panels[-columns:]:
+        panel.set_xlabel(xlabel, fontsize=8)
+    return figure, panels
 
 
 def gradients(enlarged: np.ndarray, strength: np.ndarray, edge_image: np.ndarray) -> plt.Figure:
@@ -40,22 +97,20 @@ def mask_and_keypoints(
     frame: np.ndarray, edge_image: np.ndarray, mask: np.ndarray, keypoints: np.ndarray, title: str
 ) -> plt.Figure:
     """Draw the edges, the mask and the keypoints (n, 2) of a frame. title: of the edges."""
-    figure, axes = style.frame_panels(frame, rows=3)
-    style.show_image(axes[0], dilate(edge_image, 5), f"{title}, drawn wider")
-    style.show_image(axes[1], mask, f"mask: {100 * (mask > 0).mean():.1f} % of the frame")
-    style.show_image(axes[2], frame, f"{len(keypoints)} keypoints on the mask")
-    axes[2].scatter(*keypoints.T, **style.KEYPOINT)
-    return figure
+    kept = f"{len(keypoints)} keypoints on the mask"
+    panels = {
+        f"{title}, drawn wider": dilate(edge_image, 5),
+        f"mask: {100 * (mask > 0).mean():.1f} % of the frame": mask,
+        kept: frame,
+    }
+    return pictures(frame, panels, {kept: keypoints})
 
 
 def corners(frame: np.ndarray, strength: np.ndarray, points: np.ndarray, title: str) -> plt.Figure:
     """Draw the strength of a corner at each pixel (h, w), and the keypoints (n, 2)."""
-    figure, axes = style.frame_panels(frame, rows=2)
     logarithm = np.log(strength + strength.max() / 1e4)
-    style.show_image(axes[0], logarithm, "R of every pixel (logarithm)")
-    style.show_image(axes[1], frame, title)
-    axes[1].scatter(*points.T, **style.KEYPOINT)
-    return figure
+    panels = {"R of every pixel (logarithm)": logarithm, title: frame}
+    return pictures(frame, panels, {title: points})
 
 
 def tracks(

@@ -23,16 +23,14 @@ def table(gap: Any) -> pd.DataFrame:
 
     A cell is empty if the class is absent.
     """
-    scores = gap.scores
     measures = {}
     for key, (name, factor, digits) in MEASURES.items():
-        measures[name] = (factor * scores[key]).round(digits)
-    columns = scores["model"] + ": " + scores["domain"]
-    measures = pd.DataFrame(measures).set_axis(columns).T
+        measures[name] = (factor * gap.scores[key]).round(digits)
+    columns = gap.scores["model"] + ": " + gap.scores["domain"]
+    rows = pd.DataFrame(measures).set_axis(columns).T
     classes = gap.classes.assign(column=gap.classes["model"] + ": " + gap.classes["domain"])
-    ious = classes.pivot(index=["id", "class"], columns="column", values="iou")
-    ious = ious.droplevel("id").round(3).rename("IoU: {}".format)
-    table = pd.concat([measures, ious])
+    ious = classes.pivot(index=["id", "class"], columns="column", values="iou").droplevel("id")
+    table = pd.concat([rows, ious.round(3).rename("IoU: {}".format)])
     return table.rename_axis(index="measure", columns=None).reset_index()
 
 
@@ -48,7 +46,5 @@ def label_map_quality(build: Path) -> list[dict[str, Any]]:
         return []
     used = pd.read_csv(path).query("used")
     used = used.sort_values("domain", key=lambda names: names != FRAMES, kind="stable")
-    scores = used.to_dict("records")
-    for row in scores:
-        row["seen"] = (row["model"], row["domain"]) == SEEN
-    return scores
+    seen = (used["model"] == SEEN[0]) & (used["domain"] == SEEN[1])
+    return used.assign(seen=seen).to_dict("records")

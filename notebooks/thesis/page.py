@@ -65,10 +65,8 @@ def _copy(settings: Settings, folder: Path) -> None:
         for path in (ROOT / "figures").glob(f"{name}.*"):
             files.setdefault(Path(path.name), path)
     for name, path in files.items():
-        copy = folder / name
-        if not copy.is_file() or copy.read_bytes() != path.read_bytes():
-            with atomic(copy) as temporary:
-                shutil.copyfile(path, temporary)
+        with atomic(folder / name) as temporary:
+            shutil.copyfile(path, temporary)
 
 
 def _executed(settings: Settings) -> list[Path]:
@@ -125,6 +123,7 @@ def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
     real = replace(settings, figures=settings.figures / REAL, kitti_is_embedded=False)
     numbers = beside_the_thesis(real)
     chapter = [
+        *captions.EVIDENCE,
         *captions.CHAPTERS["Chapter 4: results"],
         *(artefact for artefact in captions.ADDED if artefact["name"] in ("comparison", "widths")),
     ]

@@ -1,13 +1,11 @@
 """The ways in: the command line and the public names."""
 
 import json
-import os
 import shlex
 import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
-from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -16,7 +14,10 @@ import pytest
 import thesis_repro as tr
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
+from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
+from thesis_repro.running import results
+from thesis_repro.running.files import write_png
 
 
 def run(command, *options):
@@ -59,19 +60,6 @@ def test_a_command_shows_two_valid_examples(name):
     assert [PARSER.parse_args(words).command for _, *words in examples] == [name, name]
 
 
-def test_forms_of_widths_and_frames():
-    study = ["study", "--kitti", "a", "--output", "b"]
-    for words, widths in (
-        (["1-3,10"], {1, 2, 3, 10}),
-        (["5", "10"], {5, 10}),
-        (["1-2", "4"], {1, 2, 4}),
-    ):
-        options = PARSER.parse_args([*study, "--widths", *words])
-        assert set().union(*options.widths) == widths
-    for text, frames in (("all", None), ("40", 40)):
-        assert PARSER.parse_args([*study, "--frames", text]).frames == frames
-
-
 def test_written_masks_give_the_same_path_as_label_maps(small_world, small_labels, tmp_path):
     where = ["--kitti", small_world / "kitti", "--sequence", "00"]
     labels = ["--labels", small_labels / "00", "--dilation"]
@@ -89,10 +77,6 @@ def test_written_masks_give_the_same_path_as_label_maps(small_world, small_label
         assert one.read_bytes() == two.read_bytes()
         paths.append(one.read_bytes())
     assert len(set(paths)) == len(paths)
-    both = tmp_path / "both"
-    assert run("masks", *where, *labels, "1-2", "--frames", 5, "--output", both) == 0
-    for name in ("mask1", "mask2"):
-        assert len(list((both / name).glob("*.png"))) == 5
 
 
 def test_the_odometry_writes_poses_and_prints_a_summary(small_world, tmp_path, capsys):
@@ -126,47 +110,6 @@ def test_without_ground_truth_there_are_no_errors(
     assert (cv2.imread("path.png") is not None) == ("--plot" in options)
 
 
-def test_data_is_closed_to_outputs(tiny_kitti, tmp_path, capsys):
-    sequence = tiny_kitti / "sequences/00"
-    for where in (["--kitti", tiny_kitti, "--sequence", "00"], ["--sequence", sequence]):
-        for inside in (tiny_kitti / "poses/00.txt", sequence / "new.txt"):
-            before = inside.exists() and inside.read_bytes()
-            assert run("odometry", *where, "--output", inside) == 1
-            assert str(inside) in capsys.readouterr().err
-            assert before == (inside.exists() and inside.read_bytes())
-        assert run("odometry", *where, "--output", tmp_path / "path.txt") == 0
-
-
-def test_the_scale_gate_drops_short_steps(tiny_kitti, capsys):
-    where = ["--kitti", tiny_kitti, "--sequence", "00"]
-    for gate, says in ((0, False), (2, True)):
-        assert run("odometry", *where, "--scale-gate", gate) == 0
-        assert ("--scale-gate" in capsys.readouterr().err) == says
-
-
-NOT_UTF8 = os.fsdecode(b"caf\xe9\n\x1b")
-
-
-def test_names_that_are_not_utf8_are_shown_escaped(tiny_kitti, tmp_path, capsys):
-    root = tiny_kitti.rename(tmp_path / NOT_UTF8)
-    for place in ("sequences/{}", "poses/{}.txt"):
-        (root / place.format("00")).rename(root / place.format(NOT_UTF8))
-    labels = tmp_path / f"labels {NOT_UTF8}" / NOT_UTF8
-    labels.mkdir(parents=True)
-    for index in range(4):
-        label_map = np.repeat([[7], [23]], 24, axis=0).repeat(64, axis=1).astype(np.uint8)
-        (labels / f"{index:06d}.png").write_bytes(cv2.imencode(".png", label_map)[1].tobytes())
-    where = ["--kitti", root, "--sequence", NOT_UTF8]
-    masks = ["--labels", labels.parent, "--dilation", 3]
-    path, drawing = tmp_path / "path.txt", tmp_path / "path.svg"
-    assert run("check-data", "--kitti", root) == 0
-    assert run("masks", *where, *masks, "--output", tmp_path / f"masks {NOT_UTF8}") == 0
-    assert run("odometry", *where, *masks, "--output", path, "--plot", drawing) == 0
-    printed = capsys.readouterr().out
-    assert "caf\\udce9\\n\\x1b" in printed and "\x1b" not in printed
-    assert ElementTree.parse(drawing)
-
-
 def test_public_names():
     assert all(hasattr(tr, name) for name in tr.__all__) and not hasattr(tr, "mistyped")
     assert tr.__version__ == metadata.version("thesis-repro")
@@ -186,12 +129,47 @@ def test_tensorflow_is_loaded_on_first_use():
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
-def test_bad_input_is_one_line_in_a_notebook():
-    assert tr.InputError("frames: none")._render_traceback_() == ["InputError: frames: none"]
-
-
 CAMERA = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
 MAP, FRAME = np.full((8, 8), 7, np.uint8), np.eye(96, 128, dtype=np.uint8)
+
+
+def test_options_of_the_odometry(tiny_kitti, tmp_path, capsys):
+    (tiny_kitti / "poses/00.txt").rename(tmp_path / "truth.txt")
+    (tmp_path / "camera.txt").write_text("50 50 32 24 -0.3 0.1 0 0")
+    where = ["--kitti", tiny_kitti, "--sequence", "00", "--json", "--scale-gate"]
+    summaries = []
+    for options in (
+        [0],
+        [0, "--truth", tmp_path / "truth.txt"],
+        [0, "--spread", 20],
+        [0, "--calibration", tmp_path / "camera.txt"],
+        [2],
+    ):
+        assert run("odometry", *where, *options) == 0
+        out, err = capsys.readouterr()
+        assert ("4 of 4 steps" in err or "3 of 4 steps" in err) == (options == [2])
+        summaries.append(json.loads(out))
+    plain, true, spread, undistorted, _ = summaries
+    assert plain["rmse_m"] is None and true["rmse_m"] > 0
+    assert 10 < spread["mean_keypoints"] <= 20 < plain["mean_keypoints"]
+    assert undistorted["mean_keypoints"] != plain["mean_keypoints"]
+
+
+def test_label_maps_in_other_ids_give_the_same_masks(tiny_kitti, tmp_path):
+    labels = np.repeat([[23], [7]], 24, axis=0).repeat(64, axis=1).astype(np.uint8)
+    (tmp_path / "ids.csv").write_text("2,sky\n300,road\n")
+    numbers = np.where(labels == 7, 300, 2).astype(np.uint16)
+    colours = cityscapes.colorize(labels)[..., ::-1]
+    made = []
+    for ids, picture in (("labels", labels), ("colors", colours), (tmp_path / "ids.csv", numbers)):
+        for index in range(4):
+            write_png(tmp_path / f"maps/{index:06d}.png", picture)
+        maps = ["--labels", tmp_path / "maps", "--dilation", 3]
+        where = ["--kitti", tiny_kitti, "--sequence", "00", *maps]
+        assert run("masks", *where, "--ids", ids, "--output", tmp_path / "masks") == 0
+        made.append((tmp_path / "masks/000002.png").read_bytes())
+    assert made[0] == made[1] == made[2]
+    assert "table" in results.record(tmp_path / "masks")
 
 
 @pytest.mark.parametrize(
@@ -199,17 +177,12 @@ MAP, FRAME = np.full((8, 8), 7, np.uint8), np.eye(96, 128, dtype=np.uint8)
     [
         (lambda: tr.keypoint_mask(np.zeros((8, 8, 35), np.uint8), (16, 32), 3), "label map"),
         (lambda: tr.keypoint_mask(MAP + 30, (16, 32), 3), "label map"),
-        (lambda: tr.keypoint_mask(MAP, (16, 32, 3), 3), "size"),
-        (lambda: tr.keypoint_mask(MAP, (16, 32.0), 3), "size"),
-        (lambda: tr.keypoint_mask(MAP, (16, 0), 3), "size"),
-        (lambda: tr.keypoint_mask(MAP, (16, 32), 3, {"ids": "train"}), "settings"),
         (lambda: tr.Odometry(CAMERA.T), "intrinsics"),
         (lambda: tr.Odometry(-CAMERA), "intrinsics"),
         (lambda: tr.Odometry(np.eye(3)).step(FRAME), "intrinsics"),
         (lambda: tr.Odometry(CAMERA, [MAP]), "settings"),
         (lambda: tr.Odometry(CAMERA, start=2 * np.eye(4)), "start"),
         (lambda: tr.Odometry(CAMERA, start=np.eye(4) + np.eye(4, k=-1)[::-1]), "start"),
-        (lambda: tr.Sequence("kitti", 7), "sequence"),
     ],
 )
 def test_wrong_arguments_are_named(call, named):

@@ -66,16 +66,3 @@ def test_faults_are_named(tiny_cityscapes):
     ):
         with pytest.raises(InputError, match=named):
             cityscapes.pairs(root, split)
-
-
-def test_train_ids_become_label_ids(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.array([[*range(19), 255]], np.uint8))
-    names = [
-        cityscapes.LABELS[label].name
-        for label in cityscapes.read_label_map(tmp_path / "a.png", True)[0]
-    ]
-    assert names == [*cityscapes.TRAINED, "unlabeled"]
-    for train_ids, value in ((True, 19), (False, 255)):
-        cv2.imwrite(str(tmp_path / "a.png"), np.array([[value]], np.uint8))
-        with pytest.raises(InputError, match="a.png: .*--ids"):
-            cityscapes.read_label_map(tmp_path / "a.png", train_ids)

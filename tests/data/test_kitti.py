@@ -8,12 +8,10 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from evo.tools import file_interface
 
 from thesis_repro import checks, odometry
 from thesis_repro.command import cli
 from thesis_repro.data import kitti, kitti_raw
-from thesis_repro.data.trajectories import write_tum
 from thesis_repro.errors import InputError
 
 
@@ -29,34 +27,6 @@ def test_reads_a_sequence(tiny_kitti):
     short = sequence.subset(2)
     assert len(short) == len(short.poses) == len(short.times) == 2
     assert len(sequence.subset(99)) == len(sequence.subset(None)) == 4
-    for count in (0, -5, 2.5, "3"):
-        with pytest.raises(InputError, match=f"frames {count!r}"):
-            sequence.subset(count)
-
-
-def test_tum_files_are_read_by_evo(tmp_path):
-    random = np.random.default_rng(0)
-    poses, times = np.tile(np.eye(4), (50, 1, 1)), np.sort(random.random(50))
-    poses[:, :3, 3] = random.normal(size=(50, 3))
-    # up to half a turn
-    poses[1:, :3, :3] = [cv2.Rodrigues(vector)[0] for vector in random.normal(size=(49, 3))]
-    write_tum(tmp_path / "path.tum", poses, times)
-    trajectory = file_interface.read_tum_trajectory_file(tmp_path / "path.tum")
-    assert np.array_equal(trajectory.timestamps, times) and np.array_equal(
-        trajectory.positions_xyz, poses[:, :3, 3]
-    )
-    np.testing.assert_allclose(trajectory.poses_se3, poses, rtol=0, atol=1e-12)
-    assert (trajectory.orientations_quat_wxyz[:, 0] >= 0).all()
-
-
-def test_sequences_with_and_without_published_poses(tiny_kitti):
-    for name in ("03", "11"):
-        (tiny_kitti / "sequences" / name / "image_0").mkdir(parents=True)
-    assert kitti.sequences(tiny_kitti) == ["00", "03"] and kitti.with_frames(tiny_kitti) == [
-        "00",
-        "03",
-        "11",
-    ]
 
 
 def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
@@ -70,25 +40,13 @@ def test_colour_jpeg_frames_are_read_as_gray_with_the_colour_camera(tiny_kitti):
         )
         path.unlink()
     sequence = kitti.Sequence(tiny_kitti, "0")  # "0" stands for "00"
-    assert sequence.name == kitti.name_of(tiny_kitti, "0") == "00" and kitti.sequences(
+    assert sequence.name == kitti.locate(tiny_kitti, "0")[1].name == "00" and kitti.sequences(
         tiny_kitti
     ) == ["00"]
     assert np.array_equal(sequence.intrinsics, [[60, 0, 30], [0, 60, 20], [0, 0, 1]])
     assert sequence.frame(3).shape == (48, 64) and sequence.frame(3).dtype == np.uint8
     assert np.abs(sequence.frame(3).astype(int) - cv2.GaussianBlur(before, (0, 0), 2)).max() < 8
     assert sequence.label_names == [f"{index:06d}.png" for index in range(4)]
-
-
-def test_frames_are_ordered_by_number_and_a_missing_one_is_named(tiny_kitti):
-    images = tiny_kitti / "sequences/00/image_0"
-    for index, path in enumerate(sorted(images.glob("*.png"))):
-        path.rename(images / f"drive_{index + 8}.png")
-    assert [path.stem for path in kitti.Sequence(tiny_kitti, "00").frame_paths] == [
-        f"drive_{n}" for n in (8, 9, 10, 11)
-    ]
-    (images / "drive_11.png").rename(images / "drive_15.png")
-    with pytest.raises(InputError, match="drive_11.png"):
-        kitti.Sequence(tiny_kitti, "00")
 
 
 def test_without_ground_truth_steps_are_assumed(tiny_kitti):
@@ -102,9 +60,6 @@ def test_without_ground_truth_steps_are_assumed(tiny_kitti):
     )
     with pytest.raises(InputError, match="poses/00.txt"):
         sequence.poses  # noqa: B018
-    for speed in (0, -1, np.nan):
-        with pytest.raises(InputError):
-            kitti.Sequence(tiny_kitti, "00", speed=speed)
     (tiny_kitti / "sequences/00/times.txt").unlink()
     assert np.allclose(kitti.Sequence(tiny_kitti, "00").times, [0, 0.1, 0.2, 0.3])
     with pytest.raises(InputError, match=r"times.txt.*--fps"):
@@ -124,12 +79,6 @@ def test_frames_a_second_replace_a_missing_file_of_times(tiny_kitti):
             kitti.Sequence(tiny_kitti, "00", fps=fps)
 
 
-def test_the_error_of_a_missing_calibration_shows_its_form(tiny_kitti):
-    (tiny_kitti / "sequences/00/calib.txt").unlink()
-    with pytest.raises(InputError, match=r"calib.txt.*P0: f 0 u 0 0 f v 0 0 0 1 0"):
-        kitti.Sequence(tiny_kitti, "00")
-
-
 def test_a_folder_of_frames_needs_no_layout(tiny_kitti, tmp_path):
     folder = tmp_path / "mine"
     shutil.copytree(tiny_kitti / "sequences/00/image_0", folder)
@@ -147,14 +96,6 @@ def test_a_folder_of_frames_needs_no_layout(tiny_kitti, tmp_path):
     )
     official = kitti.Sequence(None, tiny_kitti / "sequences/00")
     assert official.has_truth and official.name == "00"
-
-
-def test_frames_of_two_kinds_are_refused(tiny_kitti):
-    shutil.copy(tiny_kitti / "sequences/00/image_0/000000.png", tiny_kitti / "a.png")
-    (tiny_kitti / "a.jpg").touch()
-    shutil.copy(tiny_kitti / "sequences/00/calib.txt", tiny_kitti)
-    with pytest.raises(InputError, match="holds PNG and JPEG images"):
-        kitti.Sequence(None, tiny_kitti)
 
 
 @pytest.mark.parametrize("size", [(1024, 320), (1226, 370)])
@@ -226,7 +167,7 @@ def test_a_folder_of_drives_is_a_root_and_a_link_a_sequence(drive, tiny_kitti):
     for root, name in ((drive.parent, NAME), (tiny_kitti, "drive0001")):
         sequence = kitti.Sequence(root, name)
         assert sequence.name == name and np.array_equal(sequence.poses, expected.poses)
-        assert checks.check_kitti(root)[1] == []
+        assert checks.check_kitti(root) == []
     assert [folder for folder, _ in cli._image_folders(drive.parent)] == [drive]
 
 
@@ -248,7 +189,7 @@ def test_a_damaged_file_is_named(drive, file, text):
         (drive / file).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=file.split("/")[-1]):
         kitti.Sequence(None, drive)
-    assert any(file.split("/")[-1] in line for line in checks.check_kitti(drive.parent)[1])
+    assert any(file.split("/")[-1] in line for line in checks.check_kitti(drive.parent))
 
 
 @pytest.mark.real

@@ -5,8 +5,6 @@ import json
 from thesis_repro.running.settings import ROOT
 
 NOTEBOOKS = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
-# those that are lessons: short cells, few names of the package
-LESSONS = [name for name in NOTEBOOKS if name < "09"]
 
 
 def named(number):

@@ -243,25 +243,6 @@ def test_the_figure_of_paths_shows_repetitions_and_their_errors():
     assert distances == [[0, 0, 0, 5], [0, 0, 1, 5], [0, 0, 2, 5]]
 
 
-def test_errors_of_all_methods_are_enlarged_alike():
-    runs = runs_of(["00", "drive0005"], lambda *_: 1.0, widths=[7], repetitions=1)
-    runs.loc[runs["method"] == "reduced", "max_keypoints"] = 512
-    chosen = {method: compare.of_method(runs, method) for method in chapter4.METHODS}
-    errors = {"baseline": 0.02, "masked": 0.2, "reduced": 0.01}  # metres
-    paths = {
-        (row.sequence, row.run): AHEAD + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [errors[method], 0, 0]]
-        for method, rows in chosen.items()
-        for row in rows.itertuples()
-    }
-    truths = {"00": AHEAD, "drive0005": AHEAD}
-    limits = set()
-    for rows in chosen.values():
-        figure = chapter4.figure_paths(truths, rows, paths)
-        limits.add(figure.axes[0].dataLim.bounds)
-        assert "x2 " in figure.axes[0].get_title() and problems(figure) == []
-    assert len(limits) == 1
-
-
 @pytest.mark.parametrize("lost", [0, 1])
 def test_a_lost_run_is_marked_where_runs_are_drawn(lost):
     runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.1)
@@ -280,38 +261,6 @@ def test_a_lost_run_is_marked_where_runs_are_drawn(lost):
         crosses = [line for line in figure.findobj(plt.Line2D) if line.get_marker() == "x"]
         words = [text.get_text() for text in figure.findobj(plt.Text)]
         assert bool(crosses) == bool(lost) and words.count("lost run") == lost
-
-
-def test_error_bars_span_the_repetitions():
-    runs = runs_of(["00"], lambda *_: 0.1)  # the mean of three equal numbers is rounded
-    for figure in (
-        chapter4.figure_of_methods(runs, "rmse"),
-        chapter4.figure_of_sequences(runs, "rmse"),
-    ):
-        assert not figure.axes[0].collections[0].get_segments()[0].size  # no range
-    rows = (runs["method"] == "baseline") & (runs["estimator"] == "thesis")
-    runs.loc[rows, "rmse"] = [1, 2, 6]
-    (segment,) = chapter4.figure_of_methods(runs, "rmse").axes[0].collections[0].get_segments()
-    assert segment[:, 1].tolist() == [1, 6]
-
-
-def test_the_table_of_times_has_sums():
-    measured = pd.DataFrame(
-        [
-            (method, stage, 10.0)
-            for method, stages in (
-                ("all keypoints", "read detection tracking pose"),
-                ("masked, width 10", "read segmentation mask detection tracking pose"),
-            )
-            for stage in stages.split()
-        ],
-        columns=["method", "stage", "milliseconds"],
-    )
-    table = tables.table_budget(measured).set_index("stage")
-    assert table.loc["all stages (ms)"].tolist() == [40, 60] and table.loc[
-        "frames a second"
-    ].tolist() == [25, 16.7]
-    assert np.isnan(table.loc["segmentation (ms)", "all keypoints"])
 
 
 HOSTILE = [

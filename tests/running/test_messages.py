@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from thesis_repro.errors import InputError
-from thesis_repro.running import files, messages, results
+from thesis_repro.running import files, messages
 
 
 def failing(error):
@@ -45,24 +45,13 @@ def test_unexpected_errors_are_raised():
         messages.run(failing(ZeroDivisionError("1/0")))
 
 
-def test_a_log_has_messages_and_the_error(tmp_path, capsys):
+def test_warnings_and_the_summary_are_printed_apart(capsys):
     messages.print_messages()
-    with pytest.raises(InputError), messages.logged(tmp_path / "out", "thesis-repro study") as run:
-        results.stage(tmp_path / "out", size=3)
-        messages.log.warning("sequence 00 failed")
-        run.end("3 runs")
-        raise InputError("bad")
+    messages.log.warning("sequence 00 failed")
+    messages.summary("3 runs", 2)
     printed = capsys.readouterr()
-    assert printed.out.startswith("3 runs\n") and "warnings: 1" in printed.out
+    assert printed.out.startswith("3 runs\n") and "from an earlier run: 2" in printed.out
     assert printed.err == "warning: sequence 00 failed\n"
-    lines = (tmp_path / "out" / messages.LOG).read_text().splitlines()
-    assert "INFO    thesis-repro study" in lines[0] and lines[-1].endswith("ERROR   bad")
-
-
-def test_a_refused_run_leaves_no_log(tmp_path):
-    with pytest.raises(InputError), messages.logged(tmp_path, "thesis-repro study"):
-        raise InputError("bad")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

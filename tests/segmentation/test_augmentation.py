@@ -47,14 +47,6 @@ def test_noise_is_as_strong_as_in_the_thesis():
     assert 2.7 < min(spread) < 4.0 and 6.0 < max(spread) < 7.3
 
 
-def test_the_copy_of_an_image_does_not_depend_on_the_others(pair):
-    images, labels = (np.stack([array] * 3) for array in pair)
-    transforms = augmentation.training_augmenter(SIZE)
-    copies, _ = augmentation.augment_set(images, labels, transforms, 5)
-    first_two, _ = augmentation.augment_set(images[:2], labels[:2], transforms, 5)
-    assert not np.array_equal(copies[0], copies[1]) and np.array_equal(copies[:2], first_two)
-
-
 @pytest.mark.parametrize(
     "transform",
     [albumentations.Normalize(), albumentations.ToFloat(), albumentations.Resize(SIZE, SIZE // 2)],

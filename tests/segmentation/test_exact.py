@@ -11,11 +11,9 @@ from collections import Counter
 import keras
 import numpy as np
 import pytest
-import tensorflow as tf
 from tensorflow.python.eager import context
 
 from thesis_repro.segmentation import prediction, training
-from thesis_repro.segmentation.exact import same_bits
 from thesis_repro.segmentation.unet import build_unet
 
 pytestmark = pytest.mark.slow
@@ -192,36 +190,3 @@ def test_other_models_keep_keras_own_batch_normalisation():
     image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 1)).astype(np.float32)
     assert inexact(operations(lambda: ours.predict(image, verbose=0))) == set()
     assert inexact(operations(lambda: copy.predict(image, verbose=0))) == {"Rsqrt"}
-
-
-@pytest.mark.parametrize(
-    "options", [{"axis": 1}, {"synchronized": True}, {"dtype": "mixed_float16"}, {"scale": False}]
-)
-def test_layers_with_unusual_settings_stay_as_they_are(options):
-    layer = keras.layers.BatchNormalization(**options)
-    model = keras.Sequential([keras.Input((8, 8, 4)), layer])
-    assert same_bits(model) is model and "call" not in vars(layer)
-
-
-def test_the_moving_averages_follow_the_batches():
-    image = np.random.default_rng(0).normal(3, 2, (4, 8, 8, 4)).astype(np.float32)
-    plain = keras.Sequential([keras.Input((8, 8, 4)), keras.layers.BatchNormalization()])
-    exact = same_bits(keras.models.clone_model(plain))
-    for _ in range(3):
-        outputs = [model(image, training=True).numpy() for model in (plain, exact)]
-    assert outputs[1] == pytest.approx(outputs[0], abs=1e-5)
-    for one, other in zip(plain.get_weights(), exact.get_weights(), strict=True):
-        assert np.array_equal(one, other)
-    assert exact(image).numpy() == pytest.approx(plain(image).numpy(), abs=1e-5)
-
-
-def test_xla_divides_exactly():
-    values = np.random.default_rng(0).uniform(0.01, 5000, 4096).astype(np.float32)
-
-    @tf.function(jit_compile=True)
-    def compiled(v):
-        return 1 / v, tf.math.reciprocal(v), tf.sqrt(1 / v), 3 / v
-
-    expected = (1 / values, 1 / values, np.sqrt(1 / values), np.float32(3) / values)
-    for ours, exact in zip(compiled(tf.constant(values)), expected, strict=True):
-        assert np.array_equal(ours, exact)

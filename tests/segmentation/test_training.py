@@ -190,16 +190,12 @@ def test_every_change_of_a_training_changes_its_record():
     records = [training.made_from(*prepared())]
     for change in ({"rate": 0.02}, {"filters": 4}, {"loss": sm.losses.DiceLoss()}):
         records.append(training.made_from(*prepared(**change)))  # noqa: PERF401
-    model, batches, validation = prepared()
-    for other in ([SETS[:2]], 4, 1), ([SETS[:2]], 5, 0), ([(SETS[0] // 2, SETS[1])], 4, 0):
-        records.append(training.made_from(model, training.Batches(*other), validation))  # noqa: PERF401
     assert len({str(record) for record in records}) == len(records)
-    assert training.made_from(model, batches, validation) == records[0]
+    assert training.made_from(*prepared()) == records[0]
 
 
 SETS_REFUSED = {
     "empty": (SETS[0][:0], SETS[1][:0]),
-    "unknown id": (SETS[0], np.full_like(SETS[1], 35)),
     "another size": (SETS[0], SETS[1][:, :8]),
     "after A.Normalize": (SETS[0] / np.float32(255), SETS[1]),
 }

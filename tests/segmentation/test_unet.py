@@ -1,8 +1,9 @@
 import pytest
 
 from thesis.captions import REPORTED
+from thesis.diagrams import summary_rows
 from thesis_repro.errors import InputError
-from thesis_repro.segmentation.unet import build_unet, summary_rows
+from thesis_repro.segmentation.unet import build_unet
 
 FIGURE = REPORTED["figure_a1_model_summary"]
 

@@ -145,13 +145,6 @@ def test_masks_are_compared_with_all_keypoints_and_every_control():
     assert compare.overall(["lower", compare.TOO_FEW]) == compare.overall([]) == compare.TOO_FEW
 
 
-def test_an_error_that_no_run_has_is_not_compared():
-    runs = runs_of({"masked": 0.5})
-    runs.loc[runs["estimator"] == "refined", "se3"] = np.nan
-    pairs = compare.comparisons(runs)[["estimator", "metric"]].drop_duplicates().to_numpy().tolist()
-    assert ["thesis", "se3"] in pairs and ["refined", "se3"] not in pairs
-
-
 def test_sources_are_compared_with_each_other():
     one, other = runs_of({"masked": 0.5}), runs_of({"masked": 0.25})
     other = other[other["method"] == "masked"].assign(source="other")
@@ -183,12 +176,6 @@ def test_sequences_far_off_the_mean_are_named():
     assert compare.far_off(pd.Series({"00": 1.0, "01": 90.0})) == []
     assert compare.far_off(pd.Series(dict.fromkeys(EIGHT, 2.9) | {"01": 1.0})) == []
     assert compare.far_off(pd.Series({"00": 1.0, "01": 0.6, "02": 1.4, "03": 90.0})) == ["03"]
-
-
-def test_shuffling_is_reported_as_a_factor():
-    runs = runs_of({}, sequences=["00"], estimators=("thesis",))
-    runs["rmse"] = [1.0, 3.0]
-    assert compare.shuffle_spread(runs)["factor"].tolist() == [3.0]
 
 
 def parts_of(
@@ -228,15 +215,6 @@ def test_leaving_one_out_shows_that_the_best_width_is_chance():
         assert (changes < 0).sum() == better
 
 
-def test_a_width_that_failed_in_one_sequence_is_not_chosen_for_all():
-    masked, baseline = parts_of(
-        lambda name, width: 0.1 if width == 15 else 1.0, ["00", "01", "02"], (5, 10, 15)
-    )
-    failed = (masked["sequence"] == "01") & (masked["dilation_width"] == 15)
-    chosen = thesis_tables.chosen_widths(masked[~failed], baseline)
-    assert set(chosen["fixed"]) == {5} and chosen["left_out"].tolist() == [5, 15, 5]
-
-
 def test_other_repetitions_confirm_a_real_optimum_and_no_chance():
     real = thesis_tables.stability(*parts_of(separate_optimum, noise=0.05))
     assert (real["same_best"] == 100).all()
@@ -248,14 +226,6 @@ def test_other_repetitions_confirm_a_real_optimum_and_no_chance():
     masked, baseline = parts_of(separate_optimum)  # only one width has repetitions
     repeated = masked[(masked["repetition"] == 0) | (masked["dilation_width"] == 10)]
     assert thesis_tables.stability(repeated, baseline).isna().all(axis=None)
-
-
-def test_the_literal_procedure_uses_one_repetition_alone():
-    masked, baseline = parts_of(lambda name, width: 1.0 if width is None else 0.5 + width / 10)
-    masked.loc[(masked["repetition"] == 1) & (masked["dilation_width"] == 7), "rmse"] = 0.2
-    for repetition, change in ((0, -40), (1, -80)):
-        changes = thesis_tables.changes_of_repetition(masked, baseline, "rmse", repetition)
-        assert changes.tolist() == pytest.approx([change] * 11)
 
 
 def test_the_best_of_many_widths_looks_better_if_masks_do_nothing():
@@ -272,15 +242,3 @@ def test_the_best_of_many_widths_looks_better_if_masks_do_nothing():
     assert (thesis_tables.null_distribution(other, 15, "mae").mean() > 0).all()
     once = baseline[baseline["repetition"] == 0]
     assert thesis_tables.null_distribution(once, 15, "rmse").empty
-
-
-def test_time_savings_are_negative_percentages_over_all_sequences():
-    seconds = pd.DataFrame(
-        {
-            "sequence": ["00", "00", "01", "01"],
-            "method": ["baseline", "masked"] * 2,
-            "dilation_width": [np.nan, 5] * 2,
-            "seconds": [10.0, 4.0, 30.0, 26.0],
-        }
-    )
-    assert thesis_tables.time_savings(seconds).to_dict() == {5: -25}

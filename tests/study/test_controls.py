@@ -82,21 +82,6 @@ def test_random_lines_and_image_edges_cover_as_much_as_the_mask(sequence, made):
     assert (made["random-lines"][3][strongest] > 0).mean() < 0.6
 
 
-@pytest.mark.parametrize("value", [0, 255])
-def test_controls_of_empty_and_full_masks(sequence, made, monkeypatch, value):
-    monkeypatch.setattr(
-        mask_files.LabelMasks,
-        "__getitem__",
-        lambda self, index: np.full(self.size, value, np.uint8),
-    )
-    lines = masks.coverage(made["random-lines"][0])
-    edges = masks.coverage(made["image-edges"][0])
-    if value:
-        assert lines > 0.99 and edges > 0.5
-    else:
-        assert lines == edges == 0
-
-
 def test_spread_keypoints_have_the_asked_number(sequence):
     counts = [len(keypoints.detect(frame, THESIS)) for frame in sequence.frames()]
     target = np.mean(counts) / 2

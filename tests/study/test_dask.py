@@ -13,7 +13,6 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.study import runner, workers
 from thesis_repro.study.jobs import first_jobs
-from thesis_repro.study.sources import by_name
 
 pytestmark = pytest.mark.slow
 
@@ -84,19 +83,3 @@ def test_a_cluster_gives_the_same_bits_although_a_worker_is_killed(
     result = runner.run_jobs(jobs, opened, small_labels, there, scheduler=scheduler)
     killer.join()
     pd.testing.assert_frame_equal(result.table, here.table, check_exact=True)
-
-
-def test_a_worker_with_other_folders_or_other_code_is_reported(
-    small_world, small_labels, tmp_path, monkeypatch
-):
-    opened = Sequence(small_world / "kitti", "00")
-    jobs = first_jobs([opened], {"thesis": ()})
-    runner.run_jobs(jobs, [opened], small_labels, tmp_path)
-    record = runner.results.record(tmp_path / "00")
-    inputs = opened, by_name(small_labels)
-    _, elsewhere = runner._run_pass(jobs, *inputs, tmp_path / "elsewhere", record, 0.1)
-    (tmp_path / "00" / "baseline-0.csv").unlink()
-    monkeypatch.setattr(runner, "_versions", lambda: {"code": "other", "opencv": "5"})
-    _, older = runner._run_pass(jobs, *inputs, tmp_path, record, 0.1)
-    assert elsewhere[jobs[0]] != older[jobs[0]]
-    assert not (tmp_path / "00" / "baseline-0.csv").exists()

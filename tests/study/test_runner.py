@@ -16,7 +16,6 @@ from thesis_repro import mask_files, masks, odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import metrics
-from thesis_repro.odometry.types import ROTATION_COLUMNS
 from thesis_repro.running import messages
 from thesis_repro.segmentation import training
 from thesis_repro.study import compare, methods, runner, workers
@@ -65,17 +64,6 @@ def test_a_run_equals_the_odometry_of_its_sequence(small_world, small_labels, fi
     assert best["rmse"] == least.loc["masked", "rmse"]
     assert least.loc["reduced", "max_keypoints"] == round(best["mean_keypoints"])
     assert np.array_equal(runner.run_poses(summary, folder)["01", "masked-15-0"], alone.poses)
-
-
-@pytest.mark.parametrize("frames, t_rel", [(151, 2.02), (99, np.nan)])
-def test_kittis_errors_need_paths_of_100_metres(frames, t_rel):
-    true = np.tile(np.eye(4), (frames, 1, 1))
-    true[:, 2, 3] = np.arange(frames)
-    columns = np.c_[1.02 * true[:, :3, 3], true[:, :3, :3].reshape(-1, 9)]
-    table = pd.DataFrame(columns, columns=[*"xyz", *ROTATION_COLUMNS])
-    measured = runner.measures(table.assign(detected=9.0, flag=""), true)
-    assert measured["t_rel"] == pytest.approx(t_rel, nan_ok=True)
-    assert measured["r_rel"] == pytest.approx(0 * t_rel, nan_ok=True)
 
 
 def test_only_missing_runs_are_run_again(small_world, small_labels, finished):
@@ -157,40 +145,6 @@ def test_a_sequence_without_structure_has_no_result(tiny_kitti, tmp_path):
     assert len(outcome.warnings) == 1 and "sequence 01, " in outcome.warnings[0]
     with pytest.raises(InputError, match="sequences/01: "):
         runner.run_jobs(jobs[2:], sequences, tmp_path / "none", tmp_path / "runs")
-
-
-def test_the_settings_of_all_masks_can_be_chosen(small_world, small_labels, tmp_path):
-    jobs = [Job("00", "masked", 10), Job("00", "exact-boundaries", 10)]
-
-    def keypoints(*settings):
-        source = Source(small_labels, "labels", "", *settings)
-        outcome = runner.run_jobs(jobs, opened(small_world, 4), [source], tmp_path)
-        return outcome.table.set_index("method")["mean_keypoints"]
-
-    thesis = keypoints()
-    assert thesis["masked"] != thesis["exact-boundaries"]
-    exact = keypoints(
-        masks.MaskSettings("exact")
-    )  # the same folder: the first results are replaced
-    assert exact["masked"] == exact["exact-boundaries"] == thesis["exact-boundaries"]
-    chosen = masks.MaskSettings(
-        "exact", symmetric=True, classes=("road", "building"), movable=3, margin=20
-    )
-    few = keypoints(chosen)
-    sequence = opened(small_world, 4)[0]
-    alone = odometry.run(
-        sequence, masks=mask_files.LabelMasks(small_labels / "00", sequence, 10, chosen)
-    )
-    assert few["masked"] == alone.frames["detected"].mean() < exact["masked"]
-
-
-def test_runs_are_timed_once(small_world, small_labels, finished, monkeypatch):
-    folder, jobs, _ = finished
-    first = [job for job in jobs if job.method != "reduced"]
-    timed = timing.time_runs(first, opened(small_world, 4), small_labels, folder)
-    assert list(timed["run"]) == [job.name for job in first] and (timed["seconds"] > 0).all()
-    again = timing.time_runs(first, opened(small_world, 4), small_labels, folder)
-    pd.testing.assert_frame_equal(timed, again)
 
 
 def test_first_jobs_are_complete_and_have_different_names(small_world, tiny_kitti):

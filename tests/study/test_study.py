@@ -17,9 +17,8 @@ from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, write_masks
-from thesis_repro.masks import MaskSettings
 from thesis_repro.report import study as report
-from thesis_repro.study import compare, runner, sources
+from thesis_repro.study import runner
 from thesis_repro.study.sources import Source
 from thesis_repro.study.study import Study
 
@@ -114,11 +113,10 @@ def test_figures_and_tables_of_a_study(done, study):
     links = re.findall('(?:href|src)="([^"#]+)"', page.read_text())
     assert {"sources.webp", "paths-01.pdf", "errors.tex"} <= set(links)
     assert all((folder / link).is_file() for link in links)
-    assert len(report.figure_sources(study).axes) == 3 * len(study.sources)
-    for path in folder.glob("paths/*/01/net/masked-07-0.txt"):
-        path.unlink()  # as if the run had failed
-    # all keypoints, by hand, ground truth
-    assert len(report.figure_paths(study, "01", folder).axes[0].lines) == 3
+    assert len(report.figure_sources(study, runs).axes) == 3 * len(study.sources)
+    failed = (runs["sequence"] == "01") & (runs["source"] == "net")
+    figure = report.figure_paths(study, runs[~failed], study.opened[1], folder)
+    assert len(figure.axes[0].lines) == 3  # all keypoints, by hand, ground truth
 
 
 @pytest.mark.skipif(not PDFLATEX, reason="needs pdflatex")
@@ -194,17 +192,6 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
 
 
-def test_a_single_sequence_may_have_plain_folders(small_world, small_labels, masks, tmp_path):
-    single = Study(
-        small_world / "kitti",
-        ("00",),
-        (Source(small_labels / "00", name="a"), Source(masks / "00", "masks", "b")),
-        (5,),
-        frames=4,
-    )
-    assert compare.sources(single.run(tmp_path / "out").table) == ["a", "b"]
-
-
 def test_results_of_another_length_are_kept(done, study):
     before = files(done[0])
     with pytest.raises(InputError, match="other settings"):
@@ -228,6 +215,7 @@ def test_results_of_another_length_are_kept(done, study):
         ("--labels {labels}/00", "2 are asked for"),
         ("--labels {less} --sequences 00", "2 of 12 frames of sequence 00"),
         ("--labels {labels} --repetitions 0", "--repetitions 0: "),
+        ("--labels {labels} --controls -1", "dilation width -1: "),
     ],
 )
 def test_bad_input_is_one_line_before_anything_runs(
@@ -260,15 +248,6 @@ def test_bad_input_is_one_line_before_anything_runs(
     )
 
 
-def test_each_source_has_the_name_before_its_folder(tmp_path):
-    folders = [("masks", "by hand", tmp_path), ("labels", None, tmp_path / "lr=0.1")]
-    made = sources.named(folders, MaskSettings())
-    assert [(source.name, source.kind) for source in made] == [
-        ("by hand", "masks"),
-        ("lr-0-1", "labels"),
-    ]
-
-
 def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_labels, tmp_path):
     shutil.copytree(small_labels / "00", tmp_path / "labels" / "00")
     damaged = tmp_path / "labels" / "00" / "000002.png"
@@ -278,3 +257,11 @@ def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_lab
     )
     with pytest.raises(InputError, match="every run with masks failed"):
         study.run(tmp_path / "out")
+
+
+def test_a_sequence_named_like_a_column_of_the_tables_is_refused(tiny_kitti):
+    for place in ("sequences/{}", "poses/{}.txt"):
+        (tiny_kitti / place.format("00")).rename(tiny_kitti / place.format("ratio"))
+    study = Study(tiny_kitti, ("ratio",), (), (5,))
+    with pytest.raises(InputError, match="ratio: has the name of a column"):
+        study.check()

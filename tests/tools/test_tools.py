@@ -1,7 +1,6 @@
 """Each tool runs on tiny input, and the numbers behind its results are right."""
 
 import keras
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -26,32 +25,7 @@ def test_bench_compares_each_measurement_with_a_reference(small_world, monkeypat
     table = bench.measure(Sequence(small_world / "kitti", "00").subset(5))
     assert table["ratio"].tolist() == pytest.approx(table["measured"] / table["reference"])
     assert (table["ratio"] > 0).all() and table["what"].str.contains(" the same bits").sum() == 1
-    assert table.to_json(orient="records").count('"ratio"') == 6
-
-
-def test_muon_treats_convolutions_as_matrices():
-    kernel = keras.Variable(np.zeros((3, 3, 8, 4), np.float32))
-    slope = np.random.default_rng(0).normal(size=kernel.shape)
-    optimizer = train_shipped.Muon(1.0, weight_decay=None, adam_weight_decay=None)
-    optimizer.build([kernel])
-    optimizer.apply_gradients([(keras.ops.convert_to_tensor(slope, "float32"), kernel)])
-    step = kernel.numpy().reshape(72, 4) / (0.2 * 72**0.5)
-    assert np.linalg.svd(step, compute_uv=False) == pytest.approx(1, abs=0.35)  # nearly orthogonal
-
-
-def test_a_view_looks_like_that_of_another_camera():
-    label = np.zeros((188, 620), np.uint8)
-    label[94 - 18 : 94 + 18, 310 - 18 : 310 + 18] = 1  # a square in KITTI's frame
-    for look, (across, down) in train_shipped.LOOKS.items():
-        shapes = []
-        for seed in range(40):
-            _, shown = train_shipped.view(
-                label, label, "kitti", look, 320, np.random.default_rng(seed)
-            )
-            rows, columns = np.nonzero(shown)
-            if len(rows) > 20 and not shown[[0, -1]].any() and not shown[:, [0, -1]].any():
-                shapes.append(np.ptp(rows) / np.ptp(columns))
-        assert np.median(shapes) == pytest.approx(down / across, rel=0.15)
+    assert table.to_json(orient="records").count('"ratio"') == 5
 
 
 @pytest.mark.torture
@@ -135,7 +109,3 @@ def test_evidence_keeps_what_shows_no_frame_and_compares_label_maps(
     monkeypatch.setattr(odometry, "run_many", None)  # would fail
     evidence.write(settings, out, others)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-    (settings.figures / "audit.csv").unlink()
-    (settings.figures / "audit.md").unlink()
-    with pytest.raises(InputError, match="audit"):
-        evidence.write(settings, out, others)

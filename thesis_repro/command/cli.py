@@ -2,17 +2,17 @@
 
 import json
 import os
-import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, replace
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from thesis_repro.command.options import MASK_OPTIONS, build_parser
-from thesis_repro.errors import InputError, missing_package, one_line
+from thesis_repro.errors import InputError, one_line
 from thesis_repro.running import messages
 from thesis_repro.running.settings import ALL_WIDTHS, PROFILES, SEED
 
@@ -24,6 +24,8 @@ OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
     "video": ("video", (".webm",)),
 }
+# settings of the odometry that a study changes in runs with masks only; --scale-gate is for all
+OF_MASKED = ("choice", "max_keypoints", "fill")
 
 
 # The commands, see COMMANDS. Their docstrings are shown by --help. Each imports its libraries
@@ -34,13 +36,12 @@ def synthesize(options: Any) -> None:
     """Write the embedded world, a rendered street, in the layouts of KITTI and Cityscapes."""
     import street_world
 
-    with messages.logged(options.out, options.command_line) as run:
-        new, total = street_world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
-        run.end(
-            f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
-            f"{total:,} images with their label maps",
-            total - new,
-        )
+    new, total = street_world.write(options.out, **PROFILES[options.profile].world, seed=SEED)
+    messages.summary(
+        f"{options.out}: kitti and cityscapes of the embedded world, profile {options.profile}, "
+        f"{total:,} images with their label maps",
+        total - new,
+    )
 
 
 def check_data(options: Any) -> int:
@@ -60,31 +61,21 @@ def predict(options: Any) -> None:
     """
     from thesis_repro.segmentation import quietly
 
-    images = [(folder, paths) for root in options.images for folder, paths in _image_folders(root)]
-    # the name of a link, not of what it points to, because `study` looks for this name
-    names = [Path(os.path.abspath(folder)).name for folder, _ in images]
-    if len(set(names)) < len(names):
-        raise InputError("--images: two folders have the same name; use two commands")
-    # sequences of a KITTI folder always get subfolders, even if there is only one
-    has_subfolders = [folder for folder, _ in images] != options.images[:1]
-    sequences = []
-    for name, (_, paths) in zip(names, images):
-        output = options.folder
-        if has_subfolders:
-            output /= name
-        sequences.append((paths[: options.frames], output))
-    _check_outputs(options, *options.images)
+    images = list(_image_folders(options.images))
+    _check_outputs(options, options.images)
     with quietly():  # this import takes seconds, so the files are checked first
         from thesis_repro.segmentation import prediction, training
-    model_file = options.model or prediction.SHIPPED
-    with messages.logged(options.folder, options.command_line) as run:
-        new = 0
-        model = training.load_model(model_file)
-        for paths, output in sequences:
-            new += prediction.write_label_maps(model, paths, output, scale=float(options.scale))
-        total = sum(len(paths) for paths, _ in sequences)
-        lines = [f"{output}: {len(paths)} label maps" for paths, output in sequences]
-        run.end("\n".join(lines), total - new)
+    model = training.load_model(options.model or prediction.SHIPPED)
+    lines, reused = [], 0
+    for folder, paths in images:
+        output = options.folder
+        if folder != options.images:  # one of several sequences
+            output /= folder.name
+        paths = paths[: options.frames]
+        new = prediction.write_label_maps(model, paths, output, scale=float(options.scale))
+        reused += len(paths) - new
+        lines.append(f"{output}: {len(paths)} label maps")
+    messages.summary("\n".join(lines), reused)
 
 
 def masks(options: Any) -> None:
@@ -92,25 +83,14 @@ def masks(options: Any) -> None:
 
     Masks are 8-bit PNG images: 255 keeps keypoints, 0 ignores them.
     """
-    from thesis_repro.mask_files import LabelMasks, write_masks
+    from thesis_repro.mask_files import write_masks
 
-    sequence, settings = _sequence(options), _mask_settings(options)
-    if not options.dilation and settings.keep != "static":
-        raise InputError("--dilation W: needed for masks from boundaries")
-    mask_sets = [
-        LabelMasks(options.labels, sequence, width, settings)
-        for width in sorted(set().union(*options.dilation or [(1,)]))
-    ]
+    sequence = _sequence(options)
+    label_masks = _masks(options, sequence)
     _check_outputs(options, options.labels, sequence.folder)
-    _warn(_check_masks(sequence, mask_sets))
-    for label_masks in mask_sets:
-        width = label_masks.dilation_width
-        folder = options.folder
-        if len(mask_sets) > 1:
-            folder /= f"mask{width}"
-        write_masks(label_masks, folder)
-        of_width = f" of width {width}" * bool(options.dilation)
-        print(f"{one_line(folder)}: {len(label_masks)} masks{of_width}")
+    _warn(_check_masks(sequence, [label_masks]))
+    write_masks(label_masks, options.folder)
+    messages.summary(one_line(f"{options.folder}: {len(label_masks)} masks"))
 
 
 def odometry(options: Any) -> None:
@@ -121,19 +101,11 @@ def odometry(options: Any) -> None:
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
 
-    changes = {}
-    for field in fields(odometry.OdometrySettings):
-        value = vars(options).get(field.name)
-        if value is not None:
-            changes[field.name] = value
-    settings = replace(odometry.THESIS, **changes)
+    settings = replace(odometry.THESIS, **_odometry_settings(options))
     sequence = _sequence(options)
     masks = _masks(options, sequence)
-    mask_sets = []
-    if masks:
-        mask_sets = [masks]
     _check_outputs(options, sequence.poses_path, options.masks, options.labels, sequence.folder)
-    _warn(_check_masks(sequence, mask_sets))
+    _warn(_check_masks(sequence, filter(None, [masks])))
     result = odometry.run(sequence, settings, masks, description=f"sequence {sequence.name}")
     if options.output:
         write_kitti_poses(options.output, result.poses)
@@ -168,6 +140,7 @@ def odometry(options: Any) -> None:
 
 def study(options: Any) -> int:
     """Compare your own label maps or masks with all keypoints and with controls."""
+    from thesis_repro import checks
     from thesis_repro.data import kitti
     from thesis_repro.running import results
     from thesis_repro.study import sources
@@ -189,7 +162,7 @@ def study(options: Any) -> int:
         if options.keep == "static":
             all_widths = (options.controls or 1,)  # one of any width, because masks have none
         widths = widths.union(*options.widths or [all_widths])
-    names = dict.fromkeys(kitti.name_of(options.kitti, name) for name in options.sequences)
+    names = dict.fromkeys(kitti.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
@@ -200,6 +173,7 @@ def study(options: Any) -> int:
         options.repetitions,
         options.frames,
         options.scale_gate,
+        {name: value for name, value in _odometry_settings(options).items() if name in OF_MASKED},
     )
     planned.check()
     folder = options.folder.absolute()
@@ -207,19 +181,20 @@ def study(options: Any) -> int:
     # this import takes seconds, so the input is checked first
     from thesis_repro.report import study
 
-    with messages.logged(folder, options.command_line) as run, results.claimed(folder):
+    with results.claimed(folder):
         warnings = []
         for sequence, masks in study.shown_masks(planned):
-            warnings += _check_masks(sequence, masks)
-        warnings = _warn(warnings)
+            warnings += _warn(_check_masks(sequence, masks))
         outcome = planned.run(folder, options.jobs, options.dask)
-        warnings += outcome.warnings + _warn(_check_runs(outcome.table))
+        runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
+        of_runs = [
+            checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
+        ]
+        warnings += outcome.warnings + _warn(chain(*of_runs))
         page = study.write(planned, outcome.table, folder, warnings)
-        failed = ""
-        if outcome.failed_jobs:
-            failed = f", {outcome.failed_jobs:,} failed (see above)"
-        run.end(f"{len(outcome.table):,} runs{failed}; open {page} in a browser", outcome.kept)
-    return int(bool(failed))
+    made = f"{len(outcome.table):,} runs, {outcome.failed_jobs:,} failed"
+    messages.summary(f"{made}; open {page} in a browser", outcome.kept)
+    return int(outcome.failed_jobs > 0)
 
 
 COMMANDS = {
@@ -268,6 +243,20 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     }
 
 
+def _odometry_settings(options: Any) -> dict[str, Any]:
+    """The settings of the odometry that options of their names and --spread give."""
+    from thesis_repro.odometry import OdometrySettings
+
+    names = [field.name for field in fields(OdometrySettings)]
+    given = {name: vars(options).get(name) for name in names}
+    settings = {name: value for name, value in given.items() if value is not None}
+    if options.spread:
+        if "max_keypoints" in settings:
+            raise InputError("--spread N, --max-keypoints N: give only one of them")
+        settings |= {"choice": "spread", "max_keypoints": options.spread}
+    return settings
+
+
 def _sequence(options: Any) -> Any:
     from thesis_repro.data.kitti import Sequence
 
@@ -277,6 +266,8 @@ def _sequence(options: Any) -> Any:
         options.camera,
         getattr(options, "speed", None),
         getattr(options, "fps", None),
+        getattr(options, "truth", None),
+        getattr(options, "calibration", None),
     )
     return sequence.subset(options.frames)
 
@@ -289,37 +280,23 @@ def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
     for masks in mask_sets:
         with suppress(InputError):  # a file that cannot be read is reported when it is used
             messages.log.info(checks.describe_masks(masks, sequence))
-            warnings += checks.of_masks(masks, sequence)
-    return warnings
-
-
-def _check_runs(runs: Any) -> list[str]:
-    """Return warnings of the first run of each sequence. runs: the table of a study."""
-    from thesis_repro import checks
-
-    warnings = []
-    for run in runs[runs["method"] == "baseline"].drop_duplicates("sequence").itertuples():
-        warnings += checks.of_run(run.sequence, run.frames, run.flagged)
+            warnings += checks.of_masks(masks)
     return warnings
 
 
 def _warn(lines: Iterable[str]) -> list[str]:
-    """Print warnings, "place: fault", and return them. One fault of several places is one line."""
-    places: dict[str, list[str]] = {}
-    for line in lines:
-        place, _, fault = line.partition(": ")
-        places.setdefault(fault, []).append(place)
-    merged = [f"{', '.join(names)}: {fault}" for fault, names in places.items()]
-    for line in merged:
+    """Print warnings, and return them."""
+    warnings = list(lines)
+    for line in warnings:
         messages.log.warning(line)
-    return merged
+    return warnings
 
 
 def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     """Yield (folder, its images) for each sequence that a path names.
 
     The path is a folder of images, a sequence, a KITTI folder or a folder of sequences.
-    Raises InputError if there are no images, or if frames of a sequence are missing.
+    Raises InputError if there are no images.
     """
     from thesis_repro.data import kitti
 
@@ -334,8 +311,6 @@ def _image_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
         paths = kitti.frames_in(image_folder)
         if not paths:
             raise InputError(f"{image_folder}: holds no PNG or JPEG images")
-        if image_folder != folder:
-            kitti.check_numbering(paths)
         yield folder, paths
 
 
@@ -363,19 +338,20 @@ def _masks(options: Any, sequence: Any) -> Any:
     from thesis_repro.mask_files import LabelMasks, MaskFolder
 
     settings = _mask_settings(options, options.labels)
+    ready_made = vars(options).get("masks")
     if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
         raise InputError("--labels DIR, --dilation W: give both or neither")
-    if options.labels and options.masks:
+    if options.labels and ready_made:
         raise InputError("--labels DIR, --masks DIR: give only one of them")
-    if options.invert and not options.masks:
+    if vars(options).get("invert") and not ready_made:
         raise InputError("--invert: needs --masks DIR")
     if options.labels:
         width = options.dilation
         if width is None:
             width = 1  # masks of what cannot move have no width
         return LabelMasks(options.labels, sequence, width, settings)
-    if options.masks:
-        return MaskFolder(options.masks, sequence, options.invert)
+    if ready_made:
+        return MaskFolder(ready_made, sequence, options.invert)
     return None
 
 
@@ -384,7 +360,7 @@ def _output_files(options: Any) -> dict[str, Path]:
 
 
 def _check_outputs(options: Any, *inputs: Path | None) -> None:
-    """Raise InputError, before anything runs, for an output that cannot be written.
+    """Raise InputError, before anything runs, for an output of an unknown kind or among data.
 
     Data is only read: no output may lie in a folder of it.
     """
@@ -400,11 +376,6 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
                 raise InputError(
                     f"{path}: lies in {folder}, which is only read; name another place"
                 )
-        parent = path.absolute().parent
-        while not parent.exists():
-            parent = parent.parent
-        if not os.access(parent, os.W_OK):
-            raise InputError(f"{path}: {parent} may not be written to; name another place")
 
 
 def _print(options: Any, record: Any, template: str, **values: Any) -> None:
@@ -421,16 +392,6 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    if arguments is None:
-        arguments = sys.argv[1:]
     options = build_parser(COMMANDS).parse_args(arguments)
-    options.command_line = shlex.join(["thesis-repro", *arguments])
     os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
-
-    def command() -> object:
-        try:
-            return options.function(options)
-        except ImportError as error:
-            raise missing_package(error) or error from None
-
-    return messages.run(command)
+    return messages.run(lambda: options.function(options))

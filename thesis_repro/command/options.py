@@ -42,9 +42,20 @@ SHARED: dict[str, dict[str, Any]] = {
         metavar="METRES",
         help="a shorter step leaves the pose as it is; 0 for slow cameras and many frames a second (0.1)",
     ),
+    "--spread": dict(
+        type=settings.positive_whole_number,
+        metavar="N",
+        help="N keypoints, as far apart as their number allows, in place of the 2000 strongest (with study: in "
+        "runs with masks)",
+    ),
+    "--fill": dict(
+        type=settings.positive_whole_number,
+        metavar="N",
+        help="fill each of 16 x 5 fields of the frame to N keypoints where the mask leaves fewer",
+    ),
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
-WIDTHS = dict(type=settings.list_of_widths, nargs="+", action="extend", metavar="W,W")
+DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
 MASK_OPTIONS: dict[str, dict[str, Any]] = {
     "--boundaries": dict(
         metavar="canny|exact",
@@ -75,9 +86,10 @@ MASK_OPTIONS: dict[str, dict[str, Any]] = {
         "between static classes (boundaries)",
     ),
     "--ids": dict(
-        metavar="labels|train",
+        metavar="labels|train|colors|FILE",
         default="labels",
-        help="label maps hold label ids or train ids (labels)",
+        help="label maps hold Cityscapes' label ids, train ids or colours, or those of a table with lines such "
+        "as 34,building or #464646,building (labels)",
     ),
     "--margin": dict(
         type=int, default=0, metavar="PIXELS", help="no keypoints near the frame's border (0)"
@@ -137,11 +149,9 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         **_shared("--frames", "--output"),
         "--images": dict(
             type=Path,
-            nargs="+",
-            action="extend",
             required=True,
             metavar="DIR",
-            help="folder of PNG or JPEG images, one sequence, or a folder of sequences; several get a subfolder each",
+            help="folder of PNG or JPEG images, one sequence, or a folder of sequences, which get a subfolder each",
         ),
         "--model": dict(
             type=Path,
@@ -165,14 +175,23 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="DIR",
             help="a label map for each frame, or a folder of them for each sequence",
         ),
-        "--dilation": dict(
-            **WIDTHS, help="in pixels, such as 5,10 or 1-15; several get a subfolder each"
-        ),
+        "--dilation": DILATION,
     },
     "odometry": {
         **_shared(*SEQUENCE),
         **MASK_OPTIONS,
-        **_shared("--invert", "--scale-gate"),
+        **_shared("--invert", "--scale-gate", "--spread", "--fill"),
+        "--truth": dict(
+            type=Path,
+            metavar="FILE",
+            help="ground truth in KITTI's, TUM's or EuRoC's format (poses/NN.txt, or poses.txt beside the frames)",
+        ),
+        "--calibration": dict(
+            type=Path,
+            metavar="FILE",
+            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2, or YAML of OpenCV or "
+            "ORB-SLAM (calib.txt, without distortion)",
+        ),
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
         ),
@@ -189,9 +208,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="DIR",
             help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
         ),
-        "--dilation": dict(
-            type=int, metavar="W", help="dilation width, in pixels, of masks from label maps"
-        ),
+        "--dilation": DILATION,
         "--estimator": dict(
             metavar="thesis|inliers|refined",
             help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
@@ -228,13 +245,16 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="NN",
             help="sequences to run (all in ROOT)",
         ),
-        **_shared("--frames", "--invert", "--scale-gate"),
+        **_shared("--frames", "--invert", "--scale-gate", "--spread", "--fill"),
         **MASK_OPTIONS,
         **_shared("--output"),
         "--labels": _source("labels", "label maps, any size"),
         "--masks": _source("masks", "masks, 255 keeps keypoints, 0 ignores them"),
         "--widths": dict(
-            **WIDTHS,
+            type=settings.list_of_widths,
+            nargs="+",
+            action="extend",
+            metavar="W,W",
             help="dilation widths of masks from label maps, in pixels, such as 5,10 (1-15)",
         ),
         "--controls": dict(
@@ -253,8 +273,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--estimator": dict(
             nargs="+",
             choices=("thesis", "refined"),
-            default=["thesis"],
-            help="one or both (thesis)",
+            default=["thesis", "refined"],
+            help="one or both (both)",
         ),
         "--jobs": dict(
             type=settings.positive_whole_number,

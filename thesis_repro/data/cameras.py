@@ -45,12 +45,3 @@ def _numbers_of_yaml(text: str) -> np.ndarray:
     # as ORB-SLAM2 and ORB-SLAM3 name them
     nodes = [file.getNode(f"{key}.{name}") for name in NAMES for key in ("Camera", "Camera1")]
     return np.array([node.real() for node in nodes if not node.empty()])
-
-
-def undistorted(
-    image: np.ndarray, matrix: np.ndarray, distortion: np.ndarray, interpolation: int
-) -> np.ndarray:
-    """Return an image as a camera with the same matrix, but without distortion, takes it."""
-    size = image.shape[1::-1]
-    maps = cv2.initUndistortRectifyMap(matrix, distortion, None, matrix, size, cv2.CV_16SC2)
-    return cv2.remap(image, *maps, interpolation)

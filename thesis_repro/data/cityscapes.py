@@ -93,9 +93,6 @@ TRAINED = (
     "motorcycle",
     "bicycle",
 )
-LABEL_OF_TRAIN_ID = np.full(256, 255, np.uint8)
-LABEL_OF_TRAIN_ID[: len(TRAINED)] = [ID[name] for name in TRAINED]
-LABEL_OF_TRAIN_ID[255] = ID["unlabeled"]
 
 
 class Pair(NamedTuple):
@@ -161,27 +158,19 @@ def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> 
     return image.reshape(height, width, channels)
 
 
-def read_label_map(path: str | Path, train_ids: bool = False) -> np.ndarray:
+def read_label_map(path: str | Path) -> np.ndarray:
     """Read a label map (height, width) of Cityscapes label ids, uint8.
 
-    train_ids: translate train ids to label ids. Raises InputError if a number is no valid id, and
-    as `read_ids` does.
+    `label_ids.read` reads other ids. Raises InputError if a number is no label id, and as
+    `read_ids` does.
     """
-    ids = read_ids(path)
-    label_map = ids
-    if train_ids:
-        label_map = LABEL_OF_TRAIN_ID[ids]
-    if label_map.max() < N_CLASSES:
-        return label_map
-    invalid = ids[label_map >= N_CLASSES].max()
-    if train_ids:
+    label_map = read_ids(path)
+    if label_map.max() >= N_CLASSES:
         raise InputError(
-            f"{path}: holds {invalid}, which is no train id (0 to 18, 255); leave out --ids train"
+            f"{path}: label id {label_map.max()} is above {N_CLASSES - 1}; take the labelIds.png files, "
+            "or give --ids train for train ids (0 to 18, 255), or --ids FILE for a table of other ids"
         )
-    raise InputError(
-        f"{path}: label id {invalid} is above {N_CLASSES - 1}; take the labelIds.png files, or give "
-        "--ids train for train ids (0 to 18, 255), or --ids FILE for a table of other ids"
-    )
+    return label_map.astype(np.uint8)
 
 
 def load(

@@ -6,10 +6,7 @@ from collections.abc import Iterator
 from copy import copy
 from decimal import Decimal
 from functools import cache, cached_property
-from itertools import pairwise
-from numbers import Integral
 from pathlib import Path
-from statistics import median_low
 
 import cv2
 import numpy as np
@@ -22,9 +19,9 @@ from thesis_repro.data.trajectories import (
     read_times,
     text_of,
 )
-from thesis_repro.errors import InputError, need
+from thesis_repro.errors import InputError
 from thesis_repro.running import messages
-from thesis_repro.running.files import images, numbers_of, read_gray
+from thesis_repro.running.files import images, read_gray
 
 # Intrinsics in pixels at the stated image size (Section 3.7.2); KITTI's gray images have no
 # distortion.
@@ -48,8 +45,10 @@ KNOWN_SIZES = {
 # left gray, left colour, then the right ones
 IMAGE_FOLDERS = ("image_0", "image_2", "image_1", "image_3")
 # names of cameras' lines in the calibration
-CALIBRATION_KEYS = {name: f"P{name[-1]}" for name in IMAGE_FOLDERS}
-CALIBRATION_KEYS |= {name: f"P_rect_{name[-2:]}" for name in kitti_raw.IMAGE_FOLDERS}
+CALIBRATION_KEYS = {
+    **{name: f"P{name[-1]}" for name in IMAGE_FOLDERS},
+    **{name: f"P_rect_{name[-2:]}" for name in kitti_raw.IMAGE_FOLDERS},
+}
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
@@ -156,20 +155,12 @@ def _say_once(line: str) -> None:
     messages.log.info(line)
 
 
-def texts_of(folder: Path, frame_folder: Path) -> tuple[Path, str, Path]:
-    """Files of a sequence's calibration, with its camera ("image_0", "image_02"), and of times."""
-    if kitti_raw.is_drive(folder):
-        camera = frame_folder.parent
-        return kitti_raw.calibration(folder), camera.name, camera / kitti_raw.TIMES
-    return folder / "calib.txt", frame_folder.name, folder / "times.txt"
-
-
 class Sequence:
     """One odometry sequence in the official layout, or one raw drive (see kitti_raw).
 
     The official layout is sequences/NN/image_0, calib.txt, times.txt and poses/NN.txt.
 
-    Frames are PNG or JPEG files, numbered without gaps. Colour frames are read as gray. Without
+    Frames are PNG or JPEG files. Colour frames are read as gray. Without
     times.txt, `times` assumes ten frames a second, as in KITTI. Without a file of poses,
     `has_truth` is False. The ground truth belongs to the camera of image_0; the camera of image_2
     is 6 cm beside it. The constructor reads and checks all files except the frames. Raises
@@ -198,7 +189,6 @@ class Sequence:
         have. calibration: file of a camera, see `cameras.read_camera`; its distortion is taken out
         of the frames.
         """
-        need("sequence", name, str | Path)
         self.root, self.folder, self.poses_path = locate(root, name)
         if truth is not None:
             self.poses_path = Path(truth)
@@ -207,15 +197,18 @@ class Sequence:
         self.frame_paths = frames_in(frame_folder)
         if not self.frame_paths:
             raise InputError(f"{frame_folder}: holds no PNG or JPEG frames")
-        check_numbering(self.frame_paths)
-        texts = texts_of(self.folder, frame_folder)
-        self.calibration_path, camera_name, self.times_path = texts
+        camera_folder, self.calibration_path = frame_folder, self.folder / "calib.txt"
+        self.times_path = self.folder / "times.txt"
+        if kitti_raw.is_drive(self.folder):
+            camera_folder = frame_folder.parent
+            self.calibration_path = kitti_raw.calibration(self.folder)
+            self.times_path = camera_folder / kitti_raw.TIMES
         self.distortion = np.empty(0)
         if calibration is not None:
             self.calibration_path = Path(calibration)
             self.intrinsics, self.distortion = cameras.read_camera(calibration)
         else:
-            self.intrinsics = read_intrinsics(self.calibration_path, camera_name)
+            self.intrinsics = read_intrinsics(self.calibration_path, camera_folder.name)
         self.has_times = self.times_path.exists()
         self.times = self._read_times(self.times_path, fps)
         self.has_truth = truth is not None or self.poses_path.exists()
@@ -269,8 +262,6 @@ class Sequence:
                 f"speed {speed}: needs the times of the frames (times.txt), or their number a second "
                 "(--fps)"
             )
-        if not 0 < speed < np.inf:
-            raise InputError(f"speed {speed}: must be metres a second, above 0")
 
     @property
     def poses(self) -> np.ndarray:
@@ -313,9 +304,6 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.frame_paths)
 
-    def __repr__(self) -> str:
-        return f"Sequence({str(self.root)!r}, {self.name!r}): {len(self)} frames"
-
     @cached_property
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
@@ -333,22 +321,20 @@ class Sequence:
         return self.undistorted(image)
 
     def _read(self, path: Path) -> np.ndarray:
-        if self._white is None:
+        if not self._white:
             return read_gray(path)
-        pixels = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH)
-        if pixels is None:
-            raise InputError(f"{path}: cannot be read; it is not a complete image")
-        return cv2.convertScaleAbs(pixels, alpha=255 / self._white)
+        return cv2.convertScaleAbs(read_gray(path, np.uint16), alpha=255 / self._white)
 
     @cached_property
-    def _white(self) -> int | None:
-        """Gray value that becomes 255, in frames of 16 bits: the largest one of the first frame."""
-        pixels = cv2.imread(str(self.frame_paths[0]), cv2.IMREAD_ANYDEPTH)
-        if pixels is None or pixels.dtype == np.uint8:
-            return None
-        white = max(int(pixels.max()), 1)
-        _say_once(f"{self.folder}: frames have 16 bits; {white}, the first one's maximum, is white")
-        return white
+    def _white(self) -> int:
+        """Gray value that becomes 255: the largest one of the first frame; 0 for 8-bit frames."""
+        first = read_gray(self.frame_paths[0], np.uint16)
+        if first.dtype == np.uint8:
+            return 0
+        _say_once(
+            f"{self.folder}: frames have 16 bits; {first.max()}, the first one's maximum, is white"
+        )
+        return int(first.max())
 
     def undistorted(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
         """Image of the frame's size without the camera's distortion, as OpenCV takes it out.
@@ -357,7 +343,11 @@ class Sequence:
         """
         if not self.distortion.any():
             return image
-        return cameras.undistorted(image, self.intrinsics, self.distortion, interpolation)
+        camera, size = self.intrinsics, image.shape[1::-1]
+        maps = cv2.initUndistortRectifyMap(
+            camera, self.distortion, None, camera, size, cv2.CV_16SC2
+        )
+        return cv2.remap(image, *maps, interpolation)
 
     def frames(self) -> Iterator[np.ndarray]:
         """Yield the frames in order."""
@@ -365,12 +355,7 @@ class Sequence:
             yield self.frame(index)
 
     def subset(self, count: int | None) -> "Sequence":
-        """Copy of the sequence with its first `count` frames; None for all frames.
-
-        Raises InputError for another count than a whole number from 1 on.
-        """
-        if count is not None and not (isinstance(count, Integral) and count > 0):
-            raise InputError(f"frames {count!r}: must be a whole number, 1 or more; None takes all")
+        """Copy of the sequence with its first `count` frames; None for all frames."""
         short = copy(self)
         short.frame_paths, short.times = self.frame_paths[:count], self.times[:count]
         if self.has_truth:
@@ -390,10 +375,6 @@ def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]
         root, name = folder.parent.parent, folder.name  # the folder belongs to a KITTI root
     if root is not None:
         root, name = Path(root), str(name)
-        if name in ("", ".", "..") or "/" in name:
-            raise InputError(
-                f"sequence {name!r}: must be the name of a folder in {folder_of(root)}, such as 00"
-            )
         if name.isdigit() and not (folder_of(root) / name).is_dir():
             name = name.zfill(2)
         folder, poses = folder_of(root) / name, root / "poses" / f"{name}.txt"
@@ -402,28 +383,6 @@ def locate(root: str | Path | None, name: str | Path) -> tuple[Path, Path, Path]
     elif not poses.exists() and (folder / "poses.txt").exists():
         poses = folder / "poses.txt"
     return root or folder.parent, folder, poses
-
-
-def name_of(root: str | Path, name: str) -> str:
-    """Full name of a sequence, "06" for "6". Its results are stored under this name."""
-    return locate(root, name)[1].name
-
-
-def check_numbering(paths: list[Path]) -> None:
-    """Raise InputError if frames count by one, and one is missing.
-
-    Names that do not count by one are accepted, for example every fifth frame, or times.
-    """
-    numbers = numbers_of(paths) or []
-    steps = [after - before for before, after in pairwise(numbers)]
-    if len(steps) < 2 or median_low(steps) != 1 or DECIMAL.fullmatch(paths[0].stem):
-        return
-    for number, step, path in zip(numbers, steps, paths):
-        if step > 1:
-            letters = path.stem.rstrip("0123456789")
-            digits = min(len(path.stem) for path in paths) - len(letters)
-            name = f"{letters}{number + 1:0{digits}d}{path.suffix}"
-            raise InputError(f"{path.with_name(name)}: this frame is missing; all are needed")
 
 
 def check_count(path: Path, count: int, frame_paths: list[Path]) -> None:

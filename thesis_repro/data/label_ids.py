@@ -1,22 +1,24 @@
 """Label maps with other ids or colours than Cityscapes' label ids, read through a table.
 
 A table is a CSV file with a line for each id (34,building) or for each colour (#464646,building).
-The names are those of `cityscapes.LABELS`; what is no class is "unlabeled". COLORS in place of a
-file stands for the colours of Cityscapes.
+The names are those of `cityscapes.LABELS`; what is no class is "unlabeled". Two tables have names:
+Cityscapes' train ids ("train") and colours ("colors").
 """
 
 import csv
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from thesis_repro.data.cityscapes import ID, LABELS, read_label_map
+from thesis_repro.data.cityscapes import ID, LABELS, TRAINED, read_label_map
 from thesis_repro.data.trajectories import text_of
 from thesis_repro.errors import InputError
+from thesis_repro.running.files import read_color, read_ids
+from thesis_repro.running.results import digest_of_file
 
-COLORS = "colors"
+LABEL_IDS, TRAIN_IDS, COLORS = "labels", "train", "colors"
 NOT_NAMED = 255  # no label id
+RGB = np.array([1 << 16, 1 << 8, 1])  # makes one number of a colour
 
 
 def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
@@ -24,11 +26,14 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
 
     Raises InputError, naming the line, for a line that is not an id or a colour and a label.
     """
+    if path == TRAIN_IDS:
+        table = {number: ID[name] for number, name in enumerate(TRAINED)}
+        return False, table | {255: ID["unlabeled"]}
     if path == COLORS:
         # of labels with one colour, the first one is meant: "car" before "license plate"
         return True, {int.from_bytes(label.color): label.id for label in reversed(LABELS)}
     lines = text_of(path).split("\n")
-    table: dict[int, int] = {}
+    table = {}
     for number, row in enumerate(csv.reader(lines), 1):
         if not row or row[0] in ("id", "color"):
             continue
@@ -44,31 +49,29 @@ def read_table(path: str | Path) -> tuple[bool, dict[int, int]]:
     return any(line.startswith("#") for line in lines), table
 
 
-def read(path: str | Path, ids: str | Path) -> np.ndarray:
+def record(ids: str | Path) -> dict[str, str]:
+    """Return what the record of results has of a table in a file: its digest."""
+    if ids in (LABEL_IDS, TRAIN_IDS, COLORS):
+        return {}
+    return {"table": digest_of_file(ids)}
+
+
+def read(path: str | Path, ids: str | Path = LABEL_IDS) -> np.ndarray:
     """Read a label map as label ids, (height, width) uint8.
 
-    ids: "labels" or "train" as in `cityscapes.read_label_map`, or else the table to read through.
-    The PNG then has ids of 1 to 16 bits, a palette (its numbers are the ids, its colours the
-    colours), or colours. Raises InputError for what is not in the table.
+    ids: "labels" as in `cityscapes.read_label_map`, or else the table to read through. The PNG has
+    ids of up to 16 bits, a palette (its numbers are the ids, its colours the colours), or colours.
+    Raises InputError for what is not in the table.
     """
-    if ids in ("labels", "train"):
-        return read_label_map(path, ids == "train")
+    if ids == LABEL_IDS:
+        return read_label_map(path)
     has_colors, table = read_table(ids)
-    try:
-        with Image.open(path, formats=["PNG"]) as image:
-            if has_colors:
-                pixels = np.asarray(image.convert("RGB")) @ np.array([1 << 16, 1 << 8, 1])
-            else:
-                pixels = np.asarray(image)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as PNG: {error}") from None
-    if pixels.ndim == 3:
-        raise InputError(f"{path}: holds colours, but {ids} names ids")
-    labels_by_value = np.full(1 << 24 if has_colors else 1 << 16, NOT_NAMED, np.uint8)
+    values = read_color(path) @ RGB if has_colors else read_ids(path)
+    labels_by_value = np.full(1 << 24, NOT_NAMED, np.uint8)
     labels_by_value[list(table)] = list(table.values())
-    labels = labels_by_value[pixels]
-    unknown = np.unique(pixels[labels == NOT_NAMED])[:10].tolist()
+    labels = labels_by_value[values]
+    unknown = np.unique(values[labels == NOT_NAMED])[:10].tolist()
     if unknown:
-        values = ", ".join(f"#{value:06x}" if has_colors else str(value) for value in unknown)
-        raise InputError(f"{path}: holds {values}, which {ids} does not name")
+        numbers = ", ".join(f"#{value:06x}" if has_colors else str(value) for value in unknown)
+        raise InputError(f"{path}: holds {numbers}, which --ids {ids} does not name")
     return labels

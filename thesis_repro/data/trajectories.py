@@ -8,7 +8,6 @@ import numpy as np
 from thesis_repro.errors import InputError
 from thesis_repro.running.files import write_text
 
-MAX_POSITION = 1e9  # metres
 ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I; pose files have few digits
 
 
@@ -123,14 +122,13 @@ def are_poses(poses: np.ndarray) -> np.ndarray:
 
     Returns (n,) booleans.
     """
-    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
+    rotations = poses[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         products = rotations @ rotations.transpose(0, 2, 1)
         errors = np.abs(products - np.eye(3)).max(axis=(1, 2))
         is_right_handed = np.linalg.det(rotations) > 0
-    is_near = np.abs(positions).max(axis=1) <= MAX_POSITION
     is_pose = (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
-    return is_pose & (errors <= ROTATION_TOLERANCE) & is_right_handed & is_near
+    return is_pose & (errors <= ROTATION_TOLERANCE) & is_right_handed
 
 
 def write_kitti_poses(path: str | Path, poses: np.ndarray) -> None:

@@ -39,7 +39,8 @@ def detect(
         columns, rows = np.rint(points).astype(int).T
         points = points[mask[rows, columns] > 0]
     if settings.fill:
-        everywhere = shi_tomasi(frame, replace(settings, max_keypoints=0), None)
+        all_strongest = replace(settings, choice="strongest", max_keypoints=0)
+        everywhere = shi_tomasi(frame, all_strongest, None)
         points = filled(points, everywhere, frame.shape, settings)
     return points
 

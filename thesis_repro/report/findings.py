@@ -80,13 +80,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
     """Return the values of one source of masks for the template."""
     runs = compare.of_source(runs, source)
     masked = compare.of_method(runs, "masked")
-    widths = masked["dilation_width"].nunique()
-    same_best, repeated = None, 0
-    if widths > 1:
-        stability = best_width.stability(masked, compare.of_method(runs, "baseline"))
-        mean = stability["same_best"].mean()
-        if not pd.isna(mean):
-            same_best, repeated = float(mean), int(stability["same_best"].count())
+    stability = best_width.stability(masked, compare.of_method(runs, "baseline"))
     judged = compare.primary_comparison(table, source)
     over_all = (table["source"] == source) & (table["reference"] == "baseline") & table["tested"]
     of_masks = table[over_all & (table["method"] == "masked")]
@@ -103,7 +97,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
         "lost": of_masks.drop_duplicates("estimator").to_dict("records"),
         "corrected": of_corrected.to_dict("records"),
         "controls": verdicts.to_dict(),
-        "widths": widths,
-        "same_best": same_best,
-        "repeated": repeated,
+        "widths": masked["dilation_width"].nunique(),
+        "same_best": stability["same_best"].mean(),
+        "repeated": stability["same_best"].count(),
     }

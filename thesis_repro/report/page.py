@@ -65,20 +65,21 @@ def describe(folder: Path, artefact: dict[str, Any]) -> dict[str, Any]:
     content = Content()
     if files and kind == "text":
         content = text_content(files[0].read_text(encoding="utf-8"))
-    elif files and kind == "table":
+    elif files and kind == "table" and files[0].suffix == ".csv":
         content = _table_content(files)
+    there = bool(files) and (kind == "figure" or content.html is not None)
     identity = name
     if kind != "text":
         identity = f"{kind}-{name}"
     described = {
         "id": identity,
-        "there": bool(files),
+        "there": there,
         "content": content.html,
         "details": content.details,
         "rows": content.rows,
         "markdown": content.markdown,
         "files": [path.name for path in files],
-        "opens": bool(files) and identity in OPENING,
+        "opens": there and identity in OPENING,
     }
     return NOT_OF_THESIS | artefact | described
 

@@ -5,7 +5,7 @@ Figures are written as SVG or WebP, tables as CSV and Markdown.
 
 import re
 from base64 import b64encode
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
@@ -134,61 +134,6 @@ def show_image(axes: plt.Axes, image: np.ndarray, title: str, **options: Any) ->
     axes.imshow(image, cmap=options.pop("cmap", "gray"), **options)
     axes.set_title(title)
     axes.set_axis_off()
-
-
-def pictures(
-    frame: np.ndarray,
-    pictures: dict[str, np.ndarray],
-    keypoints: dict[str, np.ndarray] | None = None,
-    columns: int = 1,
-    label_maps: Collection[np.ndarray] = (),
-) -> plt.Figure:
-    """Show pictures {title: picture} of a frame's shape.
-
-    keypoints: {title: (n, 2)}, shown on the picture. label_maps: of the classes in a legend.
-    """
-    figure, axes = frame_panels(frame, -(-len(pictures) // columns), columns)
-    for panel, (title, picture) in zip(axes, pictures.items()):
-        show_image(panel, picture, title)
-        if keypoints and title in keypoints:
-            panel.scatter(*keypoints[title].T, **KEYPOINT)
-    for panel in axes[len(pictures) :]:
-        panel.set_axis_off()
-    if label_maps:
-        class_legend(figure, *label_maps)
-    return figure
-
-
-def with_edges(frame: np.ndarray, edge_image: np.ndarray) -> np.ndarray:
-    """Return a gray frame as red, green, blue, with edges marked where `edge_image` is not 0."""
-    picture = np.dstack([frame] * 3)
-    picture[edge_image > 0] = EDGE_COLOR
-    return picture
-
-
-def small_panels(
-    names: list[str], xlabel: str = "", figure: Any = None
-) -> tuple[Any, list[plt.Axes]]:
-    """Return (figure, panels), one small panel for each name, at most four in a row.
-
-    xlabel: label of the lowest panel of each column. figure: a subfigure for the panels, or None
-    for a new figure.
-    """
-    columns = min(4, len(names))
-    rows = -(-len(names) // columns)
-    if figure is None:
-        figure = plt.figure(figsize=(PAGE_WIDTH, rows * 1.65 + 0.6), layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for panel in panels[len(names) :]:
-        panel.remove()
-    for panel, name in zip(panels, names, strict=False):
-        panel.set_title(name, fontsize=8, pad=3)
-        panel.tick_params(labelsize=7)
-        panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    panels = panels[: len(names)]
-    for panel in panels[-columns:]:
-        panel.set_xlabel(xlabel, fontsize=8)
-    return figure, panels
 
 
 def legend_below(figure: Any, panels: Iterable[plt.Axes], columns: int) -> None:

@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 import cv2
 import numpy as np
+from PIL import Image
 from tqdm import tqdm
 
 from thesis_repro.errors import InputError
@@ -22,12 +23,13 @@ TEMPORARY = re.compile(r"\..*\.thesis-repro-[0-9a-f]{8}(\..*)?")
 DELAY = 1  # seconds before a progress bar appears
 
 
-def read_gray(path: str | Path) -> np.ndarray:
-    """Read one image as 8-bit gray, shape (height, width). Colours become their luminance.
+def read_gray(path: str | Path, largest: type = np.uint8) -> np.ndarray:
+    """Read one image as gray, shape (height, width), uint8. Colours become their luminance.
 
-    Raises InputError if the file is not a complete image with 8 bits a channel.
+    largest: of the types of numbers that are allowed. Raises InputError if the file is not a
+    complete image of such numbers.
     """
-    return _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    return _decoded(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH, largest)
 
 
 def read_color(path: str | Path) -> np.ndarray:
@@ -40,27 +42,24 @@ def read_color(path: str | Path) -> np.ndarray:
 
 
 def read_ids(path: str | Path) -> np.ndarray:
-    """Read one PNG of numbers such as class ids, shape (height, width) uint8.
+    """Read one PNG of numbers such as class ids, shape (height, width), uint8 or uint16.
 
-    No number is changed. Raises InputError if the file is not a complete gray PNG: if it has a
-    palette, fewer than 8 bits or channels that differ. 16 bits are read if no number exceeds 255.
+    No number is changed; those of a palette are its indices. Raises InputError if the file is not a
+    complete PNG, or has channels that differ.
     """
     channels = np.atleast_3d(_decoded(path, cv2.IMREAD_UNCHANGED, np.uint16))
-    with open(path, "rb") as file:
-        header = file.read(26)
-    is_gray_png = header.startswith(b"\x89PNG") and header[24] >= 8 and header[25] != 3
-    if not is_gray_png or (channels[..., :3] != channels[..., :1]).any() or channels.max() > 255:
-        raise InputError(
-            f"{path}: must be a gray PNG of numbers up to 255, which keeps ids as they are; convert it"
-        )
-    return channels[..., 0].astype(np.uint8)
+    with Image.open(path) as image:
+        if image.mode in ("1", "P"):  # OpenCV gives colours for the numbers
+            channels = np.asarray(image)[..., None].astype(np.uint8)
+        if image.format != "PNG" or (channels[..., :3] != channels[..., :1]).any():
+            raise InputError(
+                f"{path}: must be a PNG of ids; convert it, or read colours with --ids colors or FILE"
+            )
+    return channels[..., 0]
 
 
 def _decoded(path: str | Path, flag: int, largest: type = np.uint8) -> np.ndarray:
-    """Decode an image. OpenCV checks PNG's checksums and the end of both formats.
-
-    largest: of the types of numbers that are allowed.
-    """
+    """Decode an image. OpenCV checks PNG's checksums and the end of both formats."""
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), flag)
     except OSError as error:
@@ -78,12 +77,7 @@ def _decoded(path: str | Path, flag: int, largest: type = np.uint8) -> np.ndarra
 
 
 def listed(folder: str | Path, pattern: str = "*.png") -> list[Path]:
-    """Return the files of a folder that match a pattern, in sorted order, without hidden ones.
-
-    Raises OSError for a folder that may not be listed.
-    """
-    if Path(folder).is_dir():
-        os.listdir(folder)  # raises the error that glob would hide
+    """Return the files of a folder that match a pattern, in sorted order, without hidden ones."""
     return sorted(path for path in Path(folder).glob(pattern) if not path.name.startswith("."))
 
 
@@ -104,17 +98,6 @@ def _natural_order(path: Path) -> tuple[list[tuple[str, int]], Path]:
     """Return a key that sorts names with 9 before 10."""
     pieces = re.findall(r"(\D*)(\d*)", path.stem)
     return [(letters, int(digits or -1)) for letters, digits in pieces], path
-
-
-def numbers_of(paths: Iterable[Path]) -> list[int] | None:
-    """Return the integers at the ends of file names.
-
-    Returns None if a name has none or the names start differently.
-    """
-    parts = [re.findall(r"(.*?)(\d+)$", path.stem) for path in paths]
-    if not all(parts) or len({part[0][0] for part in parts}) > 1:
-        return None
-    return [int(part[0][1]) for part in parts]
 
 
 # Writing

@@ -1,4 +1,4 @@
-"""What a run says and how it ends: the log, the summary, errors in one line, Ctrl-C."""
+"""What a run says and how it ends: messages, the summary, errors in one line, Ctrl-C."""
 
 import ctypes
 import logging
@@ -10,14 +10,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from multiprocessing import resource_tracker
-from pathlib import Path
 
 from tqdm import tqdm
 
-from thesis_repro.errors import InputError, one_line
+from thesis_repro.errors import InputError, missing_package, one_line
 
-LOG = "log.txt"  # in a folder of results, see `logged`
-RECORD = "made-from.json"  # in a folder of results, see `results.stage`
+STARTED = time.monotonic()
 log = logging.getLogger("thesis_repro")
 
 
@@ -36,8 +34,7 @@ def print_messages() -> None:
 
     Without it they go where a user of the package sends those of the logger "thesis_repro".
     """
-    if not any(isinstance(handler, _Printer) for handler in log.handlers):
-        log.addHandler(_Printer())
+    log.handlers = [_Printer()]
     log.setLevel(logging.INFO)
     log.propagate = False
 
@@ -48,6 +45,8 @@ def explain(error: BaseException) -> str | None:
     An error of the system is told in its own words. Returns None for any other error, which
     deserves its traceback.
     """
+    if isinstance(error, ImportError):
+        error = missing_package(error) or error
     if type(error).__name__ == "TerminatedWorkerError":  # of joblib, which has a page of text
         return "a process was killed, most likely because memory ran out; use fewer (--jobs, JOBS)"
     if isinstance(error, (InputError, OSError, MemoryError)):
@@ -83,67 +82,13 @@ def run_main(main: Callable[[], object]) -> None:
     sys.exit(run(main))
 
 
-# The log
-
-
-class _Log(logging.Handler):
-    """The log of a run. It is written once its folder holds results, so not by a refused run."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__()
-        self.folder = folder
-        self.lines: list[str] = []  # not yet written
-        self.warnings = 0
-        self.started = time.monotonic()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.warnings += record.levelno == logging.WARNING
-        self.write(record.levelname, record.getMessage())
-
-    def write(self, level: str, text: str) -> None:
-        """Append a line."""
-        self.lines.append(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {level:7} {one_line(text)}\n")
-        if any(map(holds_results, (self.folder, *self.folder.glob("*")))):
-            with open(self.folder / LOG, "a", encoding="utf-8") as file:
-                file.writelines(self.lines)
-            self.lines.clear()
-
-    def end(self, text: str, reused: int = 0) -> None:
-        """Print a summary of the run, its time and its warnings.
-
-        reused: the number of results from an earlier run.
-        """
-        numbers = [f"{timedelta(seconds=round(time.monotonic() - self.started))} h"]
-        if reused:
-            numbers.append(f"from an earlier run: {reused:,}")
-        numbers += [f"warnings: {self.warnings}", f"log: {self.folder / LOG}"]
-        for line in [*text.splitlines(), "; ".join(numbers)]:
-            print(line, flush=True)
-            self.write("INFO", line)
-
-
-def holds_results(folder: Path) -> bool:
-    """Return whether a folder is one of results: whether it has a record of their inputs."""
-    return (folder / RECORD).exists()
-
-
-@contextmanager
-def logged(folder: str | Path, title: str) -> Iterator[_Log]:
-    """Write what `log` prints, and the error that ends the block, into the log of a folder.
-
-    title: the first line.
-    """
-    handler = _Log(Path(folder))
-    log.addHandler(handler)
-    try:
-        handler.write("INFO", title)
-        yield handler
-    except BaseException as error:
-        with suppress(OSError):  # such as a full disk, which is the error
-            handler.write("ERROR", explain(error) or repr(error))
-        raise
-    finally:
-        log.removeHandler(handler)
+def summary(text: str, reused: int = 0) -> None:
+    """Print what a program made, and its time. reused: number of results from an earlier run."""
+    print(text)
+    time_taken = f"{timedelta(seconds=round(time.monotonic() - STARTED))} h"
+    if reused:
+        time_taken += f"; from an earlier run: {reused:,}"
+    print(time_taken, flush=True)
 
 
 @contextmanager

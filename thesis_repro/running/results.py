@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -20,9 +20,10 @@ import pandas as pd
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import messages
-from thesis_repro.running.files import TEMPORARY, atomic, progress, write_text
-from thesis_repro.running.messages import LOG, RECORD
+from thesis_repro.running.files import TEMPORARY, progress, write_text
 from thesis_repro.running.settings import ROOT
+
+RECORD = "made-from.json"  # in the folder of a stage
 
 
 def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
@@ -38,7 +39,7 @@ def stage(folder: str | Path, *, replace: Any = True, **inputs: Any) -> Path:
         inputs = json.loads(json.dumps(inputs, default=str))
         earlier = record(folder)
         sweep(folder)
-        if earlier is None and any(path.name != LOG for path in folder.iterdir()):
+        if earlier is None and any(folder.iterdir()):
             raise InputError(
                 f"{folder}: holds files that this project did not make; choose an empty or new folder"
             )
@@ -66,10 +67,9 @@ def _move_aside(folder: Path, changed: str) -> None:
     while (aside := place.with_name(f"{place.name}.old-{number}")).exists():
         number += 1
     aside.mkdir()
-    # the record goes last, so that a killed move can be repeated; the log is being written
+    # the record goes last, so that a killed move can be repeated
     for path in sorted(folder.iterdir(), key=lambda path: path.name == RECORD):
-        if path.name != LOG:
-            path.rename(aside / path.name)
+        path.rename(aside / path.name)
     messages.log.info(f"{folder}: moved what was made with another {changed} to {aside}")
 
 
@@ -122,11 +122,10 @@ _held: set[tuple[int, int]] = set()  # device and inode of each folder that this
 def claimed(folder: str | Path) -> Iterator[None]:
     """Create a folder if needed, and lock it until the block ends.
 
-    The same process may lock it again within the block. Folders that were created here and are
-    still empty at the end are removed. Raises InputError if another process has locked it.
+    The same process may lock it again within the block. Raises InputError if another process has
+    locked it.
     """
     folder = Path(folder)
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(folder, os.O_RDONLY)  # the lock ends with the process, even if killed
     status = os.fstat(descriptor)
@@ -141,9 +140,6 @@ def claimed(folder: str | Path) -> Iterator[None]:
         os.close(descriptor)
         if is_outermost:
             _held.discard(key)
-        with suppress(OSError):
-            for path in new:
-                path.rmdir()
 
 
 def _lock(descriptor: int, folder: Path) -> None:
@@ -157,8 +153,7 @@ def _lock(descriptor: int, folder: Path) -> None:
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
     """Write a table as CSV."""
-    with atomic(path) as temporary:
-        table.to_csv(temporary, index=False)
+    write_text(path, table.to_csv(index=False))
 
 
 # Digests

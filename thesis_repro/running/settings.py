@@ -15,6 +15,7 @@ from typing import Any
 from joblib import cpu_count as cores
 
 from thesis_repro.errors import InputError
+from thesis_repro.running import messages
 
 ROOT = Path(__file__).resolve().parents[2]  # of the checkout
 PREFIX = "THESIS_REPRO_"
@@ -317,10 +318,7 @@ def _run_name(folders: dict[str, Path], profile: str, sizes: Profile) -> str:
         data.insert(0, "embedded")
     parts = ["_".join(data), profile]
     for name, text in _changed_sizes(profile, sizes).items():
-        short = text.replace(", ", "_")
-        if len(short) > 40:
-            short = hashlib.sha256(short.encode()).hexdigest()[:8]
-        parts.append(f"{name.replace(' ', '-')}-{short}")
+        parts.append(f"{name.replace(' ', '-')}-{text.replace(', ', '_')}")
     return "-".join(parts)
 
 
@@ -336,8 +334,4 @@ def _changed_sizes(profile: str, sizes: Profile) -> dict[str, str]:
 
 
 if __name__ == "__main__":  # the Makefile asks for the folder of the run, below its own
-    try:
-        build = read_settings().build
-        print(build.relative_to(ROOT) if build.is_relative_to(ROOT) else build)
-    except InputError as error:
-        raise SystemExit(f"error: {error}") from None
+    messages.run_main(lambda: print(os.path.relpath(read_settings().build, ROOT)))

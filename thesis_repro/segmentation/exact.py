@@ -52,10 +52,8 @@ def _normalize(
     """Return gamma * (inputs - mean) / sqrt(variance + epsilon) + beta.
 
     In training, mean and variance are those of the batch, and the layer's moving averages follow
-    them; otherwise they are the moving averages.
+    them; otherwise they are the moving averages. mask: Keras gives one, but images have none.
     """
-    if mask is not None:  # no network here masks pixels
-        return type(layer).call(layer, inputs, training, mask)
     mean, variance = layer.moving_mean, layer.moving_variance
     if training and layer.trainable:
         mean, variance = keras.ops.moments(inputs, axes=list(range(len(inputs.shape) - 1)))

@@ -75,7 +75,22 @@ def write_label_maps(
         )
     with results.claimed(output_dir):
         folder = Path(output_dir).absolute()
-        results.stage(folder, **_made_from(model, paths, batch_size, scale))
+        inputs = {
+            "model": training.weights_digest(model),
+            "frames": results.digest_of_files(paths),
+            "batch_size": batch_size,  # the arithmetic may round differently for another one
+            **results.made_with("tensorflow", "keras", "opencv"),
+            "code": results.digest_of_code(
+                "thesis_repro.segmentation.prediction",
+                "thesis_repro.segmentation.exact",
+                "thesis_repro.data.cityscapes",
+                "thesis_repro.data.kitti",
+            ),
+            "arithmetic": segmentation.arithmetic(),
+        }
+        if scale != 1:
+            inputs["scale"] = scale
+        results.stage(folder, **inputs)
         pairs = [(path, folder / name) for path, name in zip(paths, names)]
         batches = [pairs[start : start + batch_size] for start in range(0, len(pairs), batch_size)]
         batches = [batch for batch in batches if not all(path.is_file() for _, path in batch)]
@@ -89,26 +104,6 @@ def write_label_maps(
                 list(pool.map(_write, batch, label_maps))
                 bar.update(len(batch))
     return missing
-
-
-def _made_from(model: Any, paths: list[Path], batch_size: int, scale: float) -> dict[str, Any]:
-    """Return all that the bits of label maps depend on, for the record of their folder."""
-    inputs = {
-        "model": training.weights_digest(model),
-        "frames": results.digest_of_files(paths),
-        "batch_size": batch_size,  # the network's arithmetic may round differently for another one
-        **results.made_with("tensorflow", "keras", "opencv"),
-        "code": results.digest_of_code(
-            "thesis_repro.segmentation.prediction",
-            "thesis_repro.segmentation.exact",
-            "thesis_repro.data.cityscapes",
-            "thesis_repro.data.kitti",
-        ),
-        "arithmetic": segmentation.arithmetic(),
-    }
-    if scale != 1:
-        inputs["scale"] = scale
-    return inputs
 
 
 def _write(pair: tuple[Path, Path], label_map: np.ndarray) -> None:

@@ -67,27 +67,3 @@ def _numbered(name: str, number: int) -> str:
     if number == 0:
         return name
     return f"{name}_{number}"
-
-
-def summary_rows(model: Any) -> list[dict[str, Any]]:
-    """Return a model's rows in the format of Figure A.1.
-
-    A row is a dict of layer, output_shape, params and connected_to.
-    """
-    rows = []
-    for layer in model.layers:
-        tensors = layer._inbound_nodes[0].input_tensors
-        shape = f"{tuple(layer.output.shape)}"
-        if not tensors:
-            shape = f"[{shape}]"
-        kind = type(layer).__name__.replace("BatchNormalization", "BatchNormal")
-        sources = [f"{tensor._keras_history.operation.name}[0][0]" for tensor in tensors]
-        rows.append(
-            {
-                "layer": f"{layer.name} ({kind})",
-                "output_shape": shape,
-                "params": layer.count_params(),
-                "connected_to": " ".join(sources),
-            }
-        )
-    return rows

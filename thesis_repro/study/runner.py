@@ -78,6 +78,7 @@ def run_jobs(
     processes: int = 1,
     scheduler: str | None = None,
     scale_gate: float = odometry.THESIS.scale_gate,
+    masked_settings: Mapping[str, Any] = {},
 ) -> Outcome:
     """Run the jobs that have no result yet; returns the table of all runs and how many ran.
 
@@ -86,7 +87,8 @@ def run_jobs(
     folder: for the results; results from other data, code or mask settings in it are moved aside.
     processes, scheduler: see `workers.open_pool`; the results do not depend on them. The workers of
     a scheduler need this package, and the three folders under the same paths. One thread a worker
-    is best. scale_gate: metres, of all runs, see OdometrySettings.
+    is best. scale_gate: metres, of all runs, see OdometrySettings. masked_settings: other settings
+    of the runs with masks.
 
     Jobs over the same sequence share one or several passes (`odometry.run_many`), with the results
     of separate runs. A stopped study repeats only the passes that it was in. A job that fails is
@@ -102,7 +104,14 @@ def run_jobs(
             _stage(folder, sequence, sources_by_name)
         waiting = _unfinished(jobs, folder)
         reasons = _run_passes(
-            waiting, opened, sources_by_name, folder, processes, scheduler, scale_gate
+            waiting,
+            opened,
+            sources_by_name,
+            folder,
+            processes,
+            scheduler,
+            scale_gate,
+            masked_settings,
         )
     warnings = _report(reasons)
     rows = []
@@ -165,6 +174,7 @@ def _run_passes(
     processes: int,
     scheduler: str | None,
     scale_gate: float,
+    masked_settings: Mapping[str, Any],
 ) -> dict[Job, str]:
     """Run jobs; returns which of them failed, and why."""
 
@@ -177,7 +187,9 @@ def _run_passes(
         for pass_jobs in in_passes(jobs, sequences, pool.size):
             sequence = sequences[pass_jobs[0].sequence]
             record = results.record(folder / sequence.name)
-            calls.append((pass_jobs, sequence, sources, folder, record, scale_gate))
+            calls.append(
+                (pass_jobs, sequence, sources, folder, record, scale_gate, masked_settings)
+            )
         with progress(None, "odometry", total=frames(jobs), unit="frame") as bar:
             for pass_jobs, pass_reasons in pool.run(_run_pass, calls):
                 reasons |= pass_reasons
@@ -268,6 +280,7 @@ def _run_pass(
     folder: Path,
     record: dict,
     scale_gate: float,
+    masked_settings: Mapping[str, Any] = {},
 ) -> tuple[list[Job], dict[Job, str]]:
     """Run jobs of one sequence in one pass, here or on another machine.
 
@@ -279,10 +292,12 @@ def _run_pass(
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
         masks_by_job, reasons = checked_masks(_unfinished(jobs, folder), sequence, sources)
-        runs = {
-            job.name: (replace(job.settings, scale_gate=scale_gate), masks)
-            for job, masks in masks_by_job.items()
-        }
+        runs = {}
+        for job, masks in masks_by_job.items():
+            settings = replace(job.settings, scale_gate=scale_gate)
+            if masks is not None:
+                settings = replace(settings, **masked_settings)
+            runs[job.name] = settings, masks
         run_results = odometry.run_many(sequence, runs)
         for job in masks_by_job:
             frames = run_results[job.name].frames

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from thesis_repro import mask_files
-from thesis_repro.data.cityscapes import read_label_map
+from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, MaskFolder, read_mask
@@ -59,7 +59,7 @@ class Source:
     def check_file(self, path: Path, size: tuple[int, int]) -> None:
         """Raise InputError if a file is not a label map, or not a mask of size (height, width)."""
         if self.has_label_maps:
-            read_label_map(path, self.settings.ids == "train")
+            label_ids.read(path, self.settings.ids)
         else:
             read_mask(path, size)
 
@@ -67,7 +67,8 @@ class Source:
         """Return the digests and settings that the results of a sequence depend on."""
         digest = results.digest_of_files(listed(self.sequence_folder(sequence)))
         if self.has_label_maps:
-            return {self.kind: digest, "settings": str(self.settings)}
+            settings = {"settings": str(self.settings), **label_ids.record(self.settings.ids)}
+            return {self.kind: digest, **settings}
         return {self.kind: digest, "invert": str(self.invert)}
 
 

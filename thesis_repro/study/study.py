@@ -1,8 +1,9 @@
 """A study with your own masks: its settings, the check of its input, and its runs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
@@ -20,7 +21,8 @@ class Study:
 
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
-    of each sequence, None for all. scale_gate: metres, see OdometrySettings.
+    of each sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
+    settings of the odometry, for all runs with masks.
     """
 
     kitti: Path
@@ -32,6 +34,7 @@ class Study:
     repetitions: int = 1
     frames: int | None = None
     scale_gate: float = THESIS.scale_gate
+    masked_settings: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
     def opened(self) -> list[Sequence]:
@@ -69,9 +72,11 @@ class Study:
             processes=processes,
             scheduler=scheduler,
             scale_gate=self.scale_gate,
+            masked_settings=self.masked_settings,
         )
         with results.claimed(folder):
-            results.stage(folder, replace=False, frames=self.frames, scale_gate=self.scale_gate)
+            settings = {"scale_gate": self.scale_gate, **self.masked_settings}
+            results.stage(folder, replace=False, frames=self.frames, **settings)
             first_jobs = jobs.first_jobs(
                 self.opened,
                 dict.fromkeys(self.estimators, self.widths),

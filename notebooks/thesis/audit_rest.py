@@ -1,0 +1,217 @@
+"""Measure the rows of the audit that notebook 09 does not show live.
+
+They need the files of notebooks 01 to 08 in the folder of the run.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import albumentations as A
+import numpy as np
+import pandas as pd
+from cv2 import INTER_NEAREST, resize
+
+from thesis import ablations, artefacts, audit, gap, thesis_tables, timing
+from thesis_repro.data import cityscapes
+from thesis_repro.data.cityscapes import ID, read_label_map
+from thesis_repro.data.kitti import Sequence
+from thesis_repro.mask_files import LabelMasks
+from thesis_repro.running.settings import Settings
+from thesis_repro.segmentation import augmentation, training
+from thesis_repro.study.jobs import CONTROL_WIDTH
+from thesis_repro.study.methods import masks_of_method, true_labels
+from thesis_repro.study.sources import Source
+
+SMALL = [ID[name] for name in ("pole", "traffic light", "traffic sign", "person")]
+SHADOW = (
+    0.7  # of the median road of a frame; darker road counts as shadow, in rendered frames rightly
+)
+UNMASKED = "all keypoints"  # in the table of times
+FRAMES = 12  # of each sequence whose label maps are compared with the exact ones
+
+
+def measure(
+    settings: Settings, drives: list[Sequence], repetitions: int, pairs: int
+) -> list[dict[str, Any]]:
+    """Return the measurements of all rows that are not live, for `audit.table`.
+
+    drives: the sequences of the ablations. repetitions: of each ablation. pairs: of frames of each
+    sequence whose keypoints and boundaries are measured one by one. Writes ablations.csv.
+    """
+    labels = artefacts.needed("labels", "05_prediction")
+    ablated = ablations.measure(
+        drives, labels, settings.build / "audit", processes=settings.jobs, repetitions=repetitions
+    )
+    artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
+    tracks = [ablations.tracks(drive, masks_by_name(drive, labels), pairs) for drive in drives]
+    measurements = [
+        *audit.measured(boundaries(drives, labels, pairs), "boundaries"),
+        *audit.of_ablations(ablated),
+        *audit.measured(pd.concat(tracks, ignore_index=True), "tracks"),
+        *audit.measured(right_pixels(settings, drives, labels), "shares"),
+        *of_earlier_notebooks(settings, len(drives)),
+    ]
+    if not settings.uses_shipped_model:
+        measurements += of_training(settings)
+    return measurements
+
+
+def boundaries(drives: list[Sequence], labels: Path, pairs: int) -> pd.DataFrame:
+    """Measure the boundaries of label maps; returns one row a frame (see `ablations.boundaries`).
+
+    Thin objects are those of the exact label maps, if there are any.
+    """
+    rows = []
+    for drive in drives:
+        thin_folder = true_labels(drive.root, drive.name)
+        if not thin_folder.is_dir():
+            thin_folder = labels / drive.name
+        for index in range(0, len(drive), max(1, len(drive) // pairs)):
+            name = drive.frame_paths[index].name
+            label_map = read_label_map(labels / drive.name / name)
+            thin_map = read_label_map(thin_folder / name)
+            shares = ablations.boundaries(label_map, drive.size)
+            shares |= ablations.thin_boundaries(thin_map, drive.size)
+            rows.append({"sequence": drive.name, "frame": index} | shares)
+    return pd.DataFrame(rows)
+
+
+def masks_by_name(drive: Sequence, labels: Path) -> dict[str, Any]:
+    """Return the masks of a sequence that place keypoints differently, for `ablations.tracks`."""
+    own_folder, true_folder = labels / drive.name, true_labels(drive.root, drive.name)
+    by_name: dict[str, Any] = {
+        "all keypoints": [None] * len(drive),
+        "masks": LabelMasks(own_folder, drive, CONTROL_WIDTH),
+        "exact boundaries": LabelMasks(own_folder, drive, CONTROL_WIDTH, ablations.EXACT),
+        "random lines": masks_of_method("random-lines", Source(labels), drive, CONTROL_WIDTH),
+    }
+    if true_folder.is_dir():
+        by_name["true label maps"] = LabelMasks(true_folder, drive, CONTROL_WIDTH)
+    return by_name
+
+
+def right_pixels(settings: Settings, drives: list[Sequence], labels: Path) -> pd.DataFrame:
+    """Compare label maps with the exact ones, if there are any; returns one row a frame."""
+    rows = []
+    for drive in drives:
+        whole = Sequence(settings.kitti, drive.name).subset(settings.sizes.frames).subset(FRAMES)
+        true_folder = true_labels(settings.kitti, drive.name)
+        for index, path in enumerate(whole.frame_paths):
+            if (true_folder / path.name).is_file():
+                predicted = read_label_map(labels / drive.name / path.name)
+                exact = read_label_map(true_folder / path.name)
+                shares = right_shares(predicted, exact, whole.frame(index))
+                rows.append({"sequence": drive.name, "frame": index} | shares)
+    return pd.DataFrame(rows)
+
+
+def right_shares(predicted: np.ndarray, exact: np.ndarray, frame: np.ndarray) -> dict[str, float]:
+    """Return the shares (%) of right pixels in pairs of areas: {area: share}.
+
+    rim: within a tenth of the height from the frame's edges; inside. small: SMALL things; large:
+    all others. dark: road in shadow; lit. A pair whose first area is empty is left out.
+    """
+    right = resize(predicted, exact.shape[::-1], interpolation=INTER_NEAREST) == exact
+    margin = exact.shape[0] // 10
+    rim = np.ones(exact.shape, bool)
+    rim[margin:-margin, margin:-margin] = False
+    small, road = np.isin(exact, SMALL), exact == ID["road"]
+    dark = road & (frame < SHADOW * np.median(frame[road]))
+    pairs = {
+        ("rim", "inside"): (rim, ~rim),
+        ("small", "large"): (small, ~small),
+        ("dark", "lit"): (dark, road & ~dark),
+    }
+    shares: dict[str, float] = {}
+    for names, areas in pairs.items():
+        if areas[0].any():
+            shares |= {name: 100 * right[area].mean() for name, area in zip(names, areas)}
+    return shares
+
+
+def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]:
+    """Return the rows of the tables that notebooks 05, 06 and 08 wrote. count: of the sequences."""
+    runs, shuffled = (
+        pd.read_csv(artefacts.needed(f"{name}.csv", "08_results"), dtype={"sequence": str})
+        for name in ("runs", "shuffled_runs")
+    )
+    measurements = audit.of_study(runs, shuffled)
+    found_again = pd.read_csv(artefacts.needed("found_again.csv", "06_keypoint_masks"))
+    for _, kind, _, share in found_again.itertuples():
+        measurements.append(audit.measurement("73", "found again", share, "%", metric=kind))
+    for row in gap.label_map_quality(settings.build):
+        if row["domain"] == gap.FRAMES:
+            recall, frames = 100 * row["sky_recall"], round(row["images"] / count)
+            measurements.append(audit.measurement("46", "sky", recall, "%", frames=frames))
+    seconds = pd.read_csv(timing.folder(settings) / "seconds.csv", dtype={"sequence": str})
+    savings = pd.DataFrame(
+        {name: thesis_tables.time_savings(rows) for name, rows in seconds.groupby("sequence")}
+    )
+    saved = savings[savings.index.isin(audit.WIDTHS)].mean()
+    stages = pd.read_csv(timing.folder(settings) / "budget.csv")
+    totals = stages.groupby("method")["milliseconds"].sum()
+    masked = stages[stages["method"] != UNMASKED].sort_values("stage")
+    timed_on = {"data": f"timed on {stages['processor'].iloc[0]}"}
+    whole = totals.drop(UNMASKED) / totals[UNMASKED]
+    measurements += [
+        audit.measurement("47", "saved", saved, "%", **timed_on),
+        audit.measurement("16", "whole frame", whole, "ratio", **timed_on),
+    ]
+    for row in masked.itertuples():
+        stage = {"metric": row.stage, **timed_on}
+        measurements.append(audit.measurement("49", "stage", row.milliseconds, "ms", **stage))
+    return measurements
+
+
+def of_training(settings: Settings) -> list[dict[str, Any]]:
+    """Return rows 7, 8, 24 and 44, from the training data and the network of notebook 04."""
+    pair = cityscapes.pairs(settings.cityscapes, "train")[0]
+    listed = [stems(path.parent) for path in (pair.image, pair.label)]
+    mismatched = [image != label for image, label in zip(*listed)]
+    data = artefacts.needed("data", "01_load_images_and_labels")
+    image, label_map = (np.load(data / f"train_{kind}.npy")[0] for kind in ("images", "labels"))
+    equal = [transformed_alike(image, label_map, seed) for seed in range(5)]
+    model = training.load_model(artefacts.needed("model/model.keras", "04_training"))
+    model.compile(loss=training.total_loss())
+    images, label_maps = (np.load(data / f"validation_{x}.npy")[:16] for x in ("images", "labels"))
+    blur, full = augmentation.validation_augmenter(), augmentation.training_augmenter(len(image))
+    history = pd.read_csv(settings.build / "model" / "history.csv")["val_loss"]
+    return [
+        audit.measurement("8", "pairs", 100 * np.mean(mismatched), "%"),
+        audit.measurement("24", "one-hot", 100 * np.mean(equal), "%"),
+        audit.measurement("7", "loss blur", validation_losses(model, (images, label_maps), blur)),
+        audit.measurement("7", "loss all", validation_losses(model, (images, label_maps), full)),
+        audit.measurement("44", "loss last", history.iloc[-1]),
+        audit.measurement("44", "loss best", history.min()),
+    ]
+
+
+def stems(folder: Path) -> list[str]:
+    """Return the names of a folder's images in the order of os.listdir, without their endings."""
+    names = [name for name in os.listdir(folder) if name.endswith(".png")]
+    endings = "_leftImg8bit.png", "_gtFine_labelIds.png"
+    return [name.removesuffix(endings[0]).removesuffix(endings[1]) for name in names]
+
+
+def transformed_alike(image: np.ndarray, label_map: np.ndarray, seed: int) -> bool:
+    """Return whether a one-hot mask and an integer label map are transformed alike."""
+    size, classes = len(image), cityscapes.N_CLASSES
+    integers = augmentation.training_augmenter(size)
+    floats = A.Compose(augmentation.transform_list(size, fill_mask=0))
+    _, ids = augmentation.augment(integers, image, label_map, seed)
+    encoded = augmentation.one_hot(label_map, classes)
+    _, one_hot = augmentation.augment(floats, image, encoded, seed)
+    return np.array_equal(one_hot, augmentation.one_hot(ids, classes))
+
+
+def validation_losses(
+    model: Any, held_out: tuple[np.ndarray, np.ndarray], transforms: A.Compose
+) -> list[float]:
+    """Return the losses of a network on two augmented copies of images with label maps."""
+    losses = []
+    for seed in range(2):
+        copies, maps = augmentation.augment_set(*held_out, transforms, seed)
+        encoded = augmentation.one_hot(maps, cityscapes.N_CLASSES)
+        losses.append(model.evaluate(copies.astype(np.float32), encoded, batch_size=4, verbose=0))
+    return losses
