@@ -48,7 +48,7 @@ setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 figures: setup
 	@run=$$($(BIN)/python -m thesis_repro.running.settings) || exit; mkdir -p $$run/notebooks $$run/ipython; export IPYTHONDIR=$$(realpath $$run)/ipython; \
 	[ -t 2 ] && export THESIS_REPRO_PROGRESS=$$(tty <&2) || export THESIS_REPRO_PROGRESS=/dev/null; \
-	$(MAKE) -k $(if $(filter 1,$(JOBS)),,-j2) notebooks RUN=$$run; status=$$?; \
+	trap 'kill $$!; wait $$!; exit 130' INT TERM HUP; $(MAKE) -k $(if $(filter 1,$(JOBS)),,-j2) notebooks RUN=$$run & wait $$!; status=$$?; \
 	$(BIN)/python -m thesis.page && exit $$status
 
 ifdef RUN
@@ -66,7 +66,7 @@ $(call executed,01 02 03 04): $(LEARNING)
 $(call executed,05 06 07): $(LEARNING) $(PATHS)
 $(call executed,08 09): $(EVERYTHING)
 $(call executed,02 04 05 09): $(call executed,01)
-$(call executed,04): $(call executed,02)
+$(call executed,04): $(call executed,02 03)
 $(call executed,05 09): $(call executed,04)
 $(call executed,06 07 08 09): $(call executed,05)
 $(call executed,07 08): $(call executed,06)

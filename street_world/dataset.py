@@ -244,7 +244,9 @@ def _write_missing(missing: list[Picture], jobs: int) -> None:
         # Ten at a time, because pictures of one sequence share its street.
         starts = range(1, len(missing), 10)
         work = (delayed(_write_pictures)(missing[start : start + 10]) for start in starts)
-        for count in parallel(work):
+        with messages.starting_workers():
+            counts = parallel(work)
+        for count in counts:
             bar.update(count)
 
 

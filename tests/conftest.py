@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import signal
 from contextlib import contextmanager
 
 from thesis_repro import segmentation  # noqa: F401  sets what TensorFlow reads at its import
@@ -68,23 +67,6 @@ def camvid_real():
 def reference():
     """PySLAM's own results on the real frames."""
     return _real_data("reference")
-
-
-@pytest.fixture
-def kill_when():
-    """A function that starts a command, and kills it when a condition holds.
-
-    Its child processes are killed, too.
-    """
-
-    def start(command, condition):
-        process = trials.start(command, trials.ROOT)
-        trials.wait_for(lambda: process.poll() is not None or condition(), 600)
-        assert process.returncode is None, "it ended before it could be killed"
-        trials.kill(process)
-        assert process.returncode == -signal.SIGKILL
-
-    return start
 
 
 @contextmanager

@@ -54,16 +54,6 @@ def _visible_texts(figure):
     ]
 
 
-def between_steps(slider):
-    """Say so if no step of a slider reaches its value, which a browser would round."""
-    if not hasattr(slider, "step"):
-        return None
-    steps = (slider.value - slider.min) / slider.step
-    if abs(steps - round(steps)) < 1e-9:
-        return None
-    return f"{slider} is between its steps"
-
-
 class Watch:
     """What is seen of the notebook of an IPython shell, written into a folder.
 
@@ -108,7 +98,6 @@ class Watch:
             return
         name = f"sliders-{os.environ['WATCHED']}"
         for draw, sliders in self.with_sliders:
-            self.report(*filter(None, map(between_steps, sliders.values())), name=name)
             figure = draw(**{key: slider.value for key, slider in sliders.items()})
             texts = [text for axes in figure.axes for text in (axes.title, *axes.texts)]
             self.report("; ".join(text.get_text() for text in texts), name=name)

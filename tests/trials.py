@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-import zipfile
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
@@ -101,7 +100,7 @@ def kill(process):
 
 
 def snapshot(where):
-    """{path: (size, date)} of all files below a folder; None for folders.
+    """{path: (size, date)} of all files below a folder; True for folders.
 
     Files may vanish meanwhile.
     """
@@ -110,16 +109,10 @@ def snapshot(where):
         for name in (*folders, *names):
             path = Path(folder, name)
             with suppress(FileNotFoundError):
-                versions[path.relative_to(where)] = version(path)
+                status = path.lstat()
+                version = name in folders or (status.st_size, status.st_mtime_ns)
+                versions[path.relative_to(where)] = version
     return versions
-
-
-def version(path):
-    """(size, date) of a file, None for a folder."""
-    status = path.lstat()
-    if path.is_dir():
-        return None
-    return status.st_size, status.st_mtime_ns
 
 
 def changes(before, after):
@@ -163,10 +156,6 @@ def _content(path):
         table = pd.read_csv(path, dtype=str)
         times = [name for name in table if name.endswith("_seconds")]
         return table.drop(columns=times).to_csv().encode()
-    if path.suffix == ".keras":
-        with zipfile.ZipFile(path) as file:
-            weights = [name for name in sorted(file.namelist()) if name.endswith(".h5")]
-            return b"".join(map(file.read, weights))
     return path.read_bytes()
 
 

@@ -78,14 +78,6 @@ def test_the_fit_meets_exact_points_and_keeps_the_sign_of_the_translation():
         np.testing.assert_allclose(translation, sign * AHEAD, atol=1e-7)
 
 
-def test_one_point_many_times_determines_no_motion():
-    matches = seen(np.tile([1.0, 0.5, 8.0], (50, 1)), turn(1), AHEAD)
-    estimator = RefinedEstimator()
-    motion = estimator.motion(essential(turn(1), AHEAD), matches, 1.0, moves=True)
-    assert motion.flag == NOT_DETERMINED
-    np.testing.assert_array_equal(motion.rotation, np.eye(3))
-
-
 # A step and its prior
 
 

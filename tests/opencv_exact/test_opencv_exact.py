@@ -177,22 +177,6 @@ def test_solutions_lie_well_within_their_margins_of_opencvs(options, fewest, mos
     assert len(shares) > fewest and max(shares) < 0.7 and unsure < most_unsure
 
 
-def test_a_sample_has_the_same_solutions_in_every_lane_and_company():
-    random = np.random.default_rng(5)
-    samples = [scene(random, 5, outliers=0.0) for _ in range(LANES)]
-    current, previous = (np.array(side) for side in zip(*samples))
-    current[3, :, 1] = current[3, :, 0]  # not solvable
-    together = solve_five_points(current, previous)
-    assert not together.sure[3] and together.sure.sum() >= LANES - 2
-    for first in range(LANES):
-        fewer = solve_five_points(current[first:], previous[first:])
-        np.testing.assert_array_equal(together.counts[first:], fewer.counts)
-        for k, count in enumerate(fewer.counts):
-            np.testing.assert_array_equal(
-                together.matrices[first + k, :count], fewer.matrices[k, :count]
-            )
-
-
 @numba.njit(error_model="numpy")
 def bounds(e, margin, points):
     return ransac._bounds(e, margin, points, -1)

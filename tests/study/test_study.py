@@ -2,12 +2,14 @@
 
 import re
 import shutil
+import signal
 import sys
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+import trials
 from evo.tools import file_interface
 from typeset import PDFLATEX, assert_fits
 
@@ -151,7 +153,7 @@ def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
 
 
 def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
-    done, study, small_world, small_labels, masks, tmp_path, kill_when
+    done, study, small_world, small_labels, masks, tmp_path
 ):
     folder = tmp_path / "out"
     command = [
@@ -181,7 +183,10 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
         "--output",
         folder,
     ]
-    kill_when(command, lambda: files(folder))
+    process = trials.start(command, trials.ROOT)
+    trials.wait_for(lambda: process.poll() is not None or files(folder), 600)
+    trials.kill(process)
+    assert process.returncode == -signal.SIGKILL
     finished = files(folder)
     assert study.run(folder).table.equals(done[1])
     assert finished == {path: path.stat().st_mtime_ns for path in finished}

@@ -3,76 +3,27 @@
 Trials marked `torture` are run by `make torture` alone.
 """
 
-import sys
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-from trials import thesis
-
-ROOT = Path(__file__).parents[2]
-# the training of tests/segmentation/test_training.py as a command
-TRAINING = f"""
-import sys
-sys.path[:0] = {[str(ROOT / "tests/segmentation"), str(ROOT / "tools")]!r}
-from thesis_repro.running import messages, results
-from thesis_repro.segmentation import training
-import test_training
-def main():
-    folder = results.stage(sys.argv[1], **training.made_from(*test_training.prepared()))
-    test_training.train(folder, 3, pause=0.1)
-messages.run_main(main)
-"""
+from trials import ROOT, thesis
 
 
 @pytest.fixture
-def words(small_world, small_labels, small_model):
-    """Give words(name, output), which returns a command that writes `output`.
-
-    The ending of "odometry.png" says which output it is.
-    """
+def words(small_world, small_labels, tmp_path):
+    """Give words(name, output), which returns a command that writes `output`."""
     kitti = small_world / "kitti"
-    options = {".txt": "--output", ".png": "--plot", ".webm": "--video"}
+    odometry = "odometry", "--kitti", kitti, "--sequence", "00"
+    study = "study", "--kitti", kitti, "--labels", small_labels, "--widths", 5, "--jobs", 2
+    make = "make", "-C", ROOT, "-o", ".venv/ready", "figures", "PROFILE=smoke"
 
     def command(name, output="out"):
-        if name.startswith("odometry"):
-            return thesis(
-                "odometry",
-                "--kitti",
-                kitti,
-                "--sequence",
-                "00",
-                options[Path(name).suffix],
-                f"{output}{Path(name).suffix}",
-            )
+        folder = tmp_path / output
         return {
-            "synthesize": thesis("synthesize", output, "--profile", "smoke"),
-            "training": [sys.executable, "-c", TRAINING, output],
-            "predict": thesis(
-                "predict",
-                "--images",
-                kitti / "sequences/00",
-                "--model",
-                small_model,
-                "--output",
-                output,
-            ),
-            "study": thesis(
-                "study",
-                "--kitti",
-                kitti,
-                "--labels",
-                small_labels,
-                "--widths",
-                5,
-                "--repetitions",
-                1,
-                "--jobs",
-                2,
-                "--output",
-                output,
-            ),
+            "path": thesis(*odometry, "--output", f"{output}/path.txt"),
+            "video": thesis(*odometry, "--video", f"{output}/drive.webm"),
+            "study": thesis(*study, "--repetitions", 1, "--output", output),
+            "figures": [*make, f"BUILD={folder}/build", f"FIGURES={folder}/figures"],
         }[name]
 
     return command

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
+from multiprocessing import resource_tracker
 
 from tqdm import tqdm
 
@@ -138,6 +139,22 @@ def unstopped() -> Iterator[None]:
     finally:
         _steps -= 1
     check_stop()
+
+
+@contextmanager
+def starting_workers() -> Iterator[None]:
+    """Start processes with Ctrl-C blocked, until they ignore it (`leave_ctrl_c_to_parent`).
+
+    Half started, they would print a traceback each.
+    """
+    # joblib starts it with the first worker, and its start unblocks Ctrl-C
+    resource_tracker.ensure_running()
+    with unstopped():
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
 def leave_ctrl_c_to_parent() -> None:

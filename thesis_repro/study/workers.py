@@ -27,7 +27,8 @@ class Pool(NamedTuple):
 
     def run(self, function: Callable, calls: Iterable[tuple]) -> Iterator[Any]:
         """Yield the results of calls, which are tuples of arguments, in their order."""
-        futures = [self.executor.submit(function, *call) for call in calls]
+        with messages.starting_workers():
+            futures = [self.executor.submit(function, *call) for call in calls]
         for future in futures:
             messages.check_stop()
             yield future.result()
@@ -41,7 +42,8 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
     """
     if scheduler is None:
-        executor = get_reusable_executor(processes, initializer=messages.leave_ctrl_c_to_parent)
+        with messages.unstopped():
+            executor = get_reusable_executor(processes, initializer=messages.leave_ctrl_c_to_parent)
         try:
             yield Pool(processes, executor)
         except BrokenExecutor:
