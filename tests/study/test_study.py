@@ -214,7 +214,6 @@ def test_results_of_another_length_are_kept(done, study):
         ("--masks {labels}", "320x320"),
         ("--labels {labels}/00", "2 are asked for"),
         ("--labels {less} --sequences 00", "2 of 12 frames of sequence 00"),
-        ("--labels {labels} --repetitions 0", "--repetitions 0: "),
         ("--labels {labels} --controls -1", "dilation width -1: "),
     ],
 )

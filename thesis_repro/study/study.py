@@ -43,8 +43,6 @@ class Study:
 
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
-        if self.repetitions < 1:
-            raise InputError(f"--repetitions {self.repetitions}: must be 1 or more")
         for sequence in self.opened:
             if len(sequence) < 3:
                 raise InputError(
