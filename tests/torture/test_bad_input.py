@@ -33,7 +33,6 @@ MISSING = {"missing": None}
 # (command, file, {fault: its content, None if it is missing}); the error names the file. More
 # contents are in tests/data, tests/running and tests/segmentation
 BROKEN = [
-    *[(words, f"{FRAMES}/000002.png", MISSING) for words in (ODOMETRY, MASKS, STUDY, PREDICT)],
     (ODOMETRY, f"{FRAMES}/000002.png", {"16 bits": picture(NOISE.astype(np.uint16))}),
     (ODOMETRY, f"{FRAMES}/000002.png", {"another size": picture(NOISE[:20])}),
     (ODOMETRY, f"{FRAMES}/000000.png", {"1x1": picture([[7]])}),
