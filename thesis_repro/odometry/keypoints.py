@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -103,11 +102,6 @@ def _fields(points: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
 def _detect_orb(
     frame: np.ndarray, settings: OdometrySettings, inside: np.ndarray | None
 ) -> np.ndarray:
-    found = _orb(settings.max_keypoints).detect(frame, inside)
+    found = cv2.ORB_create(settings.max_keypoints).detect(frame, inside)
     points = cv2.KeyPoint_convert(found)
     return np.reshape(points, (-1, 2)).astype(np.float32, copy=False)
-
-
-@lru_cache
-def _orb(max_keypoints: int) -> cv2.ORB:
-    return cv2.ORB_create(max_keypoints)

@@ -1,7 +1,7 @@
 """Run the odometry over a sequence: one run, or many runs in one pass, which share their work."""
 
 import time
-from collections.abc import Mapping, Sized
+from collections.abc import Iterable, Mapping, Sized
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,7 +13,6 @@ from thesis_repro.errors import InputError
 from thesis_repro.odometry.odometry import STATIONARY, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.types import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
-from thesis_repro.running import messages
 from thesis_repro.running.files import progress
 
 COUNTS = ("points", "detected", "tracked", "inliers", "pose_inliers")  # blank where there is none
@@ -178,15 +177,12 @@ def check(sequence: Any, masks: Any) -> None:
         raise InputError(f"masks: must be {len(sequence)} masks, one a frame, such as LabelMasks")
 
 
-def _indices(sequence: Sequence, description: str | None) -> Any:
+def _indices(sequence: Sequence, description: str | None) -> Iterable[int]:
     """The numbers of the frames, with a progress bar if there is a description."""
     indices = range(len(sequence))
-    if description is not None:
-        yield from progress(indices, description)
-        return
-    for index in indices:
-        messages.check_stop()
-        yield index
+    if description is None:
+        return indices
+    return progress(indices, description)
 
 
 def _result(rows: list[list], settings: OdometrySettings) -> Result:
