@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import trials
 from evo.tools import file_interface
-from typeset import PDFLATEX, assert_fits
 
 from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
@@ -117,16 +116,6 @@ def test_figures_and_tables_of_a_study(done, study):
     failed = (runs["sequence"] == "01") & (runs["source"] == "net")
     figure = report.figure_paths(study, runs[~failed], study.opened[1], folder)
     assert len(figure.axes[0].lines) == 3  # all keypoints, by hand, ground truth
-
-
-@pytest.mark.skipif(not PDFLATEX, reason="needs pdflatex")
-def test_latex_of_a_study_fits_a_column_of_an_article(done, study, tmp_path):
-    folder = tmp_path / "out"
-    shutil.copytree(done[0], folder)
-    report.write(study, done[1], folder)
-    names = ("summary", "comparison", "widths", "errors")
-    texts = {name: (folder / f"{name}.tex").read_text() for name in names}
-    assert_fits(texts, "twocolumn", tmp_path)
 
 
 def test_a_repeated_study_runs_nothing_and_another_source_only_its_runs(
