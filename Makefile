@@ -84,10 +84,10 @@ endef
 $(foreach name,$(NAMES),$(eval $(call execute,$(name))))
 $(RUN)/checked: FORCE  # rewritten only if the data has changed
 	@$(BIN)/python -m thesis_repro.checks $@
-# Render the drives of the embedded world while the network is trained. Notebook 5 would do so, too.
+# Render the drives of the embedded world and compile the shared odometry while the network is trained, to save time.
 $(call executed,05): $(if $(THESIS_REPRO_KITTI),,$(RUN)/drives)
 $(RUN)/drives: $(call executed,01)
-	@nice $(BIN)/python -m street_world && touch $@
+	@nice $(BIN)/python -m street_world && nice $(BIN)/python -c 'import thesis_repro as tr; from thesis_repro.running import settings; tr.run_many(tr.Sequence(settings.read_settings().kitti, "00").subset(3), {"": (tr.OdometrySettings(estimator="refined"), None)})' && touch $@
 endif
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $${THESIS_REPRO_KITTI:+--kitti "$$THESIS_REPRO_KITTI"} \
