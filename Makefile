@@ -57,7 +57,7 @@ ifdef RUN
 code = $(shell find $(1) -name '*.py')
 LEARNING := $(call code,thesis_repro/data thesis_repro/segmentation street_world)
 PATHS := $(call code,thesis_repro/data thesis_repro/masks.py thesis_repro/odometry opencv_exact)
-EVERYTHING := $(call code,thesis_repro/study thesis_repro/report notebooks/thesis) $(LEARNING) $(PATHS)
+EVERYTHING := $(filter-out %/page.py,$(call code,thesis_repro/study thesis_repro/report notebooks/thesis)) $(LEARNING) $(PATHS)
 NAMES := $(patsubst notebooks/%.ipynb,%,$(sort $(wildcard notebooks/*.ipynb)))
 NAMES := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))
 executed = $(patsubst %,$(RUN)/notebooks/%.ipynb,$(filter $(addsuffix _%,$(1)),$(NAMES)))

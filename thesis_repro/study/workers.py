@@ -10,7 +10,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from joblib.externals.loky import get_reusable_executor
+from joblib.externals.loky import ProcessPoolExecutor
 
 from thesis_repro.errors import InputError
 from thesis_repro.running import messages
@@ -42,15 +42,14 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
     """
     if scheduler is None:
-        with messages.unstopped():
-            executor = get_reusable_executor(processes, initializer=messages.leave_ctrl_c_to_parent)
+        with messages.unstopped():  # not joblib's shared executor, which callers may use, too
+            executor = ProcessPoolExecutor(processes, initializer=messages.leave_ctrl_c_to_parent)
         try:
             yield Pool(processes, executor)
         except BrokenExecutor:
             raise InputError(LOST) from None
-        except BaseException:
+        finally:
             executor.shutdown(kill_workers=True)
-            raise
         return
     from dask.distributed import Client, KilledWorker  # imported here because it takes a second
 
