@@ -16,6 +16,8 @@ from thesis_repro.errors import InputError
 from thesis_repro.running import messages
 
 TIMEOUT = 8  # seconds that a scheduler has to answer
+# Workers share the cores, so a library in one of them uses one thread, as joblib has it.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 LOST = "a worker process was lost; finished results are kept; repeat the command"
 
 
@@ -43,7 +45,9 @@ def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """
     if scheduler is None:
         with messages.unstopped():  # not joblib's shared executor, which callers may use, too
-            executor = ProcessPoolExecutor(processes, initializer=messages.leave_ctrl_c_to_parent)
+            executor = ProcessPoolExecutor(
+                processes, initializer=messages.leave_ctrl_c_to_parent, env=ONE_THREAD
+            )
         try:
             yield Pool(processes, executor)
         except BrokenExecutor:
