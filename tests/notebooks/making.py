@@ -13,10 +13,10 @@ FIGURES = [
     "figure_a_01",
 ]
 # the number of a notebook in a command that executes it, in the output of make
-EXECUTED = re.compile(r"(?:nbconvert|report\.execute)[^\n]*? notebooks/(\d\d)_")
+EXECUTED = re.compile(r"(?:nbconvert)[^\n]*? notebooks/(\d\d)_")
 
 
-def make_figures(tmp_path, *options, root=ROOT):
+def make_figures(tmp_path, *options, root=ROOT, target="figures"):
     # MAKEFLAGS would pass the options of an outer make on to this one
     environment = {
         name: value
@@ -25,7 +25,7 @@ def make_figures(tmp_path, *options, root=ROOT):
     }
     folders = f"BUILD={tmp_path / 'build'}", f"FIGURES={tmp_path / 'figures'}"
     return subprocess.run(
-        ["make", "figures", "PROFILE=smoke", *folders, "-o", ".venv/ready", *options],
+        ["make", target, "PROFILE=smoke", *folders, "-o", ".venv/ready", *options],
         cwd=root,
         env=environment | {"PYTHONPATH": str(root)},
         capture_output=True,
