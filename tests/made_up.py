@@ -30,7 +30,7 @@ def runs(
         error = errors(name, method, width) * np.exp(noise * random.normal())
         job = Job(name, method, width, estimator=estimator, repetition=repetition, source=source)
         row = {"run": job.name, **vars(job), "frames": 100, "flagged": 0}
-        row |= {"lost": 0, "mean_keypoints": 1900}
+        row |= {"failed": 0.0, "lost": 0, "mean_keypoints": 1900}
         if width:
             row["mean_keypoints"] = 500 + width
         row |= dict.fromkeys(compare.METRICS, error)

@@ -55,7 +55,7 @@ def table(runs, other_runs):
 
 def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
     ratios = {
-        label: texts.ratio(compare.geometric_mean(compare.ratios(rows, reference, metric)))
+        label: texts.ratio(compare.typical_ratio(compare.ratios(rows, reference, metric)))
         for metric, label in compare.JUDGING_METRICS.items()
     }
     mean_iou, where = quality.get(name, (float("nan"), "not known"))
@@ -67,7 +67,7 @@ def _row(name, rows, reference, quality, over=ALL_KEYPOINTS):
         "sequences": ", ".join(sorted(rows["sequence"].unique())),
         "over": over,
         **ratios,
-        "lost runs": compare.lost(rows),
+        "failed runs": compare.count_failed(rows),
     }
 
 
@@ -102,7 +102,7 @@ def _of_embedded_world():
             "sequences": f"{row['sequences']} drives",
             "over": ALL_KEYPOINTS,
             **{label: row[label] for label in compare.JUDGING_METRICS.values()},
-            "lost runs": row["lost runs"],
+            "failed runs": row["failed runs"],
         }
         for name, (mean_iou, where, row) in sources.items()
     ]

@@ -2,7 +2,7 @@
 
 audit.json holds the rows and lists which columns are measured for them. Notebook 09 and
 `audit_rest` measure; `table` joins the measurements to the rows. Ratios come from `study.compare`.
-Intervals are those of Student's t over `n` values: sequences unless said otherwise.
+Intervals of other means are those of Student's t over `n` values: sequences unless said otherwise.
 """
 
 import json
@@ -68,10 +68,17 @@ def share(row: str, quantity: str, percentages: Any, **more: Any) -> dict[str, A
 
 
 def ratio(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
+    """Return one measurement for a row of the audit: the ratio over one ratio a sequence."""
+    typical = compare.typical_ratio(ratios)
+    interval = {"low": typical["low"], "high": typical["high"], "n": typical["n"]}
+    return measurement(row, quantity, [], "ratio", value=typical["ratio"], **interval, **more)
+
+
+def geometric_mean(row: str, quantity: str, ratios: Any, **more: Any) -> dict[str, Any]:
     """Return one measurement for a row of the audit: the geometric mean of one ratio a sequence."""
-    mean = compare.geometric_mean(ratios)
-    interval = {"low": mean["low"], "high": mean["high"], "n": mean["n"]}
-    return measurement(row, quantity, [], "ratio", value=mean["ratio"], **interval, **more)
+    mean = compare.typical_ratio(ratios)
+    interval = {"low": mean["mean_low"], "high": mean["mean_high"], "n": mean["n"]}
+    return measurement(row, quantity, [], "ratio", value=mean["mean"], **interval, **more)
 
 
 def table(measurements: list[dict[str, Any]], data: str = "this run") -> pd.DataFrame:
@@ -179,7 +186,7 @@ def of_tables() -> list[dict[str, Any]]:
     best_widths = best["dilation_width"].isin(WIDTHS).sum()
     measurements += [
         measurement("3", "reduction", 2000 / keypoints.mean(), "ratio"),
-        ratio("3", "reduction of each", factors),
+        geometric_mean("3", "reduction of each", factors),
         measurement("3", "three", (factors >= 3).sum(), "sequences"),
         measurement("9", "categories", len(LABELS)),
         measurement("9", "outputs", classes),
@@ -201,7 +208,7 @@ def _of_changes(metric: str) -> list[dict[str, Any]]:
         measurement("1", "sum", change.sum(), "%", metric=metric),
         measurement("1", "mean", change, "%", metric=metric),
         measurement("1", "median", change.median(), "%", metric=metric),
-        ratio("1", "ratio", 1 + change / 100, metric=metric),
+        geometric_mean("1", "ratio", 1 + change / 100, metric=metric),
         measurement("4", "larger", larger, "sequences", metric=metric),
         measurement("41", "improved", improved, "sequences", metric=metric),
         measurement("41", "sign", 100 * sign_test, "%", metric=metric),

@@ -27,7 +27,7 @@ def table_4_1(runs: pd.DataFrame, reported_as: str) -> pd.DataFrame:
     table["frames"] = best["frames"]
     table["dilation width (pixels)"] = best["dilation_width"]
     table["mean keypoints"] = best["mean_keypoints"].round().astype(int)
-    table["lost runs"] = _lost_of(thesis_tables.of_chosen_width(masked))
+    table["failed runs"] = _failed_of(thesis_tables.of_chosen_width(masked))
     table[f"width, {reported_as}"] = reported["dilation_width"]
     table[f"mean keypoints, {reported_as}"] = reported["mean_keypoints"]
     return table.reset_index()
@@ -52,17 +52,16 @@ def table_of_change(
     (`thesis_tables.null_distribution`), simulated from `shuffled`: runs with all
     keypoints, many repetitions.
     The last rows have the sum of the percentages (the thesis's "aggregate"), their mean with
-    Student's t interval, and their median. A lost run counts as not improved.
+    Student's t interval, and their median.
     """
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     best = thesis_tables.of_chosen_width(masked)
-    first_best = thesis_tables.of_chosen_width(masked[masked["repetition"] == 0])
     change = thesis_tables.changes(best, baseline, metric)
     single = thesis_tables.changes_of_repetition(masked, baseline, metric)
     studies = thesis_tables.null_distribution(shuffled, masked["dilation_width"].nunique(), metric)
     reported = pd.Series(REPORTED[REPORTED_CHANGES[metric]])
-    columns = {"change (%)": (change, _summary(change, best))}
-    columns[SINGLE] = single, _summary(single, first_best)
+    columns = {"change (%)": (change, _summary(change))}
+    columns[SINGLE] = single, _summary(single)
     if len(studies.columns):
         columns[NULL] = studies.mean(), _summary_of_studies(studies)
     columns[f"change (%), {reported_as}"] = reported, _summary(reported)
@@ -70,7 +69,7 @@ def table_of_change(
     for method, rows in {"all keypoints": baseline, "best mask": best}.items():
         mean = rows.groupby("sequence")[metric].mean()
         errors[f"{metric.upper()}, {method} (m)"] = mean.map(three_digits)
-        errors[f"lost runs, {method}"] = _lost_of(rows)
+        errors[f"failed runs, {method}"] = _failed_of(rows)
     by_sequence = pd.DataFrame({name: changes for name, (changes, _) in columns.items()})
     last_rows = pd.DataFrame({name: summary for name, (_, summary) in columns.items()}, dtype=float)
     changes = pd.concat([by_sequence.reindex(errors.index), last_rows]).round(2)
@@ -78,31 +77,25 @@ def table_of_change(
     return table.rename_axis("sequence").reset_index()
 
 
-def _lost_of(runs: pd.DataFrame) -> pd.Series:
-    """Return the lost runs of each sequence as a text, "2 of 5"."""
-    lost = {name: compare.lost(rows) for name, rows in runs.groupby("sequence")}
-    return pd.Series(lost, dtype=str)
+def _failed_of(runs: pd.DataFrame) -> pd.Series:
+    """Return the failed runs of each sequence as a text, "2 of 5"."""
+    failed = {name: compare.count_failed(rows) for name, rows in runs.groupby("sequence")}
+    return pd.Series(failed, dtype=str)
 
 
 CI = f"mean, {compare.LEVEL} % CI over sequences"
 
 
-def _summary(changes: pd.Series, runs: pd.DataFrame | None = None) -> dict[str, float]:
-    """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%).
-
-    runs: those with masks behind the changes; None if only the changes are known.
-    """
+def _summary(changes: pd.Series) -> dict[str, float]:
+    """Return the last rows of Tables 4.2 and 4.3 for one column of changes (%)."""
     low, high = compare.mean_interval(changes)
-    improved = (changes < 0).sum()
-    if runs is not None:
-        improved = thesis_tables.improved(changes, runs)
     return {
         "sum (the thesis's aggregate)": changes.sum(min_count=1),
         "mean": changes.mean(),
         f"{CI}, from": low,
         f"{CI}, to": high,
         "median": changes.median(),
-        IMPROVED: improved,
+        IMPROVED: (changes < 0).sum(),
     }
 
 
@@ -126,8 +119,8 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
 
     shuffled: runs with all keypoints, to simulate the procedure if masks did nothing.
 
-    Changes are in percent: mean, median, improved and lost (sequences) of repetition 0; lowest and
-    highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
+    Changes are in percent: mean, median, improved and failed (sequences) of repetition 0; lowest
+    and highest mean of a repetition; null_mean, null_low, null_high and null_improved if masks did
     nothing (`thesis_tables.null_distribution`).
     """
     masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
@@ -151,8 +144,8 @@ def procedure(runs: pd.DataFrame, shuffled: pd.DataFrame) -> list[dict[str, Any]
             "sequences": len(by_repetition[0]),
             "mean": means[0],
             "median": by_repetition[0].median(),
-            "improved": thesis_tables.improved(by_repetition[0], best),
-            "lost": int(best["lost"].sum()),
+            "improved": int((by_repetition[0] < 0).sum()),
+            "failed": int(compare.has_failed(best).sum()),
             "lowest": min(means),
             "highest": max(means),
             "repetitions": len(means),

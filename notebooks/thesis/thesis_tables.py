@@ -24,7 +24,6 @@ __all__ = [
     "changes",
     "changes_of_repetition",
     "chosen_widths",
-    "improved",
     "middle",
     "null_distribution",
     "of_chosen_width",
@@ -89,16 +88,6 @@ def middle(values: pd.Series) -> tuple[float, float]:
     """Return the ends of the middle LEVEL percent of a number of simulated studies."""
     tail = (100 - LEVEL) / 200
     return values.quantile(tail), values.quantile(1 - tail)
-
-
-def improved(changes: pd.Series, runs: pd.DataFrame) -> int:
-    """Return the number of sequences with a negative change (%) and no lost run.
-
-    changes: by sequence, of the runs. A lost run (see `metrics.step_errors`) may have a low error
-    by chance.
-    """
-    is_lost = runs.groupby("sequence")["lost"].any()
-    return int(((changes < 0) & ~is_lost.reindex(changes.index).astype(bool)).sum())
 
 
 def time_savings(seconds: pd.DataFrame) -> pd.Series:

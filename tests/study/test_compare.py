@@ -7,7 +7,7 @@ import made_up
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import ttest_1samp
+from scipy.stats import ttest_1samp, wilcoxon
 
 from thesis import thesis_tables
 from thesis_repro.study import compare
@@ -33,7 +33,7 @@ def arms(runs, *methods):
 
 
 def ratio_of(rows, reference):
-    return compare.geometric_mean(compare.ratios(rows, reference, "rmse"))
+    return compare.typical_ratio(compare.ratios(rows, reference, "rmse"))
 
 
 def test_known_ratios_are_found_and_inverted_by_swapping():
@@ -53,7 +53,7 @@ def test_a_missing_or_zero_error_leaves_its_sequence_out(bad):
     runs.loc[(runs["sequence"] == "03") & (runs["method"] == "masked"), "rmse"] = bad
     result = ratio_of(*arms(runs, "masked", "baseline"))
     assert result["n"] == 7 and result["ratio"] == pytest.approx(0.5)
-    assert np.isnan(compare.geometric_mean([np.nan])["ratio"])
+    assert np.isnan(compare.typical_ratio([np.nan])["ratio"])
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_the_verdict_follows_the_interval(factor, verdict):
     assert five["n"] == 5 and five["verdict"] == "too few sequences to tell"
 
 
-def test_intervals_that_exclude_the_true_mean_by_chance():
+def test_intervals_that_exclude_the_true_ratio_by_chance():
     """Print the percentages of docs/reading-results.md.
 
     Call it with pytest -s -k by_chance tests/study.
@@ -81,33 +81,75 @@ def test_intervals_that_exclude_the_true_mean_by_chance():
     draws = {
         "normal": lambda shape: random.normal(size=shape),
         "heavy tails": lambda shape: random.standard_t(3, shape),
-        "either lost": lambda shape: lost(shape) * random.choice([-1, 1], shape),
-        "one lost": lambda shape: lost(shape) - 2.5 / 6,
+        "either fails": lambda shape: fails(shape, 1 / 6) * random.choice([-1, 1], shape),
+        "one fails": lambda shape: fails(shape, 1 / 6),
+        "5 % everywhere": lambda shape: random.normal(0.05, 0.05, shape),
+        "5 % everywhere, one fails": lambda shape: on_first(random.normal(0.05, 0.05, shape)),
     }
 
-    def lost(shape):
-        """Logarithms of ratios near 1, or near 12 for one sequence in six."""
-        return random.normal(0, 0.1, shape) + 2.5 * (random.random(shape) < 1 / 6)
+    def fails(shape, share):
+        """Logarithms of ratios near 1, or near 12 for a share of the sequences."""
+        return random.normal(0, 0.1, shape) + 2.5 * (random.random(shape) < share)
 
-    percent = pd.DataFrame(index=[6, 8, 11])
+    def on_first(logarithms):
+        logarithms[:, 0] += 2.5
+        return logarithms
+
+    percent = {}
     for name, draw in draws.items():
-        for count in percent.index:
+        for count in (6, 8, 11):
             studies = draw((2000, count))
-            intervals = np.array([compare.mean_interval(row) for row in studies])
-            low, high = intervals.T
-            percent.loc[count, name] = 100 * ((low > 0) | (high < 0)).mean()
-    print(percent.T)
-    assert percent["normal"].between(4, 6).all() and (percent["heavy tails"] < 5).all()
+            for kind in ("typical", "mean"):
+                interval = {"typical": compare.typical_interval, "mean": compare.mean_interval}
+                ends = np.array([interval[kind](row)[-2:] for row in studies])
+                excluded = (ends[:, 0] > 0) | (ends[:, 1] < 0)
+                percent[name, kind, count] = 100 * excluded.mean()
+    print(pd.Series(percent).unstack([1, 2]).round().astype(int).to_string())
+    for name in ("normal", "heavy tails", "either fails"):
+        assert all(percent[name, "typical", count] < 6 for count in (6, 8, 11))
+    few, hidden = "5 % everywhere", "5 % everywhere, one fails"
+    assert percent[few, "typical", 8] > 50 < percent[hidden, "typical", 8]
+    assert percent[few, "mean", 8] > 50 > 1 > percent[hidden, "mean", 8]
 
 
-def test_the_rank_test_sees_a_small_loss_everywhere_that_one_lost_sequence_hides():
+def test_a_small_loss_everywhere_shows_beside_one_sequence_that_fails():
     ratios = [1.024, 15.95, 1.171, 1.012, 1.014, 1.017, 1.101, 1.033]
-    result = compare.geometric_mean(ratios)
-    assert result["verdict"] == "no clear difference"
+    result = compare.typical_ratio(ratios)
+    assert result["verdict"] == "higher" and 1.0 < result["low"] < result["ratio"] < 1.2
     assert result["above"] == result["n"] == 8
-    assert result["rank_p"] == pytest.approx(2 / 2**8)  # all on one side
-    assert compare.geometric_mean([1.0, 2.0])["above"] == 1
-    assert np.isnan(compare.geometric_mean([1.0, 1.0])["rank_p"])
+    assert result["mean"] > 1.4 and result["mean_low"] < 1 < result["mean_high"]
+    reach = np.log(result["mean_high"] / result["mean"])
+    assert np.log(result["detectable"]) > reach  # half a study's power would be the reach
+    assert compare.typical_ratio([1.0, 2.0])["above"] == 1
+
+
+@pytest.mark.parametrize("n", [6, 8, 11])
+def test_the_interval_holds_what_the_signed_rank_test_does_not_reject(n):
+    values = np.random.default_rng(n).normal(0.3, 1, n)
+    estimate, low, high = compare.typical_interval(values)
+    assert low < estimate < high
+    for centre, rejected in ((low, -1), (high, 1)):
+        for side in (-1, 1):
+            p = wilcoxon(values - (centre + side * 1e-9), method="exact").pvalue
+            assert (p <= 0.05) == (side == rejected)
+
+
+def test_failures_are_counted_and_compared_apart():
+    runs = runs_of({"masked": 1.0})
+    is_masked = runs["method"] == "masked"
+    one_street = is_masked & (runs["sequence"] == "01")
+    runs.loc[one_street, "failed"] = 10.0
+    row = compare.primary_comparison(compare.comparisons(runs)).iloc[0]
+    assert (row["failed"], row["reference_failed"]) == ("2 of 16", "0 of 16")
+    assert (row["more_failures"], row["fewer_failures"]) == (1, 0)
+    assert row["failures_verdict"] == row["verdict"] == "no clear difference"
+    runs.loc[is_masked & (runs["sequence"] < "06"), "lost"] = 1
+    row = compare.primary_comparison(compare.comparisons(runs)).iloc[0]
+    assert (row["more_failures"], row["failures_verdict"]) == (6, "higher")  # 2 / 2**6
+    swapped = compare.failures(pd.Series([False] * 6, range(6)), pd.Series([True] * 6, range(6)))
+    assert swapped["failures_verdict"] == "lower" and swapped["fewer_failures"] == 6
+    few = compare.failures(pd.Series([True], ["00"]), pd.Series([False], ["00"]))
+    assert few["failures_verdict"] == "too few sequences to tell"
 
 
 def test_the_interval_is_students_t():

@@ -17,15 +17,15 @@ from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import ESTIMATORS
 
 SHOWN = (*compare.JUDGING_METRICS, "rmse")
-# columns of the lost runs of a method and of its reference, "2 of 40"
-LOST = {"lost runs": "lost", "lost runs of the reference": "reference_lost"}
+# columns of the failed runs of a method and of its reference, "2 of 40"
+FAILED = {"failed runs": "failed", "failed runs of the reference": "reference_failed"}
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
 
 
 def figure_comparison(table: pd.DataFrame) -> Figure:
     """Draw each method's ratio to all keypoints.
 
-    Grey dots are its sequences, the coloured mark is their geometric mean with its interval. The
+    Grey dots are its sequences, the coloured mark is their typical ratio with its interval. The
     figure has one row of panels for each estimator. Its columns are the judging metrics and the
     thesis's RMSE. With several sources of masks it shows only their masks, not the controls.
     """
@@ -109,7 +109,7 @@ def _labels(rows: pd.DataFrame) -> pd.Series:
 
 def _sequences(table: pd.DataFrame) -> list[str]:
     """Return the names of the columns with the ratio of each sequence."""
-    return list(table.columns[table.columns.get_loc("verdict") + 1 :])
+    return list(table.columns[table.columns.get_loc("failures_verdict") + 1 :])
 
 
 def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
@@ -135,7 +135,7 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
             "keypoints": f"{first['keypoints']:.0f} instead of {total:.0f}",
             **{compare.METRICS[line["metric"]]: _short(line) for _, line in pair.iterrows()},
             "verdict": compare.overall(pair["verdict"]),
-            **{name: first[column] for name, column in LOST.items()},
+            **{name: first[column] for name, column in FAILED.items()},
         }
         of_source = controls[controls["source"] == source]
         for _, best in of_source.nsmallest(1, "ratio").iterrows():
@@ -148,9 +148,10 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios of each method to all keypoints, and of masks to each control.
 
     It has one column a metric. A ratio is a text, "1.09 (0.98-1.32)". Beside each judging metric
-    stand the number of sequences with a ratio above 1 and the p-value of the rank test. The last
-    columns are the verdict on all judging metrics (`compare.overall`), the lost runs of the method
-    and of its reference, and each sequence's ratio of the first metric.
+    stand the number of sequences with a ratio above 1, the geometric mean with its interval, and
+    the ratio that these sequences could show. The last columns are the verdict on all judging
+    metrics (`compare.overall`), the failed runs of the method and of its reference, and each
+    sequence's ratio of the first metric.
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
     rows = rows.assign(label=_labels(rows))
@@ -173,12 +174,12 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
                 "sequences": pair["n"].max(),
                 **_ratios_and_counts(pair),
                 "verdict": compare.overall(judging["verdict"]),
-                **{name: first[column] for name, column in LOST.items()},
+                **{name: first[column] for name, column in FAILED.items()},
                 **by_sequence.add_prefix("sequence "),
             }
         )
     shown = pd.DataFrame(lines)
-    last = ["verdict", *LOST, *(f"sequence {name}" for name in sequences)]
+    last = ["verdict", *FAILED, *(f"sequence {name}" for name in sequences)]
     others = [name for name in shown if name not in last]
     return shown.reindex(columns=[*others, *last])
 
@@ -186,7 +187,7 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
 def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
     """Return {name of the metric: ratio as a text} for two methods, which have one row a metric.
 
-    Behind a judging metric stand "6 of 8" above 1 and the rank test's p.
+    Behind a judging metric stand "6 of 8" above 1, the geometric mean and the detectable ratio.
     """
     cells: dict[str, Any] = {}
     for _, row in pair.iterrows():
@@ -194,7 +195,9 @@ def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
         cells[name] = _short(row)
         if row["metric"] in compare.JUDGING_METRICS:
             cells[f"{name}: above 1"] = f"{row['above']} of {row['n']}"
-            cells[f"{name}: rank test, p"] = texts.two_digits(row["rank_p"])
+            mean = {end: row[f"mean_{end}"] for end in ("low", "high")}
+            cells[f"{name}: geometric mean"] = _short({"ratio": row["mean"], **mean})
+            cells[f"{name}: detectable"] = f"{row['detectable']:.2f}"
     return cells
 
 
@@ -206,8 +209,8 @@ def table_widths(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the ratios of errors to all keypoints with three choices of the width, by sequence.
 
     The choices are the best, the left-out and the fixed width. The last rows of each source have
-    the geometric mean with its interval, the number of sequences with a lower error, and that of
-    lost runs.
+    the ratio over all sequences with its interval, the number of sequences with a lower error, and
+    that of failed runs.
     """
     tables = {}
     for source in compare.sources(runs) or [""]:
@@ -225,24 +228,24 @@ def _widths(masked: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     chosen = best_width.chosen_widths(masked, baseline)
     stability = best_width.stability(masked, baseline)
     metrics = [name for name in ("rmse", "se3") if name in masked]
-    columns, lost = {}, {}
+    columns, failed = {}, {}
     for choice, label in CHOICES.items():
         rows = best_width.of_chosen_width(masked, chosen[choice])
         for metric in metrics:
             ratios = compare.ratios(rows, baseline, metric)
             name = f"{label}: {compare.METRICS[metric]}"
             columns[name] = ratios
-            lost[name] = compare.lost(rows)
+            failed[name] = compare.count_failed(rows)
     columns["best width of one repetition, in the others: RMSE"] = stability["elsewhere"]
     table = pd.DataFrame(columns, index=chosen.index).dropna(axis=1, how="all")
     shown = table.map(texts.number, na_action="ignore").astype(object)
     means, lower = {}, {}
     for name, ratios in table.items():
-        means[name] = _short(compare.geometric_mean(ratios))
+        means[name] = _short(compare.typical_ratio(ratios))
         lower[name] = f"{(ratios < 1).sum()} of {ratios.count()}"
-    shown.loc["geometric mean"] = means
+    shown.loc["all sequences"] = means
     shown.loc["lower in"] = lower
-    shown.loc["lost runs"] = lost
+    shown.loc["failed runs"] = failed
     widths = chosen[list(CHOICES)].rename(columns=CHOICES)
     widths["same best width in two repetitions (%)"] = stability["same_best"].round()
     widths = widths.dropna(axis=1, how="all").convert_dtypes()

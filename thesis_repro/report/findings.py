@@ -94,7 +94,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
         "verdict": compare.overall(judged["verdict"]),
         "width": compare.tested_width(runs),
         "masked": of_masks.to_dict("records"),
-        "lost": of_masks.drop_duplicates("estimator").to_dict("records"),
+        "failures": of_masks.drop_duplicates("estimator").to_dict("records"),
         "corrected": of_corrected.to_dict("records"),
         "controls": verdicts.to_dict(),
         "widths": masked["dilation_width"].nunique(),

@@ -40,7 +40,7 @@ def table_errors(runs: pd.DataFrame) -> pd.DataFrame:
         table[label] = means[name].map(three_digits)
     table["flagged frames"] = means["flagged"].round(1)
     groups = rows.groupby(keys, dropna=False)
-    table["lost runs"] = [compare.lost(runs_of_row) for _, runs_of_row in groups]
+    table["failed runs"] = [compare.count_failed(runs_of_row) for _, runs_of_row in groups]
     return table
 
 

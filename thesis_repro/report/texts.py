@@ -48,9 +48,7 @@ def number(value: float) -> str:
 
 
 def two_digits(value: float) -> str:
-    """Return a number as text with two digits that are not zero, such as 0.0078; "" if missing."""
-    if pd.isna(value):
-        return ""
+    """Return a number as text with two digits that are not zero, such as 0.0078."""
     return f"{float(f'{value:.2g}'):g}"
 
 
@@ -98,7 +96,6 @@ TEMPLATES.filters |= {
     "urlencode": in_url,
     "ratio": ratio_and_far_off,
     "number": number,
-    "two_digits": two_digits,
 }
 
 

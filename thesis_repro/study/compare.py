@@ -11,18 +11,26 @@ A ratio is formed in three steps:
 
 1. For each sequence, the geometric mean of the method's errors over the repetitions is divided by
    that of the reference. Half and double are then equally far from 1, which is not so for
-   percentages.
-2. The ratio is the geometric mean of the ratios of the sequences.
-3. Its interval is Student's t on the logarithms of the sequences' ratios. It estimates how far the
+   percentages. Every run counts with its own errors, also one that failed.
+2. The ratio is the Hodges-Lehmann estimate over the sequences: the median of the means of all pairs
+   of logarithms. One sequence on which a method fails hardly moves it.
+3. Its interval is that of Wilcoxon's signed-rank test, which is exact. It estimates how far the
    ratio could be off if other sequences of the same kind had been recorded.
 
 The verdict is "lower" or "higher" if the interval excludes 1, and otherwise "no clear difference".
 With fewer than MIN_SEQUENCES sequences it is "too few sequences to tell". `primary_comparison`
 selects the rows that answer the main question.
 
-Beside the interval stand the number of sequences with a ratio above 1 and the p-value of a rank
-test. One sequence on which a method gets lost widens the interval, but is one rank of many here.
-Both were added when the results were known. They decide nothing.
+How often a method fails is a question of its own, because the ratio hardly sees it. A run has
+failed if one of its steps has, or if it is lost (`metrics.step_errors`). `failures` counts such
+runs, and compares their shares by a sign test over the sequences.
+
+Beside the ratio stand the geometric mean of the sequences' ratios with Student's t interval, which
+one failing sequence widens until it says nothing; and `detectable`, the mean ratio that so few and
+so different sequences would show in 80 % of studies.
+
+Both the interval and the counts of failures were chosen when the results on real frames were known.
+The reason is the error rates in docs/reading-results.md.
 """
 
 from collections.abc import Iterable
@@ -32,7 +40,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from scipy.special import stdtrit
+from scipy.special import bdtr, stdtrit
 
 from thesis_repro.study import methods
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
@@ -59,20 +67,27 @@ COLUMNS = (
     "ratio",
     "low",
     "high",
+    "mean",
+    "mean_low",
+    "mean_high",
+    "detectable",
     "n",
     "above",
-    "rank_p",
-    "lost",
-    "reference_lost",
     "far_off",
     "verdict",
+    "failed",
+    "reference_failed",
+    "more_failures",
+    "fewer_failures",
+    "failures_verdict",
 )
 
-MIN_FOR_INTERVAL = 3  # sequences
+MIN_FOR_INTERVAL = 3  # values of a mean
 # With fewer sequences, all ratios lie on the same side of 1 by chance in more than 5 % of cases (2
 # / 2**n).
 MIN_SEQUENCES = 6
 LEVEL = 95  # percent, of all intervals
+POWER = 80  # percent of studies that would show the detectable ratio
 # a sequence is named beside the mean if its ratio differs from the median by more than this factor
 FAR_OFF = 3
 LOWER, HIGHER, NO_CLEAR_DIFFERENCE, TOO_FEW = (
@@ -97,44 +112,52 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
     return float(numbers.mean() - reach), float(numbers.mean() + reach)
 
 
-def geometric_mean(ratios: ArrayLike) -> dict[str, Any]:
-    """Return {ratio, low, high, n, above, rank_p, verdict} for one ratio a sequence.
+def typical_interval(values: ArrayLike, level: float = LEVEL) -> tuple[float, float, float]:
+    """Return the Hodges-Lehmann estimate of one value a sequence and its interval (low, high).
 
-    ratio is the geometric mean; low and high are its interval (`mean_interval` of the logarithms);
-    n is the number of sequences, above that of the ratios above 1; rank_p is that of `rank_test`.
-    The verdict is LOWER or HIGHER if the interval excludes 1, and TOO_FEW for fewer than
-    MIN_SEQUENCES sequences.
+    values: without NaN. level: percent, at least, of the interval. It holds the centres that
+    Wilcoxon's signed-rank test (exact, two-sided) does not reject, so it is (NaN, NaN) for so few
+    values that this test rejects nothing.
+    """
+    numbers = np.asarray(values, float)
+    if not len(numbers):
+        return np.nan, np.nan, np.nan
+    first, second = np.triu_indices(len(numbers))
+    pair_means = np.sort((numbers[first] + numbers[second]) / 2)
+    # the chance of each rank sum: every rank belongs to a positive difference in half of the cases
+    chances = np.ones(1)
+    for rank in range(1, len(numbers) + 1):
+        chances = np.convolve(chances, [0.5, *[0] * (rank - 1), 0.5])
+    rejected = int((chances.cumsum() <= (100 - level) / 200).sum())  # rank sums at either end
+    estimate = float(np.median(pair_means))
+    if not rejected:
+        return estimate, np.nan, np.nan
+    return estimate, float(pair_means[rejected - 1]), float(pair_means[-rejected])
+
+
+def typical_ratio(ratios: ArrayLike) -> dict[str, Any]:
+    """Return what `comparisons` says of one ratio a sequence.
+
+    {ratio, low, high (`typical_interval` of the logarithms); mean, mean_low, mean_high (the
+    geometric mean, `mean_interval`); detectable (a ratio above 1); n (sequences), above (those with
+    a ratio above 1); verdict}. The verdict is LOWER or HIGHER if the interval low to high excludes
+    1, and TOO_FEW for fewer than MIN_SEQUENCES sequences.
     """
     logarithms = np.log(np.asarray(ratios, float))
     logarithms = logarithms[np.isfinite(logarithms)]
     n = len(logarithms)
-    mean = np.nan
+    mean, detectable = np.nan, np.nan
     if n:
         mean = logarithms.mean()
-    ratio, low, high = np.exp([mean, *mean_interval(logarithms)]).tolist()
-    return {
-        "ratio": ratio,
-        "low": low,
-        "high": high,
-        "n": n,
-        "above": int((logarithms > 0).sum()),
-        "rank_p": rank_test(logarithms),
-        "verdict": _verdict(low, high, n),
-    }
-
-
-def rank_test(logarithms: np.ndarray) -> float:
-    """Return the p-value of Wilcoxon's signed-rank test (exact, two-sided), 0 to 1.
-
-    It tests whether the logarithms (n,) of ratios lie around 0. A sequence without any difference
-    is left out. NaN if fewer than MIN_SEQUENCES are left: their p-value is never below 0.05.
-    """
-    from scipy.stats import wilcoxon  # imported here because it takes half a second
-
-    different = logarithms[logarithms != 0]
-    if len(different) < MIN_SEQUENCES:
-        return np.nan
-    return float(wilcoxon(different, method="exact").pvalue)
+    if n >= MIN_FOR_INTERVAL:
+        reach = stdtrit(n - 1, (100 + LEVEL) / 200) + stdtrit(n - 1, POWER / 100)
+        detectable = reach * logarithms.std(ddof=1) / np.sqrt(n)
+    intervals = [*typical_interval(logarithms), mean, *mean_interval(logarithms), detectable]
+    names = ("ratio", "low", "high", "mean", "mean_low", "mean_high", "detectable")
+    numbers = dict(zip(names, np.exp(intervals).tolist(), strict=True))
+    above = int((logarithms > 0).sum())
+    verdict = _verdict(numbers["low"], numbers["high"], n)
+    return {**numbers, "n": n, "above": above, "verdict": verdict}
 
 
 def _verdict(low: float, high: float, n: int) -> str:
@@ -183,9 +206,9 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
 
     Masks are compared with every control. Returns a table with the columns source, method,
     dilation_width (pixels), keypoints (mean number); reference_source, reference (the method
-    compared with); metric, estimator; tested (whether the width is the `tested_width`); ratio, low,
-    high, n, above, rank_p (see `geometric_mean`); lost, reference_lost (lost runs of both methods,
-    see `lost`); far_off (see `far_off`), verdict; and one column for each sequence with its ratio.
+    compared with); metric, estimator; tested (whether the width is the `tested_width`); those of
+    `typical_ratio`; far_off (see `far_off`); those of `failures`; and one column for each sequence
+    with its ratio.
     An error that no sequence has with both methods has no row.
     """
     metrics = [name for name in METRICS if name in runs and runs[name].notna().any()]
@@ -203,20 +226,50 @@ def comparisons(runs: pd.DataFrame) -> pd.DataFrame:
                     **variant,
                     "reference_source": reference["source"],
                     "reference": reference["method"],
-                    "reference_lost": reference["lost"],
                     "estimator": estimator,
                     "metric": metric,
                     "far_off": far_off(by_sequence),
-                    **geometric_mean(by_sequence),
+                    **typical_ratio(by_sequence),
+                    **failures(errors["failed"], reference_errors["failed"]),
                     **by_sequence,
                 }
                 rows.append(row)
     return pd.DataFrame(rows, columns=[*COLUMNS, *sorted(runs["sequence"].unique())])
 
 
-def lost(runs: pd.DataFrame) -> str:
-    """Return how many of some runs are lost, such as "2 of 40" (see `metrics.step_errors`)."""
-    return f"{runs['lost'].sum()} of {len(runs)}"
+def has_failed(runs: pd.DataFrame) -> pd.Series:
+    """Return for each run whether a step of it failed or it is lost (`metrics.step_errors`)."""
+    return (runs["failed"] > 0) | (runs["lost"] > 0)
+
+
+def count_failed(runs: pd.DataFrame) -> str:
+    """Return how many of some runs failed, such as "2 of 40"."""
+    return f"{has_failed(runs).sum()} of {len(runs)}"
+
+
+def failures(failed: pd.Series, reference: pd.Series) -> dict[str, Any]:
+    """Compare how often runs fail. failed, reference: of each run, by sequence (index).
+
+    Returns {failed, reference_failed (such as "2 of 40"); more_failures, fewer_failures (sequences
+    on which a larger or a smaller share of runs failed than with the reference); failures_verdict}.
+    The verdict is that of a sign test (exact, two-sided) over these sequences. TOO_FEW if all
+    sequences together are too few.
+    """
+    shares, reference_shares = (runs.groupby(level=0).mean() for runs in (failed, reference))
+    differences = (shares - reference_shares).dropna()
+    more, fewer = int((differences > 0).sum()), int((differences < 0).sum())
+    verdict = NO_CLEAR_DIFFERENCE
+    if len(differences) < MIN_SEQUENCES:
+        verdict = TOO_FEW
+    elif 2 * bdtr(min(more, fewer), more + fewer, 0.5) <= 1 - LEVEL / 100:
+        verdict = HIGHER if more > fewer else LOWER
+    return {
+        "failed": f"{failed.sum()} of {len(failed)}",
+        "reference_failed": f"{reference.sum()} of {len(reference)}",
+        "more_failures": more,
+        "fewer_failures": fewer,
+        "failures_verdict": verdict,
+    }
 
 
 def _variants(
@@ -225,7 +278,7 @@ def _variants(
     """Split the runs by method, source and width.
 
     Returns for each part its columns of `comparisons`, and by metric the mean logarithms of its
-    errors, which are then found only once.
+    errors, which are then found only once; under "failed", whether each run has failed.
     """
     variants = []
     for method in METHODS:
@@ -240,10 +293,10 @@ def _variants(
                 "dilation_width": width,
                 "keypoints": rows.groupby("sequence")["mean_keypoints"].mean().mean(),
                 "tested": bool(tested),
-                "lost": lost(rows),
             }
-            logarithms = {metric: _mean_logarithms(rows, metric) for metric in metrics}
-            variants.append((columns, logarithms))
+            errors = {metric: _mean_logarithms(rows, metric) for metric in metrics}
+            errors["failed"] = has_failed(rows.set_index("sequence"))
+            variants.append((columns, errors))
     return variants
 
 

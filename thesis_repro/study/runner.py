@@ -337,16 +337,15 @@ def path_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """Return the errors of a path; poses, true: (n, 4, 4).
 
     They are those of `metrics.errors` and `metrics.step_errors`; t_rel (percent) and r_rel (degrees
-    per 100 m) are those of `metrics.kitti_errors`. A lost run has its RMSE in place of the aligned
-    ATE: the alignment absorbs a wrong turn near the start of the path, so that a lost run would
-    look better than any other.
+    per 100 m) are those of `metrics.kitti_errors`.
     """
-    errors = metrics.errors(poses, true)
-    step_errors = metrics.step_errors(poses, true)
-    if step_errors["lost"]:
-        errors["se3"] = errors["rmse"]
     kitti = metrics.kitti_errors(poses, true)
-    return {**errors, **step_errors, "t_rel": kitti["t_rel"], "r_rel": kitti["r_rel"]}
+    return {
+        **metrics.errors(poses, true),
+        **metrics.step_errors(poses, true),
+        "t_rel": kitti["t_rel"],
+        "r_rel": kitti["r_rel"],
+    }
 
 
 def run_poses(runs: pd.DataFrame, folder: Path) -> dict[tuple[str, str], np.ndarray]:
