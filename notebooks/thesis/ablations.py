@@ -6,7 +6,7 @@ needs.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ from thesis_repro.study.runner import CODE, measures
 
 ESTIMATORS = tuple(estimators.ESTIMATORS)
 VEGETATION = (ID["vegetation"], ID["terrain"])
+# pixels that are kept; the first two leave out distant points, the last near ones
+PARALLAX = {"parallax-1": (1, np.inf), "parallax-3": (3, np.inf), "parallax-20": (0, 20)}
 FEW_KEYPOINTS = (100, 200, 400)  # a twentieth, a tenth and a fifth of the thesis's 2000
 
 
@@ -56,6 +58,60 @@ def random_keypoints(sequence: Sequence, amount: int | float, index: int) -> np.
     columns, rows = shuffled[:amount].T
     mask = np.zeros(sequence.size, np.uint8)
     mask[rows, columns] = 255
+    return mask
+
+
+@lru_cache(maxsize=2)  # several masks of one frame use it
+def parallax(sequence: Sequence, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the keypoints (n, 2) of a frame that are tracked into the next, and their parallax.
+
+    Parallax (pixels): how far a point moves beyond what the true rotation explains. It is large for
+    near points and small for distant ones. Uses the ground truth, which an odometry does not have.
+    """
+    points = detect(sequence.frame(index), THESIS)
+    moved, tracked = track(sequence.frame(index), sequence.frame(index + 1), points)
+    motion = np.linalg.inv(sequence.poses[index]) @ sequence.poses[index + 1]
+    rays = np.column_stack([normalise(points, sequence.intrinsics), np.ones(len(points))])
+    turned = rays @ motion[:3, :3] @ sequence.intrinsics.T  # of points at infinity
+    distances = np.linalg.norm(moved - turned[:, :2] / turned[:, 2:], axis=1)
+    return points[tracked], distances[tracked]
+
+
+def with_parallax(sequence: Sequence, least: float, most: float, index: int) -> np.ndarray:
+    """Return a mask that keeps the keypoints with a parallax in a range, one pixel each.
+
+    (Section 5.2.2: keypoints that are far away, or close to the camera, are left out.)
+    """
+    mask = np.zeros(sequence.size, np.uint8)
+    if index + 1 < len(sequence):  # those of the last frame are not used
+        points, distances = parallax(sequence, index)
+        columns, rows = points[(distances >= least) & (distances < most)].astype(int).T
+        mask[rows, columns] = 255
+    return mask
+
+
+def as_many(sequence: Sequence, least: float, most: float, index: int) -> np.ndarray:
+    """Return a mask that keeps as many keypoints as `with_parallax`, drawn at random."""
+    number = int(np.count_nonzero(with_parallax(sequence, least, most, index)))
+    return random_keypoints(sequence, number, index)
+
+
+def half_in_turns(sequence: Sequence, into: bool, index: int) -> np.ndarray:
+    """Return a mask that keeps one half of the frame in a turn, and elsewhere all of it.
+
+    into: whether it is the half that the camera turns into (Section 5.2.2). Which steps turn is
+    known from the ground truth (`metrics.TURN_RATE`).
+    """
+    mask = np.full(sequence.size, 255, np.uint8)
+    following = sequence.poses[index : index + 2]
+    motion = np.linalg.inv(following[0]) @ following[-1]
+    if metrics.angles(motion) > metrics.TURN_RATE:
+        middle = sequence.size[1] // 2
+        turns_right = motion[0, 2] > 0  # the optical axis moves to the right
+        if turns_right == into:
+            mask[:, :middle] = 0
+        else:
+            mask[:, middle:] = 0
     return mask
 
 
@@ -170,6 +226,12 @@ def _methods(
     }
     for few in FEW_KEYPOINTS:
         methods[f"strongest-{few}"] = replace(THESIS, max_keypoints=few), None
+    for name, span in PARALLAX.items():
+        for prefix, function in {"": with_parallax, "as many as ": as_many}.items():
+            chosen = FunctionMasks(partial(function, sequence, *span))
+            methods[prefix + name] = THESIS, chosen
+    for name, into in {"turned-into": True, "turned-from": False}.items():
+        methods[name] = THESIS, FunctionMasks(partial(half_in_turns, sequence, into))
     return methods | {"orb": (replace(THESIS, detector="orb"), None)}
 
 
