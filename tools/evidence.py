@@ -79,6 +79,7 @@ def write(settings, folder, others=()):
         sequences, labels, settings.build / "few_keypoints", settings.jobs
     )
     few = few_keypoints.table(few_runs)
+    times = few_keypoints.time_steps(sequences[0], labels)
     streets = _streets(sequences)
     results.sweep(folder)
     for name in KEPT:
@@ -86,14 +87,14 @@ def write(settings, folder, others=()):
     style.save_all(
         {
             "failures": failures.figure(steps, sequences, label_masks),
-            "few_keypoints": few_keypoints.figure(few),
+            "few_keypoints": few_keypoints.figure(few, times),
             "label_quality": label_quality.figure(qualities),
         },
         {
             "failures": failures.table(steps),
             "streets": streets,
             "label_quality": qualities,
-            "few_keypoints": few_keypoints.summary(few),
+            "few_keypoints": few_keypoints.summary(few, times),
         },
         folder,
         note,

@@ -21,8 +21,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from time import process_time
 from typing import Any
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -73,23 +75,29 @@ def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
 
 
 def measure(
-    sequences: Iterable[Sequence], labels: Path, folder: Path, processes: int = 1
+    sequences: Iterable[Sequence],
+    labels: Path,
+    folder: Path,
+    processes: int = 1,
+    seeds: Iterable[int | None] = SEEDS,
 ) -> pd.DataFrame:
     """Run all choices on sequences. Returns one row a run; finished sequences are not repeated.
 
-    labels: a folder with one folder of label maps a sequence. folder: of the results.
+    labels: a folder with one folder of label maps a sequence. folder: of the results. seeds: that
+    shuffle the matched points, one run each; None leaves their order.
     """
     opened = list(sequences)
     files = {}
     for sequence in opened:
         inputs = {
+            "seeds": list(seeds),
             "frames": results.digest_of_files(sequence.frame_paths),
             "labels": results.digest_of_files(sorted((labels / sequence.name).glob("*.png"))),
             "code": results.digest_of_code(*CODE),
         }
         files[sequence.name] = results.stage(folder / sequence.name, **inputs) / "runs.csv"
     calls = [
-        (sequence, labels, files[sequence.name])
+        (sequence, labels, files[sequence.name], list(seeds))
         for sequence in opened
         if not files[sequence.name].is_file()
     ]
@@ -100,12 +108,12 @@ def measure(
     return pd.concat(tables, ignore_index=True)
 
 
-def _measure_one(sequence: Sequence, labels: Path, file: Path) -> None:
+def _measure_one(sequence: Sequence, labels: Path, file: Path, seeds: Iterable[int | None]) -> None:
     """Run all choices on one sequence, and write the table of its runs."""
     runs = {}
     for (choice, number), (settings, masks) in choices(sequence, labels).items():
         for estimator in ESTIMATORS:
-            for seed in SEEDS:
+            for seed in seeds:
                 changed = replace(settings, estimator=estimator, shuffle_seed=seed)
                 runs[choice, number, estimator, seed or 0] = changed, masks
     rows = []
@@ -125,6 +133,28 @@ def _measure_one(sequence: Sequence, labels: Path, file: Path) -> None:
         }
         rows.append(row)
     results.write_table(file, pd.DataFrame(rows))
+
+
+def time_steps(sequence: Sequence, labels: Path, frames: int = 40) -> pd.DataFrame:
+    """Return the CPU time (milliseconds) of a frame for each choice: its fastest of three runs.
+
+    With the thesis's estimator, one thread and the mask made from its label map, without the
+    network. Random choices are left out, because they are drawn from all detected keypoints.
+    """
+    cv2.setNumThreads(1)
+    excerpt = sequence.subset(frames)
+    rows = []
+    for (choice, number), (settings, masks) in choices(excerpt, labels).items():
+        if choice == "random":
+            continue
+        seconds = []
+        for _ in range(3):
+            start = process_time()
+            odometry.run(excerpt, settings, masks)
+            seconds.append(process_time() - start)
+        milliseconds = round(1000 * min(seconds) / len(excerpt), 1)
+        rows.append({"choice": choice, "number": number, "milliseconds": milliseconds})
+    return pd.DataFrame(rows)
 
 
 def table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -163,9 +193,12 @@ def _within(ratios: pd.Series, margin: float) -> dict[str, bool]:
     return {"as_good": is_below and bool(low > -np.log(margin)), "no_worse": is_below}
 
 
-def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one row a choice and number, for readers. rows: of `table`."""
+def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Return one row a choice and number, for readers. rows: of `table`; times: `time_steps`."""
     lines = []
+    milliseconds = pd.Series(dtype=float)
+    if times is not None:
+        milliseconds = times.set_index(["choice", "number"])["milliseconds"]
     for (choice, number), chosen in rows.groupby(["choice", "number"], sort=False):
         line: dict[str, Any] = {
             "keypoints": f"{chosen['keypoints'].iloc[0]:.0f}",
@@ -177,6 +210,8 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
         for estimator, of_estimator in chosen.groupby("estimator", sort=False):
             failed, runs = of_estimator[["failed", "runs"]].iloc[0]
             line[f"failed, {ESTIMATORS[estimator]}"] = f"{failed} of {runs}"
+        if times is not None:
+            line["CPU time a frame (ms)"] = milliseconds.get((choice, number))
         line["as good (rule 4)"] = _answer(rows, choice, number, "as_good")
         line["no worse (rule 5)"] = _answer(rows, choice, number, "no_worse")
         lines.append(line)
@@ -193,21 +228,40 @@ def _answer(rows: pd.DataFrame, choice: str, number: int, rule: str) -> str:
     return ""
 
 
-def figure(rows: pd.DataFrame) -> Figure:
-    """Draw the ratios of both errors against the number of keypoints. rows: of `table`."""
+def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
+    """Draw the ratios of both errors against the number of keypoints, and the time of a frame.
+
+    rows: of `table`. times: of `time_steps`, drawn below the errors if given.
+    """
+    more = times is not None
     drawing, panels = style.new_figure(
-        len(ERRORS), len(ESTIMATORS), sharex=True, sharey=True, height=5.2
+        len(ERRORS) + more, len(ESTIMATORS), sharex=True, height=5.2 + 1.6 * more
     )
-    for panel_row, error in zip(panels, ERRORS, strict=True):
+    for panel_row, error in zip(panels, ERRORS, strict=False):
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
             _draw_curves(panel, shown)
             panel.set_title(f"{ERRORS[error]}, {ESTIMATORS[estimator]}")
         panel_row[0].set_ylabel("ratio to all keypoints")
-    for panel in panels[-1]:
+    if times is not None:
+        numbers = rows.drop_duplicates(["choice", "number"])[["choice", "number", "keypoints"]]
+        timed = times.merge(numbers, on=["choice", "number"])
+        _draw_times(panels[-1, 0], timed)
+        panels[-1, 1].axis("off")
+    for panel in (panels[-1, 0], panels[len(ERRORS) - 1, -1]):
         panel.set_xlabel("keypoints a frame")
+        panel.tick_params(labelbottom=True)
     style.legend_below(drawing, panels.ravel()[:1], 3)
     return drawing
+
+
+def _draw_times(panel: plt.Axes, timed: pd.DataFrame) -> None:
+    for index, choice in enumerate(LABELS):
+        of_choice = timed[timed["choice"] == choice].sort_values("keypoints")
+        look = style.line_style(index)
+        panel.plot(of_choice["keypoints"], of_choice["milliseconds"], marker="o", **look)
+    panel.set_ylabel("CPU time a frame (ms)")
+    panel.set_ylim(0)
 
 
 def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
@@ -224,7 +278,7 @@ def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
         )
     panel.set_xscale("log")
     panel.set_yscale("log")
-    panel.set_xticks([50, 100, 200, 400, 800], ["50", "100", "200", "400", "800"])
+    panel.set_xticks([50, 100, 200, 400, 800, 1900], ["50", "100", "200", "400", "800", "1900"])
     panel.set_yticks([0.5, 1, 2, 5, 10], ["0.5", "1", "2", "5", "10"])
     panel.minorticks_off()
     panel.set_ylim(0.45, 25)
