@@ -1,10 +1,12 @@
 """Controls, ablations, the null distribution of the thesis's procedure, tracks and boundaries."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from thesis import ablations, thesis_tables
 from thesis_repro import mask_files, masks
@@ -140,6 +142,34 @@ def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, sma
     enlarged = cv2.resize(label_map, sequence.size[::-1], interpolation=cv2.INTER_NEAREST)
     _, method_masks = runs["no-vegetation", "thesis", 0]
     assert np.array_equal(method_masks[0] == 0, np.isin(enlarged, (21, 22)))
+
+
+def test_keypoints_are_divided_by_their_parallax(small_world):
+    sequence = Sequence(small_world / "kitti", "00").subset(3)
+    points, distances = ablations.parallax(sequence, 1)
+    spans = ((0, 3), (3, 20), (20, np.inf))
+    kept = [ablations.with_parallax(sequence, *span, 1) > 0 for span in spans]
+    assert [mask.sum() for mask in kept] == [
+        ((distances >= low) & (distances < high)).sum() for low, high in spans
+    ]
+    assert sum(mask.sum() for mask in kept) == len(points) > 100
+    drawn = ablations.as_many(sequence, *spans[0], 1)
+    assert np.count_nonzero(drawn) == kept[0].sum() and not np.array_equal(drawn > 0, kept[0])
+    assert not ablations.with_parallax(sequence, *spans[0], 2).any()  # no frame follows the last
+
+
+@pytest.mark.parametrize("degrees, kept_half", [(3, "right"), (-3, "left"), (0.5, "both")])
+def test_the_half_that_the_camera_turns_into_is_kept(degrees, kept_half):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    turning = SimpleNamespace(size=(4, 10), poses=poses)
+    mask, other = (ablations.half_in_turns(turning, into, 0) for into in (True, False))
+    halves = {"left": mask[:, :5].all(), "right": mask[:, 5:].all()}
+    assert {name for name, whole in halves.items() if whole} == (
+        {"left", "right"} if kept_half == "both" else {kept_half}
+    )
+    assert np.array_equal(other == 0, mask > 0) or kept_half == "both"
+    assert ablations.half_in_turns(turning, True, 1).all()  # the last frame
 
 
 def test_boundaries_between_close_ids_are_lost_and_between_distant_ids_found():
