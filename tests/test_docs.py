@@ -5,6 +5,7 @@ import shlex
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 from thesis_repro.command import cli
@@ -40,6 +41,92 @@ def test_the_example_of_the_readme_compares_three_paths(small_world, tmp_path, m
     every, masked, few = [path.frames["detected"].mean() for path in paths]
     assert few == 200 and 200 < masked < every
     assert len(capsys.readouterr().out.splitlines()) == 3
+
+
+EVIDENCE = ROOT / "figures/kitti_excerpts"
+MASKS = {"keypoints": "masks, width 10"}
+ALL = {"over": "all keypoints"}
+REFINED, THESIS = {"estimator": "refined estimator"}, {"estimator": "thesis's estimator"}
+BOTH = ("aligned ATE", "rotation error a frame")
+COUNTS = ("aligned ATE: above 1", "failed runs", "failed runs of the reference")
+FEW = (
+    "aligned ATE, refined estimator",
+    "rotation error a frame, refined estimator",
+    "aligned ATE, thesis's estimator",
+    "rotation error a frame, thesis's estimator",
+)
+# (text, table on real frames, row, columns whose numbers the text gives)
+NUMBERS = [
+    ("README.md", "comparison", {**MASKS, **ALL, **REFINED}, BOTH),
+    ("docs/answer.md", "comparison", {**MASKS, **ALL, **REFINED}, (*BOTH, "RMSE", *COUNTS)),
+    ("docs/answer.md", "comparison", {**MASKS, **ALL, **THESIS}, (*BOTH, "RMSE", *COUNTS)),
+    ("docs/answer.md", "comparison", {**MASKS, "over": "edges of the image", **REFINED}, BOTH[1:]),
+    (
+        "docs/answer.md",
+        "comparison",
+        {**MASKS, "over": "keypoints spread out", **REFINED},
+        BOTH[1:],
+    ),
+    ("docs/answer.md", "comparison", {**MASKS, "over": "fewer keypoints", **REFINED}, BOTH[1:]),
+    *(
+        ("docs/answer.md", "comparison", {"keypoints": method, **ALL, **REFINED}, BOTH)
+        for method in (
+            "corrected mask",
+            "exact class boundaries",
+            "fewer keypoints",
+            "all but movable things",
+            "all but the boundaries",
+            "boundaries of static things",
+        )
+    ),
+    (
+        "docs/answer.md",
+        "comparison",
+        {"keypoints": "fewer keypoints", **ALL, **THESIS},
+        (*BOTH, "RMSE", "failed runs"),
+    ),
+    *(
+        ("docs/answer.md", "few_keypoints", {"how chosen": chosen, "keypoints": number}, FEW)
+        for chosen, number in (
+            ("spread over the frame", "200"),
+            ("spread over the frame", "100"),
+            ("random ones", "400"),
+            ("random ones", "200"),
+            ("the strongest", "200"),
+            ("the strongest on the mask", "199"),
+            ("the strongest on the mask", "790"),
+            ("mask, filled to 5 a field", "926"),
+        )
+    ),
+    ("README.md", "table_4_2", {"sequence": "mean"}, ("change (%)", "change (%), one run each")),
+    ("docs/answer.md", "table_4_2", {"sequence": "median"}, ("change (%)",)),
+    ("README.md", "few_keypoints", {"how chosen": "all keypoints"}, ("keypoints",)),
+]
+
+
+@pytest.mark.parametrize("text, table, row, columns", NUMBERS)
+def test_numbers_in_texts_are_those_of_the_tables(text, table, row, columns):
+    words = (ROOT / text).read_text(encoding="utf-8")
+    rows = pd.read_csv(EVIDENCE / f"{table}.csv", dtype=str)
+    (line,) = rows[(rows[list(row)] == pd.Series(row)).all(axis=1)].to_dict("records")
+    for column in columns:
+        for number in re.findall(r"[\d.]+", line[column].partition(",")[0]):
+            shown = number
+            if table == "table_4_2":  # texts have one digit
+                shown = f"{float(number):.1f}"
+            assert shown in words, f"{column}: {line[column]}"
+
+
+def test_the_first_training_is_that_of_the_comparison():
+    trainings = pd.read_csv(ROOT / "figures/trainings.csv")
+    compared = pd.read_csv(ROOT / "figures/comparison.csv")
+    for row in trainings[trainings["training"] == "seed 0"].itertuples():
+        is_same = compared["estimator"].str.startswith(row.estimator)
+        is_same &= (compared["keypoints"] == "masks, width 10") & (compared["over"] == ALL["over"])
+        (line,) = compared[is_same].to_dict("records")
+        for column, name in (("se3", "aligned ATE"), ("rotation", "rotation error a frame")):
+            ends = [getattr(row, f"{column}_{end}") for end in ("ratio", "low", "high")]
+            assert line[name] == "{:.2f} ({:.2f}-{:.2f})".format(*ends)
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.odometry import THESIS, metrics
-from thesis_repro.report import style
+from thesis_repro.report import style, texts
 from thesis_repro.running import results
 from thesis_repro.study import compare, workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
@@ -206,7 +206,8 @@ def summary(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> pd.DataFra
         }
         for row in chosen.itertuples():
             name = f"{ERRORS[row.error]}, {ESTIMATORS[row.estimator]}"
-            line[name] = f"{row.ratio:.2f} ({row.low:.2f}-{row.high:.2f}), {row.above} of {row.n}"
+            ratio, low, high = map(texts.number, (row.ratio, row.low, row.high))
+            line[name] = f"{ratio} ({low}-{high}), {row.above} of {row.n}"
         for estimator, of_estimator in chosen.groupby("estimator", sort=False):
             failed, runs = of_estimator[["failed", "runs"]].iloc[0]
             line[f"failed, {ESTIMATORS[estimator]}"] = f"{failed} of {runs}"

@@ -65,10 +65,10 @@ def null_distribution(baseline: pd.DataFrame, widths: int, metric: str) -> pd.Da
 
     Then a run with masks is a run with all keypoints whose matched points are shuffled in another
     way. For each sequence, one of its runs with all keypoints is drawn as the benchmark, and
-    another for each of `widths` widths, always with replacement. The one with the lowest RMSE is
-    the best width. Returns STUDIES rows, one column a sequence, without those that were run only
-    once. A sequence's own runs limit how good its best width can be, so few repetitions make the
-    simulated changes too small.
+    another one for each of `widths` widths. The one with the lowest RMSE is the best width, and the
+    benchmark beats it in one of widths + 1 studies. Returns STUDIES rows, one column a sequence,
+    without those that were run only once. A sequence with fewer than widths + 1 runs has all of
+    them drawn, which is the best of fewer widths.
     """
     random = np.random.default_rng(0)
     columns = {}
@@ -76,8 +76,8 @@ def null_distribution(baseline: pd.DataFrame, widths: int, metric: str) -> pd.Da
         if len(runs) < 2:
             continue
         errors, rmse = runs[metric].to_numpy(), runs["rmse"].to_numpy()
-        drawn = random.integers(len(runs), size=(STUDIES, widths + 1))
-        benchmark, of_widths = drawn[:, 0], drawn[:, 1:]
+        drawn = random.permuted(np.tile(np.arange(len(runs)), (STUDIES, 1)), axis=1)
+        benchmark, of_widths = drawn[:, 0], drawn[:, 1 : widths + 1]
         best_column = rmse[of_widths].argmin(axis=1)
         best = of_widths[np.arange(STUDIES), best_column]
         columns[name] = percent_change(errors[best], errors[benchmark])
