@@ -114,7 +114,6 @@ def figure(table):
     table: from `table`.
     """
     rows = table[(table["over"] == ALL_KEYPOINTS) & table["mean IoU"].notna()]
-    same_quality = rows.groupby("mean IoU").cumcount()
     labels = list(compare.JUDGING_METRICS.values())
     drawing, panels = style.new_figure(1, len(labels), height=3.6, squeeze=False)
     for panel, label in zip(panels[0], labels):
@@ -125,8 +124,7 @@ def figure(table):
             marker, filling = "s", "white"
             if row["odometry"] == REAL:
                 marker, filling = "o", color
-            # sources of one quality stand side by side
-            x = row["mean IoU"] + 0.012 * same_quality[index]
+            x = row["mean IoU"]
             panel.plot([x, x], [low, high], **style.interval_style(color, "_"))
             panel.plot(
                 x,

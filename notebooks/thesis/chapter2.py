@@ -59,7 +59,7 @@ def figure_2_02(
         remark = " (above: the first channel)"
     terms = " + ".join(f"{term:.2f}" for term in sums)
     total = bias + sums.sum()
-    figure.supxlabel(f"y = b + Σ w x = {bias:.2f} + {terms} ≈ {total:.1f}{remark}", fontsize=9)
+    figure.supxlabel(f"y = b + Σ w x = {bias:.4f} + {terms} ≈ {total:.1f}{remark}", fontsize=9)
     return figure
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from thesis import frames
@@ -66,8 +67,7 @@ def figure_3_06(
     pictures = {
         "frame": frame,
         "predicted label map": style.label_colors(label_map, frame),
-        # thin lines would drop out where the picture is reduced
-        "edges of the label map, drawn wider": dilate(edge_image, 5),
+        "edges of the label map": edge_image,
         f"edges dilated by {dilation_width}x{dilation_width}": mask,
     }
     return frames.pictures(frame, pictures, columns=2, label_maps=[label_map])
@@ -92,4 +92,15 @@ def figure_masks(
     for title, mask in masks.items():
         shaded = np.where(mask > 0, frame // 2 + 127, frame // 3)
         pictures[title] = frames.with_edges(shaded, edges)
-    return frames.pictures(frame, pictures, keypoints, columns=2)
+    figure = frames.pictures(frame, pictures, keypoints, columns=2)
+    keypoint_color = style.KEYPOINT["color"]
+    marks = [
+        Patch(facecolor="#bbbbbb", edgecolor="black", label="kept by the mask"),
+        Line2D([], [], linestyle="none", marker="o", color=keypoint_color, label="keypoints on it"),
+    ]
+    if true_edges is not None:
+        red, green, blue = style.EDGE_COLOR
+        true_color = (red / 255, green / 255, blue / 255)
+        marks.append(Line2D([], [], color=true_color, label="true boundaries of classes"))
+    figure.legend(handles=marks, loc="outside lower center", ncols=3)
+    return figure

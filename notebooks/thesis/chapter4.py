@@ -39,8 +39,8 @@ METHODS = {
     "reduced": ("plainly reduced", REDUCED, "\\\\"),
 }
 BAND = "lowest to highest of the repetitions"
-# cross on a lost run (see `metrics.step_errors`), and on a mean over runs of which one is lost
-LOST: dict[str, Any] = {
+# cross on a failed run (see `compare.has_failed`), and on a mean over runs of which one failed
+FAILED: dict[str, Any] = {
     "linestyle": "none",
     "marker": "x",
     "color": "black",
@@ -48,7 +48,7 @@ LOST: dict[str, Any] = {
     "markeredgewidth": 1.4,
     "zorder": 4,
     "clip_on": False,
-    "label": "lost run",
+    "label": "failed run",
 }
 
 
@@ -285,9 +285,9 @@ def _draw_estimates(
         distance = np.linalg.norm(differences[run.run], axis=1)
         above.plot(drawn[:, 0], drawn[:, 2], **line)
         below.plot(along, distance, **line)
-        if run.lost:
-            above.plot(drawn[-1, 0], drawn[-1, 2], **LOST)
-            below.plot(along[-1], distance[-1], **LOST)
+        if run.failed > 0 or run.lost > 0:
+            above.plot(drawn[-1, 0], drawn[-1, 2], **FAILED)
+            below.plot(along[-1], distance[-1], **FAILED)
 
 
 def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
@@ -321,7 +321,12 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
-    _lines(axes, _by_width(masked, metric))
+    by_width = _by_width(masked, metric)
+    _lines(axes, by_width, logarithmic=True)
+    failed = compare.has_failed(masked).groupby([masked["sequence"], masked["dilation_width"]])
+    for (name, width), has_failed in failed.any().items():
+        if has_failed:
+            axes.plot(width, by_width.loc[name, width], **FAILED)
     axes.set(
         xlabel="dilation width (pixels)",
         ylabel=label,
@@ -364,9 +369,9 @@ def _draw_repetitions(panel: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
     panel.plot(
         errors["mean"], color=MASKED, marker="o", markersize=2, linewidth=1.1, label="masked, mean"
     )
-    lost = errors["mean"][runs.groupby("dilation_width")["lost"].any()]
-    if len(lost):
-        panel.plot(lost.index, lost, **LOST)
+    failed = errors["mean"][compare.has_failed(runs).groupby(runs["dilation_width"]).any()]
+    if len(failed):
+        panel.plot(failed.index, failed, **FAILED)
 
 
 def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
@@ -408,13 +413,19 @@ def _by_width(runs: pd.DataFrame, column: str) -> pd.DataFrame:
     return runs.groupby(["sequence", "dilation_width"])[column].mean().unstack()
 
 
-def _lines(axes: plt.Axes, table: pd.DataFrame) -> None:
-    """Draw one line for each row of a table with one column for each dilation width."""
+def _lines(axes: plt.Axes, table: pd.DataFrame, logarithmic: bool = False) -> None:
+    """Draw one line for each row of a table with one column for each dilation width.
+
+    logarithmic: the vertical axis, so that large rows do not hide small ones.
+    """
     for index, (_, row) in enumerate(table.iterrows()):
         marker = MARKERS[index % len(MARKERS)]
         axes.plot(row.index, row, marker=marker, markersize=3.5, **style.line_style(index))
     axes.set_xticks(table.columns.astype(int))
-    axes.set_ylim(0, None)
+    if logarithmic:
+        style.ratio_axis(axes.yaxis, table.to_numpy())
+    else:
+        axes.set_ylim(0, None)
     _name_lines(axes, table)
 
 
@@ -424,18 +435,18 @@ def _name_lines(axes: plt.Axes, table: pd.DataFrame) -> None:
     lines = table.ffill(axis=1).assign(color=colors)
     width = table.columns[-1]
     lines = lines.sort_values(width)
-    height = axes.get_ylim()[1]
-    distance = height / max(len(lines), 18)
-    places = lines[width].to_numpy(copy=True)
+    distance = 1 / max(len(lines), 18)  # part of the panel's height
+    ends = np.column_stack([np.full(len(lines), width), lines[width]])
+    places = axes.transLimits.transform(axes.transScale.transform(ends))[:, 1]
     for index in range(1, len(places)):
         places[index] = max(places[index], places[index - 1] + distance)
-    highest = height + distance * np.arange(1 - len(places), 1)
+    highest = 1 + distance * np.arange(1 - len(places), 1)
     for (name, line), place in zip(lines.iterrows(), np.minimum(places, highest), strict=True):
         axes.annotate(
             str(name),
             (width, line[width]),
             (1.02, place),
-            textcoords=axes.get_yaxis_transform(),
+            textcoords="axes fraction",
             va="center",
             fontsize=8,
             arrowprops={
@@ -458,13 +469,13 @@ def runs_of_methods(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 def _spread_by_method(runs: pd.DataFrame, metric: str) -> tuple[list[str], dict[str, pd.DataFrame]]:
     """Return the sequences and a table for each of METHODS.
 
-    A table has one row a sequence: mean, lowest, highest, and whether a run is lost.
+    A table has one row a sequence: mean, lowest, highest, and whether a run failed.
     """
     names = sorted(compare.of_method(runs, "baseline")["sequence"].unique())
     tables = {}
     for method, rows in runs_of_methods(runs).items():
-        lost = rows.groupby("sequence")["lost"].any()
-        tables[method] = compare.spread(rows, metric).assign(lost=lost).reindex(names)
+        failed = compare.has_failed(rows).groupby(rows["sequence"]).any()
+        tables[method] = compare.spread(rows, metric).assign(failed=failed).reindex(names)
     return names, tables
 
 
@@ -487,9 +498,9 @@ def _bar(
         edgecolor="white",
         linewidth=0,
     )
-    lost = table["lost"].eq(True).to_numpy()
-    if lost.any():
-        axes.plot(np.array(positions)[lost], table["mean"][lost], **LOST)
+    failed = table["failed"].eq(True).to_numpy()
+    if failed.any():
+        axes.plot(np.array(positions)[failed], table["mean"][failed], **FAILED)
     table = table.where(table["highest"] > table["lowest"])  # a single run has no error bar
     mean = table["mean"]
     errors = [mean - table["lowest"], table["highest"] - mean]

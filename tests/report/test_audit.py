@@ -41,7 +41,8 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
         ("3", "reduction of each", "", 2.689),
         ("4", "larger", "MAE", 7),
         ("41", "improved", "RMSE", 6),
-        ("41", "sign", "RMSE", 50),
+        ("41", "by chance", "RMSE", 10.3125),
+        ("41", "sign", "RMSE", 0.0335),
         ("60", "keypoints", "", 761.7),
     ],
 )

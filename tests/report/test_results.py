@@ -221,7 +221,7 @@ def test_the_comparison_figure_shows_ratios_and_their_interval():
     axes = comparison.figure_comparison(table).axes[0]
     row = table[
         (table["estimator"] == "thesis")
-        & (table["metric"] == comparison.SHOWN[0])
+        & (table["metric"] == list(compare.JUDGING_METRICS)[0])
         & table["tested"]
         & (table["method"] == "masked")
         & (table["reference"] == "baseline")
@@ -248,12 +248,12 @@ def test_the_figure_of_paths_shows_repetitions_and_their_errors():
     assert distances == [[0, 0, 0, 5], [0, 0, 1, 5], [0, 0, 2, 5]]
 
 
-@pytest.mark.parametrize("lost", [0, 1])
-def test_a_lost_run_is_marked_where_runs_are_drawn(lost):
+@pytest.mark.parametrize("failed", [0, 1])
+def test_a_failed_run_is_marked_where_runs_are_drawn(failed):
     runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.1)
     rows = (runs["method"] == "baseline") & (runs["sequence"] == "05")
     masked_rows = (runs["method"] == "masked") & (runs["sequence"] == "05")
-    runs.loc[(rows | masked_rows) & (runs["repetition"] == 1), "lost"] = lost
+    runs.loc[(rows | masked_rows) & (runs["repetition"] == 1), "failed"] = 50.0 * failed
     of_all = compare.of_method(runs, "baseline")
     paths = {(row.sequence, row.run): AHEAD for row in of_all.itertuples()}
     truths = {"00": AHEAD, "05": AHEAD}
@@ -265,7 +265,7 @@ def test_a_lost_run_is_marked_where_runs_are_drawn(lost):
     ):
         crosses = [line for line in figure.findobj(plt.Line2D) if line.get_marker() == "x"]
         words = [text.get_text() for text in figure.findobj(plt.Text)]
-        assert bool(crosses) == bool(lost) and words.count("lost run") == lost
+        assert bool(crosses) == bool(failed) and words.count("failed run") == failed
 
 
 HOSTILE = [

@@ -3,7 +3,6 @@
 They compare masks with all keypoints, with controls and with masks from other sources.
 """
 
-import textwrap
 from typing import Any
 
 import numpy as np
@@ -16,69 +15,80 @@ from thesis_repro.report.style import BASELINE, MASKED
 from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import ESTIMATORS
 
-SHOWN = (*compare.JUDGING_METRICS, "rmse")
+# methods in the figure, few enough for a small screen; the table has all
+SHOWN = ("masked", "corrected", "mirrored", "spread")
+REACHES = (2, 4, 8, 16, 64)  # of the figure's axis, which goes from 1 / reach to reach
 # columns of the failed runs of a method and of its reference, "2 of 40"
 FAILED = {"failed runs": "failed", "failed runs of the reference": "reference_failed"}
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
 
 
 def figure_comparison(table: pd.DataFrame) -> Figure:
-    """Draw each method's ratio to all keypoints.
+    """Draw the ratios of masks and of some controls to all keypoints.
 
-    Grey dots are its sequences, the coloured mark is their typical ratio with its interval. The
-    figure has one row of panels for each estimator. Its columns are the judging metrics and the
-    thesis's RMSE. With several sources of masks it shows only their masks, not the controls.
+    Grey dots are the sequences, the coloured mark is their typical ratio with its interval. The
+    figure has one row of panels for each estimator and one column for each judging metric, all with
+    one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge. With
+    several sources of masks the figure shows only their masks.
     """
     rows = _tested(_over_all_keypoints(table))
+    rows = rows[rows["method"].isin(SHOWN) & rows["metric"].isin(compare.JUDGING_METRICS)]
     if rows["source"].nunique() > 1:  # controls of every source would be dozens of rows
         rows = rows[rows["method"] == "masked"]
     rows = rows.assign(label=_labels(rows))
     order = list(rows["label"].unique())
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
-    metrics = [name for name in SHOWN if (rows["metric"] == name).any()]
-    height = 0.7 + (0.9 + 0.21 * len(order)) * len(estimators)
+    metrics = [name for name in compare.JUDGING_METRICS if (rows["metric"] == name).any()]
+    height = 0.7 + (0.8 + 0.36 * len(order)) * len(estimators)
     figure, axes = style.new_figure(
-        len(estimators), len(metrics), squeeze=False, sharey=True, height=height
+        len(estimators), len(metrics), squeeze=False, sharex=True, sharey=True, height=height
     )
+    distances = rows[_sequences(table)].astype(float).map(np.log).abs().stack()
+    shown = [reach for reach in REACHES if (distances < np.log(reach)).mean() >= 0.9]
+    reach = (shown or REACHES[-1:])[0]
     for panels, estimator in zip(axes, estimators, strict=True):
         panels[0].set_ylabel(ESTIMATORS[estimator])
         for panel, metric in zip(panels, metrics, strict=True):
-            shown = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
-            _draw_ratios(panel, shown, order, _sequences(table))
+            of_panel = rows[(rows["estimator"] == estimator) & (rows["metric"] == metric)]
+            _draw_ratios(panel, of_panel, order, _sequences(table), reach)
     for panel, metric in zip(axes[0], metrics):
-        panel.set_title(textwrap.fill(compare.METRICS[metric], 18))
+        panel.set_title(compare.METRICS[metric])
     for panel in axes[-1]:
-        panel.set_xlabel("ratio to all keypoints\n(left of 1: lower)", fontsize=8)
+        panel.set_xlabel("ratio to all keypoints (left of 1: lower)", fontsize=8)
     return figure
 
 
-def _draw_ratios(panel: Axes, rows: pd.DataFrame, order: list[str], sequences: list[str]) -> None:
+def _draw_ratios(
+    panel: Axes, rows: pd.DataFrame, order: list[str], sequences: list[str], reach: float
+) -> None:
     """Draw the ratios of one estimator and metric, each at the place of its label in `order`."""
+    style.ratio_axis(panel.xaxis, [1 / reach, reach])
+    dot: dict[str, Any] = {"color": "#555555", "markersize": 4, "markeredgewidth": 0}
     for _, row in rows.iterrows():
         y = order.index(row["label"])
         color = BASELINE
         if row["method"] == "masked":
             color = MASKED
         values = row[sequences].dropna().astype(float)
-        panel.plot(
-            values,
-            [y - 0.22] * len(values),
-            "o",
-            color="#555555",
-            alpha=0.45,
-            markersize=3,
-            markeredgewidth=0,
-        )
+        inside = values[(values < reach) & (values > 1 / reach)]
+        panel.plot(inside, [y - 0.1] * len(inside), "o", alpha=0.45, **dot)
+        for edge, marker, beyond in (
+            (1 / reach, "<", values[values <= 1 / reach]),
+            (reach, ">", values[values >= reach]),
+        ):
+            if len(beyond):
+                named = [f"{name}: {value:.3g}" for name, value in beyond.items()]
+                place: dict[str, Any] = {"ha": "right" if edge > 1 else "left", "fontsize": 7}
+                panel.plot(edge, y - 0.1, marker, clip_on=False, **dot)
+                panel.text(edge, y - 0.22, f" {', '.join(named)} ", va="bottom", **place)
         interval = [row["low"], row["high"]]
-        panel.plot(interval, [y + 0.15] * 2, **style.interval_style(color, "|"))
-        panel.plot(row["ratio"], y + 0.15, "D", color=color, markersize=4, markeredgewidth=0)
+        panel.plot(interval, [y + 0.2] * 2, **style.interval_style(color, "|"))
+        panel.plot(row["ratio"], y + 0.2, "D", color=color, markersize=4, markeredgewidth=0)
     panel.axvline(1, color="black", linewidth=0.8)
     panel.grid(axis="y", visible=False)
     panel.set_yticks(range(len(order)), order)
-    panel.set_ylim(len(order) - 0.5, -0.6)
+    panel.set_ylim(len(order) - 0.5, -0.7)
     panel.tick_params(labelsize=7)
-    drawn = np.concatenate([line.get_xdata() for line in panel.lines])
-    style.ratio_axis(panel.xaxis, drawn)
 
 
 def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
