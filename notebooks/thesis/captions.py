@@ -23,7 +23,6 @@ ADDED = [
     _OF_STUDIES.get((artefact["kind"], artefact["name"]), {}) | artefact
     for artefact in _CAPTIONS["added"]
 ]
-EVIDENCE = _CAPTIONS["evidence"]  # artefacts of real frames alone
 MADE_BY = _CAPTIONS["made_by"]  # {notebook: names of the artefacts that it writes}
 OF_THESIS = [artefact for artefacts in CHAPTERS.values() for artefact in artefacts]
 THESIS = [artefact["name"] for artefact in OF_THESIS]

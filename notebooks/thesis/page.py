@@ -122,10 +122,14 @@ def _of_real_frames(settings: Settings) -> list[dict[str, Any]]:
     """Return the described artefacts of the evidence on real frames that is in git."""
     real = replace(settings, figures=settings.figures / REAL, kitti_is_embedded=False)
     numbers = beside_the_thesis(real)
+
+    def added(*names: str) -> list[dict[str, Any]]:
+        return [artefact for artefact in captions.ADDED if artefact["name"] in names]
+
     chapter = [
-        *captions.EVIDENCE,
+        *added("few_keypoints"),
         *captions.CHAPTERS["Chapter 4: results"],
-        *(artefact for artefact in captions.ADDED if artefact["name"] in ("comparison", "widths")),
+        *added("comparison", "widths"),
     ]
     described = [_describe(artefact, real, numbers) for artefact in chapter]
     for artefact in described:
