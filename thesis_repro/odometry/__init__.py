@@ -8,35 +8,23 @@ the runs. With the settings THESIS, the result equals that of PySLAM of August 2
 On some frames PySLAM crashes; here a rule says what happens. Doubtful frames get a flag. "Kept"
 means that the pose does not change:
 
-| frame                                     | flag: rule                                         |
-|-------------------------------------------|----------------------------------------------------|
-| black, overexposed or without contrast    | "flat frame": skipped. The next motion is measured |
-|                                           | from the last frame before it, over the sum of the |
-|                                           | step lengths                                       |
-| no new keypoint (mask all zero, say)      | "no keypoints": the tracked points are tracked     |
-|                                           | further                                            |
-| no point to track                         | "no points": kept; starts again from this frame's  |
-|                                           | keypoints                                          |
-| too few correspondences                   | "fewer than five correspondences": kept            |
-| no essential matrix, or several           | "no essential matrix", "several essential          |
-|                                           | matrices": kept                                    |
-| inliers no more than by chance (scene     | "no agreement": kept                               |
-| cut)                                      |                                                    |
-| step shorter than the gate (PySLAM's      | "stationary": kept                                 |
-| rule)                                     |                                                    |
-| rotation larger than a car's              | "too large a turn": the pose moves, as in PySLAM   |
+- black, overexposed or without contrast: "flat frame", skipped. The next motion is measured from the
+  last frame before it, over the sum of the step lengths
+- no new keypoint (mask all zero, say): "no keypoints", the tracked points are tracked further
+- no point to track: "no points", kept; starts again from this frame's keypoints
+- too few correspondences: "fewer than five correspondences", kept
+- no essential matrix, or several: "no essential matrix", "several essential matrices", kept
+- inliers no more than by chance (scene cut): "no agreement", kept
+- step shorter than the gate (PySLAM's rule): "stationary", kept
+- rotation larger than a car's: "too large a turn", the pose moves, as in PySLAM
 
-With estimator="refined" there are two more flags, and the pose is always moved
-(see refined.motion_prior):
+With estimator="refined" there are two more flags, and the pose is always moved (see
+refined.motion_prior):
 
-| motion                                    | flag: rule                                         |
-|-------------------------------------------|----------------------------------------------------|
-| inconsistent with the previous step       | "ambiguous motion": the best consistent motion if  |
-|                                           | nearly as many points are near it, otherwise the   |
-|                                           | estimated motion                                   |
-| not determined (all points on a line)     | "ambiguous motion" if a consistent motion is       |
-|                                           | found, otherwise "motion not determined": the      |
-|                                           | previous motion, with this step's length           |
+- motion inconsistent with the previous step: "ambiguous motion", the best consistent motion if
+  nearly as many points are near it, otherwise the estimated motion
+- motion not determined (all points on a line): "ambiguous motion" if a consistent motion is found,
+  otherwise "motion not determined": the previous motion, with this step's length
 """
 
 from thesis_repro.odometry.odometry import OPENCV, Calls, Odometry

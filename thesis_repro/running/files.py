@@ -187,6 +187,8 @@ def progress(
         "leave": False,
         "delay": DELAY,
     }
+    if type(sys.stderr).__module__ == "ipykernel.iostream":  # a notebook shows it as an error
+        options["file"] = sys.stdout
     other = os.environ.get("THESIS_REPRO_PROGRESS")
     if other:
         options["file"] = _opened(other)
