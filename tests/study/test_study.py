@@ -8,15 +8,19 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 import trials
 from evo.tools import file_interface
 
 from thesis_repro.command.cli import main
+from thesis_repro.data import label_ids
+from thesis_repro.data.cityscapes import ID, TRAINED
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, write_masks
 from thesis_repro.report import study as report
+from thesis_repro.running.files import write_png
 from thesis_repro.study import runner
 from thesis_repro.study.sources import Source
 from thesis_repro.study.study import Study
@@ -181,6 +185,24 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
 
 
+def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, tmp_path):
+    numbers = np.full(256, 255, np.uint8)  # train ids, by label id
+    numbers[[ID[name] for name in TRAINED]] = range(len(TRAINED))
+    for path in sorted((small_labels / "00").iterdir()):
+        train_ids = numbers[cv2.imread(str(path), cv2.IMREAD_UNCHANGED)]
+        write_png(tmp_path / "train" / "00" / path.name, train_ids)
+        label_map = label_ids.read(tmp_path / "train" / "00" / path.name, "train")
+        write_png(tmp_path / "7:00" / "00" / path.name, label_map)
+    where = ["--kitti", small_world / "kitti", "--sequences", "00", "--frames", 4]
+    sources = ["--labels", f"mine={tmp_path / 'train'}:train", "--labels", tmp_path / "7:00"]
+    counts = ["--widths", 5, "--repetitions", 1, "--estimator", "thesis", "--jobs", 1]
+    words = [*where, *sources, *counts, "--output", tmp_path / "out"]
+    assert main(["study", *map(str, words)]) == 0
+    runs = pd.read_csv(tmp_path / "out" / "runs.csv", keep_default_na=False).set_index("source")
+    assert list(runs.index) == ["", "mine", "7-00"]
+    assert runs.loc["mine", "rmse"] == runs.loc["7-00", "rmse"] != runs.loc["", "rmse"]
+
+
 def test_results_of_another_length_are_kept(done, study):
     before = files(done[0])
     with pytest.raises(InputError, match="other settings"):
@@ -193,6 +215,8 @@ def test_results_of_another_length_are_kept(done, study):
     [
         ("", "--labels"),
         ("--labels nowhere", "nowhere: "),
+        ("--labels nowhere:train", "nowhere: "),
+        ("--labels {labels}:none.csv", "none.csv: "),
         ("--labels {labels} --labels {labels}", "small_labels"),
         ("--labels a={labels} --masks A={masks}", "'A'"),
         ("--labels a*b={labels}", "--labels a*b="),

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -86,11 +86,16 @@ def named(
 ) -> tuple[Source, ...]:
     """Return sources from (kind, name, folder). Without a name, that of the folder is used.
 
-    settings: for all masks from label maps. invert: for all ready-made masks.
+    settings: for all masks from label maps; a folder of them may name its ids, as in FOLDER:train.
+    invert: for all ready-made masks.
     Raises InputError for a name that cannot be a folder's name, and for equal names.
     """
     sources: list[Source] = []
     for kind, given_name, folder in folders:
+        of_source = settings
+        path, colon, ids = str(folder).rpartition(":")
+        if colon and kind == "labels" and not folder.is_dir():  # a folder's name may have a colon
+            folder, of_source = Path(path), replace(settings, ids=ids)
         if given_name is not None and not re.fullmatch(r"[\w+-]+( [\w+-]+)*", given_name):
             raise InputError(
                 f"--{kind} {given_name}={folder}: a name has letters, digits, '_', '+', '-' and single "
@@ -104,7 +109,7 @@ def named(
                 f"--{kind} {folder}: two folders of masks would be called {name!r}; give one another name, "
                 f"--{kind} NAME={folder}"
             )
-        sources.append(Source(folder.absolute(), kind, name, settings, invert and kind == "masks"))
+        sources.append(Source(folder.absolute(), kind, name, of_source, invert and kind == "masks"))
     return tuple(sources)
 
 
