@@ -102,14 +102,13 @@ def _shared(*names: str) -> dict[str, dict[str, Any]]:
 
 
 def _source(kind: str, form: str, content: str) -> dict[str, Any]:
-    """Return the arguments of an option that adds a source of masks to a study."""
+    """Return the arguments of an option that adds a source to a study."""
     return dict(
         dest="sources",
         action="append",
         metavar=form,
         type=lambda text: (kind, *_name_and_folder(text)),
-        help=f"folder with a subfolder NN for each sequence ({content}), and a name for it (the folder's); "
-        "can be repeated",
+        help=f"{content}, and a name for it (the folder's); can be repeated",
     )
 
 
@@ -251,9 +250,25 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--labels": _source(
             "labels",
             "[NAME=]DIR[:IDS]",
-            "label maps, any size, with these ids instead of those that --ids names",
+            "folder with a subfolder NN of label maps for each sequence, with these ids instead of those that "
+            "--ids names",
         ),
-        "--masks": _source("masks", "[NAME=]DIR", "masks, 255 keeps keypoints, 0 ignores them"),
+        "--masks": _source(
+            "masks",
+            "[NAME=]DIR",
+            "folder with a subfolder NN of masks for each sequence, 255 keeps keypoints, 0 ignores them",
+        ),
+        "--keypoints": _source(
+            "keypoints",
+            "[NAME=]FILE.py",
+            "Python file, which is executed, with your function detect(frame, settings, mask) or "
+            "track(previous, current, points, settings)",
+        ),
+        "--paths": _source(
+            "paths",
+            "[NAME=]DIR",
+            "folder with the path NN.txt of another system for each sequence, in KITTI's or TUM's format, metres",
+        ),
         "--widths": dict(
             type=settings.list_of_widths,
             nargs="+",
