@@ -186,10 +186,30 @@ distortion_coefficients: !!opencv-matrix
 """
 
 
+KALIBR = """cam0:
+  T_cam_imu:
+  - [0.0, 1.0, 0.0, 0.06]
+  - [-1.0, 0.0, 0.0, 0.01]
+  - [0.0, 0.0, 1.0, -0.01]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.3, 0.1, 0.01, -0.02]
+  distortion_model: radtan
+  intrinsics: [50, 51.0, 32, 24]
+  resolution: [64, 48]
+  rostopic: /cam0/image_raw
+cam1:
+  camera_model: omni
+  intrinsics: [1.1, 60, 61, 31, 23]
+"""
+
+
 @pytest.mark.parametrize(
     "name, text",
     [
         ("camera.txt", " ".join(map(str, NUMBERS))),
+        ("camera.yaml", KALIBR),
         ("camera.yaml", f"%YAML:1.0\n---\n{ORB_SLAM}"),
         ("camera.yaml", f'%YAML:1.0\nCamera.type: "PinHole"\n{ORB_SLAM}'),
         ("camera.yaml", ORB_SLAM.replace("Camera.", "Camera1.")),
@@ -215,6 +235,10 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
         ("camera.txt", "50 50 32 24 0.1"),
         ("camera.txt", "P0: 50 0 32"),
         ("camera.yaml", "a: [1"),
+        ("camera.yaml", KALIBR.replace("radtan", "equidistant")),
+        ("camera.yaml", KALIBR.replace("pinhole", "omni")),
+        ("camera.yaml", KALIBR.replace("intrinsics", "extrinsics")),
+        ("camera.yaml", KALIBR.replace("32, 24", "32")),
         ("camera.yaml", ORB_SLAM.replace("p1", "k3").replace("p2", "k4")),  # a fisheye camera
     ],
 )

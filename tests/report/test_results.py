@@ -13,6 +13,7 @@ from thesis import chapter4, tables, thesis_tables
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, findings, style, texts
+from thesis_repro.report import study as report_study
 from thesis_repro.report import tables as report_tables
 from thesis_repro.study import compare
 from thesis_repro.study.jobs import ESTIMATORS
@@ -125,8 +126,29 @@ def test_failed_runs_are_counted():
     assert (
         comparison.table_widths(runs).set_index("sequence").loc["failed runs"].iloc[4] == "1 of 33"
     )
-    errors = report_tables.table_errors(runs)
-    assert errors["failed runs"].value_counts()["1 of 3"] == 6  # three widths, two estimators
+
+
+def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
+    runs = runs_of(ELEVEN, halved, noise=0.2)
+    table = comparison.table_errors(compare.comparisons(runs), runs)
+    methods = ["all keypoints", "masks, width 10", *(compare.METHODS[name] for name in CONTROLS)]
+    assert list(table["method"]) == 4 * methods and list(table.columns[3:]) == ELEVEN
+    assert list(table["estimator"].unique()) == ["vote of all points", "refined estimator"]
+    assert list(table["error"].unique()) == ["aligned ATE (m)", "rotation error a frame (deg)"]
+    masked = (runs["method"] == "masked") & (runs["dilation_width"] == 10)
+    errors = runs[masked & (runs["estimator"] == "refined") & (runs["sequence"] == "03")]["se3"]
+    cell = table[table["estimator"] == "refined estimator"].set_index("method").iloc[1]["03"]
+    mean, spread = map(float, cell.strip("*").split(" ± "))
+    assert (mean, spread) == pytest.approx((errors.mean(), errors.std()), abs=0.00051)
+    bold = table[ELEVEN].map(lambda cell: cell.startswith("**"))
+    of_masks = bold[table["method"] == "masks, width 10"]
+    assert (bold.sum() == 4).all() and of_masks.to_numpy().mean() > 0.9
+    pieces = report_study.latex_errors(table).split("\\end{tabular}")[:-1]
+    assert len(pieces) == 12 and all("{lllll}" in piece or "{llll}" in piece for piece in pieces)
+    assert sum(piece.count("\\textbf{") for piece in pieces) == 44
+    once = runs[runs["repetition"] == 0]
+    single = comparison.table_errors(compare.comparisons(once), once)
+    assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
 
 
 def test_ratios_in_the_tables_equal_the_comparison():
@@ -186,7 +208,7 @@ def test_findings_follow_the_verdict(errors, names, verdict, sources):
     assert text.count("do worse than all") == (verdict == compare.HIGHER) * len(sources)
     row = compare.primary_comparison(table, sources[0]).iloc[0]
     # the ratios of several sources stand in a table
-    summary = comparison.table_summary(table, runs).set_index("masks").loc[sources[0]]
+    summary = comparison.table_summary(table, runs).set_index("source").loc[sources[0]]
     assert texts.ratio(row).replace("95 % CI ", "") == summary["aligned ATE"]
     assert (texts.ratio(row) in text) == (len(sources) == 1) and summary["verdict"] == verdict
 

@@ -8,15 +8,19 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 import trials
 from evo.tools import file_interface
 
 from thesis_repro.command.cli import main
+from thesis_repro.data import label_ids
+from thesis_repro.data.cityscapes import ID, TRAINED
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, write_masks
 from thesis_repro.report import study as report
+from thesis_repro.running.files import write_png
 from thesis_repro.study import runner
 from thesis_repro.study.sources import Source
 from thesis_repro.study.study import Study
@@ -181,6 +185,79 @@ def test_a_killed_study_resumes_and_ends_as_an_undisturbed_one(
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
 
 
+def test_each_folder_of_label_maps_may_name_its_ids(small_world, small_labels, tmp_path):
+    numbers = np.full(256, 255, np.uint8)  # train ids, by label id
+    numbers[[ID[name] for name in TRAINED]] = range(len(TRAINED))
+    for path in sorted((small_labels / "00").iterdir()):
+        train_ids = numbers[cv2.imread(str(path), cv2.IMREAD_UNCHANGED)]
+        write_png(tmp_path / "train" / "00" / path.name, train_ids)
+        label_map = label_ids.read(tmp_path / "train" / "00" / path.name, "train")
+        write_png(tmp_path / "7:00" / "00" / path.name, label_map)
+    where = ["--kitti", small_world / "kitti", "--sequences", "00", "--frames", 4]
+    sources = ["--labels", f"mine={tmp_path / 'train'}:train", "--labels", tmp_path / "7:00"]
+    counts = ["--widths", 5, "--repetitions", 1, "--estimator", "thesis", "--jobs", 1]
+    words = [*where, *sources, *counts, "--output", tmp_path / "out"]
+    assert main(["study", *map(str, words)]) == 0
+    runs = pd.read_csv(tmp_path / "out" / "runs.csv", keep_default_na=False).set_index("source")
+    assert list(runs.index) == ["", "mine", "7-00"]
+    assert runs.loc["mine", "rmse"] == runs.loc["7-00", "rmse"] != runs.loc["", "rmse"]
+
+
+@pytest.fixture
+def brought(study, done, tmp_path):
+    """A study of own keypoints, which are all keypoints, and of the paths with all keypoints."""
+    (tmp_path / "mine.py").write_text("from thesis_repro.odometry.odometry import detect\n")
+    (tmp_path / "slam").mkdir()
+    for name, form in (("00", "kitti"), ("01", "tum")):
+        written = done[0] / "paths" / form / name / "baseline-0.txt"
+        shutil.copy(written, tmp_path / "slam" / f"{name}.txt")
+    sources = (
+        Source(tmp_path / "mine.py", "keypoints", "mine"),
+        Source(tmp_path / "slam", "paths", "slam"),
+    )
+    return replace(study, sources=sources, widths=(), tested=None)
+
+
+def test_own_keypoints_and_paths_are_rows_as_masks_are(brought, tmp_path):
+    brought.check()
+    runs = brought.run(tmp_path / "out").table
+    keys = ["sequence", "repetition"]
+    of_all, mine, slam = (
+        runs[runs["source"] == name].set_index(keys) for name in ("", "mine", "slam")
+    )
+    numbers = ["rmse", "se3", "rotation", "mean_keypoints"]
+    assert mine[numbers].equals(of_all[numbers]) and len(mine) == 4
+    expected = of_all.loc[slam.index, numbers[:3]]
+    assert np.allclose(slam[numbers[:3]], expected, atol=1e-8) and len(slam) == 2
+    report.write(brought, runs, tmp_path / "out")
+    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
+    assert list(summary["source"]) == ["mine", "slam"] and summary["keypoints"].count() == 1
+    errors = pd.read_csv(tmp_path / "out" / "errors.csv")
+    assert list(errors["method"]) == ["all keypoints", "mine", "slam"] * 2
+    times = files(tmp_path / "out")
+    path = tmp_path / "slam" / "00.txt"
+    path.write_text(path.read_text() + "1 0 0 0 0 1 0 0 0 0 1 9\n" * 6)  # twelve, as frames are
+    again = brought.run(tmp_path / "out")
+    changed = {path for path, time in times.items() if path.stat().st_mtime_ns != time}
+    assert (again.made, again.kept) == (1, len(runs) - 1) and len(changed) == 1
+    assert again.table["se3"].equals(runs["se3"])
+
+
+@pytest.mark.parametrize(
+    "name, text, named",
+    [
+        ("mine.py", "detector = 5", "mine.py: must define"),
+        ("slam/00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 5, "00.txt: 5 poses for 6 frames"),
+        ("slam/00.txt", "1 0 0 0 0 1 0 0 0 0 1\n" * 6, "00.txt, line 1: "),
+        ("slam/00.tum", "", "slam: must hold one path of sequence 00"),
+    ],
+)
+def test_what_is_no_path_and_no_keypoints_is_named(brought, tmp_path, name, text, named):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=named):
+        brought.check()
+
+
 def test_results_of_another_length_are_kept(done, study):
     before = files(done[0])
     with pytest.raises(InputError, match="other settings"):
@@ -193,6 +270,8 @@ def test_results_of_another_length_are_kept(done, study):
     [
         ("", "--labels"),
         ("--labels nowhere", "nowhere: "),
+        ("--labels nowhere:train", "nowhere: "),
+        ("--labels {labels}:none.csv", "none.csv: "),
         ("--labels {labels} --labels {labels}", "small_labels"),
         ("--labels a={labels} --masks A={masks}", "'A'"),
         ("--labels a*b={labels}", "--labels a*b="),
@@ -243,7 +322,7 @@ def test_a_study_without_any_masked_run_is_one_clear_line(small_world, small_lab
     study = Study(
         small_world / "kitti", ("00",), (Source(tmp_path / "labels", name="net"),), (5,), frames=5
     )
-    with pytest.raises(InputError, match="every run with masks failed"):
+    with pytest.raises(InputError, match="every run but those with all keypoints failed"):
         study.run(tmp_path / "out")
 
 

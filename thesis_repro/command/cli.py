@@ -139,7 +139,7 @@ def odometry(options: Any) -> None:
 
 
 def study(options: Any) -> int:
-    """Compare your own label maps or masks with all keypoints and with controls."""
+    """Compare your own masks, keypoints or paths with all keypoints and with controls."""
     from thesis_repro import checks
     from thesis_repro.data import kitti
     from thesis_repro.running import results
@@ -148,7 +148,8 @@ def study(options: Any) -> int:
 
     if not options.sources:
         raise InputError(
-            "no masks: name a folder of label maps with --labels, or of masks with --masks"
+            "nothing to compare: name a folder of label maps with --labels or of masks with --masks, own "
+            "--keypoints, or --paths"
         )
     kinds = {kind for kind, _, _ in options.sources}
     has_labels = "labels" in kinds

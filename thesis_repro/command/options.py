@@ -101,15 +101,14 @@ def _shared(*names: str) -> dict[str, dict[str, Any]]:
     return {name: SHARED[name] for name in names}
 
 
-def _source(kind: str, content: str) -> dict[str, Any]:
-    """Return the arguments of an option that adds a source of masks to a study."""
+def _source(kind: str, form: str, content: str) -> dict[str, Any]:
+    """Return the arguments of an option that adds a source to a study."""
     return dict(
         dest="sources",
         action="append",
-        metavar="[NAME=]DIR",
+        metavar=form,
         type=lambda text: (kind, *_name_and_folder(text)),
-        help=f"folder with a subfolder NN for each sequence ({content}), and a name for it (the folder's); "
-        "can be repeated",
+        help=f"{content}, and a name for it (the folder's); can be repeated",
     )
 
 
@@ -189,8 +188,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--calibration": dict(
             type=Path,
             metavar="FILE",
-            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2, or YAML of OpenCV or "
-            "ORB-SLAM (calib.txt, without distortion)",
+            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2, or YAML of OpenCV, "
+            "ORB-SLAM or Kalibr (calib.txt, without distortion)",
         ),
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
@@ -248,8 +247,28 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         **_shared("--frames", "--invert", "--scale-gate", "--spread", "--fill"),
         **MASK_OPTIONS,
         **_shared("--output"),
-        "--labels": _source("labels", "label maps, any size"),
-        "--masks": _source("masks", "masks, 255 keeps keypoints, 0 ignores them"),
+        "--labels": _source(
+            "labels",
+            "[NAME=]DIR[:IDS]",
+            "folder with a subfolder NN of label maps for each sequence, with these ids instead of those that "
+            "--ids names",
+        ),
+        "--masks": _source(
+            "masks",
+            "[NAME=]DIR",
+            "folder with a subfolder NN of masks for each sequence, 255 keeps keypoints, 0 ignores them",
+        ),
+        "--keypoints": _source(
+            "keypoints",
+            "[NAME=]FILE.py",
+            "Python file, which is executed, with your function detect(frame, settings, mask) or "
+            "track(previous, current, points, settings)",
+        ),
+        "--paths": _source(
+            "paths",
+            "[NAME=]DIR",
+            "folder with the path NN.txt of another system for each sequence, in KITTI's or TUM's format, metres",
+        ),
         "--widths": dict(
             type=settings.list_of_widths,
             nargs="+",

@@ -1,5 +1,6 @@
 """Cameras of own frames, with distortion as OpenCV describes it."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ def read_camera(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Camera matrix, (3, 3) pixels, and distortion coefficients in OpenCV's order, (n,).
 
     The file holds the numbers of NAMES, or is a YAML file as OpenCV's calibration or ORB-SLAM has
-    it. Raises InputError for any other file, such as that of a fisheye camera.
+    it, or Kalibr for cam0. Raises InputError for any other file, such as that of a fisheye camera.
     """
     text = text_of(path)
     try:
@@ -28,13 +29,19 @@ def read_camera(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         numbers = np.empty(0)
     if len(numbers) < 4 or len(numbers) in (5, 6, 7):
         raise InputError(
-            f"{path}: must hold {' '.join(NAMES[:-1])}, or be YAML of OpenCV's calibration or ORB-SLAM"
+            f"{path}: must hold {' '.join(NAMES[:-1])}, or be YAML of OpenCV's calibration, ORB-SLAM or "
+            "Kalibr (pinhole, radtan)"
         )
     fx, fy, cx, cy = numbers[:4]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), numbers[4:]
 
 
 def _numbers_of_yaml(text: str) -> np.ndarray:
+    # Kalibr's; OpenCV does not read all its lists
+    fields = dict(re.findall(r"(\w+): *\[?([^]\n]*)", text.partition("cam1:")[0]))
+    if (fields.get("camera_model"), fields.get("distortion_model")) == ("pinhole", "radtan"):
+        numbers = fields.get("intrinsics", ""), fields.get("distortion_coeffs", "")
+        return np.array(",".join(numbers).split(","), np.float64)
     if not text.startswith("%YAML"):  # OpenCV reads only files that begin with it
         text = f"%YAML:1.0\n---\n{text}"
     file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)

@@ -8,8 +8,8 @@ the runs. With the settings THESIS, the result equals that of PySLAM of August 2
 On some frames PySLAM crashes; here a rule says what happens. Doubtful frames get a flag. "Kept"
 means that the pose does not change:
 
-- black, overexposed or without contrast: "flat frame", skipped. The next motion is measured from the
-  last frame before it, over the sum of the step lengths
+- black, overexposed or without contrast: "flat frame", skipped. The next motion is measured from
+  the last frame before it, over the sum of the step lengths
 - no new keypoint (mask all zero, say): "no keypoints", the tracked points are tracked further
 - no point to track: "no points", kept; starts again from this frame's keypoints
 - too few correspondences: "fewer than five correspondences", kept

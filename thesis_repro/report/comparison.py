@@ -3,6 +3,8 @@
 They compare masks with all keypoints, with controls and with masks from other sources.
 """
 
+from itertools import product
+from math import floor, log10
 from typing import Any
 
 import numpy as np
@@ -14,12 +16,16 @@ from thesis_repro.report import style, texts
 from thesis_repro.report.style import BASELINE, MASKED
 from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import ESTIMATORS
+from thesis_repro.study.methods import ERRORS
+from thesis_repro.study.sources import UNMASKED
 
+BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls
 # methods in the figure, few enough for a small screen; the table has all
-SHOWN = ("masked", "corrected", "mirrored", "spread")
+SHOWN = (*BROUGHT, "corrected", "mirrored", "spread")
 REACHES = (2, 4, 8, 16, 64)  # of the figure's axis, which goes from 1 / reach to reach
 # columns of the failed runs of a method and of its reference, "2 of 40"
 FAILED = {"failed runs": "failed", "failed runs of the reference": "reference_failed"}
+NEUTRAL_ESTIMATORS = ESTIMATORS | {"thesis": "vote of all points"}  # for a table in another paper
 CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one width for all"}
 
 
@@ -31,11 +37,8 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
     one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge. With
     several sources of masks the figure shows only their masks.
     """
-    rows = _tested(_over_all_keypoints(table))
+    rows = _shown(table)
     rows = rows[rows["method"].isin(SHOWN) & rows["metric"].isin(compare.JUDGING_METRICS)]
-    if rows["source"].nunique() > 1:  # controls of every source would be dozens of rows
-        rows = rows[rows["method"] == "masked"]
-    rows = rows.assign(label=_labels(rows))
     order = list(rows["label"].unique())
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
     metrics = [name for name in compare.JUDGING_METRICS if (rows["metric"] == name).any()]
@@ -95,6 +98,14 @@ def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
     return table[(table["reference"] == "baseline") & (table["method"] != "baseline")]
 
 
+def _shown(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of `compare.comparisons` for figures and tables of errors, with labels."""
+    rows = _tested(_over_all_keypoints(table))
+    if rows["source"].nunique() > 1:  # controls of every source would be dozens of rows
+        rows = rows[rows["method"].isin(BROUGHT)]
+    return rows.assign(label=_labels(rows))
+
+
 def _tested(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of the tested width.
 
@@ -107,14 +118,15 @@ def _tested(rows: pd.DataFrame) -> pd.DataFrame:
 def _labels(rows: pd.DataFrame) -> pd.Series:
     """Label each row with its method and the width of its masks.
 
-    If there are several sources, the label begins with the row's source.
+    If there are several sources, the label begins with the row's source. Own keypoints and paths
+    are labelled with the name of their source.
     """
-    width = rows["dilation_width"].where(rows["method"] == "masked")
+    width = rows["dilation_width"].where(rows["method"] == "masked").astype(object)
     width = width.map(", width {:g}".format, na_action="ignore").fillna("")
     labels = rows["method"].map(compare.METHODS) + width
-    if rows["source"].nunique() > 1:
-        labels = rows["source"] + ": " + labels
-    return labels
+    if len(compare.sources(rows)) > 1:
+        labels = (rows["source"] + ": " + labels).str.removeprefix(": ")  # all keypoints have none
+    return labels.mask(rows["method"].isin(UNMASKED), rows["source"])
 
 
 def _sequences(table: pd.DataFrame) -> list[str]:
@@ -123,30 +135,32 @@ def _sequences(table: pd.DataFrame) -> list[str]:
 
 
 def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each source: the answer of a study (`compare.primary_comparison`).
+    """Return one row for each source: the answer of a study, see `compare.primary_comparison`.
 
-    The columns are the mean number of keypoints that the masks leave and that of all, the ratio of
-    each judging metric, the verdict, and the control that does not use the classes in the frame and
-    has the lowest ratio of the first judging metric.
+    The columns are the mean number of keypoints that the source leaves and that of all, the ratio
+    of each judging metric, the verdict, and the control that does not use the classes in the frame
+    and has the lowest ratio of the first judging metric.
     """
-    judged = compare.primary_comparison(table)
-    estimator = compare.judging_estimator(judged)
+    estimator = compare.judging_estimator(table)
     total = compare.of_method(runs, "baseline", estimator)["mean_keypoints"].mean()
-    controls = _tested(_over_all_keypoints(table))
-    controls = controls[controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
-    controls = controls[controls["estimator"] == estimator]
+    over_all = _over_all_keypoints(table[table["estimator"] == estimator])
+    judged = over_all[over_all["tested"] & over_all["metric"].isin(compare.JUDGING_METRICS)]
+    judged = judged[judged["method"].isin(BROUGHT)]
     first_metric = next(iter(compare.JUDGING_METRICS))
-    controls = controls[controls["metric"] == first_metric]
+    controls = _tested(over_all[over_all["metric"] == first_metric])
+    controls = controls[controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
     rows = []
     for source, pair in judged.groupby("source", sort=False):
         first = pair.iloc[0]
         row = {
-            "masks": source,
+            "source": source,
             "keypoints": f"{first['keypoints']:.0f} instead of {total:.0f}",
             **{compare.METRICS[line["metric"]]: _short(line) for _, line in pair.iterrows()},
             "verdict": compare.overall(pair["verdict"]),
             **{name: first[column] for name, column in FAILED.items()},
         }
+        if first["method"] == "paths":
+            row["keypoints"] = ""
         of_source = controls[controls["source"] == source]
         for _, best in of_source.nsmallest(1, "ratio").iterrows():
             row["best control"] = f"{compare.METHODS[best['method']]} {texts.number(best['ratio'])}"
@@ -164,7 +178,8 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     sequence's ratio of the first metric.
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
-    rows = rows.assign(label=_labels(rows))
+    numbers = rows["keypoints"].round().astype("Int64")  # missing for paths of another system
+    rows = rows.assign(label=_labels(rows), keypoints=numbers)
     sequences = _sequences(table)
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
     lines = []
@@ -179,7 +194,7 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
             {
                 "estimator": ESTIMATORS[first["estimator"]],
                 "keypoints": first["label"],
-                "number": round(first["keypoints"]),
+                "number": first["keypoints"],
                 "over": over,
                 "sequences": pair["n"].max(),
                 **_ratios_and_counts(pair),
@@ -213,6 +228,37 @@ def _ratios_and_counts(pair: pd.DataFrame) -> dict[str, Any]:
 
 def _short(row: dict[str, Any] | pd.Series) -> str:
     return texts.ratio(row).replace(f"{compare.LEVEL} % CI ", "")
+
+
+def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the errors of the methods of the figure and of all keypoints, one column a sequence.
+
+    There is a row for each judging metric, estimator and method. A cell has the mean and the
+    standard deviation over the repetitions, "0.0103 ± 0.0021". The lowest mean of a sequence is
+    bold, as Markdown has it: "**0.0103 ± 0.0021**".
+    """
+    labels = [compare.METHODS["baseline"], *_shown(table)["label"].unique()]
+    parts = {}
+    for metric, estimator in product(compare.JUDGING_METRICS, NEUTRAL_ESTIMATORS):
+        rows = runs[runs["estimator"] == estimator].dropna(subset=[metric])
+        errors = rows.groupby([_labels(rows), "sequence"])[metric]
+        means = errors.mean().unstack().reindex(labels)
+        cells = errors.agg(_mean_and_spread).unstack().reindex(labels)
+        cells = cells.mask(means == means.min(), "**" + cells + "**")
+        error = ERRORS[metric]
+        parts[f"{error.title} ({error.unit})", NEUTRAL_ESTIMATORS[estimator]] = cells.dropna(
+            how="all"
+        )
+    return pd.concat(parts, names=["error", "estimator", "method"]).reset_index()
+
+
+def _mean_and_spread(errors: pd.Series) -> str:
+    """Return "0.0103 ± 0.0021", or only the mean of a single error."""
+    mean = errors.mean()
+    digits = max(0, 2 - floor(log10(max(mean, 1e-9))))  # after the point, for three that are not 0
+    if len(errors) == 1:
+        return f"{mean:.{digits}f}"
+    return f"{mean:.{digits}f} ± {errors.std():.{digits}f}"
 
 
 def table_widths(runs: pd.DataFrame) -> pd.DataFrame:

@@ -11,6 +11,7 @@ import pandas as pd
 from thesis_repro.report import texts
 from thesis_repro.study import best_width, compare
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
+from thesis_repro.study.sources import UNMASKED
 
 # what the template of the findings says of every comparison, whatever was run
 OF_COMPARISONS = {
@@ -52,6 +53,7 @@ def text(
     deciding = [label for name, label in compare.JUDGING_METRICS.items() if name in measured]
     both_masked = (table["method"] == "masked") & (table["reference"] == "masked")
     once = table["source"] < table["reference_source"]  # each pair of sources
+    unmasked = table["method"].isin(UNMASKED)
     return texts.render(
         "findings.md.j2",
         **OF_COMPARISONS,
@@ -66,7 +68,7 @@ def text(
         estimators_run=set(table["estimator"]),
         sources=[_source_values(runs, table, source) for source in with_masks],
         procedure=procedure,
-        against_each_other=table[both_masked & once & _judging(table)].to_dict("records"),
+        others=table[(both_masked & once | unmasked) & _judging(table)].to_dict("records"),
     )
 
 

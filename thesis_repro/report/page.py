@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
-from thesis_repro.report import tables, texts
+from thesis_repro.report import texts
 from thesis_repro.running.settings import ROOT
 
 PAGE = "index.html"
@@ -102,12 +102,14 @@ def text_content(text: str) -> Content:
 
 
 def _table_content(files: list[Path]) -> Content:
-    """Return a table. files: its CSV file and, if it was written, its Markdown file."""
-    table = tables.read(files[0])
+    """Return a table. files: its CSV file and its Markdown file."""
+    text = files[1].read_text(encoding="utf-8")
+    table = text.partition("\n\n")[0]  # without the data note
+    rows = table.count("\n") - 1
     markdown = None
-    if len(table) <= ROWS_SHOWN and len(files) > 1:
-        markdown = files[1].read_text(encoding="utf-8")
-    return Content(tables.html(table), rows=len(table), markdown=markdown)
+    if rows <= ROWS_SHOWN:
+        markdown = text
+    return Content(texts.html(table), rows=rows, markdown=markdown)
 
 
 def made_with() -> dict[str, Any]:

@@ -3,6 +3,7 @@
 Tables are also written as LaTeX and figures as PDF, for use in a paper.
 """
 
+import re
 from collections.abc import Collection
 from pathlib import Path
 
@@ -16,15 +17,16 @@ from thesis_repro.errors import one_line
 from thesis_repro.mask_files import LabelMasks, label_map_of
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, keypoints, metrics
-from thesis_repro.report import comparison, findings, page, paths, style, tables
+from thesis_repro.report import comparison, findings, page, paths, style
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, methods, runner
 from thesis_repro.study.jobs import ESTIMATORS
-from thesis_repro.study.sources import KINDS, FileMasks, Source
+from thesis_repro.study.sources import KINDS, UNMASKED, FileMasks, Source
 from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
+FIT = 4  # columns of errors across a page, in letters that can be read
 
 
 @style.applied()
@@ -43,9 +45,11 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     masks = [
         f"{source.name} ({KINDS[source.kind]}{changed[source.name]})" for source in study.sources
     ]
-    note = one_line(f"odometry: {data}; masks: {', '.join(masks)}")
+    note = one_line(f"odometry: {data}; compared: {', '.join(masks)}")
     write_paths(study, runs, folder)
-    figures = {"sources": figure_sources(study, runs)}
+    figures = {}
+    if (runs["method"] == "masked").any():
+        figures["sources"] = figure_sources(study, runs)
     for sequence in study.opened:
         figures[f"paths-{sequence.name}"] = figure_paths(study, runs, sequence, folder)
     # for texts and tables
@@ -59,12 +63,15 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         "summary": comparison.table_summary(table, runs),
         "comparison": comparison.table_comparison(table),
         "widths": comparison.table_widths(runs),
-        "errors": tables.table_errors(runs),
+        "errors": comparison.table_errors(table, runs),
     }
     for name, rows in numbers.items():
+        text = latex(rows)
+        if name == "errors":
+            text = latex_errors(rows)
         if name == "summary" and len(rows):  # one column a source fits into a column of text
-            rows = rows.set_index("masks").T.rename_axis("masks").reset_index()
-        write_text(folder / f"{name}.tex", f"% {note}\n{latex(rows)}")
+            text = latex(rows.set_index("source").T.rename_axis("source").reset_index())
+        write_text(folder / f"{name}.tex", f"% {note}\n{text}")
     numbers["runs"] = runs.round(6)  # hundreds of pages in LaTeX
     names = style.save_all(figures, numbers, folder, note)
     widths = sorted(runs["dilation_width"].dropna().astype(int).unique())
@@ -101,11 +108,30 @@ def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
 
 
 def latex(table: pd.DataFrame) -> str:
-    """Return a table as LaTeX, as wide as a column of text; it needs booktabs and graphicx."""
+    """Return a table as LaTeX, no wider than a column of text; it needs booktabs and graphicx.
+
+    A text between ** is bold.
+    """
     if table.empty:
         return ""
     text = table.to_latex(index=False, na_rep="", escape=True, float_format="{:g}".format)
-    return f"\\resizebox{{\\linewidth}}{{!}}{{%\n{text}}}\n"
+    text = re.sub(r"\*\*(.*?)\*\*", r"\\textbf{\1}", text).replace("±", r"$\pm$")
+    width = r"\ifdim\width>\linewidth\linewidth\else\width\fi"
+    return f"\\resizebox{{{width}}}{{!}}{{%\n{text}}}\n"
+
+
+def latex_errors(table: pd.DataFrame) -> str:
+    """Return `comparison.table_errors` as LaTeX: tables of at most FIT sequences.
+
+    Each table has one error and one estimator, which stand in a line above it.
+    """
+    parts = []
+    for (error, estimator), rows in table.groupby(["error", "estimator"], sort=False):
+        sequences = rows.columns.drop(["error", "estimator", "method"])
+        for first in range(0, len(sequences), FIT):
+            columns = ["method", *sequences[first : first + FIT]]
+            parts.append(f"\\noindent {error}, {estimator}\\par\n{latex(rows[columns])}")
+    return "\n".join(parts)
 
 
 def shown_width(study: Study) -> int | None:
@@ -120,8 +146,9 @@ def shown_width(study: Study) -> int | None:
 
 def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
     """Return each sequence with the masks of each source, at the `shown_width`."""
+    sources = [source for source in study.sources if source.kind not in UNMASKED]
     return [
-        (sequence, [source.masks(sequence, shown_width(study)) for source in study.sources])
+        (sequence, [source.masks(sequence, shown_width(study)) for source in sources])
         for sequence in study.opened
     ]
 
@@ -160,13 +187,13 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
 
 
 def figure_paths(study: Study, runs: pd.DataFrame, sequence: Sequence, folder: Path) -> Figure:
-    """Draw a path with all keypoints and one with each source's masks, shifted as for the RMSE."""
+    """Draw the path with all keypoints and that of each source, shifted as for the RMSE."""
     widths = runs["dilation_width"]
     rows = runs[
         (runs["sequence"] == sequence.name)
         & (runs["repetition"] == 0)
         & (runs["estimator"] == compare.judging_estimator(runs))
-        & runs["method"].isin(["baseline", "masked"])
+        & runs["method"].isin(["baseline", "masked", *UNMASKED])
         & (widths.isna() | (widths == shown_width(study)))
     ]
     shown = {}

@@ -285,11 +285,15 @@ def _rounded(number: re.Match) -> str:
 
 
 def save_table(table: pd.DataFrame, folder: Path, name: str, note: str) -> None:
-    """Write folder/name.csv and folder/name.md with the data note under the Markdown table."""
+    """Write folder/name.csv and folder/name.md with the data note under the Markdown table.
+
+    A text between ** is bold in Markdown.
+    """
     # spreadsheets take a text that begins so for a formula
-    cells = table.replace("^([=+@-])", r"'\1", regex=True)
+    cells = table.replace({r"^([=+@-])": r"'\1", r"\*\*": ""}, regex=True)
     write_text(folder / f"{name}.csv", cells.to_csv(index=False, lineterminator="\n"))
-    write_text(folder / f"{name}.md", f"{markdown(table)}\n{in_markdown(note)}\n")
+    text = markdown(table).replace(r"\*\*", "**")
+    write_text(folder / f"{name}.md", f"{text}\n{in_markdown(note)}\n")
 
 
 def save_all(

@@ -15,7 +15,7 @@ from typing import Any
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.odometry import THESIS, OdometrySettings, estimators
 from thesis_repro.study.methods import MASK_CONTROLS, METHODS, OF_LABEL_MAPS, true_labels
-from thesis_repro.study.sources import Source
+from thesis_repro.study.sources import UNMASKED, Source
 
 # Pixels: the dilation width of Section 3.6 and Figures 3.6 and 4.5, at which masks are tested. It
 # was fixed before any run. (The code of appendix A.8 dilates by 5, audit row 26.)
@@ -101,7 +101,7 @@ def first_jobs(
     widths: pixels, for masks from label maps, by estimator: {"thesis": range(1, 16)}.
     tested: width (pixels) of the controls, None for no controls; it is added to the widths of every
     estimator.
-    sources: of masks. All keypoints are run once for all sources.
+    sources: of masks, keypoints or paths. All keypoints are run once for all sources.
     """
     all_widths = set(chain(*widths.values()))
     if tested:
@@ -110,6 +110,11 @@ def first_jobs(
     for sequence in sequences:
         jobs += repeated([Job(sequence.name, "baseline")], widths, repetitions)
         for source in sources:
+            if source.kind in UNMASKED:
+                times = {"paths": 1}.get(source.kind, repetitions)  # a path has nothing to shuffle
+                job = Job(sequence.name, source.kind, source=source.name)
+                jobs += repeated([job], widths, times)
+                continue
             widths_of_source: list[Any] = [None]  # of ready-made masks
             if source.has_label_maps:
                 widths_of_source = sorted(all_widths)
@@ -158,15 +163,18 @@ def in_passes(
 
     Each of several workers gets about PIECES passes, so that all end at about the same time. Jobs
     with the same keypoints stay in one pass, where they share most of their work. A single worker
-    gets one pass a sequence.
+    gets one pass a sequence. Own keypoints and paths share nothing.
     """
     groups: dict[Job, list[Job]] = {}
+    passes: list[list[Job]] = []
     for job in jobs:
+        if job.method in UNMASKED:
+            passes.append([job])
+            continue
         same_keypoints = replace(job, estimator="", repetition=0)
         groups.setdefault(same_keypoints, []).append(job)
     # work is measured in frames, of which a group of jobs reads each once
     work = sum(len(sequences[key.sequence]) for key in groups)
-    passes: list[list[Job]] = []
     for name, sequence in sequences.items():
         groups_of_sequence = [group for key, group in groups.items() if key.sequence == name]
         size = len(groups) or 1

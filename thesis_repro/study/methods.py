@@ -187,6 +187,8 @@ class Method(NamedTuple):
 METHODS = {  # in the order in which they are shown
     "baseline": Method("all keypoints", has_masks=False),
     "masked": Method("masks"),
+    "keypoints": Method("own keypoints", has_masks=False),  # these two as sources.KINDS has them
+    "paths": Method("path of another system", has_masks=False),
     "exact-boundaries": Method(
         "exact class boundaries", settings=partial(replace, boundaries="exact")
     ),

@@ -31,7 +31,7 @@ from thesis_repro.study.methods import (
     min_distance,
     true_labels,
 )
-from thesis_repro.study.sources import Source, by_name
+from thesis_repro.study.sources import UNMASKED, Source, by_name
 from thesis_repro.study.workers import open_pool
 
 # rooms whose code decides the results
@@ -298,10 +298,16 @@ def _run_pass(
             if masks is not None:
                 settings = replace(settings, **masked_settings)
             runs[job.name] = settings, masks
-        run_results = odometry.run_many(sequence, runs)
+        if jobs[0].method in UNMASKED:
+            source = sources[jobs[0].source]
+            run_results = {name: source.run(sequence, own) for name, (own, _) in runs.items()}
+        else:
+            run_results = odometry.run_many(sequence, runs)
         for job in masks_by_job:
             frames = run_results[job.name].frames
-            if frames["detected"].isna().all():  # the path is a point, whatever the method
+            if (
+                frames["detected"].isna().all() and job.method != "paths"
+            ):  # the path is a point, whatever the method
                 reasons[job] = (
                     f"{sequence.folder}: no frame has any structure (all are black, white or of "
                     "one gray); check how they were written"

@@ -1,31 +1,44 @@
-"""The sources of a study's masks: one or several folders of label maps or of ready-made masks."""
+"""What a user brings to a study: masks, keypoints or the paths of another system."""
 
 import re
+import runpy
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TypeAlias
 
-from thesis_repro import mask_files
+import numpy as np
+import pandas as pd
+
+from thesis_repro import mask_files, odometry
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence
+from thesis_repro.data.trajectories import have_times, read_poses, read_poses_at
 from thesis_repro.errors import InputError
 from thesis_repro.mask_files import LabelMasks, MaskFolder, read_mask
 from thesis_repro.masks import MaskSettings
 from thesis_repro.running import results
-from thesis_repro.running.files import listed
+from thesis_repro.running.files import images, listed
 
-KINDS = {"labels": "label maps", "masks": "masks"}
+KINDS = {
+    "labels": "label maps",
+    "masks": "masks",
+    "keypoints": "own keypoints",
+    "paths": "paths of another system",
+}
+UNMASKED = ("keypoints", "paths")  # kinds without masks; their methods have the same names
 FileMasks: TypeAlias = LabelMasks | MaskFolder  # both have `paths`, the files that they read
 
 
 @dataclass(frozen=True)
 class Source:
-    """A source of masks.
+    """A source of masks, or of runs without masks.
 
     folder: holds one folder for each sequence or, for a single sequence, the files themselves.
     kind: "labels" for label maps of any size, whose boundaries are dilated; "masks" for masks of
-    the frames' size.
+    the frames' size; "keypoints" for a Python file (`own_calls`) in place of the folder; "paths"
+    for a folder with a file of poses for each sequence.
     name: used in the names of its runs; empty if there is only one source.
     settings: how masks are made from label maps. invert: swap kept and ignored pixels of ready-made
     masks.
@@ -63,13 +76,70 @@ class Source:
         else:
             read_mask(path, size)
 
+    def file(self, sequence: str) -> Path:
+        """Return the file of the keypoints, or of the path of a sequence."""
+        if self.kind == "keypoints":
+            return self.folder
+        paths = [path for path in listed(self.folder, "*") if path.stem == sequence]
+        if len(paths) != 1:
+            raise InputError(
+                f"{self.folder}: must hold one path of sequence {sequence}, such as {sequence}.txt, in "
+                "KITTI's or TUM's format"
+            )
+        return paths[0]
+
+    def read(self, sequence: Sequence) -> odometry.Calls | np.ndarray:
+        """Return the `own_calls` of keypoints, or the `own_path` of a sequence."""
+        if self.kind == "keypoints":
+            return own_calls(self.folder)
+        return own_path(self.file(sequence.name), sequence)
+
+    def run(self, sequence: Sequence, settings: odometry.OdometrySettings) -> odometry.Result:
+        """Return the run with own keypoints, or a path as if it were a run."""
+        brought = self.read(sequence)
+        if isinstance(brought, odometry.Calls):
+            return odometry.run(sequence, settings, calls=brought)
+        steps = [odometry.Step(index, pose=pose) for index, pose in enumerate(brought)]
+        return odometry.Result(brought, pd.DataFrame([step.row() for step in steps]))
+
     def record(self, sequence: str) -> dict[str, str]:
         """Return the digests and settings that the results of a sequence depend on."""
+        if self.kind in UNMASKED:
+            return {self.kind: results.digest_of_file(self.file(sequence))}
         digest = results.digest_of_files(listed(self.sequence_folder(sequence)))
         if self.has_label_maps:
             settings = {"settings": str(self.settings), **label_ids.record(self.settings.ids)}
             return {self.kind: digest, **settings}
         return {self.kind: digest, "invert": str(self.invert)}
+
+
+@cache
+def own_calls(path: Path) -> odometry.Calls:
+    """Return the odometry's calls with the functions that a Python file defines in their places.
+
+    Raises InputError if it defines none of them, and what its code raises.
+    """
+    defined = runpy.run_path(str(path))
+    own = {name: defined[name] for name in odometry.Calls._fields if name in defined}
+    if not own:
+        raise InputError(f"{path}: must define a function detect or track")
+    return odometry.OPENCV._replace(**own)
+
+
+def own_path(path: Path, sequence: Sequence) -> np.ndarray:
+    """Return the path of another system, (n, 4, 4), metres, moved to where the odometry starts.
+
+    The file has poses with times, or one for each frame; those after the sequence's last frame are
+    left out. Raises InputError if a frame has no pose.
+    """
+    if have_times(path):
+        _, poses = read_poses_at(path, sequence.times)
+    else:
+        poses = read_poses(path)
+    # a study may use only the first frames
+    if len(poses) not in (len(sequence), len(images(sequence.frame_paths[0].parent))):
+        raise InputError(f"{path}: {len(poses)} poses for {len(sequence)} frames; each needs one")
+    return odometry.start_pose(sequence) @ np.linalg.inv(poses[0]) @ poses[: len(sequence)]
 
 
 def by_name(sources: Path | Iterable[Source]) -> dict[str, Source]:
@@ -86,11 +156,16 @@ def named(
 ) -> tuple[Source, ...]:
     """Return sources from (kind, name, folder). Without a name, that of the folder is used.
 
-    settings: for all masks from label maps. invert: for all ready-made masks.
+    settings: for all masks from label maps; a folder of them may name its ids, as in FOLDER:train.
+    invert: for all ready-made masks.
     Raises InputError for a name that cannot be a folder's name, and for equal names.
     """
     sources: list[Source] = []
     for kind, given_name, folder in folders:
+        of_source = settings
+        path, colon, ids = str(folder).rpartition(":")
+        if colon and kind == "labels" and not folder.is_dir():  # a folder's name may have a colon
+            folder, of_source = Path(path), replace(settings, ids=ids)
         if given_name is not None and not re.fullmatch(r"[\w+-]+( [\w+-]+)*", given_name):
             raise InputError(
                 f"--{kind} {given_name}={folder}: a name has letters, digits, '_', '+', '-' and single "
@@ -101,10 +176,10 @@ def named(
         # some file systems ignore case
         if name.lower() in [source.name.lower() for source in sources]:
             raise InputError(
-                f"--{kind} {folder}: two folders of masks would be called {name!r}; give one another name, "
+                f"--{kind} {folder}: two sources would be called {name!r}; give one another name, "
                 f"--{kind} NAME={folder}"
             )
-        sources.append(Source(folder.absolute(), kind, name, settings, invert and kind == "masks"))
+        sources.append(Source(folder.absolute(), kind, name, of_source, invert and kind == "masks"))
     return tuple(sources)
 
 
@@ -119,6 +194,10 @@ def check(
     """
     for source in sources:
         kind = KINDS[source.kind]
+        if source.kind in UNMASKED:
+            for sequence in sequences:
+                source.read(sequence)
+            continue
         if not source.folder.is_dir():
             raise InputError(
                 f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence"

@@ -17,7 +17,7 @@ RUNS = "runs"  # folder of the results of the runs
 
 @dataclass(frozen=True)
 class Study:
-    """One or several sources of masks, compared with all keypoints.
+    """One or several sources of masks, own keypoints or paths, compared with all keypoints.
 
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
@@ -83,9 +83,10 @@ class Study:
                 repetitions=self.repetitions,
             )
             first = run_jobs(first_jobs)
-            if not (first.table["method"] == "masked").any():
+            if (first.table["method"] == "baseline").all():
                 raise InputError(
-                    "every run with masks failed (see above), so there is nothing to compare"
+                    "every run but those with all keypoints failed (see above), so there is nothing to "
+                    "compare"
                 )
             if not self.tested:
                 return first
