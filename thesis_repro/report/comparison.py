@@ -111,8 +111,8 @@ def _labels(rows: pd.DataFrame) -> pd.Series:
     If there are several sources, the label begins with the row's source. Own keypoints and paths
     are labelled with the name of their source.
     """
-    width = rows["dilation_width"].where(rows["method"] == "masked").astype(object)
-    width = width.map(", width {:g}".format, na_action="ignore").fillna("")
+    width = rows["dilation_width"].where(rows["method"] == "masked")
+    width = width.map(", width {:g}".format, na_action="ignore").astype(object).fillna("")
     labels = rows["method"].map(compare.METHODS) + width
     if len(compare.sources(rows)) > 1:
         labels = (rows["source"] + ": " + labels).str.removeprefix(": ")  # all keypoints have none
