@@ -33,7 +33,7 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
 
     Grey dots are its sequences, the coloured mark is their geometric mean with its interval. The
     figure has one row of panels for each estimator. Its columns are the judging metrics and the
-    thesis's RMSE. With several sources it shows only these, not the controls.
+    thesis's RMSE. With several sources of masks it shows no controls.
     """
     rows = _shown(table)
     order = list(rows["label"].unique())
@@ -91,7 +91,8 @@ def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
 def _shown(table: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of `compare.comparisons` for figures and tables of errors, with labels."""
     rows = _tested(_over_all_keypoints(table))
-    if rows["source"].nunique() > 1:  # controls of every source would be dozens of rows
+    sources_of_masks = rows.loc[rows["method"] == "masked", "source"]
+    if sources_of_masks.nunique() > 1:  # controls of every source would be dozens of rows
         rows = rows[rows["method"].isin(BROUGHT)]
     return rows.assign(label=_labels(rows))
 
