@@ -139,7 +139,11 @@ def _other_runs(settings, sequences, others):
     """Return {source: runs with its masks} on the sequences that a source has label maps of."""
     listed = {}
     for source in others:
-        covered = [each.name for each in sequences if source.sequence_folder(each.name).is_dir()]
+        covered = [
+            each.name
+            for each in sequences
+            if mask_files.folder_of_sequence(source.folder, each.name).is_dir()
+        ]
         if not covered:
             wanted = ", ".join(each.name for each in sequences)
             raise InputError(f"{source.folder}: holds no folder of label maps of {wanted}")

@@ -146,6 +146,10 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     pieces = report_study.latex_errors(table).split("\\end{tabular}")[:-1]
     assert len(pieces) == 12 and all("{lllll}" in piece or "{llll}" in piece for piece in pieces)
     assert sum(piece.count("\\textbf{") for piece in pieces) == 44
+    paths = runs[runs["method"] == "baseline"].assign(method="paths", source="slam")
+    beside = pd.concat([runs_of(ELEVEN, halved, noise=0.2, sources=("net",)), paths])
+    shown = comparison.table_errors(compare.comparisons(beside), beside)
+    assert len(shown) == len(table) + 4 and "slam" in set(shown["method"])
     once = runs[runs["repetition"] == 0]
     single = comparison.table_errors(compare.comparisons(once), once)
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)

@@ -227,8 +227,9 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     errors: dict[str, float | None] = dict.fromkeys(ERRORS)
     if sequence.has_truth:
         values = metrics.errors(result.poses, sequence.poses).values()
-        measured = dict(zip(ERRORS, values, strict=True))
-        errors |= {name: value for name, value in measured.items() if value == value}  # not NaN
+        errors |= {
+            name: value for name, value in zip(ERRORS, values, strict=True) if value == value
+        }  # not NaN
     mean_keypoints = 0.0
     detected = result.frames["detected"].dropna()
     if len(detected):  # no frame may have structure
@@ -248,8 +249,7 @@ def _odometry_settings(options: Any) -> dict[str, Any]:
     """The settings of the odometry that options of their names and --spread give."""
     from thesis_repro.odometry import OdometrySettings
 
-    names = [field.name for field in fields(OdometrySettings)]
-    given = {name: vars(options).get(name) for name in names}
+    given = {field.name: vars(options).get(field.name) for field in fields(OdometrySettings)}
     settings = {name: value for name, value in given.items() if value is not None}
     if options.spread:
         if "max_keypoints" in settings:

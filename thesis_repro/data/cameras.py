@@ -40,8 +40,8 @@ def _numbers_of_yaml(text: str) -> np.ndarray:
     # Kalibr's; OpenCV does not read all its lists
     fields = dict(re.findall(r"(\w+): *\[?([^]\n]*)", text.partition("cam1:")[0]))
     if (fields.get("camera_model"), fields.get("distortion_model")) == ("pinhole", "radtan"):
-        numbers = fields.get("intrinsics", ""), fields.get("distortion_coeffs", "")
-        return np.array(",".join(numbers).split(","), np.float64)
+        numbers = f"{fields.get('intrinsics')},{fields.get('distortion_coeffs')}"
+        return np.array(numbers.split(","), np.float64)
     if not text.startswith("%YAML"):  # OpenCV reads only files that begin with it
         text = f"%YAML:1.0\n---\n{text}"
     file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)

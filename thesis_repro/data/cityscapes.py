@@ -120,9 +120,8 @@ def pairs(root: str | Path, split: str, limit: int | None = None) -> list[Pair]:
     root = Path(root)
     if (root / "leftImg8bit").is_dir():  # one folder a city
         image_folder = root / "leftImg8bit" / split
-        label_folder = root / "gtFine" / split
         images = _by_name(image_folder, "*/*", "_leftImg8bit.png")
-        labels = _by_name(label_folder, "*/*", "_gtFine_labelIds.png")
+        labels = _by_name(root / "gtFine" / split, "*/*", "_gtFine_labelIds.png")
     elif (root / split).is_dir():
         image_folder = root / split
         images = _by_name(image_folder, "*", ".png")

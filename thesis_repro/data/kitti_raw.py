@@ -70,7 +70,7 @@ def read_poses(folder: str | Path) -> np.ndarray:
     scanner_to_camera = _rigid_motion(calibration(folder, "velo_to_cam"), "R", "T")
     rectify = _rigid_motion(calibration(folder, "cam_to_cam"), "R_rect_00")
     to_camera = rectify @ (scanner_to_camera @ to_scanner)
-    measured = np.array([_numbers(path, None, 30)[:6] for path in _measurements(folder)])
+    measured = np.array([_numbers(path, "", 30)[:6] for path in _measurements(folder)])
     if not len(measured):
         raise InputError(f"{Path(folder) / OXTS}: holds no measurements, one file a frame")
     poses = _imu_poses(measured)
@@ -80,9 +80,9 @@ def read_poses(folder: str | Path) -> np.ndarray:
 def _rigid_motion(path: Path, rotation: str, translation: str | None = None) -> np.ndarray:
     """Return the 4x4 matrix of two lines of a calibration file; without the second, no shift."""
     motion = np.eye(4)
-    motion[:3, :3] = _numbers(path, rotation, 9).reshape(3, 3)
+    motion[:3, :3] = _numbers(path, f"{rotation}:", 9).reshape(3, 3)
     if translation is not None:
-        motion[:3, 3] = _numbers(path, translation, 3)
+        motion[:3, 3] = _numbers(path, f"{translation}:", 3)
     return motion
 
 
@@ -106,11 +106,8 @@ def _imu_poses(measured: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _numbers(path: Path, key: str | None, count: int) -> np.ndarray:
-    """Return the `count` numbers of a file's first line, or of its line `key`."""
-    prefix = ""
-    if key is not None:
-        prefix = f"{key}:"
+def _numbers(path: Path, prefix: str, count: int) -> np.ndarray:
+    """Return the `count` numbers of a file's first line that begins with a prefix."""
     lines = [line for line in text_of(path).splitlines() if line.startswith(prefix)]
     try:
         numbers = np.array(lines[0].removeprefix(prefix).split(), np.float64)

@@ -35,7 +35,7 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
     Grey dots are the sequences, the coloured mark is their typical ratio with its interval. The
     figure has one row of panels for each estimator and one column for each judging metric, all with
     one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge. With
-    several sources of masks the figure shows only their masks.
+    several sources of masks it shows no controls.
     """
     rows = _shown(table)
     rows = rows[rows["method"].isin(SHOWN) & rows["metric"].isin(compare.JUDGING_METRICS)]
@@ -101,7 +101,8 @@ def _over_all_keypoints(table: pd.DataFrame) -> pd.DataFrame:
 def _shown(table: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of `compare.comparisons` for figures and tables of errors, with labels."""
     rows = _tested(_over_all_keypoints(table))
-    if rows["source"].nunique() > 1:  # controls of every source would be dozens of rows
+    sources_of_masks = rows.loc[rows["method"] == "masked", "source"]
+    if sources_of_masks.nunique() > 1:  # controls of every source would be dozens of rows
         rows = rows[rows["method"].isin(BROUGHT)]
     return rows.assign(label=_labels(rows))
 
@@ -121,8 +122,8 @@ def _labels(rows: pd.DataFrame) -> pd.Series:
     If there are several sources, the label begins with the row's source. Own keypoints and paths
     are labelled with the name of their source.
     """
-    width = rows["dilation_width"].where(rows["method"] == "masked").astype(object)
-    width = width.map(", width {:g}".format, na_action="ignore").fillna("")
+    width = rows["dilation_width"].where(rows["method"] == "masked")
+    width = width.map(", width {:g}".format, na_action="ignore").astype(object).fillna("")
     labels = rows["method"].map(compare.METHODS) + width
     if len(compare.sources(rows)) > 1:
         labels = (rows["source"] + ": " + labels).str.removeprefix(": ")  # all keypoints have none

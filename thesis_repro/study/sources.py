@@ -11,12 +11,12 @@ from typing import TypeAlias
 import numpy as np
 import pandas as pd
 
-from thesis_repro import mask_files, odometry
+from thesis_repro import odometry
 from thesis_repro.data import label_ids
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import have_times, read_poses, read_poses_at
 from thesis_repro.errors import InputError
-from thesis_repro.mask_files import LabelMasks, MaskFolder, read_mask
+from thesis_repro.mask_files import LabelMasks, MaskFolder, folder_of_sequence, read_mask
 from thesis_repro.masks import MaskSettings
 from thesis_repro.running import results
 from thesis_repro.running.files import images, listed
@@ -55,10 +55,6 @@ class Source:
         """Whether masks are made from label maps, so that they have a dilation width."""
         return self.kind == "labels"
 
-    def sequence_folder(self, sequence: str) -> Path:
-        """Return the folder with the files of one sequence."""
-        return mask_files.folder_of_sequence(self.folder, sequence)
-
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
         """Return the masks of a sequence. dilation_width: pixels, for masks from label maps.
 
@@ -80,13 +76,7 @@ class Source:
         """Return the file of the keypoints, or of the path of a sequence."""
         if self.kind == "keypoints":
             return self.folder
-        paths = [path for path in listed(self.folder, "*") if path.stem == sequence]
-        if len(paths) != 1:
-            raise InputError(
-                f"{self.folder}: must hold one path of sequence {sequence}, such as {sequence}.txt, in "
-                "KITTI's or TUM's format"
-            )
-        return paths[0]
+        return self.folder / f"{sequence}.txt"
 
     def read(self, sequence: Sequence) -> odometry.Calls | np.ndarray:
         """Return the `own_calls` of keypoints, or the `own_path` of a sequence."""
@@ -106,7 +96,7 @@ class Source:
         """Return the digests and settings that the results of a sequence depend on."""
         if self.kind in UNMASKED:
             return {self.kind: results.digest_of_file(self.file(sequence))}
-        digest = results.digest_of_files(listed(self.sequence_folder(sequence)))
+        digest = results.digest_of_files(listed(folder_of_sequence(self.folder, sequence)))
         if self.has_label_maps:
             settings = {"settings": str(self.settings), **label_ids.record(self.settings.ids)}
             return {self.kind: digest, **settings}
@@ -203,7 +193,10 @@ def check(
                 f"{source.folder}: no such folder; it must hold a folder of {kind} for each sequence"
             )
         for sequence in sequences:
-            if len(sequences) > 1 and source.sequence_folder(sequence.name) == source.folder:
+            if (
+                len(sequences) > 1
+                and folder_of_sequence(source.folder, sequence.name) == source.folder
+            ):
                 raise InputError(
                     f"{source.folder}: holds the {kind} of one sequence, but {len(sequences)} are "
                     "asked for; put them into a folder for each, such as "
