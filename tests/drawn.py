@@ -72,10 +72,11 @@ class Watch:
             file.writelines(f"{line}\n" for line in lines)
 
     def wrap_functions_of_style(self, _):
-        style = sys.modules.get("thesis_repro.report.style")
-        if style is None or hasattr(style.save_figure, "__wrapped__"):
+        artefacts = sys.modules.get("thesis.artefacts")
+        if artefacts is None or hasattr(artefacts.style.save_figure, "__wrapped__"):
             return
-        save_figure, show_sliders = style.save_figure, style.with_sliders
+        style = artefacts.style
+        save_figure, show_sliders = style.save_figure, artefacts.with_sliders
 
         @functools.wraps(save_figure)
         def checked(figure, folder, name, note):
@@ -86,7 +87,7 @@ class Watch:
             self.with_sliders.append((draw, sliders))
             show_sliders(draw, **sliders)
 
-        style.save_figure, style.with_sliders = checked, remembered
+        style.save_figure, artefacts.with_sliders = checked, remembered
 
     def report_hidden(self, _):
         pyplot = sys.modules.get("matplotlib.pyplot")

@@ -1,6 +1,8 @@
 """Where a notebook finds the files of earlier ones, and where its figures and tables go."""
 
 import json
+from base64 import b64encode
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,3 +57,26 @@ def save_table(table: pd.DataFrame, name: str, folder: Path | None = None, note:
     """Save a table as CSV and Markdown, by default in the folder of the figures. note: as above."""
     settings = read_settings()
     style.save_table(table, folder or settings.figures, name, note or settings.data_note)
+
+
+def with_sliders(draw: Callable[..., plt.Figure], **sliders: Any) -> None:
+    """Show the figure that `draw` returns, with sliders of ipywidgets for its arguments.
+
+    What shows no sliders, such as nbconvert or a repository's page, shows the first figure.
+    """
+    from IPython.core.pylabtools import print_figure
+    from IPython.display import display
+    from ipywidgets import Image, VBox
+
+    picture = Image(layout={"width": "720px"})
+
+    def redraw(_: Any = None) -> None:
+        values = {name: slider.value for name, slider in sliders.items()}
+        picture.value = print_figure(draw(**values), dpi=150)
+        plt.close()
+
+    for slider in sliders.values():
+        slider.observe(redraw, "value")
+    redraw()
+    both = VBox([*sliders.values(), picture])._repr_mimebundle_()
+    display(both | {"image/png": b64encode(picture.value).decode()}, raw=True)

@@ -20,8 +20,8 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from thesis import captions, thesis_tables, trainings
-from thesis_repro.report import page, tables, texts
+from thesis import captions, tables, thesis_tables, trainings
+from thesis_repro.report import page, texts
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import atomic, listed, write_text
 from thesis_repro.running.settings import ROOT, Settings, read_settings

@@ -4,14 +4,34 @@
 `thesis_tables`.
 """
 
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from thesis import thesis_tables
 from thesis.captions import REPORTED
-from thesis_repro.report.tables import IMPROVED, three_digits
 from thesis_repro.study import compare
+
+IMPROVED = "sequences improved"  # a row of counts
+
+
+def three_digits(value: float) -> float:
+    """Round a number to three significant digits."""
+    return float(f"{value:.3g}")
+
+
+def read(path: Path) -> pd.DataFrame:
+    """Read a CSV file as a table with nullable integers.
+
+    Returns an empty table if the file does not exist.
+    """
+    if not path.is_file():
+        return pd.DataFrame()
+    # a name may look like a number or a missing value
+    texts = dict.fromkeys(("sequence", "masks", "source"), str)
+    table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""])
+    return table.convert_dtypes()
 
 
 def table_4_1(runs: pd.DataFrame, reported_as: str) -> pd.DataFrame:

@@ -1,23 +1,20 @@
 """Figures of chapter 2 and of frames show the numbers of the data and can be read.
 
-Also the axes that figures share, and the video of the odometry.
+Also the axes that figures share.
 """
 
 import re
 from xml.etree import ElementTree
 
-import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from drawn import problems
 from matplotlib.text import Text
-from street import Street, Stripes
 
 from thesis import chapter2, chapter3, chapter4, flicker
 from thesis_repro.data.cityscapes import ID, LABELS
-from thesis_repro.odometry import Odometry
-from thesis_repro.report import paths, style, video
+from thesis_repro.report import paths, style
 
 
 def texts(figure):
@@ -185,52 +182,6 @@ def test_a_ratio_axis_has_a_few_round_ticks_within_it(low, high):
     assert all(
         float(axis.get_major_formatter()(tick)) == pytest.approx(tick, rel=1e-5) for tick in ticks
     )
-
-
-# The video
-
-BLUE = 178, 114, 0  # colour of the estimate in OpenCV's order
-
-
-@pytest.fixture
-def drive():
-    street = Street(4)
-    street.times = 0.1 * np.arange(4)
-    return street
-
-
-def painted(image, color):
-    return (image == np.array(color)).all(axis=2)
-
-
-def test_a_frame_shows_kept_and_discarded_keypoints(drive):
-    mask = Stripes(60)[0]
-    odometry = Odometry(drive.intrinsics)
-    odometry.step(drive.frame(0), mask=mask)
-    step = odometry.step(drive.frame(1), 0.4, mask)
-    image = video.draw_frame(drive.frame(1), step, mask=mask)
-    inside = cv2.erode(mask, np.ones((7, 7))) > 0  # away from the edges, which dots cross
-    outside = cv2.dilate(mask, np.ones((7, 7))) == 0
-    assert (
-        painted(image, video.KEPT)[inside].sum() > 500
-        and not painted(image, video.KEPT)[outside].any()
-    )
-    assert (
-        painted(image, video.DISCARDED)[outside].sum() > 500
-        and not painted(image, video.DISCARDED)[inside].any()
-    )
-    assert painted(image, video.OUTLINE).any() and painted(image, video.INLIER).any()
-
-
-def test_the_video_has_every_frame(drive, tmp_path):
-    video.write_video(tmp_path / "drive.webm", drive, masks=Stripes(60))
-    file = cv2.VideoCapture(str(tmp_path / "drive.webm"))
-    assert int(file.get(cv2.CAP_PROP_FOURCC)) == cv2.VideoWriter_fourcc(*"VP80")
-    frames = [frame for got, frame in iter(file.read, (False, None))]
-    assert [frame.shape for frame in frames] == [(280, 480, 3)] * 4
-    for frame, picture in zip(frames, video.pictures(drive, masks=Stripes(60)), strict=True):
-        assert np.abs(frame.astype(int) - picture).mean() < 15  # other frames differ by more
-    assert [file.name for file in tmp_path.iterdir()] == ["drive.webm"]
 
 
 def test_the_last_bits_of_coordinates_do_not_change_a_file(tmp_path):

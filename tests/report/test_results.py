@@ -14,7 +14,6 @@ from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, findings, style, texts
 from thesis_repro.report import study as report_study
-from thesis_repro.report import tables as report_tables
 from thesis_repro.study import compare
 from thesis_repro.study.jobs import ESTIMATORS
 
@@ -321,7 +320,7 @@ def test_names_stay_names_in_texts_and_tables(tmp_path):
     assert read.count("<td") == 3 * len(HOSTILE) and f"<p>{shown[0]}</p>" in read
     assert all(read.count(f">{name}</td>") == 2 for name in shown)
     # a spreadsheet must not calculate with it, and the page shows it as it is in the file
-    table = report_tables.read(tmp_path / "table.csv")
+    table = tables.read(tmp_path / "table.csv")
     in_file = [name.encode(errors="backslashreplace").decode() for name in HOSTILE]
     in_file[HOSTILE.index("=1+1")] = "'=1+1"
     assert list(table["sequence"]) == list(table["masks"]) == in_file

@@ -21,7 +21,6 @@ def words(small_world, small_labels, tmp_path):
         folder = tmp_path / output
         return {
             "path": thesis(*odometry, "--output", f"{output}/path.txt"),
-            "video": thesis(*odometry, "--video", f"{output}/drive.webm"),
             "study": thesis(*study, "--repetitions", 1, "--output", output),
             "figures": [*make, f"BUILD={folder}/build", f"FIGURES={folder}/figures"],
         }[name]

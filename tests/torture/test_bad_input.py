@@ -55,7 +55,6 @@ REFUSED = f"""
 {LABELLED} --masks masks -> --masks
 {ODOMETRY} --plot {FRAMES}/../new.png -> new.png
 {ODOMETRY} --tum kitti/sequences/00/../new.txt -> ../new.txt
-{MASKED} --video masks/new.mp4 -> masks/new.mp4
 {MASKS[:-3]}kitti/masks -> kitti/masks
 study --kitti kitti --labels labels --output labels/study -> labels/study
 odometry --kitti kitti --sequence 77 -> sequences/77

@@ -56,7 +56,6 @@ def disk(tmp_path):
     "name, kilobytes",
     [
         ("path", 0),
-        long("video", 0),
         long("study", 40),
     ],
 )
@@ -179,7 +178,7 @@ def without_network():
 def test_odd_names_and_no_network_work_and_data_is_only_read(folder, tmp_path):
     root, out = folder.rename(tmp_path.with_name(ODD)), tmp_path / f"out {ODD}"
     kitti, labels = ["--kitti", root / "kitti"], ["--labels", root / "labels"]
-    drawn = ["--plot", out / f"{ODD}.svg", "--video", out / f"{ODD}.webm"]
+    drawn = ["--plot", out / f"{ODD}.svg"]
     masks = ["--masks", out / f"masks {ODD}"]
     quick = ["--repetitions", 1, "--widths", 2, 3, "--jobs", 1, "--controls", 3]
     before = snapshot(root)

@@ -22,7 +22,6 @@ OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "output": ("poses in KITTI format", ()),
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
-    "video": ("video", (".webm",)),
 }
 # settings of the odometry that a study changes in runs with masks only; --scale-gate is for all
 OF_MASKED = ("choice", "max_keypoints", "fill")
@@ -114,10 +113,6 @@ def odometry(options: Any) -> None:
     steps = len(sequence), result.failed_steps, result.dropped_steps
     _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
     record = _record(result, sequence)
-    if options.video:
-        from thesis_repro.report import video
-
-        video.write_video(options.video, sequence, settings, masks)
     if options.plot:
         from thesis_repro.report import paths, style
 

@@ -228,11 +228,6 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="FILE",
             help="draw the paths and their errors (.png, .svg, .pdf, .jpg)",
         ),
-        "--video": dict(
-            type=Path,
-            metavar="OUT.webm",
-            help="write a video of the frames, the keypoints and the path",
-        ),
         "--json": dict(action="store_true", help="print JSON instead of text"),
     },
     "study": {

@@ -1,1 +1,1 @@
-"""Tables, figures, texts, videos and pages of the results."""
+"""Tables, figures, texts and pages of the results."""

@@ -4,8 +4,7 @@ Figures are written as SVG or WebP, tables as CSV and Markdown.
 """
 
 import re
-from base64 import b64encode
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
@@ -161,29 +160,6 @@ def class_legend(figure: plt.Figure, *label_maps: np.ndarray, also: Iterable[Any
     rows = -(-len(handles) // 5)
     figure.set_figheight(figure.get_figheight() + 0.1 + 0.16 * rows)
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, markerscale=2)
-
-
-def with_sliders(draw: Callable[..., plt.Figure], **sliders: Any) -> None:
-    """Show the figure that `draw` returns, with sliders of ipywidgets for its arguments.
-
-    What shows no sliders, such as nbconvert or a repository's page, shows the first figure.
-    """
-    from IPython.core.pylabtools import print_figure
-    from IPython.display import display
-    from ipywidgets import Image, VBox
-
-    picture = Image(layout={"width": "720px"})
-
-    def redraw(_: Any = None) -> None:
-        values = {name: slider.value for name, slider in sliders.items()}
-        picture.value = print_figure(draw(**values), dpi=150)
-        plt.close()
-
-    for slider in sliders.values():
-        slider.observe(redraw, "value")
-    redraw()
-    both = VBox([*sliders.values(), picture])._repr_mimebundle_()
-    display(both | {"image/png": b64encode(picture.value).decode()}, raw=True)
 
 
 def ratio_axis(axis: Any, values: np.ndarray | list[float]) -> None:
