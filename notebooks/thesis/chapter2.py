@@ -49,17 +49,19 @@ def figure_2_02(
     _mark(figure, response_panel, pixel, 1, "response")
     _mark(figure, activation_panel, pixel, 1, "activation")
     field = patch[row - reach : row + reach + 1, column - reach : column + reach + 1]
-    products = field * kernel
-    sums = products.sum(axis=(0, 1))
+    # every number is rounded before it is used, so that a reader can check the sum
+    weights = kernel.astype(float).round(4)
+    products = (field * weights).round(2)
+    terms = np.array([bias, *products.sum(axis=(0, 1))]).round(2) + 0.0  # no -0.00
     show_numbers(lower[0], field[..., 0], "its receptive field x (marked)", ".0f")
-    show_numbers(lower[1], kernel[..., 0], "times the kernel's weights w", ".4f")
-    show_numbers(lower[2], products[..., 0], "is w x", ".2f")
+    show_numbers(lower[1], weights[..., 0], "times the kernel's weights w", ".4f")
+    show_numbers(lower[2], products[..., 0] + 0.0, "is w x", ".2f")
     remark = ""
-    if len(sums) > 1:
+    if len(terms) > 2:
         remark = " (above: the first channel)"
-    terms = " + ".join(f"{term:.2f}" for term in sums)
-    total = bias + sums.sum()
-    figure.supxlabel(f"y = b + Σ w x = {bias:.4f} + {terms} ≈ {total:.1f}{remark}", fontsize=9)
+    shown = " + ".join(f"{term:.2f}" if term >= 0 else f"({term:.2f})" for term in terms)
+    total = f"{terms.sum():.2f}{remark}; {feature_map[row, column]:.2f} before rounding"
+    figure.supxlabel(f"y = b + Σ w x = {shown} = {total}", fontsize=9)
     return figure
 
 
@@ -328,7 +330,7 @@ def show_numbers(
     image = values
     if colors is not None:
         image = colors
-    limit = 2 * np.abs(values).max()
+    limit = 2.0 * np.abs(values).max()
     style.show_image(axes, image, title, cmap="PuOr", vmin=-limit, vmax=limit)
     for (row, column), value in np.ndenumerate(values):
-        axes.text(column, row, format(value, form), ha="center", va="center")
+        axes.text(column, row, format(value, form), ha="center", va="center", fontsize=8)

@@ -89,7 +89,7 @@ def _time_jobs(
                     mask, mask_seconds = _timed(job_masks.__getitem__, index)
                 step = odometries[job].step(frame, scales[index], mask)
                 if index > 1:
-                    # Section 4.2 counts the odometry and the making of the mask, not the prediction
+                    # Section 4.2 counts the odometry and the masks; the network is not counted
                     seconds[job] += mask_seconds + sum(step.seconds.values())
     rows = [
         {
