@@ -261,6 +261,9 @@ def _draw_times(panel: plt.Axes, timed: pd.DataFrame) -> None:
         of_choice = timed[timed["choice"] == choice].sort_values("keypoints")
         look = style.line_style(index)
         panel.plot(of_choice["keypoints"], of_choice["milliseconds"], marker="o", **look)
+        if choice == "all":
+            (place,) = of_choice[["keypoints", "milliseconds"]].to_numpy()
+            panel.annotate("all", place, (-8, 0), textcoords="offset points", ha="right")
     panel.set_ylabel("CPU time a frame (ms)")
     panel.set_ylim(0)
 
