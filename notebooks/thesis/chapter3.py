@@ -4,13 +4,13 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 
 from thesis import frames
 from thesis_repro.data.cityscapes import Label
 from thesis_repro.masks import dilate
 from thesis_repro.report import style
-from thesis_repro.report.style import BLUE, ORANGE, SKY
+from thesis_repro.report.style import BLUE, ORANGE, RED, SKY
 
 
 def figure_3_03(
@@ -63,14 +63,32 @@ def figure_3_06(
     mask: np.ndarray,
     dilation_width: int,
 ) -> Figure:
-    """Figure 3.6: a frame, its predicted label map, its edges and the edges dilated."""
+    """Figure 3.6: a frame, its predicted label map, its edges and the edges dilated.
+
+    Below, the window with most edges is enlarged. It is marked in the frame and in the label map.
+    """
+    height, width = np.array(frame.shape) // 5
+    windows = [
+        np.s_[top : top + height, left : left + width]
+        for top in range(0, 4 * height, height // 2)
+        for left in range(0, 4 * width, width // 2)
+    ]
+    window = max(windows, key=lambda window: edge_image[window].sum())
     pictures = {
         "frame": frame,
         "predicted label map": style.label_colors(label_map, frame),
         "edges of the label map": edge_image,
         f"edges dilated by {dilation_width}x{dilation_width}": mask,
+        "edges in the marked part": edge_image[window],
+        "dilated edges in the marked part": mask[window],
     }
-    return frames.pictures(frame, pictures, columns=2, label_maps=[label_map])
+    figure = frames.pictures(frame, pictures, columns=2, label_maps=[label_map])
+    # lines of one pixel would drop out where the picture is reduced to the nearest pixels
+    figure.axes[2].images[0].set_interpolation("antialiased")
+    for panel in figure.axes[:2]:
+        corner = window[1].start, window[0].start
+        panel.add_patch(Rectangle(corner, width, height, fill=False, edgecolor=RED))
+    return figure
 
 
 def figure_masks(
