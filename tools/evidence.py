@@ -75,11 +75,10 @@ def write(settings, folder, others=()):
     lengths = ", ".join(f"{sequence.name} ({len(sequence)} frames)" for sequence in sequences)
     note = f"odometry: real KITTI frames, {lengths}; label maps by the model in the package"
     qualities = label_quality.table(runs, other_runs)
-    few_runs = few_keypoints.measure(
-        sequences, labels, settings.build / "few_keypoints", settings.jobs
-    )
+    few_folder = settings.build / "few_keypoints"
+    few_runs = few_keypoints.measure(sequences, labels, few_folder, settings.jobs)
     few = few_keypoints.table(few_runs)
-    times = few_keypoints.time_steps(sequences[0], labels)
+    times = few_keypoints.time_steps(sequences[0], labels, few_folder)
     streets = _streets(sequences)
     results.sweep(folder)
     for name in KEPT:

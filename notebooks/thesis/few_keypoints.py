@@ -135,12 +135,16 @@ def _measure_one(sequence: Sequence, labels: Path, file: Path, seeds: Iterable[i
     results.write_table(file, pd.DataFrame(rows))
 
 
-def time_steps(sequence: Sequence, labels: Path, frames: int = 40) -> pd.DataFrame:
+def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40) -> pd.DataFrame:
     """Return the CPU time (milliseconds) of a frame for each choice: its fastest of three runs.
 
     With the thesis's estimator, one thread and the mask made from its label map, without the
     network. Random choices are left out, because they are drawn from all detected keypoints.
+    folder: that of `measure`, which is called before. Times in it are not measured again.
     """
+    file = folder / sequence.name / "milliseconds.csv"
+    if file.is_file():
+        return pd.read_csv(file)
     cv2.setNumThreads(1)
     excerpt = sequence.subset(frames)
     rows = []
@@ -154,7 +158,9 @@ def time_steps(sequence: Sequence, labels: Path, frames: int = 40) -> pd.DataFra
             seconds.append(process_time() - start)
         milliseconds = round(1000 * min(seconds) / len(excerpt), 1)
         rows.append({"choice": choice, "number": number, "milliseconds": milliseconds})
-    return pd.DataFrame(rows)
+    times = pd.DataFrame(rows)
+    results.write_table(file, times)
+    return times
 
 
 def table(runs: pd.DataFrame) -> pd.DataFrame:
