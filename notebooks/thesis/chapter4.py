@@ -7,6 +7,7 @@ only run.
 Bands and error bars go from the lowest to the highest repetition.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,6 +21,7 @@ from thesis import frames, thesis_tables
 from thesis.flicker import View
 from thesis_repro.data.cityscapes import colorize
 from thesis_repro.odometry import THESIS
+from thesis_repro.odometry.keypoints import detect
 from thesis_repro.report import style, texts
 from thesis_repro.report.style import (
     BASELINE,
@@ -122,12 +124,21 @@ def figure_4_05(
 def figure_overview(
     frame: np.ndarray, all_keypoints: np.ndarray, mask: np.ndarray, kept_keypoints: np.ndarray
 ) -> plt.Figure:
-    """Draw all keypoints of a frame beside those on its mask; keypoints are (n, 2) pixels."""
+    """Draw all keypoints of a frame, those on its mask, and 200 that are spread over the frame.
+
+    Keypoints are (n, 2) pixels.
+    """
+    spread = detect(frame, replace(THESIS, choice="spread", max_keypoints=200))
     all_title = f"all {len(all_keypoints)} keypoints"
-    kept_title = f"the {len(kept_keypoints)} keypoints on the mask (light)"
-    dimmed = np.where(mask > 0, frame, frame // 3)
-    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints}
-    return frames.pictures(frame, {all_title: frame, kept_title: dimmed}, keypoints, columns=2)
+    kept_title = f"{len(kept_keypoints)} on the mask (light)"
+    spread_title = f"{len(spread)} spread over the frame"
+    pictures = {
+        all_title: frame,
+        kept_title: np.where(mask > 0, frame, frame // 3),
+        spread_title: frame,
+    }
+    keypoints = {all_title: all_keypoints, kept_title: kept_keypoints, spread_title: spread}
+    return frames.pictures(frame, pictures, keypoints, columns=3)
 
 
 MARKERS = "os^Dv"  # of lines, beside their colours and dashes
