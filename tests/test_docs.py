@@ -10,6 +10,7 @@ import pytest
 
 from thesis_repro.command import cli
 from thesis_repro.command.options import build_parser
+from thesis_repro.report import texts
 from thesis_repro.running.settings import ROOT
 
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -55,6 +56,7 @@ FEW = (
     "aligned ATE, thesis's estimator",
     "rotation error a frame, thesis's estimator",
 )
+SPREAD = {"how chosen": "spread over the frame", "keypoints": "200"}
 # (text, table on real frames, row, columns whose numbers the text gives)
 NUMBERS = [
     ("README.md", "comparison", {**MASKS, **ALL, **REFINED}, BOTH),
@@ -101,6 +103,10 @@ NUMBERS = [
     ("README.md", "table_4_2", {"sequence": "mean"}, ("change (%)", "change (%), one run each")),
     ("docs/answer.md", "table_4_2", {"sequence": "median"}, ("change (%)",)),
     ("README.md", "few_keypoints", {"how chosen": "all keypoints"}, ("keypoints",)),
+    *(
+        ("docs/answer.md", "few_keypoints", row, ("CPU time a frame (ms)",))
+        for row in ({"keypoints": "1894"}, SPREAD, {"keypoints": "790"})
+    ),
 ]
 
 
@@ -115,6 +121,36 @@ def test_numbers_in_texts_are_those_of_the_tables(text, table, row, columns):
             if table == "table_4_2":  # texts have one digit
                 shown = f"{float(number):.1f}"
             assert shown in words, f"{column}: {line[column]}"
+
+
+@pytest.mark.parametrize(
+    "quantity, metric",
+    [
+        ("half turned into over all keypoints", "rotation error in turns"),
+        ("half turned into over the other half", "rotation error in turns"),
+        ("far keypoints left out (parallax below 3 pixels), over all", BOTH[1]),
+        ("far keypoints left out (parallax below 3 pixels), over as many at random", BOTH[1]),
+        ("near keypoints left out (parallax of 20 pixels or more), over all", BOTH[1]),
+    ],
+)
+def test_the_answer_has_the_numbers_of_the_audit(quantity, metric):
+    rows = pd.read_csv(EVIDENCE / "audit.csv")
+    chosen = {"quantity": quantity, "metric": metric, "estimator": "refined"}
+    (row,) = rows[(rows[list(chosen)] == pd.Series(chosen)).all(axis=1)].to_dict("records")
+    shown = "{} ({}-{})".format(*(texts.number(row[end]) for end in ("value", "low", "high")))
+    assert shown in (ROOT / "docs/answer.md").read_text(encoding="utf-8")
+
+
+def test_texts_have_the_measured_times():
+    budget = pd.read_csv(EVIDENCE / "budget.csv").set_index("stage")
+    whole = budget.loc["all stages (ms)"]
+    odometry = budget.loc[["mask (ms)", "detection (ms)", "tracking (ms)", "pose (ms)"]].sum()
+    every, masked = odometry["all keypoints"], odometry["masked, width 10"]
+    saved, factor = round(100 - 100 * masked / every), whole["masked, width 10"] / whole.iloc[0]
+    answer = (ROOT / "docs/answer.md").read_text(encoding="utf-8")
+    assert f"{masked:.1f} ms a frame in place of {every:.1f} (-{saved} %" in answer
+    for text in (answer, (ROOT / "README.md").read_text(encoding="utf-8")):
+        assert f"{saved} %" in text and f"{factor:.1f} times as long" in text
 
 
 def test_the_first_training_is_that_of_the_comparison():

@@ -249,6 +249,7 @@ def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
             _draw_curves(panel, shown)
             panel.set_title(f"{ERRORS[error]}, {ESTIMATORS[estimator]}")
+            style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())
         panel_row[0].set_ylabel("ratio to all keypoints")
     if times is not None:
         numbers = rows.drop_duplicates(["choice", "number"])[["choice", "number", "keypoints"]]
@@ -287,8 +288,5 @@ def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
             position, of_choice["low"], of_choice["high"], color=look["color"], linewidth=0.9
         )
     panel.set_xscale("log")
-    panel.set_yscale("log")
     panel.set_xticks([50, 100, 200, 400, 800, 1900], ["50", "100", "200", "400", "800", "1900"])
-    panel.set_yticks([0.5, 1, 2, 5, 10], ["0.5", "1", "2", "5", "10"])
     panel.minorticks_off()
-    panel.set_ylim(0.45, 25)

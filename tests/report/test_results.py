@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from drawn import problems
 
-from thesis import chapter4, tables, thesis_tables
+from thesis import chapter4, few_keypoints, tables, thesis_tables
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, findings, style, texts
@@ -257,6 +257,22 @@ def test_the_comparison_figure_shows_ratios_and_their_interval():
     assert marker.get_xdata() == pytest.approx([row["ratio"]])
     # so that the ends of an interval shorter than the marker are seen
     assert interval.get_markersize() > 1.5 * marker.get_markersize()
+
+
+def test_the_curve_of_few_keypoints_shows_every_ratio():
+    rows = [
+        {"choice": choice, "number": number, "keypoints": number or 1900, "estimator": estimator}
+        | {"error": error, "ratio": 2.0, "low": 0.3, "high": 90.0 if number == 50 else 3.0}
+        for choice, number in (("all", 0), ("strongest", 50), ("strongest", 400))
+        for estimator in few_keypoints.ESTIMATORS
+        for error in few_keypoints.ERRORS
+    ]
+    times = pd.DataFrame({"choice": ["all"], "number": [0], "milliseconds": [50.0]})
+    figure = few_keypoints.figure(pd.DataFrame(rows), times)
+    assert problems(figure) == []
+    for panel in figure.axes[:4]:
+        low, high = panel.get_ylim()
+        assert low < 0.3 and high > 90
 
 
 def test_the_figure_of_paths_shows_repetitions_and_their_errors():

@@ -111,7 +111,9 @@ def first_jobs(
         jobs += repeated([Job(sequence.name, "baseline")], widths, repetitions)
         for source in sources:
             if source.kind in UNMASKED:
-                times = {"paths": 1}.get(source.kind, repetitions)  # a path has nothing to shuffle
+                times = repetitions
+                if source.kind == "paths":
+                    times = 1  # a path has nothing to shuffle
                 job = Job(sequence.name, source.kind, source=source.name)
                 jobs += repeated([job], widths, times)
                 continue

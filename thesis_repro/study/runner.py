@@ -305,9 +305,8 @@ def _run_pass(
             run_results = odometry.run_many(sequence, runs)
         for job in masks_by_job:
             frames = run_results[job.name].frames
-            if (
-                frames["detected"].isna().all() and job.method != "paths"
-            ):  # the path is a point, whatever the method
+            # without keypoints, the path is a point, whatever the method
+            if frames["detected"].isna().all() and job.method != "paths":
                 reasons[job] = (
                     f"{sequence.folder}: no frame has any structure (all are black, white or of "
                     "one gray); check how they were written"
