@@ -22,7 +22,7 @@ from thesis.flicker import View
 from thesis_repro.data.cityscapes import colorize
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import detect
-from thesis_repro.report import style, texts
+from thesis_repro.report import style
 from thesis_repro.report.style import (
     BASELINE,
     EDGE_COLOR,
@@ -141,6 +141,12 @@ def figure_overview(
     return frames.pictures(frame, pictures, keypoints, columns=3)
 
 
+def _two_digits(value: float) -> str:
+    """Return a number as text with two digits that are not zero, such as 0.0078."""
+    rounded = float(f"{value:.2g}")
+    return f"{rounded:g}"
+
+
 MARKERS = "os^Dv"  # of lines, beside their colours and dashes
 # around a keypoint of the frame before
 RING: dict[str, Any] = {"s": 34, "facecolors": "none", "edgecolors": PINK, "linewidths": 1.1}
@@ -224,7 +230,7 @@ def figure_paths(
         for difference in differences.values():
             above.update_datalim((true + factor * difference)[:, [0, 2]])
         _draw_estimates(above, below, true, differences, factor, runs)
-        mean, *span = map(texts.two_digits, errors.loc[name])
+        mean, *span = map(_two_digits, errors.loc[name])
         if len(runs) > 1:
             mean += f" ({'-'.join(span)})"
         enlarged = "errors not enlarged"

@@ -47,8 +47,8 @@ def figure_comparison(table: pd.DataFrame) -> Figure:
         len(estimators), len(metrics), squeeze=False, sharex=True, sharey=True, height=height
     )
     distances = rows[_sequences(table)].astype(float).map(np.log).abs().stack()
-    shown = [reach for reach in REACHES if (distances < np.log(reach)).mean() >= 0.9]
-    reach = (shown or REACHES[-1:])[0]
+    wide_enough = [reach for reach in REACHES if (distances < np.log(reach)).mean() >= 0.9]
+    reach = min(wide_enough, default=REACHES[-1])
     for panels, estimator in zip(axes, estimators, strict=True):
         panels[0].set_ylabel(ESTIMATORS[estimator])
         for panel, metric in zip(panels, metrics, strict=True):

@@ -21,7 +21,7 @@ OF_COMPARISONS = {
     "deciding_metrics": list(compare.JUDGING_METRICS),
     "too_few": compare.TOO_FEW,
     "fewest": compare.MIN_SEQUENCES,
-    "least": compare.MIN_FOR_INTERVAL,
+    "power": compare.POWER,
     "level": compare.LEVEL,
     "far": compare.FAR_OFF,
     "thesis_width": CONTROL_WIDTH,

@@ -47,11 +47,6 @@ def number(value: float) -> str:
     return f"{value:.{digits}f}"
 
 
-def two_digits(value: float) -> str:
-    """Return a number as text with two digits that are not zero, such as 0.0078."""
-    return f"{float(f'{value:.2g}'):g}"
-
-
 def ratio(row: dict[str, Any] | pd.Series) -> str:
     """Return "1.09 (95 % CI 0.98-1.32)" for a row with ratio, low and high.
 
