@@ -222,9 +222,8 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     errors: dict[str, float | None] = dict.fromkeys(ERRORS)
     if sequence.has_truth:
         values = metrics.errors(result.poses, sequence.poses).values()
-        errors |= {
-            name: value for name, value in zip(ERRORS, values, strict=True) if value == value
-        }  # not NaN
+        measured = dict(zip(ERRORS, values, strict=True))
+        errors |= {name: value for name, value in measured.items() if value == value}  # not NaN
     mean_keypoints = 0.0
     detected = result.frames["detected"].dropna()
     if len(detected):  # no frame may have structure
