@@ -256,7 +256,8 @@ def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 def _mean_and_spread(errors: pd.Series) -> str:
     """Return "0.0103 ± 0.0021", or only the mean of a single error."""
     mean = errors.mean()
-    digits = max(0, 2 - floor(log10(max(mean, 1e-9))))  # after the point, for three that are not 0
+    magnitude = max(mean, 1e-4)  # an error of 0 gets no more digits than a tenth of a millimetre
+    digits = max(0, 2 - floor(log10(magnitude)))  # after the point, for three that are not 0
     if len(errors) == 1:
         return f"{mean:.{digits}f}"
     return f"{mean:.{digits}f} ± {errors.std():.{digits}f}"
