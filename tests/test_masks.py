@@ -1,14 +1,23 @@
+import platform
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 
 from thesis_repro import mask_files, masks
-from thesis_repro.data.cityscapes import ID
+from thesis_repro.data.cityscapes import ID, resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.masks import MaskSettings
 
 SIZE = (376, 1240)
+# on x86_64
+RECORDED = {
+    "label map, enlarged": 3492872803,
+    "mask": 243009454,
+    "frame of the network": 1817078014,
+}
 
 
 def bands(*names):
@@ -184,11 +193,25 @@ def test_wrong_settings_are_named(setting, value):
 
 def test_the_thesis_mask_is_its_three_calls():
     label_map = streets()
-    enlarged = cv2.resize(label_map, SIZE[::-1])
+    enlarged = resize_bilinear(label_map, SIZE)
     for width in (1, 5, 10):
         expected = cv2.dilate(cv2.Canny(enlarged, 5, 15), np.ones((width, width), np.uint8))
         assert np.array_equal(masks.thesis_mask(label_map, SIZE, width), expected)
         assert np.array_equal(masks.keypoint_mask(label_map.astype(int), SIZE, width), expected)
+
+
+def test_frames_and_masks_have_the_recorded_bits_on_every_processor():
+    label_map = streets()
+    frame = np.random.default_rng(1).integers(0, 256, SIZE, np.uint8)
+    images = {
+        "label map, enlarged": resize_bilinear(label_map, SIZE),
+        "mask": masks.thesis_mask(label_map, SIZE, 10),
+        "frame of the network": resize_bilinear(frame, (320, 320)),
+    }
+    assert {name: zlib.crc32(image.tobytes()) for name, image in images.items()} == RECORDED
+    if platform.machine() == "x86_64":  # elsewhere OpenCV may round one channel differently
+        assert np.array_equal(images["label map, enlarged"], cv2.resize(label_map, SIZE[::-1]))
+        assert np.array_equal(images["frame of the network"], cv2.resize(frame, (320, 320)))
 
 
 def test_wrong_arguments_are_named(labelled):

@@ -10,7 +10,7 @@ from numbers import Integral
 import cv2
 import numpy as np
 
-from thesis_repro.data.cityscapes import ID, N_CLASSES
+from thesis_repro.data.cityscapes import ID, N_CLASSES, resize_bilinear
 from thesis_repro.errors import InputError
 
 CANNY = (5, 15)  # both thresholds (Section 3.6)
@@ -30,7 +30,7 @@ def canny_edges(
     Resizing is bilinear, which creates wrong ids along every boundary. Canny's gradients are those
     of ids, so it finds a boundary only if the two ids differ enough. Both are the thesis's way.
     """
-    enlarged = cv2.resize(label_map, size[::-1])
+    enlarged = resize_bilinear(label_map, size)
     return cv2.Canny(enlarged, *thresholds)
 
 

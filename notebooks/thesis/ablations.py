@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro import masks, odometry
-from thesis_repro.data.cityscapes import ID, read_label_map
+from thesis_repro.data.cityscapes import ID, read_label_map, resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
@@ -312,7 +312,7 @@ def boundaries(label_map: np.ndarray, size: tuple[int, int]) -> dict[str, float]
     and after a Gaussian.
     """
     nearest = cv2.resize(label_map, size[::-1], interpolation=cv2.INTER_NEAREST)
-    bilinear = cv2.resize(label_map, size[::-1])
+    bilinear = resize_bilinear(label_map, size)
     exact = masks.edges(label_map, size, EXACT) > 0
     edges = masks.edges(label_map, size)
     missed = masks.dilate(edges, 2 * NEAR + 1) == 0

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from thesis_repro import mask_files, masks, odometry
+from thesis_repro.data.cityscapes import resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.running.files import needed, progress, write_text
 from thesis_repro.running.settings import Settings, cores
@@ -198,7 +199,7 @@ def _segment(model: Any, frame: np.ndarray) -> np.ndarray:
     _, height, width, channels = model.input_shape
     if channels == 3:
         frame = cv2.cvtColor(frame, cv2.COLOR_GRAY2RGB)
-    image = cv2.resize(frame, (width, height)).reshape(height, width, channels)
+    image = resize_bilinear(frame, (height, width)).reshape(height, width, channels)
     return prediction.predict(model, image[None])[0]
 
 

@@ -153,8 +153,21 @@ def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> 
     channels: 1 for gray, as in the thesis; 3 for red, green, blue.
     """
     read = read_gray if channels == 1 else read_color
-    image = cv2.resize(read(path), (width, height))
+    image = resize_bilinear(read(path), (height, width))
     return image.reshape(height, width, channels)
+
+
+def resize_bilinear(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Resize an image, (h, w) or (h, w, 3) uint8, to (height, width): the same bits everywhere.
+
+    On ARM processors, OpenCV resizes a single channel by other code, whose result differs by up to
+    two gray levels. Two channels take the same code as on x86. There, `cv2.resize` of the image
+    alone gives the same bits.
+    """
+    if image.ndim == 3:
+        return cv2.resize(image, size[::-1])
+    twice = cv2.resize(cv2.merge([image, image]), size[::-1])
+    return cv2.extractChannel(twice, 0)
 
 
 def read_label_map(path: str | Path) -> np.ndarray:

@@ -8,6 +8,7 @@ import fcntl
 import hashlib
 import json
 import os
+import platform
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -175,11 +176,15 @@ def digest_of_code(*rooms: str) -> str:
 
 
 def made_with(*packages: str) -> dict[str, Any]:
-    """Return the versions of packages that results depend on; "opencv" is any of its four."""
+    """Return the machine and the versions of packages that results depend on.
+
+    "opencv" is any of its four. The machine is "x86_64" or "arm64", say: OpenCV and TensorFlow
+    round differently on other architectures.
+    """
     versions = {"opencv": cv2.__version__}
     for name in set(packages) - {"opencv"}:
         versions[name] = metadata.version(name)
-    return {"versions": versions}
+    return {"versions": versions, "machine": platform.machine()}
 
 
 def digest_of_files(paths: Iterable[str | Path]) -> str:
