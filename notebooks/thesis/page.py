@@ -52,10 +52,7 @@ def update(settings: Settings, folder: Path) -> None:
             if not html.is_file() or html.stat().st_mtime < path.stat().st_mtime:
                 write_text(html, notebook_html(path, folder / page.PAGE))
         write_text(folder / page.PAGE, build(settings))
-        gallery = texts.render(
-            "gallery.md.j2", settings=settings, chapters=_chapters(settings), page=page.PAGE
-        )
-        write_text(folder / GALLERY, gallery)
+        write_text(folder / GALLERY, gallery(settings))
 
 
 def _copy(settings: Settings, folder: Path) -> None:
@@ -158,39 +155,45 @@ def build(settings: Settings) -> str:
         if executed:
             latest = max(path.stat().st_mtime for path in executed)
             made["day"] = f"{datetime.fromtimestamp(latest, UTC):%d %B %Y}"
+    docs = _links_to_documents(settings)
+    answer = None
+    if docs and settings.figures_in_git:
+        answer = _answer(docs)
     return texts.render(
         "page.html.j2",
         title=f"Keypoint masks, {settings.run}",
         settings=settings,
-        network=trainings.network_note(settings),
         chapters=chapters,
         shown=sum(artefact["there"] for artefact in of_thesis),
         of=len(captions.THESIS),
         card=captions.CARD,
         missing=missing,
-        documents=_documents(settings),
+        docs=docs,
+        lead=answer,
         notebooks=notebooks,
         folder=os.path.relpath(settings.build / "notebooks", settings.figures),
         made=made,
     )
 
 
-def _documents(settings: Settings) -> dict[str, page.Content]:
-    """Return the texts of the folder docs that a page has, if links from it reach the folder."""
-    names = []
-    if settings.figures_in_git:
-        names.append("answer")
-    if settings.figures.is_relative_to(ROOT):
-        names.append("own-masks")
-    documents = {}
-    for name in names:
-        text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
-        # links are relative to docs
-        folder = quote(os.path.relpath(ROOT / "docs", settings.figures))
-        text = re.sub(r"\]\((?!\w+:|#)", f"]({folder}/", text)
-        _, _, without_title = text.partition("\n")
-        documents[name] = page.text_content(without_title)
-    return documents
+def gallery(settings: Settings) -> str:
+    """Return the gallery of a run as Markdown, made from the files in its folders."""
+    chapters = _chapters(settings)
+    return texts.render("gallery.md.j2", settings=settings, chapters=chapters, page=page.PAGE)
+
+
+def _links_to_documents(settings: Settings) -> str | None:
+    """Return the way from the page to the folder docs; None if the page may move without it."""
+    if not settings.figures.is_relative_to(ROOT):
+        return None
+    return quote(os.path.relpath(ROOT / "docs", settings.figures))
+
+
+def _answer(docs: str) -> Markup:
+    """Return the first paragraph of docs/answer.md. docs: the way to that folder."""
+    text = (ROOT / "docs" / "answer.md").read_text(encoding="utf-8")
+    paragraph = text.split("\n\n")[1]
+    return texts.html(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", paragraph))
 
 
 def _describe(
@@ -254,7 +257,7 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
     Their form is {name of the artefact: numbers}. A name is missing if its file was not written.
     """
     numbers: dict[str, Any] = {}
-    history = tables.read(settings.build / "model" / "history.csv")
+    history = tables.read(settings.figures / "figure_4_01.csv")
     if len(history):
         best = history.loc[history["val_loss"].idxmin()]
         last = history.iloc[-1]

@@ -19,7 +19,7 @@ ENDINGS = {"figure": (".svg", ".webp", ".pdf"), "table": (".csv", ".md", ".tex")
 # the files), title and caption.
 ARTEFACTS = json.loads((Path(__file__).parent / "captions.json").read_text(encoding="utf-8"))
 OPENING = ("findings", "figure-comparison", "table-summary")  # ids of those at the top of a page
-ROWS_SHOWN = 36  # of a table in a repository's gallery
+ROWS_SHOWN = 36  # of a table; a longer one is linked
 # packages that affect the numbers most
 PACKAGES = (
     "tensorflow",
@@ -90,7 +90,7 @@ class Content(NamedTuple):
     html: Markup | None = None
     details: Markup | None = None  # of a text: the part that the page folds
     rows: int = 0  # of a table
-    markdown: str | None = None  # of a table that is short enough for a gallery
+    markdown: str | None = None  # of a table that is short enough to be shown
 
 
 def text_content(text: str) -> Content:
