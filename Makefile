@@ -1,99 +1,106 @@
+# Works with GNU make from 3.81 on, which macOS has.
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
 PYTHON ?= python3
 BIN := .venv/bin
-# Settings reach Python as THESIS_REPRO_ variables: the known ones, and all on the command line, so that Python names a
-# misspelled one. Relative paths start here.
-SETTINGS := KITTI CITYSCAPES KITTI_SEMANTIC PROFILE BUILD FIGURES JOBS DASK_SCHEDULER \
-            IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES WIDTHS REPETITIONS
-GIVEN := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
-$(foreach name,$(filter-out PYTHON GPU LABELS CAMVID PSEUDO RUN MAKE% -%,$(sort $(SETTINGS) $(GIVEN))),\
-  $(if $($(name)),$(eval export THESIS_REPRO_$(name) = $$($(name)))))
-# Everything runs this checkout, without the user's settings of Python and Jupyter.
+# What is set on the command line reaches Python as THESIS_REPRO_ variables, and Python names a misspelled one.
+MINE := PYTHON GPU LABELS CAMVID PSEUDO LISTEN RUN
+given := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
+$(foreach name,$(filter-out $(MINE) MAKE% -%,$(sort $(given))),$(eval export THESIS_REPRO_$(name) := $(value $(name))))
+# Everything runs this checkout and its environment, without the user's settings of Python, pip and Jupyter.
 export PYTHONPATH := $(CURDIR):$(CURDIR)/notebooks
 export PYTHONWARNINGS := ignore
 export JUPYTER_NO_CONFIG := 1
+export JUPYTER_PREFER_ENV_PATH := 1
 export PYDEVD_DISABLE_FILE_VALIDATION := 1
-unexport PYTHONDONTWRITEBYTECODE PYTHONSTARTUP
+unexport PYTHONHOME PYTHONDONTWRITEBYTECODE PYTHONSTARTUP JUPYTER_PATH TF_USE_LEGACY_KERAS
 
-.PHONY: help setup figures notebooks evidence trainings test torture lint lab bench weights clean check-data FORCE
+.PHONY: help setup figures notebooks page evidence trainings test torture lint lab bench weights pins clean check-data FORCE
 help:
 	@echo "make figures     write every table and figure to figures/, from embedded data, or from KITTI=/path CITYSCAPES=/path"
 	@echo "                 (KITTI_SEMANTIC=/path: also test the label maps); size: PROFILE=smoke|lab|demo|thesis, or single:"
 	@echo "                 IMAGE_SIZE BASE_FILTERS BATCH_SIZE EPOCHS FRAMES=N|all WIDTHS=5,10|1-15 REPETITIONS; processes: JOBS"
 	@echo "make test, lint  run the tests, and every notebook with PROFILE=smoke; check format, style (Ruff) and types (mypy)"
-	@echo "make torture     run the tests of kills, faults and bad input (some minutes)"
-	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each)"
+	@echo "make torture     run the tests of kills, faults, bad input, and of the oldest and newest packages (some minutes)"
+	@echo "make lab         open copies of the notebooks in JupyterLab with PROFILE=lab (up to two minutes each);"
+	@echo "                 in a container LISTEN=0.0.0.0"
 	@echo "make check-data  check the folders KITTI=/path CITYSCAPES=/path KITTI_SEMANTIC=/path"
 	@echo "make evidence    make figures PROFILE=thesis from KITTI=/path, and keep what shows no frame; LABELS='/path /path'"
 	@echo "make trainings   after make figures: train nine more networks, and compare masks from all ten (half an hour)"
 	@echo "make bench       measure the relative cost of odometry and network (KITTI=/path), into build/bench.json"
 	@echo "make weights     train the shipped model anew into build/shipped, CAMVID=/path KITTI_SEMANTIC=/path PSEUDO=/path"
+	@echo "make page, pins  write the page anew from the figures in git; resolve the pins of environment.txt anew"
 	@echo "make setup       install the pinned packages into .venv (GPU=1: and CUDA); make clean: delete .venv and all results"
-# uv takes a third of pip's time, but ignores pip's settings, so pip is used if uv cannot reach a package index.
-install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --no-deps $(1) 2>/dev/null || \
-          $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-compile $(1)
+
+# uv takes a third of pip's time, but ignores pip's settings, so pip follows if uv reaches no index. The options in PIP
+# undo settings of pip that would install elsewhere.
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-user --target= --prefix=
+install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --no-deps $(1) || \
+          { echo "uv failed, so pip is used" && $(PIP) --no-deps --no-compile $(1); }
 setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
 .venv/ready: environment.txt pyproject.toml
+	@$(PYTHON) tools/can_install.py
 	@echo "installing the pinned packages into .venv (2.4 GB)" && $(PYTHON) -m venv .venv
-	@$(BIN)/pip install --quiet --disable-pip-version-check $$(grep -o '^uv==[0-9.]*' environment.txt) 2>/dev/null || true
+	@$(PIP) $$(grep -o '^uv==[0-9.]*' environment.txt)
 	@$(call install,-r environment.txt)
-	@$(call install,--no-build-isolation -e .) && touch $@
+	@$(call install,--no-build-isolation -e .)
+	@mkdir -p .venv/share/jupyter/lab/settings && touch $@ && \
+	echo '{"@jupyterlab/apputils-extension:notification": {"fetchNews": "false"}}' >.venv/share/jupyter/lab/settings/overrides.json
 .venv/ready-gpu: environment-gpu.txt .venv/ready
 	@$(call install,-r environment-gpu.txt) && touch $@
 
-# The notebooks that run independently of a failed one still run. Bars inside notebooks go to the terminal.
 figures: setup
-	@run=$$($(BIN)/python -m thesis_repro.running.settings) || exit; mkdir -p $$run/notebooks $$run/ipython; export IPYTHONDIR=$$(realpath $$run)/ipython; \
-	[ -t 2 ] && export THESIS_REPRO_PROGRESS=$$(tty <&2) || export THESIS_REPRO_PROGRESS=/dev/null; \
-	trap 'kill $$!; wait $$!; exit 130' INT TERM HUP; $(MAKE) -k $(if $(filter 1,$(JOBS)),,-j2) notebooks RUN=$$run & wait $$!; status=$$?; \
-	$(BIN)/python -m thesis.page && exit $$status
+	@$(BIN)/python -m thesis.figures
+page: setup
+	@$(BIN)/python -m thesis.page
 
+# Which notebook needs what; `thesis.figures` runs this with the folder of the run. A notebook is executed again if one that
+# it needs was, or if the code that it uses has changed. With real frames and no Cityscapes, the shipped model makes the
+# label maps, so nothing is rendered or trained.
 ifdef RUN
-# A notebook is executed again if one that it needs was, or if the code that it uses has changed. With real frames and no
-# Cityscapes, the shipped model makes the label maps, so nothing is rendered or trained.
 code = $(shell find $(1) -name '*.py')
 LEARNING := $(call code,thesis_repro/data thesis_repro/segmentation street_world)
 PATHS := $(call code,thesis_repro/data thesis_repro/masks.py thesis_repro/mask_files.py thesis_repro/odometry opencv_exact)
-EVERYTHING := $(filter-out %/page.py,$(call code,thesis_repro/study thesis_repro/report notebooks/thesis)) $(LEARNING) $(PATHS)
+DRAWING := $(filter-out %/page.py %/figures.py,$(call code,thesis_repro/study thesis_repro/report notebooks/thesis))
 NAMES := $(patsubst notebooks/%.ipynb,%,$(sort $(wildcard notebooks/*.ipynb)))
 NAMES := $(if $(or $(THESIS_REPRO_CITYSCAPES),$(if $(THESIS_REPRO_KITTI),,embedded)),$(NAMES),$(filter-out 01_% 02_% 04_%,$(NAMES)))
 executed = $(patsubst %,$(RUN)/notebooks/%.ipynb,$(filter $(addsuffix _%,$(1)),$(NAMES)))
+imports = $(wildcard $(patsubst %,notebooks/thesis/%.py,$(shell grep -ho 'from thesis import [a-z0-9_, ]*' $(1) | tr -d ,)))
+
 notebooks: $(NAMES:%=$(RUN)/notebooks/%.ipynb)
 $(call executed,01 02 03 04): $(LEARNING)
 $(call executed,05 06 07): $(LEARNING) $(PATHS)
-$(call executed,08 09): $(EVERYTHING)
+$(call executed,08 09): $(LEARNING) $(PATHS) $(DRAWING)
 $(call executed,02 04 05 09): $(call executed,01)
 $(call executed,04): $(call executed,02 03)
 $(call executed,05 09): $(call executed,04)
 $(call executed,06 07 08 09): $(call executed,05)
 $(call executed,07 08): $(call executed,06)
 $(call executed,09): $(call executed,08)
-# nbconvert writes under another name: a notebook that exists is done. The modules that it draws with are its imports.
-define execute
-$(RUN)/notebooks/$(1).ipynb: notebooks/$(1).ipynb $(RUN)/checked \
-  $(wildcard $(patsubst %,notebooks/thesis/%.py,$(shell grep -ho 'from thesis import [a-z0-9_, ]*' notebooks/$(1).ipynb | tr -d ,)))
-	@trap 'kill $$$$!; exit 130' INT TERM HUP; \
+$(foreach name,$(NAMES),$(eval $(call executed,$(name)): $(call imports,notebooks/$(name).ipynb)))
+
+# nbconvert writes under another name: a notebook that exists is done.
+$(RUN)/notebooks/%.ipynb: notebooks/%.ipynb $(RUN)/checked
+	@trap 'kill $$!; exit 130' INT TERM HUP; \
 	$(BIN)/jupyter nbconvert --to notebook --execute --ExecutePreprocessor.kernel_name=python3 \
-	  --ExecutePreprocessor.timeout=-1 --output-dir $$(@D) --output .$(1) $$< >$$(@:.ipynb=.log) 2>&1 & wait $$$$! \
-	&& mv $$(@D)/.$(1).ipynb $$@ && echo "$(1): done in $$$$SECONDS s" \
-	|| { echo "$(1) failed: $$$$(sed 's/\x1b\[[0-9;]*m//g' $$(@:.ipynb=.log) | grep . | tail -n 1) ($$(@:.ipynb=.log))" >&2; exit 1; }
-endef
-$(foreach name,$(NAMES),$(eval $(call execute,$(name))))
+	  --ExecutePreprocessor.timeout=-1 --output-dir $(@D) --output .$* $< >$(@:.ipynb=.log) 2>&1 & wait $$! \
+	&& mv $(@D)/.$*.ipynb $@ && echo "$*: done in $$SECONDS s" \
+	|| { echo "$* failed: $$(tr -d '\033' <$(@:.ipynb=.log) | sed 's/\[[0-9;]*m//g' | grep . | tail -n 1) ($(@:.ipynb=.log))" >&2; exit 1; }
 $(RUN)/checked: FORCE  # rewritten only if the data has changed
 	@$(BIN)/python -m thesis_repro.checks $@
 # Render the drives of the embedded world and compile the shared odometry while the network is trained, to save time.
 $(call executed,05): $(if $(THESIS_REPRO_KITTI),,$(RUN)/drives)
 $(RUN)/drives: $(call executed,01)
-	@nice $(BIN)/python -m street_world && nice $(BIN)/python -c 'import thesis_repro as tr; from thesis_repro.running import settings; tr.run_many(tr.Sequence(settings.read_settings().kitti, "00").subset(3), {"": (tr.OdometrySettings(estimator="refined"), None)})' && touch $@
+	@nice $(BIN)/python tools/drives.py && touch $@
 endif
+
 check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $${THESIS_REPRO_KITTI:+--kitti "$$THESIS_REPRO_KITTI"} \
 	  $${THESIS_REPRO_CITYSCAPES:+--cityscapes "$$THESIS_REPRO_CITYSCAPES"} $${THESIS_REPRO_KITTI_SEMANTIC:+--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC"}
 test: setup
-	@$(BIN)/python -m pytest -q -n $(shell nproc) --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 torture: setup
 	@$(BIN)/python -m pytest -q -m torture
 lint: setup
@@ -101,19 +108,22 @@ lint: setup
 # Lessons edit copies, so that the notebooks in git stay as they are. An edited copy is kept.
 LAB := $(or $(THESIS_REPRO_BUILD),build)/lab
 lab: setup
-	@mkdir -p "$(LAB)" && cp -rn notebooks/*.ipynb notebooks/thesis "$(LAB)"
+	@mkdir -p "$(LAB)" && cd notebooks && for path in *.ipynb thesis; do test -e "$(abspath $(LAB))/$$path" || cp -r $$path "$(abspath $(LAB))"; done
 	@echo "the notebooks are copies in $(LAB); delete one to get it anew"
-	@THESIS_REPRO_PROFILE=$(or $(PROFILE),lab) PYTHONPATH=$(CURDIR) $(BIN)/jupyter lab "$(LAB)" $(if $(filter 0,$(shell id -u)),--allow-root)
+	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH=$(CURDIR) $(BIN)/jupyter lab "$(LAB)" --log-level=ERROR \
+	  $(if $(LISTEN),--ip=$(LISTEN) --no-browser) $(if $(filter 0,$(shell id -u)),--allow-root)
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)
 	@$(BIN)/python tools/bench.py --kitti "$${THESIS_REPRO_KITTI:-build/world-demo/kitti}"
 evidence: setup
-	@$(MAKE) figures PROFILE=thesis
+	@THESIS_REPRO_PROFILE=thesis $(BIN)/python -m thesis.figures
 	@THESIS_REPRO_PROFILE=thesis $(BIN)/python tools/evidence.py $(foreach folder,$(LABELS),"$(folder)")
 trainings: setup
 	@$(BIN)/python tools/trainings.py
 weights: setup
 	@$(BIN)/python tools/train_shipped.py "$(CAMVID)" "$(KITTI_SEMANTIC)" "$(PSEUDO)" build/shipped
+pins: setup
+	@$(BIN)/python tools/pins.py
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find figures -mindepth 1 -maxdepth 1 -type d -not -name kitti_excerpts -not -name timings -exec rm -rf {} +

@@ -10,7 +10,6 @@ EXTRAS = {
         "h5py",
         "segmentation_models",
         "albumentations",
-        "psutil",
     ),
     "notebooks": ("IPython", "ipywidgets", "nbconvert", "nbformat", "latex2mathml", "livelossplot"),
     "cluster": ("dask", "distributed"),

@@ -3,9 +3,9 @@
 It needs no network or server. README.md beside it is a gallery of the same, for reading in a
 repository.
 
-`python -m thesis.page`, with the folder notebooks in PYTHONPATH, copies the figures
-and tables of the current run to the folder in which they are read, writes the page and the gallery
-there, and converts executed notebooks to HTML.
+`update` copies the figures and tables of a run to the folder in which they are read, writes page
+and gallery there, and converts executed notebooks to HTML. `make page` only writes page and
+gallery.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from thesis import captions, tables, thesis_tables, trainings
+from thesis import captions, tables, thesis_tables
 from thesis_repro.report import page, texts
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import atomic, listed, write_text
@@ -276,11 +276,11 @@ def beside_the_thesis(settings: Settings) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the page of the run of the current settings."""
+    """Write the page and the gallery anew from the figures in git."""
     settings = read_settings()
-    update(settings, settings.published)
-    if note := trainings.network_note(settings):
-        print(note)
+    settings = replace(settings, figures=settings.published)
+    write_text(settings.figures / page.PAGE, build(settings))
+    write_text(settings.figures / GALLERY, gallery(settings))
 
 
 if __name__ == "__main__":

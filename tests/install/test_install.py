@@ -13,6 +13,8 @@ import pytest
 from packaging.requirements import Requirement
 from trials import refused, run, snapshot, succeed
 
+import can_install
+from thesis_repro.running import results
 from thesis_repro.running.settings import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -49,11 +51,8 @@ def wheel(tmp_path_factory):
     return next((folder / "dist").glob("*.whl"))
 
 
-# The newest packages are nearly those of environment.txt, with which all other tests run.
-VERSIONS = ["lowest-direct", pytest.param("highest", marks=pytest.mark.torture)]
-
-
-@pytest.fixture(scope="module", params=VERSIONS)
+# minutes of downloads: a job of their own in CI, `pytest -m torture tests/install`
+@pytest.fixture(scope="module", params=["lowest-direct", "highest"])
 def installed(request, wheel, tmp_path_factory):
     """The folder of a new environment without the extras, but with OpenCV."""
     folder = tmp_path_factory.mktemp(request.param) / "environment"
@@ -65,7 +64,7 @@ def installed(request, wheel, tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_an_installed_package_runs_without_the_extras(
     installed, small_world, small_labels, tmp_path
 ):
@@ -113,7 +112,11 @@ def test_a_type_checker_sees_the_types_of_the_main_names(tmp_path):
     assert wrong == [("2", "arg-type"), ("3", "arg-type"), ("4", "attr-defined")]
 
 
-READY = ("-o", ".venv/ready")  # nothing is installed
+def plan(root, *options, **changes):
+    """What `make notebooks` would execute in a run's folder, from its output."""
+    where = succeed([sys.executable, "-m", "thesis_repro.running.settings"], root, **changes)
+    words = ["make", "-n", "-o", ".venv/ready", "notebooks", f"RUN={where.stdout.strip()}"]
+    return succeed([*words, *options], root, **changes).stdout
 
 
 @pytest.fixture
@@ -121,17 +124,51 @@ def checkout(tmp_path):
     """A folder with the Makefile, and an environment that make takes for its own."""
     for name in ("Makefile", "environment.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, tmp_path)
+    for name in ("thesis_repro", "street_world", "opencv_exact", "notebooks", "tools"):
+        (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / ".venv").symlink_to(sys.prefix)
     return tmp_path
 
 
 def test_make_reads_settings_from_its_arguments_and_the_environment(checkout):
-    for folder in ("thesis_repro", "street_world", "opencv_exact", "notebooks"):
-        (checkout / folder).symlink_to(ROOT / folder)
-    make = ["make", *READY, "figures", f"FIGURES={checkout}/figures"]  # -n writes its page, too
-    planned = succeed([*make, "-n", "PROFILE=smoke", "BUILD=mine"], checkout)
-    assert "mine/embedded-smoke/notebooks/01_load" in planned.stdout
-    planned = succeed([*make, "-n"], checkout, THESIS_REPRO_BUILD="other")
-    assert "other/embedded-demo/notebooks/01_load" in planned.stdout
-    refused = run([*make, "EPOCH=3"], checkout)
+    figures = ["make", "-o", ".venv/ready", "figures", f"FIGURES={checkout}/figures"]
+    before = snapshot(checkout)
+    planned = succeed([*figures, "-n", "PROFILE=smoke"], checkout)
+    assert "thesis.figures" in planned.stdout and snapshot(checkout) == before  # nothing is written
+    assert "/embedded-demo/notebooks/01_load" in plan(checkout, THESIS_REPRO_BUILD="other")
+    refused = run([*figures, "EPOCH=3"], checkout)
     assert refused.returncode == 2 and "error: EPOCH: " in refused.stderr
+
+
+def test_two_runs_in_one_folder_are_refused(checkout):
+    folders = {"PROFILE": "smoke", "BUILD": str(checkout / "b"), "FIGURES": str(checkout / "f")}
+    with results.claimed(checkout / "b" / "embedded-smoke" / "notebooks"):
+        words = [f"{name}={value}" for name, value in folders.items()]
+        second = run(["make", "-o", ".venv/ready", "figures", *words], checkout)
+    assert second.returncode == 2 and "another run uses it" in second.stderr
+    assert not list((checkout / "b").rglob("*.ipynb"))
+
+
+@pytest.mark.parametrize(
+    "version, system, machine, cure",
+    [
+        ((3, 10), "Linux", "x86_64", "PYTHON=python3.12"),
+        ((3, 14), "Darwin", "arm64", "PYTHON=python3.12"),
+        ((3, 12), "Darwin", "x86_64", "Dockerfile"),
+        ((3, 12), "Windows", "AMD64", "WSL"),
+        ((3, 13), "Darwin", "arm64", ""),
+        ((3, 11), "Linux", "aarch64", ""),
+    ],
+)
+def test_what_cannot_be_installed_is_said_with_its_cure(version, system, machine, cure):
+    line = can_install.reason(version, system, machine)
+    assert cure in line and bool(line) == bool(cure) and "\n" not in line
+
+
+def test_nothing_is_installed_if_the_python_does_not_fit(checkout, tmp_path):
+    (checkout / ".venv").unlink()
+    python = tmp_path / "python3.10"  # says so in place of tools/can_install.py
+    python.write_text("#!/bin/sh\necho error: cure >&2\nexit 1\n")
+    python.chmod(0o755)
+    failed = run(["make", "setup", f"PYTHON={python}"], checkout)
+    assert failed.returncode == 2 and "cure" in failed.stderr and failed.left == []

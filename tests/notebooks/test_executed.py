@@ -114,6 +114,7 @@ def test_make_figures_executes_no_notebook_twice(executed):
         ("thesis_repro/mask_files.py", {"05", "06", "07", "08", "09"}),
         ("street_world/street.py", {name[:2] for name in NOTEBOOKS}),
         ("notebooks/thesis/page.py", set()),
+        ("docs/answer.md", set()),
     ],
 )
 def test_what_changed_is_made_again(executed, changed, again):

@@ -36,7 +36,8 @@ def test_a_failing_notebook_does_not_stop_the_others(tmp_path):
 
 @pytest.mark.notebooks
 def test_real_frames_alone_need_no_training(tmp_path, tiny_kitti):
-    planned = make_figures(tmp_path, f"KITTI={tiny_kitti}", "-n")
+    options = f"KITTI={tiny_kitti}", f"RUN={tmp_path / 'run'}", "-n"
+    planned = make_figures(tmp_path, *options, target="notebooks")
     assert planned.returncode == 0, planned.stderr
     assert EXECUTED.findall(planned.stdout.replace("\\\n", "")) == [
         "03",

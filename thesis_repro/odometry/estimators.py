@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thesis_repro.odometry.types import Matches, Motion
+from thesis_repro.odometry.types import Matches, Motion, motion_of_vote
 
 
 class Entry(NamedTuple):
@@ -42,7 +42,7 @@ class VoteOfInliers:
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
         """Return the motion of a step (see odometry.Estimator)."""
         inliers = matches.inliers
-        votes, rotation, translation = self.calls.recover_pose(
+        voted = self.calls.recover_pose(
             essential, matches.current[inliers], matches.previous[inliers]
         )
-        return Motion(rotation, translation, votes)
+        return motion_of_vote(*voted)

@@ -123,10 +123,8 @@ class VoteOfAll(NamedTuple):
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
         """Return the motion of a step (see types.Estimator)."""
-        votes, rotation, translation = self.calls.recover_pose(
-            essential, matches.current, matches.previous
-        )
-        return Motion(rotation, translation, votes)
+        voted = self.calls.recover_pose(essential, matches.current, matches.previous)
+        return types.motion_of_vote(*voted)
 
 
 class Odometry:

@@ -44,6 +44,7 @@ if "tensorflow" not in sys.modules:
 for _name, _value in _variables.items():
     os.environ.setdefault(_name, _value)
 os.environ["KERAS_BACKEND"] = "tensorflow"  # the package calls TensorFlow itself
+os.environ["TF_USE_LEGACY_KERAS"] = "0"  # and Keras 3
 
 GPUS = "/dev/nvidiactl", "/dev/dxg"  # device files of NVIDIA's driver and of WSL 2
 

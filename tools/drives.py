@@ -1,12 +1,16 @@
-"""`python -m street_world` renders the drives of the current settings, as notebook 5 does."""
+"""Render the drives of the embedded world, as notebook 5 does, and compile the shared odometry.
+
+The Makefile runs it while notebook 4 trains the network, to save time.
+"""
 
 import street_world
+import thesis_repro as tr
 from thesis_repro.running import messages
 from thesis_repro.running.settings import read_settings
 
 
 def main() -> None:
-    """Render the drives of the current settings."""
+    """Render the drives of the current settings, and run three frames of one with an estimator."""
     settings = read_settings()
     street_world.write(
         settings.world,
@@ -16,6 +20,8 @@ def main() -> None:
         only="kitti",
         replace=not settings.cityscapes_is_embedded,
     )
+    refined = tr.OdometrySettings(estimator="refined")
+    tr.run_many(tr.Sequence(settings.kitti, "00").subset(3), {"": (refined, None)})
 
 
 if __name__ == "__main__":

@@ -1,0 +1,54 @@
+"""Execute the notebooks of a run, and write its page: what `make figures` does.
+
+The Makefile knows which notebook needs what. This holds the lock of the run while make works.
+"""
+
+import os
+import platform
+import subprocess
+import sys
+
+from thesis import page, trainings
+from thesis_repro.running import messages, results
+from thesis_repro.running.settings import ROOT, Settings, read_settings
+
+
+def main() -> int:
+    """Execute what is not up to date, write the page, and return make's status.
+
+    A notebook that fails does not stop those that do not need it. Raises InputError if another run
+    uses the folder.
+    """
+    settings = read_settings()
+    if settings.figures_in_git and platform.machine() not in ("x86_64", "AMD64"):
+        messages.log.warning(
+            f"figures: those in git are from an x86 processor; on {platform.machine()} some numbers "
+            "will differ; FIGURES=/path keeps both"
+        )
+    with results.claimed(settings.build / "notebooks"):
+        status = _execute(settings)
+        page.update(settings, settings.published)
+    if note := trainings.network_note(settings):
+        print(note)
+    return status
+
+
+def _execute(settings: Settings) -> int:
+    ipython = settings.build / "ipython"
+    ipython.mkdir(exist_ok=True)
+    at_once = [] if settings.jobs == 1 else ["-j2"]
+    folder = os.path.relpath(settings.build, ROOT)
+    command = [os.environ.get("MAKE", "make"), "-k", *at_once, "notebooks", f"RUN={folder}"]
+    # bars inside notebooks go to the terminal
+    terminal = os.ttyname(2) if sys.stderr.isatty() else os.devnull
+    variables = {"IPYTHONDIR": str(ipython.resolve()), "THESIS_REPRO_PROGRESS": terminal}
+    process = subprocess.Popen(command, cwd=ROOT, env=os.environ | variables)
+    try:
+        return process.wait()
+    finally:  # after Ctrl-C, too
+        process.terminate()
+        process.wait()
+
+
+if __name__ == "__main__":
+    messages.run_main(main)
