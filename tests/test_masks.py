@@ -200,6 +200,7 @@ def test_the_thesis_mask_is_its_three_calls():
         assert np.array_equal(masks.keypoint_mask(label_map.astype(int), SIZE, width), expected)
 
 
+@pytest.mark.bits
 def test_frames_and_masks_have_the_recorded_bits_on_every_processor():
     label_map = streets()
     frame = np.random.default_rng(1).integers(0, 256, SIZE, np.uint8)
