@@ -34,6 +34,12 @@ def inlined(function: Callable, **options: Any) -> Callable:
     return compiled(function, forceinline=True, no_cpython_wrapper=True, **options)
 
 
+def is_on_disk(function: Any) -> bool:
+    """Return whether the machine code of a compiled function is on disk."""
+    file = getattr(getattr(function, "_cache", None), "_cache_file", None)
+    return file is not None and bool(file._load_index())
+
+
 def _notice_changes(dispatcher: Any, folder: Path) -> None:
     """Let Numba compile anew after a change of a module in a function's folder or this package.
 

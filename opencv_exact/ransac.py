@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from opencv_exact import epipolar
-from opencv_exact.compiling import compiled, inlined
+from opencv_exact.compiling import compiled, inlined, is_on_disk
 from opencv_exact.five_point import SAMPLE_SIZE
 from opencv_exact.real_roots import LANES
 from opencv_exact.solver import Solutions, correspondences, solve
@@ -108,6 +108,11 @@ def find_essential_matrix(
     if solution is None:
         return _opencv(current, previous, threshold, probability)
     return solution.matrix, solution.mask
+
+
+def is_compiled() -> bool:
+    """Return whether an earlier search has compiled this module, so that it only has to load."""
+    return is_on_disk(_next_doubtful)
 
 
 def draw_samples(points: int, samples: int) -> np.ndarray:

@@ -19,18 +19,22 @@ from thesis_repro.study import compare, runner
 from thesis_repro.study.jobs import Job
 
 
-def is_decisive(job: Job, tested: int) -> bool:
-    """Return whether a run is made in the embedded world, where no conclusion rests on the others.
+def is_shown(job: Job, tested: int, controlled: list[str]) -> bool:
+    """Return whether a run is made in the embedded world, which is no evidence about real streets.
 
-    Each job is run once. The refined estimator decides, and Section 4.2 compares all keypoints,
-    masks of the `tested` width and plainly reduced keypoints: these are repeated. The masks that
+    All keypoints, masks of each width and plainly reduced keypoints are run with the thesis's
+    estimator; what Section 4.2 compares is repeated, with masks of the `tested` width. Controls are
+    run once, with the refined estimator, which decides, on the sequences `controlled`. Masks that
     published systems use (`masks.KEEP`) are compared on real frames only.
     """
     if job.method in KEEP:
         return False
     is_tested = job.method == "masked" and job.dilation_width == tested
-    is_compared = job.method in ("baseline", "reduced") or is_tested
-    return job.repetition == 0 or job.estimator == "refined" or is_compared
+    if job.method in ("baseline", "reduced") or is_tested:
+        return True
+    if job.method == "masked":
+        return job.repetition == 0 or job.estimator == "refined"
+    return job.estimator == "refined" and job.repetition == 0 and job.sequence in controlled
 
 
 def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:

@@ -455,6 +455,21 @@ def test_wrong_frames_and_masks_are_named_and_leave_the_state(drive):
     assert follower.step(frame, Fraction(2, 5), Stripes(40)[1] > 0).updated
 
 
+def test_a_long_run_takes_faster_calls_with_the_same_bits(drive, monkeypatch):
+    expected = odometry.run(drive).frames
+    odometry.run_many(drive.subset(3), {"": (THESIS, None)})  # compiles them
+    searched = counted(monkeypatch, sharing.opencv_exact, "find_essential_matrix")
+    monkeypatch.setattr(odometry.runs, "FRAMES_TO_LOAD", len(drive) + 1)
+    odometry.run(drive)
+    assert not searched
+    monkeypatch.setattr(odometry.runs, "FRAMES_TO_LOAD", len(drive))
+    frames = odometry.run(drive).frames
+    assert searched
+    numbers = [name for name in frames if not name.endswith("seconds")]
+    pd.testing.assert_frame_equal(frames[numbers], expected[numbers], check_exact=True)
+    assert (frames[["track_seconds", "essential_seconds"]].sum() > 0).all()
+
+
 @pytest.mark.parametrize("make", [odometry.run, odometry.run_many])
 def test_wrong_sequences_and_masks_are_named_before_a_frame_is_read(drive, make):
     unread = Changed(drive)

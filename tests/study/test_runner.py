@@ -3,8 +3,6 @@
 import shutil
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -23,13 +21,6 @@ from thesis_repro.study.jobs import Job, first_jobs
 from thesis_repro.study.sources import Source
 
 WIDTHS = (5, 10, 15)
-
-
-@contextmanager
-def in_this_process(processes, scheduler):
-    """A pool whose calls a test can disturb."""
-    with ThreadPoolExecutor(1) as executor:
-        yield workers.Pool(1, executor)
 
 
 def opened(world, frames=None):
@@ -91,7 +82,6 @@ def test_a_stopped_pass_is_repeated_and_ends_as_an_undisturbed_one(
 
     with monkeypatch.context() as patch:
         patch.setattr(Sequence, "frame", frame)
-        monkeypatch.setattr(runner, "open_pool", in_this_process)
         outcome = runner.run_jobs(jobs, opened(small_world), small_labels, tmp_path)
     assert set(outcome.table["sequence"]) == {"00"} and outcome.failed_jobs == 4
     assert str(error) in outcome.warnings[0]

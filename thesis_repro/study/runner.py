@@ -287,8 +287,9 @@ def _run_pass(
     record: of the sequence's results, as the main process sees it. Returns the jobs, and the
     reasons of those that failed.
     """
-    cv2.setNumThreads(1)  # the processes already use every core
     reasons: dict[Job, str] = {}
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # the processes already use every core
     try:
         results.check_worker(folder / sequence.name, record, **_versions())
         masks_by_job, reasons = checked_masks(_unfinished(jobs, folder), sequence, sources)
@@ -318,6 +319,8 @@ def _run_pass(
         if not isinstance(error, InputError):
             reason = f"{type(error).__name__}: {error}"
         reasons = dict.fromkeys(_unfinished(jobs, folder), reason) | reasons
+    finally:
+        cv2.setNumThreads(threads)
     return jobs, reasons
 
 

@@ -22,13 +22,18 @@ LOST = "a worker process was lost; finished results are kept; repeat the command
 
 
 class Pool(NamedTuple):
-    """Workers. size: number of calls that run at the same time."""
+    """Workers. size: number of calls that run at the same time. executor: None for this process."""
 
     size: int
-    executor: Executor
+    executor: Executor | None = None
 
     def run(self, function: Callable, calls: Iterable[tuple]) -> Iterator[Any]:
         """Yield the results of calls, which are tuples of arguments, in their order."""
+        if self.executor is None:
+            for call in calls:
+                messages.check_stop()
+                yield function(*call)
+            return
         with messages.starting_workers():
             futures = [self.executor.submit(function, *call) for call in calls]
         for future in futures:
@@ -40,9 +45,12 @@ class Pool(NamedTuple):
 def open_pool(processes: int, scheduler: str | None = None) -> Iterator[Pool]:
     """Open a pool on a Dask scheduler or, without one, on processes of this machine.
 
-    processes: their number. scheduler: its address, "tcp://host:8786".
+    processes: their number; one is this process. scheduler: its address, "tcp://host:8786".
     Raises InputError if the scheduler does not answer or has no workers, or if a worker is lost.
     """
+    if scheduler is None and processes == 1:
+        yield Pool(1)
+        return
     if scheduler is None:
         with messages.unstopped():  # not joblib's shared executor, which callers may use, too
             executor = ProcessPoolExecutor(
