@@ -11,12 +11,12 @@ import pandas as pd
 
 from thesis import chapter4, gap, tables, trainings
 from thesis_repro.data import kitti
-from thesis_repro.masks import KEEP
 from thesis_repro.report import findings
 from thesis_repro.running.files import write_text
 from thesis_repro.running.settings import Settings
 from thesis_repro.study import compare, runner
 from thesis_repro.study.jobs import Job
+from thesis_repro.study.methods import AS_SLAM_SYSTEMS
 
 
 def is_shown(job: Job, tested: int, controlled: list[str]) -> bool:
@@ -25,9 +25,9 @@ def is_shown(job: Job, tested: int, controlled: list[str]) -> bool:
     All keypoints, masks of each width and plainly reduced keypoints are run with the thesis's
     estimator; what Section 4.2 compares is repeated, with masks of the `tested` width. Controls are
     run once, with the refined estimator, which decides, on the sequences `controlled`. Masks that
-    published systems use (`masks.KEEP`) are compared on real frames only.
+    published systems use (`methods.AS_SLAM_SYSTEMS`) are compared on real frames only.
     """
-    if job.method in KEEP:
+    if job.method in AS_SLAM_SYSTEMS:
         return False
     is_tested = job.method == "masked" and job.dilation_width == tested
     if job.method in ("baseline", "reduced") or is_tested:

@@ -202,14 +202,14 @@ COMMANDS = {
 # Helpers of several commands
 
 
-# the errors of `metrics.errors`, in its order, with their units
-ERRORS = (
-    "rmse_m",
-    "mae_m",
-    "ate_se3_m",
-    "relative_translation_percent",
-    "relative_rotation_deg_per_100m",
-)
+# {error of `metrics.errors`: its name in a record}
+ERRORS = {
+    "rmse": "rmse_m",
+    "mae": "mae_m",
+    "se3": "ate_se3_m",
+    "translation_percent": "relative_translation_percent",
+    "rotation_deg_per_100m": "relative_rotation_deg_per_100m",
+}
 
 
 def _record(result: Any, sequence: Any) -> dict[str, Any]:
@@ -219,11 +219,11 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     """
     from thesis_repro.odometry import metrics
 
-    errors: dict[str, float | None] = dict.fromkeys(ERRORS)
+    errors: dict[str, float | None] = dict.fromkeys(ERRORS.values())
     if sequence.has_truth:
-        values = metrics.errors(result.poses, sequence.poses).values()
-        measured = dict(zip(ERRORS, values, strict=True))
-        errors |= {name: value for name, value in measured.items() if value == value}  # not NaN
+        for name, value in metrics.errors(result.poses, sequence.poses).items():
+            if value == value:  # not NaN
+                errors[ERRORS[name]] = value
     mean_keypoints = 0.0
     detected = result.frames["detected"].dropna()
     if len(detected):  # no frame may have structure

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from thesis_repro.report import style, texts
 from thesis_repro.report.style import BASELINE, MASKED
 from thesis_repro.study import best_width, compare
+from thesis_repro.study.errors import ERRORS
 from thesis_repro.study.jobs import ESTIMATORS
-from thesis_repro.study.methods import ERRORS
 from thesis_repro.study.sources import UNMASKED
 
 BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls

@@ -161,16 +161,19 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
 
 
 @cache
-def digest_of_code(*rooms: str) -> str:
+def digest_of_code(*rooms: str, without: tuple[str, ...] = ()) -> str:
     """Return a digest of the code that results come from.
 
-    rooms: dotted names of packages ("thesis_repro.odometry", with all that is in it) or modules. A
-    changed comment changes the digest, too.
+    rooms: dotted names of packages ("thesis_repro.odometry", with all that is in it) or modules.
+    without: modules in these packages that results do not depend on. A changed comment changes the
+    digest, too.
     """
+    left_out = [ROOT.joinpath(*name.split(".")).with_suffix(".py") for name in without]
     digest = hashlib.sha256()
     for room in rooms:
         place = ROOT.joinpath(*room.split("."))
-        for path in sorted(place.rglob("*.py")) or [place.with_suffix(".py")]:
+        paths = sorted(place.rglob("*.py")) or [place.with_suffix(".py")]
+        for path in (path for path in paths if path not in left_out):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 

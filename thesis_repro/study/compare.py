@@ -43,8 +43,9 @@ from numpy.typing import ArrayLike
 from scipy.special import bdtr, stdtrit
 
 from thesis_repro.study import methods
+from thesis_repro.study.errors import ERRORS
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
-from thesis_repro.study.methods import ERRORS, MASK_CONTROLS
+from thesis_repro.study.methods import MASK_CONTROLS
 
 # {name: title} of the methods and errors that are compared. The judging metrics decide (see
 # `primary_comparison`).
@@ -354,11 +355,11 @@ def overall(verdicts: Iterable[str]) -> str:
 def judging_estimator(table: pd.DataFrame) -> str:
     """Return the estimator that decides.
 
-    It is the refined one if it has errors, since shuffling changes them least.
+    It is the refined one if it has errors, since shuffling changes them least, and otherwise the
+    first that was run.
     """
-    if (table["estimator"] == "refined").any():
-        return "refined"
-    return "thesis"
+    estimators = [*table["estimator"], "thesis"]
+    return "refined" if "refined" in estimators else estimators[0]
 
 
 def shuffle_spread(runs: pd.DataFrame) -> pd.DataFrame:

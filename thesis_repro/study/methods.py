@@ -1,9 +1,9 @@
-"""What a study compares: one table of methods, and one of errors.
+"""What a study compares: one table of methods.
 
 A method chooses the keypoints of a run. Beside all keypoints and masks, there are *controls*: masks
 and settings that leave as many keypoints as the masks of the segmentation, chosen differently. If
 the odometry gains as much from a control, the segmentation is not what helps. A new method is an
-entry in METHODS, a new error of a path one in ERRORS (and a number in `runner.path_errors`).
+entry in METHODS, a new error of a path one in study/errors.py.
 """
 
 from collections.abc import Callable
@@ -16,33 +16,10 @@ import cv2
 import numpy as np
 
 from thesis_repro.data.kitti import TRUE_LABELS, Sequence
-from thesis_repro.masks import KEEP, MaskSettings, dilate
+from thesis_repro.masks import MaskSettings, dilate
 from thesis_repro.odometry import THESIS
-from thesis_repro.odometry.metrics import RELATIVE_LENGTH
 from thesis_repro.odometry.odometry import detect
 from thesis_repro.study.sources import FileMasks, Source
-
-
-class Error(NamedTuple):
-    """An error of a path. title, unit: in tables and figures. decides: whether masks help."""
-
-    title: str
-    unit: str
-    decides: bool = False
-
-
-# The deciding errors are those that a constant angle between camera and ground truth leaves alone.
-ERRORS = {
-    "se3": Error("aligned ATE", "m", decides=True),
-    "rotation": Error("rotation error a frame", "deg", decides=True),
-    "rmse": Error("RMSE", "m"),
-    "mae": Error("MAE", "m"),
-    "translation_percent": Error(f"translation error over {RELATIVE_LENGTH:g} m", "%"),
-    "rotation_deg_per_100m": Error(f"rotation error over {RELATIVE_LENGTH:g} m", "deg/100 m"),
-    "t_rel": Error("KITTI's t_rel", "%"),
-    "r_rel": Error("KITTI's r_rel", "deg/100 m"),
-}
-
 
 # Masks that are controls. They are indexed by frame number, as in `masks`.
 
@@ -190,7 +167,7 @@ METHODS = {  # in the order in which they are shown
     "keypoints": Method("own keypoints", has_masks=False),  # these two as sources.KINDS has them
     "paths": Method("path of another system", has_masks=False),
     "exact-boundaries": Method(
-        "exact class boundaries", settings=partial(replace, boundaries="exact")
+        "exact class boundaries", settings=partial(replace, boundaries="exact", keep="boundaries")
     ),
     "corrected": Method(
         "corrected mask", settings=lambda settings: replace(CORRECTED, ids=settings.ids)
@@ -210,7 +187,8 @@ METHODS = {  # in the order in which they are shown
     "spread": Method("keypoints spread out", has_masks=False, is_control=True),
     "reduced": Method("reduced keypoints", has_masks=False, is_compared=False),  # Figure 4.12
 }
-OF_LABEL_MAPS = ("exact-boundaries", "corrected", *KEEP[1:], "true-labels")
+AS_SLAM_SYSTEMS = ("static", "inverse", "static-boundaries")
+OF_LABEL_MAPS = ("exact-boundaries", "corrected", *AS_SLAM_SYSTEMS, "true-labels")
 # the methods with masks beside "masked", in the order of their runs
 MASK_CONTROLS = ("other-frame", "mirrored", "random-lines", "image-edges", *OF_LABEL_MAPS)
 

@@ -18,11 +18,11 @@ import pandas as pd
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import metrics
 from thesis_repro.odometry.runs import is_flagged, poses_of
 from thesis_repro.running import messages, results
 from thesis_repro.running.files import listed, progress, write_text
 from thesis_repro.study import compare
+from thesis_repro.study.errors import path_errors
 from thesis_repro.study.jobs import ESTIMATORS, Job, in_passes, repeated
 from thesis_repro.study.methods import (
     METHODS,
@@ -34,7 +34,7 @@ from thesis_repro.study.methods import (
 from thesis_repro.study.sources import UNMASKED, Source, by_name
 from thesis_repro.study.workers import open_pool
 
-# rooms whose code decides the results
+# rooms whose code decides the poses
 CODE = (
     "opencv_exact",
     "thesis_repro.odometry",
@@ -46,6 +46,7 @@ CODE = (
     "thesis_repro.study.methods",
     "thesis_repro.study.sources",
 )
+READERS = ("thesis_repro.odometry.metrics",)  # read poses: a change of them repeats no run
 
 
 @dataclass(frozen=True)
@@ -237,7 +238,7 @@ def _stage(folder: Path, sequence: Sequence, sources: dict[str, Source]) -> None
 
 def _versions() -> dict[str, Any]:
     return {
-        "code": results.digest_of_code(*CODE),
+        "code": results.digest_of_code(*CODE, without=READERS),
         **results.made_with("opencv", "numpy", "numba"),
     }
 
@@ -338,21 +339,6 @@ def measures(frames: pd.DataFrame, true: np.ndarray) -> dict[str, Any]:
         **path_errors(poses_of(frames), true),
         "mean_keypoints": frames["detected"].mean(),
         "flagged": int(is_flagged(frames).sum()),
-    }
-
-
-def path_errors(poses: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Return the errors of a path; poses, true: (n, 4, 4).
-
-    They are those of `metrics.errors` and `metrics.step_errors`; t_rel (percent) and r_rel (degrees
-    per 100 m) are those of `metrics.kitti_errors`.
-    """
-    kitti = metrics.kitti_errors(poses, true)
-    return {
-        **metrics.errors(poses, true),
-        **metrics.step_errors(poses, true),
-        "t_rel": kitti["t_rel"],
-        "r_rel": kitti["r_rel"],
     }
 
 
