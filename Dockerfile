@@ -8,6 +8,7 @@ USER reader
 
 # .devcontainer stops here and installs into the folder that it opens
 FROM tools
+RUN mkdir /home/reader/thesis-repro  # Podman's WORKDIR would make it root's
 WORKDIR /home/reader/thesis-repro
 COPY --chown=reader . .
 RUN make setup

@@ -8,7 +8,7 @@ BIN := .venv/bin
 # What is set on the command line reaches Python as THESIS_REPRO_ variables, and Python names a misspelled one.
 MINE := PYTHON GPU LABELS CAMVID PSEUDO LISTEN RUN
 given := $(foreach name,$(.VARIABLES),$(if $(filter command line,$(origin $(name))),$(name)))
-$(foreach name,$(filter-out $(MINE) MAKE% -%,$(sort $(given))),$(eval export THESIS_REPRO_$(name) := $(value $(name))))
+$(foreach name,$(filter-out $(MINE) MAKE% -%,$(sort $(given))),$(eval export THESIS_REPRO_$(name) := $$($(name))))
 # Everything runs this checkout and its environment, without the user's settings of Python, pip and Jupyter.
 export PYTHONPATH := $(CURDIR):$(CURDIR)/notebooks
 export PYTHONWARNINGS := ignore
@@ -79,7 +79,7 @@ $(call executed,05 09): $(call executed,04)
 $(call executed,06 07 08 09): $(call executed,05)
 $(call executed,07 08): $(call executed,06)
 $(call executed,09): $(call executed,08)
-$(foreach name,$(NAMES),$(eval $(call executed,$(name)): $(call imports,notebooks/$(name).ipynb)))
+$(foreach name,$(NAMES),$(eval $(RUN)/notebooks/$(name).ipynb: $(call imports,notebooks/$(name).ipynb)))
 
 # nbconvert writes under another name: a notebook that exists is done.
 $(RUN)/notebooks/%.ipynb: notebooks/%.ipynb $(RUN)/checked
@@ -100,7 +100,7 @@ check-data: setup
 	@$(BIN)/python -m thesis_repro check-data $${THESIS_REPRO_KITTI:+--kitti "$$THESIS_REPRO_KITTI"} \
 	  $${THESIS_REPRO_CITYSCAPES:+--cityscapes "$$THESIS_REPRO_CITYSCAPES"} $${THESIS_REPRO_KITTI_SEMANTIC:+--kitti-semantic "$$THESIS_REPRO_KITTI_SEMANTIC"}
 test: setup
-	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -q -n logical --dist loadfile --no-loadscope-reorder
 torture: setup
 	@$(BIN)/python -m pytest -q -m torture
 lint: setup
@@ -110,7 +110,7 @@ LAB := $(or $(THESIS_REPRO_BUILD),build)/lab
 lab: setup
 	@mkdir -p "$(LAB)" && cd notebooks && for path in *.ipynb thesis; do test -e "$(abspath $(LAB))/$$path" || cp -r $$path "$(abspath $(LAB))"; done
 	@echo "the notebooks are copies in $(LAB); delete one to get it anew"
-	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH=$(CURDIR) $(BIN)/jupyter lab "$(LAB)" --log-level=ERROR \
+	@THESIS_REPRO_PROFILE=$(or $(THESIS_REPRO_PROFILE),lab) PYTHONPATH="$(CURDIR)" $(BIN)/jupyter lab "$(LAB)" --log-level=ERROR \
 	  $(if $(LISTEN),--ip=$(LISTEN) --no-browser) $(if $(filter 0,$(shell id -u)),--allow-root)
 bench: setup
 	@$(if $(KITTI),,$(BIN)/python -m thesis_repro synthesize build/world-demo)

@@ -219,6 +219,7 @@ def train(camvid, kitti_semantic, pseudo, folder):
     made_from = {
         "code": results.digest_of_code("thesis_repro.segmentation.unet"),
         "tool": results.digest_of_file(Path(__file__)),
+        **results.made_with("tensorflow", "keras"),
         "phases": [COMMON, LAST],
         "steps": EPOCH,
         "images": results.digest_of_files(

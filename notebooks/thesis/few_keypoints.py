@@ -94,6 +94,7 @@ def measure(
             "frames": results.digest_of_files(sequence.frame_paths),
             "labels": results.digest_of_files(sorted((labels / sequence.name).glob("*.png"))),
             "code": results.digest_of_code(*CODE),
+            **results.made_with("opencv", "numpy", "numba"),
         }
         files[sequence.name] = results.stage(folder / sequence.name, **inputs) / "runs.csv"
     calls = [

@@ -19,22 +19,18 @@ from thesis_repro.study.jobs import Job
 from thesis_repro.study.methods import AS_SLAM_SYSTEMS
 
 
-def is_shown(job: Job, tested: int, controlled: list[str]) -> bool:
-    """Return whether a run is made in the embedded world, which is no evidence about real streets.
+def is_decisive(job: Job, tested: int) -> bool:
+    """Return whether a run is made in the embedded world, where no conclusion rests on the others.
 
-    All keypoints, masks of each width and plainly reduced keypoints are run with the thesis's
-    estimator; what Section 4.2 compares is repeated, with masks of the `tested` width. Controls are
-    run once, with the refined estimator, which decides, on the sequences `controlled`. Masks that
+    Each job is run once. The refined estimator decides, and Section 4.2 compares all keypoints,
+    masks of the `tested` width and plainly reduced keypoints: these are repeated. The masks that
     published systems use (`methods.AS_SLAM_SYSTEMS`) are compared on real frames only.
     """
     if job.method in AS_SLAM_SYSTEMS:
         return False
     is_tested = job.method == "masked" and job.dilation_width == tested
-    if job.method in ("baseline", "reduced") or is_tested:
-        return True
-    if job.method == "masked":
-        return job.repetition == 0 or job.estimator == "refined"
-    return job.estimator == "refined" and job.repetition == 0 and job.sequence in controlled
+    is_compared = job.method in ("baseline", "reduced") or is_tested
+    return job.repetition == 0 or job.estimator == "refined" or is_compared
 
 
 def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:

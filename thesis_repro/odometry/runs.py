@@ -10,7 +10,7 @@ import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.odometry import STATIONARY, Calls, Odometry
+from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.types import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
 from thesis_repro.running import messages
@@ -110,7 +110,7 @@ def run(
     are fewer masks than frames, and for another kind of sequence, settings or masks.
     """
     check(sequence, masks)
-    calls = calls or _faster_calls(len(sequence))
+    calls = calls or _faster_calls(len(sequence), settings)
     odometry = Odometry(sequence.intrinsics, settings, start_pose(sequence), calls)
     step_lengths = scales(sequence)
     rows = []
@@ -123,16 +123,20 @@ def run(
     return _result(rows, settings)
 
 
-def _faster_calls(frames: int) -> Calls | None:
+def _faster_calls(frames: int, settings: OdometrySettings) -> Calls | None:
     """Return faster calls with the bits of OpenCV's if they pay in a run of so many frames."""
     if frames < FRAMES_TO_LOAD:
         return None
-    from opencv_exact import is_compiled  # loads Numba
-    from thesis_repro.odometry.sharing import SharedCalls
+    import opencv_exact  # loads Numba
+    from thesis_repro.odometry import sharing
 
-    if frames < FRAMES_TO_COMPILE and not is_compiled():
+    if frames < FRAMES_TO_COMPILE and not opencv_exact.is_compiled():
         return None
-    return SharedCalls().calls
+
+    def find(current: np.ndarray, previous: np.ndarray, threshold: float) -> tuple:
+        return opencv_exact.find_essential_matrix(current, previous, threshold, PROBABILITY)
+
+    return Calls(settings.detect_function(), sharing.track, find, opencv_exact.recover_pose)
 
 
 def run_many(

@@ -190,6 +190,7 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
     arrays = [array for pair in (*batches.sets, *validation.sets) for array in pair]
     return {
         "code": results.digest_of_code("thesis_repro.segmentation", "thesis_repro.data.cityscapes"),
+        **results.made_with("tensorflow", "keras", "albumentations"),
         "arithmetic": segmentation.arithmetic(),
         "network": zlib.crc32(json.dumps(model.get_config(), default=str).encode()),
         "first_weights": weights_digest(model),
