@@ -36,7 +36,7 @@ help:
 
 # uv takes a third of pip's time, but ignores pip's settings, so pip follows if uv reaches no index. The options in PIP
 # undo settings of pip that would install elsewhere.
-PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-user --target= --prefix=
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-user --target= --prefix="$(CURDIR)/.venv"
 install = $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --no-deps $(1) || \
           { echo "uv failed, so pip is used" && $(PIP) --no-deps --no-compile $(1); }
 setup: .venv/ready $(if $(filter 1,$(GPU)),.venv/ready-gpu)
