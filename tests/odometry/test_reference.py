@@ -75,6 +75,7 @@ def test_estimators_give_the_recorded_motions(run):
         motion = VoteOfAll().motion(*arguments)
         assert motion.pose_inliers == step["votes"]
         assert motion.flag == ("" if step["votes"] else "no votes")
+        assert motion.flag == ("" if step["votes"] else "no votes")
         assert_recorded(motion.rotation, step["rotations"])
         assert_recorded(motion.translation, step["translations"])
         motion = refined.motion(*arguments)
