@@ -201,7 +201,7 @@ def test_the_thesis_mask_is_its_three_calls():
 
 
 @pytest.mark.bits
-def test_frames_and_masks_have_the_recorded_bits_on_every_processor():
+def test_frames_and_masks_have_the_bits_recorded_on_x86():
     label_map = streets()
     frame = np.random.default_rng(1).integers(0, 256, SIZE, np.uint8)
     images = {

@@ -1,4 +1,4 @@
-"""A study of the embedded world gives the table of runs in git on every x86 processor with AVX2.
+"""A study of the embedded world gives the table of runs in git, on x86 processors with AVX2.
 
 Errors go through BLAS and LAPACK, whose kernels differ between processors in the last digits.
 """

@@ -158,11 +158,11 @@ def read_image(path: str | Path, height: int, width: int, channels: int = 1) -> 
 
 
 def resize_bilinear(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize an image, (h, w) or (h, w, 3) uint8, to (height, width): the same bits everywhere.
+    """Resize an image, (h, w) or (h, w, 3) uint8, to (height, width), bilinearly.
 
-    On ARM processors, OpenCV resizes a single channel by other code, whose result differs by up to
-    two gray levels. Two channels take the same code as on x86. There, `cv2.resize` of the image
-    alone gives the same bits.
+    One channel has the same bits on x86 and on ARM. OpenCV has other code for it on ARM, whose
+    result differs by up to two gray levels, but not for two channels. On x86, `cv2.resize` of the
+    image alone gives these bits, too. Three channels were not compared on ARM.
     """
     if image.ndim == 3:
         return cv2.resize(image, size[::-1])

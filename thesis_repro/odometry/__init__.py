@@ -15,8 +15,8 @@ means that the pose does not change:
 - too few correspondences: "fewer than five correspondences", kept
 - no essential matrix, or several: "no essential matrix", "several essential matrices", kept
 - inliers no more than by chance (scene cut): "no agreement", kept
-- no match in front of both cameras for any of the four motions: "no votes", moved by the first of
-  them, as in PySLAM (which one is first depends on the processor)
+- no match in front of both cameras and nearer than 50 step lengths, for any of the four motions:
+  "no votes", moved by the first of them, as in PySLAM (which one is first depends on the processor)
 - step shorter than the gate (PySLAM's rule): "stationary", kept
 - rotation larger than a car's: "too large a turn", the pose moves, as in PySLAM
 
