@@ -20,7 +20,7 @@ from thesis_repro.data.cityscapes import ID, read_label_map, resize_bilinear
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
 from thesis_repro.masks import MaskSettings
-from thesis_repro.odometry import THESIS, OdometrySettings, estimators, metrics
+from thesis_repro.odometry import THESIS, OdometrySettings, estimators, keypoints, metrics
 from thesis_repro.odometry.odometry import detect, normalise, track
 from thesis_repro.odometry.runs import Masks
 from thesis_repro.running import results
@@ -187,7 +187,8 @@ def runs_of(
         if estimator == "inliers" and method not in ("baseline", "masked"):
             continue
         settings, method_masks = methods[method]
-        seeded = replace(settings, estimator=estimator, shuffle_seed=repetition or None)
+        make = estimators.ESTIMATORS[estimator].make
+        seeded = replace(settings, estimator=make, shuffle_seed=repetition or None)
         runs[method, estimator, repetition] = seeded, method_masks
     return runs
 
@@ -215,7 +216,7 @@ def _methods(
     methods: dict[str, tuple[OdometrySettings, Masks | None]] = {
         "baseline": (THESIS, None),
         "masked": (THESIS, thesis_masks),
-        "filter": (replace(THESIS, mask_mode="filter"), thesis_masks),
+        "filter": (replace(THESIS, detector=keypoints.filtered), thesis_masks),
         "nearest": (THESIS, FunctionMasks(nearest)),
         "symmetric": (THESIS, symmetric),
         # Section 5.2.2: trees and bushes
@@ -232,7 +233,7 @@ def _methods(
             methods[prefix + name] = THESIS, chosen
     for name, into in {"turned-into": True, "turned-from": False}.items():
         methods[name] = THESIS, FunctionMasks(partial(half_in_turns, sequence, into))
-    return methods | {"orb": (replace(THESIS, detector="orb"), None)}
+    return methods | {"orb": (replace(THESIS, detector=keypoints.orb), None)}
 
 
 # Keypoints and boundaries one by one

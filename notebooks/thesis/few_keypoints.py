@@ -34,7 +34,8 @@ from thesis.ablations import FunctionMasks, random_keypoints
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
-from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.odometry import THESIS, estimators, metrics
+from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.report import style, texts
 from thesis_repro.running import results
 from thesis_repro.study import compare, workers
@@ -62,14 +63,14 @@ def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
     chosen: dict[tuple[str, int], tuple] = {
         ("all", 0): (THESIS, None),
         ("mask", 0): (THESIS, masks),
-        ("filled", 0): (replace(THESIS, fill=FILL), masks),
+        ("filled", 0): (replace(THESIS, detector=filled(FILL)), masks),
     }
     for number in NUMBERS:
         few = replace(THESIS, max_keypoints=number)
         drawn = FunctionMasks(partial(random_keypoints, sequence, number))
         chosen["strongest", number] = few, None
         chosen["random", number] = THESIS, drawn
-        chosen["spread", number] = replace(few, choice="spread"), None
+        chosen["spread", number] = replace(THESIS, detector=spread(number)), None
         chosen["mask", number] = few, masks
     return chosen
 
@@ -115,7 +116,8 @@ def _measure_one(sequence: Sequence, labels: Path, file: Path, seeds: Iterable[i
     for (choice, number), (settings, masks) in choices(sequence, labels).items():
         for estimator in ESTIMATORS:
             for seed in seeds:
-                changed = replace(settings, estimator=estimator, shuffle_seed=seed)
+                make = estimators.ESTIMATORS[estimator].make
+                changed = replace(settings, estimator=make, shuffle_seed=seed)
                 runs[choice, number, estimator, seed or 0] = changed, masks
     rows = []
     for (choice, number, estimator, seed), result in odometry.run_many(sequence, runs).items():

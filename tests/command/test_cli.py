@@ -18,10 +18,8 @@ from thesis_repro.command.options import build_parser
 from thesis_repro.data import cityscapes
 from thesis_repro.data.trajectories import read_poses
 from thesis_repro.masks import BOUNDARIES, KEEP
-from thesis_repro.odometry.settings import CHOICES
 from thesis_repro.running import results
 from thesis_repro.running.files import write_png
-from thesis_repro.study.jobs import ESTIMATORS
 
 
 def run(command, *words):
@@ -197,9 +195,6 @@ def test_wrong_arguments_are_named(call, named):
 @pytest.mark.parametrize(
     "command, option, names",
     [
-        ("odometry", "--estimator", CHOICES["estimator"]),
-        ("odometry", "--detector", CHOICES["detector"]),
-        ("study", "--estimator", ESTIMATORS),
         ("masks", "--keep", KEEP),
         ("masks", "--boundaries", BOUNDARIES),
     ],

@@ -5,8 +5,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
-from dataclasses import fields, replace
-from importlib import import_module
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,6 @@ OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
 }
-# settings of the odometry that a study changes in runs with masks only; --scale-gate is for all
-OF_MASKED = ("choice", "max_keypoints", "fill")
 
 
 # The commands, see COMMANDS. Their docstrings are shown by --help. Each imports its libraries
@@ -95,12 +92,19 @@ def masks(options: Any) -> None:
 def odometry(options: Any) -> None:
     """Run the visual odometry on one sequence; print its errors, number of keypoints and time."""
     with redirect_stdout(sys.stderr):  # evo prints a line when it first writes its own settings
-        import_module("evo.main_ape")
+        import evo.main_ape  # noqa: F401
     from thesis_repro import checks, odometry
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
+    from thesis_repro.odometry.estimators import ESTIMATORS
 
-    settings = replace(odometry.THESIS, **_odometry_settings(options))
+    settings = replace(
+        odometry.THESIS,
+        detector=_detector(options),
+        estimator=ESTIMATORS[options.estimator].make,
+        max_keypoints=options.max_keypoints,
+        scale_gate=options.scale_gate,
+    )
     sequence = _sequence(options)
     masks = _masks(options, sequence)
     _check_outputs(options, sequence.poses_path, options.masks, options.labels, sequence.folder)
@@ -169,7 +173,7 @@ def study(options: Any) -> int:
         options.repetitions,
         options.frames,
         options.scale_gate,
-        {name: value for name, value in _odometry_settings(options).items() if name in OF_MASKED},
+        {"detector": detector} if (detector := _detector(options)) else {},
     )
     planned.check()
     folder = options.folder.absolute()
@@ -239,17 +243,19 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     }
 
 
-def _odometry_settings(options: Any) -> dict[str, Any]:
-    """The settings of the odometry that options of their names and --spread give."""
-    from thesis_repro.odometry import OdometrySettings
+def _detector(options: Any) -> Any:
+    """The detector that --detector, --spread and --fill choose; None for the thesis's."""
+    from thesis_repro.odometry.estimators import DETECTORS
+    from thesis_repro.odometry.keypoints import filled, spread
 
-    given = {field.name: vars(options).get(field.name) for field in fields(OdometrySettings)}
-    settings = {name: value for name, value in given.items() if value is not None}
+    detector = DETECTORS[vars(options).get("detector", "shi-tomasi")]
     if options.spread:
-        if "max_keypoints" in settings:
-            raise InputError("--spread N, --max-keypoints N: give only one of them")
-        settings |= {"choice": "spread", "max_keypoints": options.spread}
-    return settings
+        if detector or vars(options).get("max_keypoints", 2000) != 2000:
+            raise InputError("--spread N: goes without --max-keypoints and --detector")
+        detector = spread(options.spread)
+    if options.fill:
+        detector = filled(options.fill, detector)
+    return detector
 
 
 def _sequence(options: Any) -> Any:
@@ -387,6 +393,7 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    options = build_parser(COMMANDS).parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = build_parser(COMMANDS, arguments).parse_args(arguments)
     os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
     return messages.run(lambda: options.function(options))

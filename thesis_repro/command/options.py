@@ -1,7 +1,7 @@
 """The options of the command line. cli.py has the commands."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
@@ -123,8 +123,38 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     return name, Path(folder).expanduser()  # a shell replaces "~" only at the start of a word
 
 
-# the arguments of `add_argument` for each option of each command
-COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
+# Options whose names stand in a table, which takes a second to import
+
+
+def _estimator() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import ESTIMATORS
+
+    return dict(
+        choices=tuple(ESTIMATORS),
+        default="thesis",
+        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+    )
+
+
+def _compared_estimators() -> dict[str, Any]:
+    from thesis_repro.study.jobs import ESTIMATORS
+
+    names = list(ESTIMATORS)
+    return dict(nargs="+", choices=names, default=names, help="one or several (all)")
+
+
+def _detector() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import DETECTORS
+
+    return dict(
+        choices=tuple(DETECTORS),
+        default="shi-tomasi",
+        help="keypoint detector; the tracker stays the same (shi-tomasi)",
+    )
+
+
+# the arguments of `add_argument` for each option of each command, or a function that returns them
+COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
     "synthesize": {
         "out": dict(
             type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
@@ -208,16 +238,13 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
         ),
         "--dilation": DILATION,
-        "--estimator": dict(
-            metavar="thesis|inliers|refined",
-            help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
-        ),
-        "--detector": dict(
-            metavar="shi-tomasi|orb",
-            help="keypoint detector; the tracker stays the same (shi-tomasi)",
-        ),
+        "--estimator": _estimator,
+        "--detector": _detector,
         "--max-keypoints": dict(
-            type=int, metavar="N", help="maximum number of keypoints in a frame (2000)"
+            type=int,
+            default=2000,
+            metavar="N",
+            help="maximum number of keypoints in a frame (2000)",
         ),
         "--output": dict(
             type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
@@ -256,8 +283,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--keypoints": _source(
             "keypoints",
             "[NAME=]FILE.py",
-            "Python file, which is executed, with your function detect(frame, settings, mask) or "
-            "track(previous, current, points, settings)",
+            "Python file, which is executed, with your function detect(frame, settings, mask), "
+            "track(previous, current, points, settings) or find_essential_matrix(current, previous, threshold)",
         ),
         "--paths": _source(
             "paths",
@@ -284,12 +311,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="N",
             help="shuffles of the matched points for each run (5)",
         ),
-        "--estimator": dict(
-            nargs="+",
-            choices=("thesis", "refined"),
-            default=["thesis", "refined"],
-            help="one or both (both)",
-        ),
+        "--estimator": _compared_estimators,
         "--jobs": dict(
             type=settings.positive_whole_number,
             default=settings.cores(),
@@ -304,8 +326,13 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
-def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
-    """Return the parser. functions: of the commands, by name; their docstrings are the help."""
+def build_parser(
+    functions: dict[str, Callable], arguments: Collection[str]
+) -> argparse.ArgumentParser:
+    """Return the parser of arguments. functions: of the commands, by name.
+
+    Their docstrings are the help. Only the command in the arguments gets its options.
+    """
     parser = argparse.ArgumentParser(
         prog="thesis-repro",
         description="Keypoint masks from semantic segmentation for monocular visual odometry. "
@@ -329,9 +356,9 @@ def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
         )
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
-        for option, arguments in COMMANDS[name].items():
+        for option, how in COMMANDS[name].items() if name in arguments else ():
             group: Any = sub
             if option in MASK_OPTIONS:
                 group = mask_options
-            group.add_argument(option, **arguments)
+            group.add_argument(option, **(how if isinstance(how, dict) else how()))
     return parser

@@ -40,7 +40,7 @@ class Job:
     masks that leave as many keypoints. source: name of the source of the masks, or of the masks
     that gave the number of keypoints; empty if there is only one source. max_keypoints,
     min_distance (pixels): limits of the detector.
-    estimator: "thesis" or "refined", see OdometrySettings.
+    estimator: one of estimators.ESTIMATORS.
     repetition: 0 is the thesis's single run; any other number is the seed that shuffles the matched
     points.
     """
@@ -77,7 +77,7 @@ class Job:
     def settings(self) -> OdometrySettings:
         """The thesis's settings of the odometry, with the changes that the job asks for."""
         changes: dict[str, Any] = {
-            "estimator": self.estimator,
+            "estimator": estimators.ESTIMATORS[self.estimator].make,
             "max_keypoints": self.max_keypoints,
             "min_distance": self.min_distance,
             "shuffle_seed": self.repetition or None,
