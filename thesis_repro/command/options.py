@@ -56,12 +56,59 @@ SHARED: dict[str, dict[str, Any]] = {
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
 DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
-MASK_OPTIONS: dict[str, dict[str, Any]] = {
-    "--boundaries": dict(
-        metavar="canny|exact",
+
+
+# Options whose names stand in a table, which takes a second to import
+
+
+def _boundaries() -> dict[str, Any]:
+    from thesis_repro.masks import BOUNDARIES
+
+    return dict(
+        metavar="|".join(BOUNDARIES),
         default="canny",
         help="edges by Canny or all changes of class (canny)",
-    ),
+    )
+
+
+def _keep() -> dict[str, Any]:
+    from thesis_repro.masks import KINDS
+
+    where = ", ".join(kind.help for kind in KINDS.values())
+    return dict(
+        metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
+    )
+
+
+def _estimator() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import ESTIMATORS
+
+    return dict(
+        choices=tuple(ESTIMATORS),
+        default="thesis",
+        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+    )
+
+
+def _compared_estimators() -> dict[str, Any]:
+    from thesis_repro.study.jobs import ESTIMATORS
+
+    names = list(ESTIMATORS)
+    return dict(nargs="+", choices=names, default=names, help="one or several (all)")
+
+
+def _detector() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import DETECTORS
+
+    return dict(
+        choices=tuple(DETECTORS),
+        default="shi-tomasi",
+        help="keypoint detector; the tracker stays the same (shi-tomasi)",
+    )
+
+
+MASK_OPTIONS: dict[str, dict[str, Any] | Callable] = {
+    "--boundaries": _boundaries,
     "--symmetric": dict(
         action="store_true", help="centre masks on boundaries; the thesis's are half a pixel off"
     ),
@@ -79,12 +126,7 @@ MASK_OPTIONS: dict[str, dict[str, Any]] = {
         metavar="PIXELS",
         help="no keypoints on people and vehicles, nor within PIXELS of them (0)",
     ),
-    "--keep": dict(
-        metavar="boundaries|static|inverse|static-boundaries",
-        default="boundaries",
-        help="keypoints on boundaries, on all but movable things, on all but boundaries, or on boundaries "
-        "between static classes (boundaries)",
-    ),
+    "--keep": _keep,
     "--ids": dict(
         metavar="labels|train|colors|FILE",
         default="labels",
@@ -121,36 +163,6 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     if not equals or "/" in name or Path(text).is_dir():
         return None, Path(text)
     return name, Path(folder).expanduser()  # a shell replaces "~" only at the start of a word
-
-
-# Options whose names stand in a table, which takes a second to import
-
-
-def _estimator() -> dict[str, Any]:
-    from thesis_repro.odometry.estimators import ESTIMATORS
-
-    return dict(
-        choices=tuple(ESTIMATORS),
-        default="thesis",
-        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
-    )
-
-
-def _compared_estimators() -> dict[str, Any]:
-    from thesis_repro.study.jobs import ESTIMATORS
-
-    names = list(ESTIMATORS)
-    return dict(nargs="+", choices=names, default=names, help="one or several (all)")
-
-
-def _detector() -> dict[str, Any]:
-    from thesis_repro.odometry.estimators import DETECTORS
-
-    return dict(
-        choices=tuple(DETECTORS),
-        default="shi-tomasi",
-        help="keypoint detector; the tracker stays the same (shi-tomasi)",
-    )
 
 
 # the arguments of `add_argument` for each option of each command, or a function that returns them
@@ -327,11 +339,12 @@ COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
 
 
 def build_parser(
-    functions: dict[str, Callable], arguments: Collection[str]
+    functions: dict[str, Callable], arguments: Collection[str] | None = None
 ) -> argparse.ArgumentParser:
     """Return the parser of arguments. functions: of the commands, by name.
 
-    Their docstrings are the help. Only the command in the arguments gets its options.
+    Their docstrings are the help. Only the command in the arguments gets its options; without
+    arguments, all do.
     """
     parser = argparse.ArgumentParser(
         prog="thesis-repro",
@@ -356,7 +369,9 @@ def build_parser(
         )
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
-        for option, how in COMMANDS[name].items() if name in arguments else ():
+        if arguments is not None and name not in arguments:
+            continue
+        for option, how in COMMANDS[name].items():
             group: Any = sub
             if option in MASK_OPTIONS:
                 group = mask_options
