@@ -123,7 +123,7 @@ def mask_cost(sequence, labels):
     """
     source, costs = Source(labels), np.zeros(2)
     kinds = [source.masks(sequence, width) for width in WIDTHS] + [
-        methods.masks_of_method(method, source, sequence, methods.LINE_WIDTH)
+        methods.METHODS[method].choose(sequence, source, methods.LINE_WIDTH)[1]
         for method in methods.MASK_CONTROLS
         if method != "true-labels"
     ]

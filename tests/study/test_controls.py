@@ -31,7 +31,7 @@ def made(sequence, small_labels):
     source = Source(small_labels)
     by_method = {"masked": mask_files.LabelMasks(small_labels / "00", sequence, WIDTH)}
     for method in methods.MASK_CONTROLS:
-        by_method[method] = methods.masks_of_method(method, source, sequence, WIDTH)
+        _, by_method[method] = methods.METHODS[method].choose(sequence, source, WIDTH)
     return by_method
 
 
@@ -124,6 +124,7 @@ def test_controls_leave_as_many_keypoints_as_masks_of_the_tested_width(
 def test_every_ablation_differs_from_its_reference_in_one_thing(small_world, small_labels):
     sequence = Sequence(small_world / "kitti", "00").subset(4)
     runs = ablations.runs_of(sequence, small_labels / "00", repetitions=2)
+    runs = {(job.method, job.estimator, job.repetition): run[1:] for job, run in runs.items()}
     settings, thesis_masks = runs["masked", "thesis", 0]
     assert settings == THESIS
     expected = mask_files.LabelMasks(small_labels / "00", sequence, 10)

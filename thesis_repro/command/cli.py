@@ -152,21 +152,20 @@ def study(options: Any) -> int:
         )
     kinds = {kind for kind, _, _ in options.sources}
     has_labels = "labels" in kinds
+    mask_settings = _mask_settings(options, has_labels)
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     if options.invert and "masks" not in kinds:
         raise InputError("--invert: needs --masks DIR")
     widths: set[int] = set()
     if has_labels:
-        all_widths = ALL_WIDTHS
-        if options.keep == "static":
-            all_widths = (options.controls or 1,)  # one of any width, because masks have none
+        all_widths = ALL_WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
     names = dict.fromkeys(kitti.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
-        sources.named(options.sources, _mask_settings(options, has_labels), options.invert),
+        sources.named(options.sources, mask_settings, options.invert),
         tuple(sorted(widths)),
         options.controls,
         tuple(dict.fromkeys(options.estimator)),
@@ -340,17 +339,14 @@ def _masks(options: Any, sequence: Any) -> Any:
 
     settings = _mask_settings(options, options.labels)
     ready_made = vars(options).get("masks")
-    if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
+    if bool(options.labels) != (options.dilation is not None or not settings.has_width):
         raise InputError("--labels DIR, --dilation W: give both or neither")
     if options.labels and ready_made:
         raise InputError("--labels DIR, --masks DIR: give only one of them")
     if vars(options).get("invert") and not ready_made:
         raise InputError("--invert: needs --masks DIR")
     if options.labels:
-        width = options.dilation
-        if width is None:
-            width = 1  # masks of what cannot move have no width
-        return LabelMasks(options.labels, sequence, width, settings)
+        return LabelMasks(options.labels, sequence, options.dilation, settings)
     if ready_made:
         return MaskFolder(ready_made, sequence, options.invert)
     return None
