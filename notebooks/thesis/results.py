@@ -22,15 +22,15 @@ from thesis_repro.study.methods import AS_SLAM_SYSTEMS
 def is_decisive(job: Job, tested: int) -> bool:
     """Return whether a run is made in the embedded world, where no conclusion rests on the others.
 
-    Each job is run once. The refined estimator decides, and Section 4.2 compares all keypoints,
-    masks of the `tested` width and plainly reduced keypoints: these are repeated. The masks that
-    published systems use (`methods.AS_SLAM_SYSTEMS`) are compared on real frames only.
+    Each job is run once. Section 4.2 compares all keypoints, masks of the `tested` width and
+    plainly reduced keypoints: these are repeated. The masks that published systems use
+    (`methods.AS_SLAM_SYSTEMS`) are compared on real frames only.
     """
     if job.method in AS_SLAM_SYSTEMS:
         return False
     is_tested = job.method == "masked" and job.dilation_width == tested
     is_compared = job.method in ("baseline", "reduced") or is_tested
-    return job.repetition == 0 or job.estimator == "refined" or is_compared
+    return job.repetition == 0 or is_compared
 
 
 def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any]) -> tuple[str, str]:
