@@ -68,6 +68,34 @@ def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsy
         assert (str(tiny_kitti) in capsys.readouterr().out) == reports
 
 
+@pytest.mark.parametrize(
+    "times, speed, scale, said",
+    [
+        ([0, 0.1, 0.2, 0.3], None, 1, []),
+        ([0, 0.1, 0.2, 0.3], None, 9, []),  # 90 m/s
+        ([0, 0.1, 0.2, 0.3], None, 100, ["3 of 3 steps"]),  # centimetres
+        (None, None, 40, []),  # a frame a second
+        (None, None, 1000, ["3 of 3 steps"]),  # millimetres
+        ([0, 1e8, 2e8, 3e8], 8, 1, ["8e+08 m in 1e+08 s"]),  # nanoseconds
+        ([0, 0.1, 0.2, 60], 8, 1, ["1 of 3 steps", "before 000003.png"]),
+        ([0, 0.1, 0.2, 60], None, 1, ["before 000003.png"]),
+        ([0, 0.1, 0.2, 0.9], None, 1, []),
+    ],
+)
+def test_steps_that_nothing_drives_are_named(tiny_kitti, times, speed, scale, said):
+    if times:
+        (tiny_kitti / "sequences/00/times.txt").write_text("".join(f"{t}\n" for t in times))
+    else:
+        (tiny_kitti / "sequences/00/times.txt").unlink()
+    poses = tiny_kitti / "poses/00.txt"
+    poses.write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {scale * index}\n" for index in range(4)))
+    if speed:
+        poses.unlink()
+    lines = checks.of_sequence(Sequence(tiny_kitti, "00", speed=speed))
+    assert len(lines) == len(said)
+    assert all(text in line for text, line in zip(said, lines))
+
+
 def test_a_centre_far_from_the_middle_and_steps_that_were_left_out(tiny_kitti):
     assert checks.of_sequence(Sequence(tiny_kitti, "00")) == []
     (tiny_kitti / "sequences/00/calib.txt").write_text("P0: 50 0 37 0 0 50 24 0 0 0 1 0\n")

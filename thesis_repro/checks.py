@@ -24,6 +24,9 @@ from thesis_repro.running.settings import read_settings
 # Of the principal point from the middle, in frame widths and heights. KITTI has at most 0.04.
 # Frames are cropped at their upper or lower edge more often than at their sides.
 MAX_CENTRE_OFFSET = 0.075, 0.15
+# What drives stays below them; KITTI's car reaches 2.8 m a frame and 26 m/s.
+MAX_STEP, MAX_SPEED = 50.0, 100.0  # metres a frame, metres a second
+MAX_GAP = 10  # intervals between frames
 MASK_SAMPLES = 6  # frames whose masks are looked at
 MIN_SHARE = 0.005  # of the frames: that masks keep, and of a class that is named
 MAX_DROPPED = 0.1  # share of a run's steps
@@ -147,16 +150,46 @@ def main(path: Path) -> int:
 
 
 def of_sequence(sequence: kitti.Sequence) -> list[str]:
-    """Warn of a camera whose principal point is far from the middle of the frames."""
+    """Warn of a principal point far from the middle of the frames, and of impossible steps."""
     height, width = sequence.size
     u, v = sequence.intrinsics[:2, 2]
     across, down = MAX_CENTRE_OFFSET
-    if abs(u / width - 0.5) <= across and abs(v / height - 0.5) <= down:
-        return []
-    return [
-        f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
-        f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
-    ]
+    warnings = []
+    if abs(u / width - 0.5) > across or abs(v / height - 0.5) > down:
+        warnings.append(
+            f"sequence {sequence.name}: {sequence.calibration_path.name} has the centre {u:g}, {v:g}, far "
+            f"from the middle of frames of {width}x{height} pixels; it must belong to frames of this size"
+        )
+    return warnings + _of_steps(sequence)
+
+
+def _of_steps(sequence: kitti.Sequence) -> list[str]:
+    """Warn of steps longer or faster than what drives, and of gaps in the times."""
+    intervals = np.diff(sequence.times)
+    lengths, unit = sequence.assumed_steps[1:], "times in seconds, and the speed in metres a second"
+    if sequence.has_truth:
+        lengths = np.linalg.norm(np.diff(sequence.poses[:, :3, 3], axis=0), axis=1)
+        unit = "true positions in metres, and times in seconds"
+    impossible = lengths > MAX_STEP
+    if sequence.has_times:
+        impossible |= lengths > MAX_SPEED * intervals
+    gaps = intervals > MAX_GAP * (np.median(intervals) if len(intervals) else 0)
+    warnings = []
+    if impossible.any():
+        first = impossible.argmax()
+        warnings.append(
+            f"sequence {sequence.name}: {impossible.sum()} of {len(lengths)} steps are impossible; the "
+            f"first is {lengths[first]:.3g} m in {intervals[first]:.3g} s, to "
+            f"{sequence.frame_paths[first + 1].name}; are {unit}?"
+        )
+    if gaps.any():
+        first = gaps.argmax()
+        warnings.append(
+            f"sequence {sequence.name}: the times have {gaps.sum()} gaps; the first is "
+            f"{intervals[first]:.3g} s, before {sequence.frame_paths[first + 1].name}; the odometry cannot "
+            "bridge them, so run the parts on their own"
+        )
+    return warnings
 
 
 def of_run(
