@@ -58,6 +58,16 @@ def test_sequences_without_ground_truth_need_no_poses(tiny_kitti):
     assert [line.split("poses/")[1][:6] for line in problems] == ["00.txt", "11.txt"]
 
 
+def test_frames_that_equal_the_one_before_are_counted(tiny_kitti, capsys):
+    images = tiny_kitti / IMAGES
+    assert checks.check_kitti(tiny_kitti) == []
+    assert "equal" not in capsys.readouterr().out
+    for index in (2, 3):
+        shutil.copy(images / "000001.png", images / f"{index:06d}.png")
+    assert checks.check_kitti(tiny_kitti) == []
+    assert "2 frames equal the frame before" in capsys.readouterr().out
+
+
 def test_unchanged_data_is_checked_once(tiny_kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("THESIS_REPRO_KITTI", str(tiny_kitti))
     for frame, reports in ((None, True), (None, False), (0, True)):

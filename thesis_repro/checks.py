@@ -5,6 +5,7 @@ can only be guessed is not checked: the figures of a study show frames, masks an
 """
 
 import sys
+import zlib
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -72,7 +73,15 @@ def check_kitti(root: Path) -> list[str]:
             f"{sequence.has_truth}; with times: {sequence.has_times}"
         )
         print("\n".join(f"  {one_line(line)}" for line in [fact, *of_sequence(sequence)]))
-        problems += _damaged(sequence.frame, range(len(sequence)), f"sequence {name}")
+        checksums: dict[int, int] = {}
+
+        def read(index: int, sequence: Any = sequence, checksums: Any = checksums) -> None:
+            checksums[index] = zlib.crc32(sequence.frame(index).data)
+
+        problems += _damaged(read, range(len(sequence)), f"sequence {name}")
+        equal = sum(checksums[index] == checksums.get(index - 1) for index in checksums)
+        if equal:
+            print(f"  sequence {name}: {equal} frames equal the frame before, and are no steps")
     return sorted(problems)
 
 
