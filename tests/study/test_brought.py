@@ -1,5 +1,7 @@
 """Studies of what people bring: true poses of another kind, own keypoints."""
 
+import re
+
 import cv2
 import numpy as np
 import pandas as pd
@@ -11,6 +13,9 @@ from thesis_repro.command.cli import main
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.data.trajectories import write_kitti_poses
 from thesis_repro.odometry import metrics
+from thesis_repro.report import study as report
+from thesis_repro.study import sources
+from thesis_repro.study.study import Study
 
 
 @pytest.fixture
@@ -71,3 +76,66 @@ def test_real_poses_of_other_kinds_are_told(kitti_real):
     ):
         assert metrics.TRUTH_KINDS[kind] in metrics.foreign_truth(estimated, poses)
     assert metrics.foreign_truth(estimated, true) == ""
+
+
+DETECT = """
+import cv2, numpy as np
+def detect(frame, settings, mask):
+    return {}
+"""
+CORNERS = "cv2.goodFeaturesToTrack(frame, 300, 0.01, 5)[:, 0]"
+TRACK = """
+def track(previous, current, points, settings):
+    return {}
+"""
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        (
+            DETECT.format(f"{CORNERS}[:, ::-1]"),
+            "detect returned u .*, outside the frame of 480x160",
+        ),
+        (
+            DETECT.format(f"{CORNERS}.astype(int)"),
+            r"detect returned int64 \(\d+, 2\); must be float32",
+        ),
+        (DETECT.format(f"{CORNERS}[None]"), r"detect returned float32 \(1, \d+, 2\)"),
+        (DETECT.format("cv2.ORB.create().detect(frame)"), "detect returned tuple; must be"),
+        (DETECT.format("cv2.cvtColor(frame, 99999)"), "error: OpenCV"),
+        (TRACK.format("points, [1] * len(points)"), "track returned .* and list"),
+        (TRACK.format("points[1:], points[1:, 0] > 0"), "track returned float32"),
+        (TRACK.format("points"), "own.py: "),
+    ],
+)
+def test_own_functions_are_tried_before_the_study(street, text, said, capsys):
+    path = street.parent / "own.py"
+    path.write_text(text)
+    code, out = study(street, "--keypoints", path)
+    error = capsys.readouterr().err
+    assert code == 1 and not out.exists()
+    assert re.search(f"own.py: .*{said}|{said}", error) and "\\n" not in error
+    assert error.count("own.py") == 1
+
+
+def test_own_keypoints_are_drawn(street, capsys):
+    path = street.parent / "own.py"
+    path.write_text(DETECT.format(CORNERS))
+    code, out = study(street, "--keypoints", f"own={path}", "--masks", street.parent / "masks")
+    assert code == 0
+    planned = Study(
+        street,
+        ("00", "01"),
+        sources.named([("keypoints", "own", path), ("masks", None, street.parent / "masks")], None),
+        (),
+    )
+    runs = pd.read_csv(out / "runs.csv", dtype={"sequence": str}, keep_default_na=False)
+    figure = report.figure_sources(planned, runs)
+    own, masked = np.reshape(figure.axes, (2, 3))
+    expected = cv2.goodFeaturesToTrack(Street(12).frame(6), 300, 0.01, 5)[:, 0]
+    assert np.array_equal(own[2].collections[0].get_offsets(), expected)
+    assert not own[1].images and masked[1].images
+    failed = runs[runs["source"] != "own"]
+    assert report._failed(planned, failed)["source"].tolist() == ["own"]
+    assert report._failed(planned, runs).empty

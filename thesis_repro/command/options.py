@@ -256,8 +256,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--keypoints": _source(
             "keypoints",
             "[NAME=]FILE.py",
-            "Python file, which is executed, with your function detect(frame, settings, mask) or "
-            "track(previous, current, points, settings)",
+            "Python file, which is executed, with your function detect(frame, settings, mask), "
+            "track(previous, current, points, settings), or others of the odometry's four calls",
         ),
         "--paths": _source(
             "paths",
