@@ -230,8 +230,15 @@ def of_masks(source: LabelMasks | MaskFolder) -> list[str]:
     """
     folder = source.paths[0].parent
     shares = [coverage(source[index]) for index in _sampled(source)]
-    if isinstance(source, LabelMasks) and source.settings.ids == "labels":
+    ids = np.arange(cityscapes.N_CLASSES)
+    if isinstance(source, LabelMasks):
         ids = np.flatnonzero(_class_shares(source))
+    if len(ids) == 1:
+        return [
+            f"{folder}: label maps hold nothing but {cityscapes.LABELS[ids[0]].name}; the network that "
+            "made them does not work, or has other ids"
+        ]
+    if isinstance(source, LabelMasks) and source.settings.ids == "labels":
         if ids.max() < len(cityscapes.TRAINED):
             return [
                 f"{folder}: label maps hold no id above {ids.max()}, so no sky, vegetation or cars; "
