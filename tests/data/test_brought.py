@@ -203,6 +203,43 @@ cam1:
   camera_model: omni
   intrinsics: [1.1, 60, 61, 31, 23]
 """
+ROS = """image_width: 64
+image_height: 48
+camera_name: front
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [50.0, 0.0, 32.0, 0.0, 51.0, 24.0,
+    0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 4
+  data: [-0.3, 0.1, 0.01, -0.02]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+"""
+CAMERA_INFO = """header: {frame_id: "front"}
+height: 48
+width: 64
+distortion_model: "plumb_bob"
+D: [-0.3, 0.1, 0.01, -0.02]
+K: [50.0, 0.0, 32.0, 0.0, 51.0, 24.0, 0.0, 0.0, 1.0]
+"""
+EUROC = """sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, -0.02, 1.0, 0.0, 0.0, -0.06, 0.0, 0.0, 1.0, 0.01, 0.0, 0.0, 0.0, 1.0]
+rate_hz: 20
+resolution: [64, 48]
+camera_model: pinhole
+intrinsics: [50.0, 51.0, 32.0, 24.0] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.3, 0.1, 0.01, -0.02]
+"""
 
 
 @pytest.mark.parametrize(
@@ -214,6 +251,10 @@ cam1:
         ("camera.yaml", f'%YAML:1.0\nCamera.type: "PinHole"\n{ORB_SLAM}'),
         ("camera.yaml", ORB_SLAM.replace("Camera.", "Camera1.")),
         ("camera.yml", f"%YAML:1.0\n---\n{OPENCV}"),
+        ("camera.yml", f"image_width: 64\nimage_height: 48\nfisheye_model: 0\n{OPENCV}"),
+        ("camera.yaml", ROS),
+        ("camera.yaml", CAMERA_INFO),
+        ("camera.yaml", EUROC),
     ],
 )
 def test_distortion_is_taken_out_as_opencv_does(own, name, text):
@@ -235,8 +276,7 @@ def test_distortion_is_taken_out_as_opencv_does(own, name, text):
         ("camera.txt", "50 50 32 24 0.1"),
         ("camera.txt", "P0: 50 0 32"),
         ("camera.yaml", "a: [1"),
-        ("camera.yaml", KALIBR.replace("radtan", "equidistant")),
-        ("camera.yaml", KALIBR.replace("pinhole", "omni")),
+        ("camera.yaml", OPENCV.replace(".1, 0.01, -0.02 ]", ".1 ]")),
         ("camera.yaml", KALIBR.replace("intrinsics", "extrinsics")),
         ("camera.yaml", KALIBR.replace("32, 24", "32")),
         ("camera.yaml", ORB_SLAM.replace("p1", "k3").replace("p2", "k4")),  # a fisheye camera
@@ -246,6 +286,47 @@ def test_another_file_is_no_camera(own, name, text):
     (own / name).write_text(text)
     with pytest.raises(InputError, match=f"{name}: must hold fx fy cx cy"):
         kitti.Sequence(None, own, calibration=own / name)
+
+
+@pytest.mark.parametrize(
+    "text, model",
+    [
+        (f"fisheye_model: 1\n{OPENCV}", "fisheye_model is 1"),
+        (KALIBR.replace("radtan", "equidistant"), "distortion_model is equidistant"),
+        (KALIBR.replace("pinhole", "omni"), "camera_model is omni"),
+        (ROS.replace("plumb_bob", "fisheye"), "distortion_model is fisheye"),
+        (f'Camera.type: "KannalaBrandt8"\n{ORB_SLAM}', "Camera.type is KannalaBrandt8"),
+    ],
+)
+def test_a_camera_of_another_model_is_named(own, text, model):
+    (own / "camera.yaml").write_text(text)
+    with pytest.raises(InputError, match=f"camera.yaml: {model}"):
+        kitti.Sequence(None, own, calibration=own / "camera.yaml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"image_width: 80\nimage_height: 60\n{OPENCV}",
+        ROS.replace("image_width: 64", "image_width: 128"),
+        CAMERA_INFO.replace("height: 48", "height: 50"),
+        EUROC.replace("64, 48", "48, 64"),
+        KALIBR.replace("64, 48", "640, 480"),
+        f"Camera.width: 63\nCamera.height: 48\n{ORB_SLAM}",
+    ],
+)
+def test_a_camera_of_frames_of_another_size_is_named(own, text):
+    (own / "camera.yaml").write_text(text)
+    sequence = kitti.Sequence(None, own, calibration=own / "camera.yaml")
+    with pytest.raises(InputError, match=r"camera.yaml: .*, but .*000000.png has 64x48"):
+        sequence.frame(0)
+
+
+def test_a_rough_camera_is_four_numbers(own):
+    (own / "camera.txt").write_text("64 64 32 24")
+    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    assert np.array_equal(sequence.intrinsics, [[64, 0, 32], [0, 64, 24], [0, 0, 1]])
+    assert np.array_equal(sequence.frame(0), kitti.Sequence(None, own).frame(0))
 
 
 def test_frames_of_16_bits_are_scaled_by_their_maximum(own, caplog):

@@ -112,6 +112,9 @@ def odometry(options: Any) -> None:
         write_tum(options.tum, result.poses, sequence.times)
     steps = len(sequence), result.failed_steps, result.dropped_steps
     _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
+    if sequence.has_truth:
+        reason = metrics.foreign_truth(result.poses, sequence.poses)
+        _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
     record = _record(result, sequence)
     if options.plot:
         from thesis_repro.report import paths, style
@@ -182,6 +185,7 @@ def study(options: Any) -> int:
         for sequence, masks in study.shown_masks(planned):
             warnings += _warn(_check_masks(sequence, masks))
         outcome = planned.run(folder, options.jobs, options.dask)
+        planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
         runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
         of_runs = [
             checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()

@@ -188,8 +188,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--calibration": dict(
             type=Path,
             metavar="FILE",
-            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2, or YAML of OpenCV, "
-            "ORB-SLAM or Kalibr (calib.txt, without distortion)",
+            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are "
+            "enough), or YAML of OpenCV, ROS, EuRoC, Kalibr or ORB-SLAM (calib.txt, without distortion)",
         ),
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
@@ -256,8 +256,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--keypoints": _source(
             "keypoints",
             "[NAME=]FILE.py",
-            "Python file, which is executed, with your function detect(frame, settings, mask) or "
-            "track(previous, current, points, settings)",
+            "Python file, which is executed, with your function detect(frame, settings, mask), "
+            "track(previous, current, points, settings), or others of the odometry's four calls",
         ),
         "--paths": _source(
             "paths",

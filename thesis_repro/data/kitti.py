@@ -203,10 +203,11 @@ class Sequence:
             camera_folder = frame_folder.parent
             self.calibration_path = kitti_raw.calibration(self.folder)
             self.times_path = camera_folder / kitti_raw.TIMES
-        self.distortion = np.empty(0)
+        self.distortion, self.stated_size = np.empty(0), None
         if calibration is not None:
             self.calibration_path = Path(calibration)
-            self.intrinsics, self.distortion = cameras.read_camera(calibration)
+            camera_of_file = cameras.read_camera(calibration)
+            self.intrinsics, self.distortion, self.stated_size = camera_of_file
         else:
             self.intrinsics = read_intrinsics(self.calibration_path, camera_folder.name)
         self.has_times = self.times_path.exists()
@@ -308,7 +309,8 @@ class Sequence:
     def size(self) -> tuple[int, int]:
         """Size (height, width) of the first frame. Raises InputError as `check_camera` does."""
         size = self._read(self.frame_paths[0]).shape
-        check_camera(self.calibration_path, self.intrinsics, self.frame_paths[0], size)
+        first = self.frame_paths[0]
+        check_camera(self.calibration_path, self.intrinsics, first, size, self.stated_size)
         return size
 
     def frame(self, index: int) -> np.ndarray:
@@ -437,11 +439,15 @@ def is_camera_matrix(matrix: np.ndarray) -> bool:
 
 
 def check_camera(
-    path: Path | str, intrinsics: np.ndarray, frame: Path | str, size: tuple[int, int]
+    path: Path | str,
+    intrinsics: np.ndarray,
+    frame: Path | str,
+    size: tuple[int, int],
+    stated: tuple[int, int] | None = None,
 ) -> None:
-    """Raise InputError if frames are too small or do not fit the camera matrix.
+    """Raise InputError if frames are too small or do not fit the camera.
 
-    size: height and width.
+    size: height and width. stated: those that the camera's file says its frames have.
     """
     height, width = size
     if min(size) < MIN_FRAME_SIDE:
@@ -449,10 +455,11 @@ def check_camera(
             f"{frame}: {width}x{height} pixels; each side needs {MIN_FRAME_SIDE} or more"
         )
     (fx, _, u), (_, fy, v), _ = intrinsics
-    of_kitti = KNOWN_SIZES.get((round(fx, 3), round(u, 3)))
-    if of_kitti and of_kitti != (width, height):
+    if stated is None:
+        stated = KNOWN_SIZES.get((round(fx, 3), round(u, 3)), (width, height))[::-1]
+    if stated != size:
         raise InputError(
-            f"{path}: is KITTI's for frames of {of_kitti[0]}x{of_kitti[1]} pixels, but these have "
+            f"{path}: is for frames of {stated[1]}x{stated[0]} pixels, but {frame} has "
             f"{width}x{height}; scale or shift focal lengths and centre as the frames were"
         )
     center_fits = 0 <= u <= width and 0 <= v <= height

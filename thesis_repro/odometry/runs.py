@@ -12,7 +12,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
-from thesis_repro.odometry.types import FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
+from thesis_repro.odometry.types import EQUAL, FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
 from thesis_repro.running import messages
 from thesis_repro.running.files import progress
 
@@ -53,7 +53,7 @@ class Result:
 
     @property
     def failed_steps(self) -> int:
-        """Number of frames with a flag other than "stationary"."""
+        """Number of frames with a flag other than "stationary" and "equal frame"."""
         return int(is_flagged(self.frames).sum())
 
     @property
@@ -63,8 +63,8 @@ class Result:
 
 
 def is_flagged(frames: pd.DataFrame) -> pd.Series:
-    """Whether a frame has a flag other than "stationary", booleans (n,), see Result.frames."""
-    return ~frames["flag"].isin(["", STATIONARY])
+    """Whether a frame has a flag that tells of doubt, booleans (n,), see Result.frames."""
+    return ~frames["flag"].isin(["", STATIONARY, EQUAL])
 
 
 def start_pose(sequence: Sequence) -> np.ndarray:

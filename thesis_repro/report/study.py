@@ -22,10 +22,11 @@ from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, methods, runner
 from thesis_repro.study.jobs import ESTIMATORS
-from thesis_repro.study.sources import KINDS, UNMASKED, FileMasks, Source
+from thesis_repro.study.sources import KINDS, UNMASKED, FileMasks, Source, own_calls
 from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
+DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on frames
 FIT = 4  # columns of errors across a page, in letters that can be read
 
 
@@ -48,7 +49,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     note = one_line(f"odometry: {data}; compared: {', '.join(masks)}")
     write_paths(study, runs, folder)
     figures = {}
-    if (runs["method"] == "masked").any():
+    if runs["method"].isin(DRAWN).any():
         figures["sources"] = figure_sources(study, runs)
     for sequence in study.opened:
         figures[f"paths-{sequence.name}"] = figure_paths(study, runs, sequence, folder)
@@ -60,7 +61,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf")
     numbers = {
-        "summary": comparison.table_summary(table, runs),
+        "summary": pd.concat([comparison.table_summary(table, runs), _failed(study, runs)]),
         "comparison": comparison.table_comparison(table),
         "widths": comparison.table_widths(runs),
         "errors": comparison.table_errors(table, runs),
@@ -154,15 +155,15 @@ def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
 
 
 def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
-    """Draw the middle frame of the first sequence that has runs with masks, one row a source.
+    """Draw the middle frame of the first sequence that has such runs, one row a source.
 
     A row shows the source's label map (or the frame, if there is none), its mask and the kept
-    keypoints, so that a person sees which masks are inverted or lie elsewhere. Sources whose runs
-    failed are left out.
+    keypoints, so that a person sees which masks are inverted or lie elsewhere. Own keypoints have
+    no mask. Sources whose runs failed are left out.
     """
-    masked = runs[runs["method"] == "masked"]
-    name = masked["sequence"].iloc[0]
-    with_runs = set(masked.loc[masked["sequence"] == name, "source"])
+    drawn = runs[runs["method"].isin(DRAWN)]
+    name = drawn["sequence"].iloc[0]
+    with_runs = set(drawn.loc[drawn["sequence"] == name, "source"])
     sources = [source for source in study.sources if source.name in with_runs]
     (sequence,) = (sequence for sequence in study.opened if sequence.name == name)
     index = len(sequence) // 2
@@ -170,20 +171,30 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
     label_maps = []
     figure, axes = style.frame_panels(frame, len(sources), 3, 1.5 * style.PAGE_WIDTH)
     for (first, second, third), source in zip(np.reshape(axes, (-1, 3)), sources, strict=True):
-        masks = source.masks(sequence, shown_width(study))
         style.show_image(first, frame, f"{source.name}: frame {index}")
-        if isinstance(masks, LabelMasks):
-            label_maps.append(label_map_of(masks, index))
-            colors = style.label_colors(label_maps[-1], frame)
-            style.show_image(first, colors, f"{source.name}: label map")
-        mask = masks[index]
-        style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
-        points = keypoints.detect(frame, THESIS, mask)
+        if source.kind == "keypoints":
+            second.set_axis_off()
+            points = own_calls(source.folder).detect(frame, THESIS, None)
+        else:
+            masks = source.masks(sequence, shown_width(study))
+            if isinstance(masks, LabelMasks):
+                label_maps.append(label_map_of(masks, index))
+                colors = style.label_colors(label_maps[-1], frame)
+                style.show_image(first, colors, f"{source.name}: label map")
+            mask = masks[index]
+            style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
+            points = keypoints.detect(frame, THESIS, mask)
         style.show_image(third, frame, f"{source.name}: {len(points)} keypoints")
         third.scatter(*points.T, **style.KEYPOINT)
     if label_maps:
         style.class_legend(figure, *label_maps)
     return figure
+
+
+def _failed(study: Study, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of the summary for sources without any run."""
+    names = [source.name for source in study.sources if source.name not in set(runs["source"])]
+    return pd.DataFrame({"source": names, "verdict": ["all runs failed"] * len(names)})
 
 
 def figure_paths(study: Study, runs: pd.DataFrame, sequence: Sequence, folder: Path) -> Figure:

@@ -111,9 +111,11 @@ class Batches:
 
         transforms: if given, there are two sets of one length, and every epoch augments the first
         set again and uses the result instead of the second set.
-        Raises InputError for an empty set, images that are not uint8, and images and label maps
-        that do not match.
+        Raises InputError for an empty set, images that are not uint8, images and label maps that do
+        not match, ids above 34 and a batch size below 1.
         """
+        if batch_size < 1:
+            raise InputError(f"batch size {batch_size}: must be 1 or more")
         for images, labels in sets:
             is_uint8 = images.ndim == 4 and images.dtype == np.uint8
             if not is_uint8 or len(images) == 0 or images.shape[:3] != labels.shape:
@@ -121,6 +123,13 @@ class Batches:
                     f"images {images.shape} {images.dtype} and label maps {labels.shape}; expected (n, "
                     "size, size, channels) uint8 and (n, size, size), n at least 1"
                 )
+            for number, label_map in enumerate(labels):
+                unknown = label_map[(label_map >= N_CLASSES) & (label_map != augmentation.NOTHING)]
+                if len(unknown):
+                    raise InputError(
+                        f"label map {number}: holds {unknown[0]}; must hold Cityscapes label ids, 0 to "
+                        f"{N_CLASSES - 1}, or {augmentation.NOTHING} for no class"
+                    )
         self.sets, self.batch_size, self.seed = sets, batch_size, seed
         self.transforms = transforms
         self.epoch = 0
@@ -264,6 +273,22 @@ class ResumableTraining(keras.callbacks.Callback):
         """Move the progress bar."""
         self._bar.update()
 
+    def on_test_end(self, logs: Any = None) -> None:
+        """Stop if the validation loss is not finite, before anything of the epoch is written.
+
+        Raises InputError.
+        """
+        loss = float((logs or {}).get("loss", 0))
+        if not np.isfinite(loss):
+            self._bar.close()
+            kept = "no network was written"
+            if self.rows:
+                kept = f"the best network of the {len(self.rows)} epochs before is kept"
+            raise InputError(
+                f"{self.folder}: the loss of epoch {self.batches.epoch + 1} is {loss:g}, so the training has "
+                f"stopped, and {kept}; try a smaller learning rate or another loss"
+            )
+
     def on_epoch_end(self, epoch: int, logs: Any = None) -> None:
         """Write the history and the checkpoint."""
         self.rows.append({"epoch": epoch + 1} | {name: float(logs[name]) for name in logs})
@@ -297,8 +322,8 @@ def load_model(path: str | Path) -> Any:
 
     Code in the file is never executed: Keras' safe mode refuses it, and all layers that are not
     Keras' own. The classes may be any up to 256; those of the thesis's network are Cityscapes' ids.
-    Raises InputError if the file is missing, truncated, no model, or holds code, and if the network
-    does not map images of one size to a class for each pixel.
+    Raises InputError if the file is missing, truncated, no model, or holds code, if its weights are
+    not finite, and if the network does not map images of one size to a class for each pixel.
     """
     if Path(path).is_dir():
         raise InputError(
@@ -324,6 +349,11 @@ def load_model(path: str | Path) -> Any:
         raise InputError(
             f"{path}: a model from {inputs} to {outputs}; expected (None, height, width, 1 or 3) to "
             "(None, height, width, classes), so name another model"
+        )
+    if not all(np.isfinite(weights).all() for weights in model.get_weights()):
+        raise InputError(
+            f"{path}: has weights that are no finite numbers, because its training broke; train it again, "
+            "or name another model"
         )
     return same_bits(model)
 

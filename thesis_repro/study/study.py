@@ -5,10 +5,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry import THESIS
-from thesis_repro.running import results
+from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.running import messages, results
 from thesis_repro.study import compare, jobs, runner, sources
 from thesis_repro.study.sources import Source
 
@@ -60,7 +62,9 @@ class Study:
     def run(self, folder: Path, processes: int = 1, scheduler: str | None = None) -> runner.Outcome:
         """Run the jobs whose results are not in the folder yet, see `runner.run_jobs`.
 
-        Raises InputError for a folder with results of another number of frames.
+        Sequences whose true poses are not the camera's are left out of the table, with a warning.
+        Raises InputError for a folder with results of another number of frames, and if no sequence
+        is left.
         """
         run_jobs = partial(
             runner.run_jobs,
@@ -82,22 +86,49 @@ class Study:
                 sources=self.sources,
                 repetitions=self.repetitions,
             )
-            first = run_jobs(first_jobs)
+            outcome = first = run_jobs(first_jobs)
             if (first.table["method"] == "baseline").all():
                 raise InputError(
                     "every run but those with all keypoints failed (see above), so there is nothing to "
                     "compare"
                 )
-            if not self.tested:
-                return first
-            more_jobs = runner.keypoint_controls(
-                first.table,
-                self.opened,
-                self.sources,
-                self.repetitions,
-                self.tested,
-                self.estimators,
-            )
-            both = run_jobs(first_jobs + more_jobs)
-        # the second call counts the runs of the first one as kept
-        return replace(both, made=both.made + first.made, kept=both.kept - first.made)
+            foreign = self._foreign_truths(first.table, folder)
+            if self.tested:
+                more_jobs = runner.keypoint_controls(
+                    first.table,
+                    self.opened,
+                    self.sources,
+                    self.repetitions,
+                    self.tested,
+                    self.estimators,
+                )
+                both = run_jobs(first_jobs + more_jobs)
+                # the second call counts the runs of the first one as kept
+                made, kept = both.made + first.made, both.kept - first.made
+                outcome = replace(both, made=made, kept=kept)
+        table = outcome.table[~outcome.table["sequence"].isin(foreign)]
+        return replace(outcome, table=table, warnings=[*outcome.warnings, *foreign.values()])
+
+    def _foreign_truths(self, table: pd.DataFrame, folder: Path) -> dict[str, str]:
+        """Return a line for each sequence whose true poses are not the camera's, and print it.
+
+        Raises InputError if they are those of all sequences.
+        """
+        runs = table[(table["method"] == "baseline") & (table["repetition"] == 0)]
+        poses = runner.run_poses(runs, folder / RUNS)
+        lines = {}
+        for sequence in self.opened:
+            reasons = [
+                metrics.foreign_truth(estimate, sequence.poses)
+                for (name, _), estimate in poses.items()
+                if name == sequence.name
+            ]
+            if reasons and all(reasons):  # with every estimator
+                lines[sequence.name] = (
+                    f"{sequence.poses_path}: {reasons[0]}; sequence {sequence.name} is left out"
+                )
+        if set(runs["sequence"]) == set(lines):
+            raise InputError(next(iter(lines.values())))
+        for line in lines.values():
+            messages.log.warning(line)
+        return lines
