@@ -1,4 +1,4 @@
-"""Figures 4.2 to 4.16: single frames, errors in metres, and keypoints.
+"""Figures 4.3 to 4.16: single frames, errors in metres, and keypoints.
 
 `thesis_repro.report.comparison` shows ratios of errors.
 
@@ -19,7 +19,6 @@ from matplotlib.patches import Patch
 
 from thesis import frames, thesis_tables
 from thesis.flicker import View
-from thesis_repro.data.cityscapes import colorize
 from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import detect
 from thesis_repro.report import style
@@ -52,21 +51,6 @@ FAILED: dict[str, Any] = {
     "clip_on": False,
     "label": "failed run",
 }
-
-
-def figure_4_02(
-    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, model_name: str
-) -> plt.Figure:
-    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction.
-
-    Section 4.1.
-    """
-    figure, axes = style.new_figure(1, 3, height=2.5)
-    style.show_image(axes[0], image, "image")
-    style.show_image(axes[1], colorize(label_map), "label map")
-    style.show_image(axes[2], colorize(prediction), f"prediction of\n{model_name}")
-    style.class_legend(figure, label_map, prediction)
-    return figure
 
 
 def figure_4_03(
