@@ -41,7 +41,7 @@ RUNS = ("runs", "shuffled_runs", "ablations")  # tables of runs in the build fol
 # What the sequences show at their start: 00 to 10 are KITTI odometry's, the others raw drives.
 STREETS = {
     "00": "a residential street with parked cars",
-    "01": "a slip road onto a motorway",
+    "01": "a ramp onto a motorway",
     "02": "a main road, then a turn into a road between trees",
     "05": "a residential street with few parked cars",
     "06": "a straight street past a building site, with parked cars",
@@ -160,16 +160,21 @@ def _other_runs(settings, sequences, others):
 
 
 def _streets(sequences):
-    """Return what each sequence shows, its length (metres) and the sum of its turns (degrees)."""
+    """Return what each sequence shows, its length (metres) and the sum of its turns (degrees).
+
+    A turn is the yaw of a step, its rotation about the camera's axis down. Pitch and roll, which a
+    road's unevenness gives, are no turns.
+    """
     rows = []
     for sequence in sequences:
         steps = np.linalg.inv(sequence.poses[:-1]) @ sequence.poses[1:]
+        yaw = np.degrees(np.arctan2(steps[:, 0, 2], steps[:, 2, 2]))
         rows.append(
             {
                 "sequence": sequence.name,
                 "frames": len(sequence),
                 "metres": round(metrics.travelled(sequence.poses)[-1]),
-                "turns (degrees)": round(metrics.angles(steps[:, :3, :3]).sum()),
+                "turns (degrees)": round(np.abs(yaw).sum()),
                 "street": STREETS.get(sequence.name, ""),
             }
         )

@@ -44,6 +44,7 @@ from thesis_repro.study.runner import CODE
 NUMBERS = (50, 100, 200, 400, 800)
 FILL = 5  # keypoints in each of 16 x 5 fields of the frame
 SEEDS = (None, 1, 2, 3)  # of the shuffles
+TIMED_RUNS = 5
 LABELS = {
     "all": "all keypoints",
     "strongest": "the strongest",
@@ -54,6 +55,7 @@ LABELS = {
 }
 ERRORS = {"se3": "aligned ATE", "rotation": "rotation error a frame"}
 MARGINS = {"se3": 1.25, "rotation": 1.1}  # a ratio between 1 / margin and margin is "as good"
+NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
 
 def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
@@ -137,10 +139,11 @@ def _measure_one(sequence: Sequence, labels: Path, file: Path, seeds: Iterable[i
 
 
 def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40) -> pd.DataFrame:
-    """Return the CPU time (milliseconds) of a frame for each choice: its fastest of three runs.
+    """Return the CPU time (milliseconds) of a frame for each choice: its fastest of some runs.
 
     With the thesis's estimator, one thread and the mask made from its label map, without the
-    network. Random choices are left out, because they are drawn from all detected keypoints.
+    network. The choices take turns, so that other programs slow all of them alike. Random choices
+    are left out, because they are drawn from all detected keypoints.
     folder: that of `measure`, which is called before. Times in it are not measured again.
     """
     file = folder / sequence.name / "milliseconds.csv"
@@ -148,17 +151,18 @@ def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40)
         return pd.read_csv(file)
     cv2.setNumThreads(1)
     excerpt = sequence.subset(frames)
-    rows = []
-    for (choice, number), (settings, masks) in choices(excerpt, labels).items():
-        if choice == "random":
-            continue
-        seconds = []
-        for _ in range(3):
+    timed = {key: run for key, run in choices(excerpt, labels).items() if key[0] != "random"}
+    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in timed}
+    for _ in range(TIMED_RUNS):
+        for key, (settings, masks) in timed.items():
             start = process_time()
             odometry.run(excerpt, settings, masks)
-            seconds.append(process_time() - start)
-        milliseconds = round(1000 * min(seconds) / len(excerpt), 1)
-        rows.append({"choice": choice, "number": number, "milliseconds": milliseconds})
+            seconds[key].append(process_time() - start)
+    # whole ones: repeated measurements differ by more than a millisecond
+    rows = [
+        {"choice": choice, "number": number, "milliseconds": round(1000 * least / len(excerpt))}
+        for (choice, number), least in ((key, min(runs)) for key, runs in seconds.items())
+    ]
     times = pd.DataFrame(rows)
     results.write_table(file, times)
     return times
@@ -239,25 +243,29 @@ def _answer(rows: pd.DataFrame, choice: str, number: int, rule: str) -> str:
 def figure(rows: pd.DataFrame, times: pd.DataFrame | None = None) -> Figure:
     """Draw the ratios of both errors against the number of keypoints, and the time of a frame.
 
-    rows: of `table`. times: of `time_steps`, drawn below the errors if given.
+    Ratios near 1 are drawn once more, enlarged; arrows there mark intervals that are cut. rows: of
+    `table`. times: of `time_steps`, drawn below the errors if given.
     """
     more = times is not None
+    scales = [(error, near) for error in ERRORS for near in (False, True)]
     drawing, panels = style.new_figure(
-        len(ERRORS) + more, len(ESTIMATORS), sharex=True, height=5.2 + 1.6 * more
+        len(scales) + more, len(ESTIMATORS), sharex=True, height=9 + 1.6 * more
     )
-    for panel_row, error in zip(panels, ERRORS, strict=False):
+    for panel_row, (error, near) in zip(panels, scales, strict=False):
         for panel, estimator in zip(panel_row, ESTIMATORS, strict=True):
             shown = rows[(rows["error"] == error) & (rows["estimator"] == estimator)]
-            _draw_curves(panel, shown)
-            panel.set_title(f"{ERRORS[error]}, {ESTIMATORS[estimator]}")
-            style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())
+            _draw_curves(panel, shown, near)
+            title = f"{ERRORS[error]}, {ESTIMATORS[estimator]}"
+            panel.set_title(f"the same, {NEAR[0]} to {NEAR[1]}" if near else title)
+            if not near:
+                style.ratio_axis(panel.yaxis, rows[["ratio", "low", "high"]].to_numpy())
         panel_row[0].set_ylabel("ratio to all keypoints")
     if times is not None:
         numbers = rows.drop_duplicates(["choice", "number"])[["choice", "number", "keypoints"]]
         timed = times.merge(numbers, on=["choice", "number"])
         _draw_times(panels[-1, 0], timed)
         panels[-1, 1].axis("off")
-    for panel in (panels[-1, 0], panels[len(ERRORS) - 1, -1]):
+    for panel in (panels[-1, 0], panels[len(scales) - 1, -1]):
         panel.set_xlabel("keypoints a frame")
         panel.tick_params(labelbottom=True)
     style.legend_below(drawing, panels.ravel()[:1], 3)
@@ -276,7 +284,7 @@ def _draw_times(panel: plt.Axes, timed: pd.DataFrame) -> None:
     panel.set_ylim(0)
 
 
-def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
+def _draw_curves(panel: plt.Axes, rows: pd.DataFrame, near: bool) -> None:
     panel.axhline(1, color=style.GRAY, linewidth=0.8)
     for index, (choice, label) in enumerate(LABELS.items()):
         of_choice = rows[rows["choice"] == choice].sort_values("keypoints")
@@ -288,6 +296,15 @@ def _draw_curves(panel: plt.Axes, rows: pd.DataFrame) -> None:
         panel.vlines(
             position, of_choice["low"], of_choice["high"], color=look["color"], linewidth=0.9
         )
+        if near:
+            inside = of_choice["ratio"].between(*NEAR)
+            cut_low, cut_high = inside & (of_choice["low"] < NEAR[0]), of_choice["high"] > NEAR[1]
+            for edge, marker, cut in zip(NEAR, "v^", (cut_low, inside & cut_high), strict=True):
+                for place in position[cut]:
+                    mark: dict[str, Any] = {"color": look["color"], "markersize": 4}
+                    panel.plot(place, edge, marker, clip_on=False, **mark)
+    if near:
+        panel.set_ylim(*NEAR)
     panel.set_xscale("log")
     panel.set_xticks([50, 100, 200, 400, 800, 1900], ["50", "100", "200", "400", "800", "1900"])
     panel.minorticks_off()

@@ -20,8 +20,6 @@ from thesis_repro.study.jobs import ESTIMATORS
 from thesis_repro.study.sources import UNMASKED
 
 BROUGHT = ("masked", *UNMASKED)  # methods of what a user brings; the others are controls
-# methods in the figure, few enough for a small screen; the table has all
-SHOWN = (*BROUGHT, "corrected", "mirrored", "spread")
 REACHES = (2, 4, 8, 16, 64)  # of the figure's axis, which goes from 1 / reach to reach
 # columns of the failed runs of a method and of its reference, "2 of 40"
 FAILED = {"failed runs": "failed", "failed runs of the reference": "reference_failed"}
@@ -30,19 +28,19 @@ CHOICES = {"best": "best width", "left_out": "left-out width", "fixed": "one wid
 
 
 def figure_comparison(table: pd.DataFrame) -> Figure:
-    """Draw the ratios of masks and of some controls to all keypoints.
+    """Draw the ratios of masks, other masks and controls to all keypoints.
 
     Grey dots are the sequences, the coloured mark is their typical ratio with its interval. The
     figure has one row of panels for each estimator and one column for each judging metric, all with
-    one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge. With
-    several sources of masks it shows no controls.
+    one scale, which shows nine of ten sequences. A sequence beyond it is named at the edge, and an
+    arrow marks an interval that is cut. With several sources of masks it shows no controls.
     """
     rows = _shown(table)
-    rows = rows[rows["method"].isin(SHOWN) & rows["metric"].isin(compare.JUDGING_METRICS)]
+    rows = rows[rows["metric"].isin(compare.JUDGING_METRICS)]
     order = list(rows["label"].unique())
     estimators = [name for name in ESTIMATORS if (rows["estimator"] == name).any()]
     metrics = [name for name in compare.JUDGING_METRICS if (rows["metric"] == name).any()]
-    height = 0.7 + (0.8 + 0.36 * len(order)) * len(estimators)
+    height = 0.7 + (0.8 + 0.33 * len(order)) * len(estimators)
     figure, axes = style.new_figure(
         len(estimators), len(metrics), squeeze=False, sharex=True, sharey=True, height=height
     )
@@ -84,8 +82,14 @@ def _draw_ratios(
                 place: dict[str, Any] = {"ha": "right" if edge > 1 else "left", "fontsize": 7}
                 panel.plot(edge, y - 0.1, marker, clip_on=False, **dot)
                 panel.text(edge, y - 0.22, f" {', '.join(named)} ", va="bottom", **place)
-        interval = [row["low"], row["high"]]
+        interval = np.clip([row["low"], row["high"]], 1 / reach, reach)
         panel.plot(interval, [y + 0.2] * 2, **style.interval_style(color, "|"))
+        for edge, marker, is_cut in (
+            (1 / reach, "<", row["low"] < 1 / reach),
+            (reach, ">", row["high"] > reach),
+        ):
+            if is_cut:
+                panel.plot(edge, y + 0.2, marker, color=color, markersize=5, clip_on=False)
         panel.plot(row["ratio"], y + 0.2, "D", color=color, markersize=4, markeredgewidth=0)
     panel.axvline(1, color="black", linewidth=0.8)
     panel.grid(axis="y", visible=False)

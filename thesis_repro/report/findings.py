@@ -78,6 +78,16 @@ def _judging(table: pd.DataFrame) -> pd.Series:
     return metric & (table["estimator"] == compare.judging_estimator(table))
 
 
+def _without_far_off(row: pd.Series) -> dict[str, Any]:
+    """Return a row of `compare.comparisons` over the sequences that are not far off.
+
+    It has the names of those left out, too.
+    """
+    ratios = row.drop([*compare.COLUMNS, *row["far_off"]]).dropna()
+    typical = compare.typical_ratio(ratios)
+    return {"metric": row["metric"], "left_out": row["far_off"], "far_off": [], **typical}
+
+
 def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict[str, Any]:
     """Return the values of one source of masks for the template."""
     runs = compare.of_source(runs, source)
@@ -93,6 +103,7 @@ def _source_values(runs: pd.DataFrame, table: pd.DataFrame, source: str) -> dict
     return {
         "name": source,
         "judged": judged.to_dict("records"),
+        "without": [_without_far_off(row) for _, row in judged.iterrows() if row["far_off"]],
         "verdict": compare.overall(judged["verdict"]),
         "width": compare.tested_width(runs),
         "masked": of_masks.to_dict("records"),
