@@ -106,14 +106,18 @@ def figure_4_05(
 
 
 def figure_overview(
-    frame: np.ndarray, all_keypoints: np.ndarray, mask: np.ndarray, kept_keypoints: np.ndarray
+    frame: np.ndarray,
+    all_keypoints: np.ndarray,
+    mask: np.ndarray,
+    kept_keypoints: np.ndarray,
+    title: str,
 ) -> plt.Figure:
     """Draw all keypoints of a frame, those on its mask, and 200 that are spread over the frame.
 
-    Keypoints are (n, 2) pixels.
+    Keypoints are (n, 2) pixels. title: of the frame.
     """
     spread = detect(frame, replace(THESIS, choice="spread", max_keypoints=200))
-    all_title = f"all {len(all_keypoints)} keypoints"
+    all_title = f"{title}: all {len(all_keypoints)} keypoints"
     kept_title = f"{len(kept_keypoints)} on the mask (light)"
     spread_title = f"{len(spread)} spread over the frame"
     pictures = {
@@ -122,7 +126,11 @@ def figure_overview(
         spread_title: frame,
     }
     keypoints = {all_title: all_keypoints, kept_title: kept_keypoints, spread_title: spread}
-    return frames.pictures(frame, pictures, keypoints, columns=3)
+    figure = frames.pictures(frame, pictures, keypoints)
+    for panel, points in zip(figure.axes, keypoints.values(), strict=True):
+        # two thousand dots must not merge, and two hundred must be seen
+        panel.collections[0].set_sizes([np.clip(2000 / len(points), 1.2, 8)])
+    return figure
 
 
 def _two_digits(value: float) -> str:

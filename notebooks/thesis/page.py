@@ -190,10 +190,10 @@ def _links_to_documents(settings: Settings) -> str | None:
 
 
 def _answer(docs: str) -> Markup:
-    """Return the first paragraph of docs/answer.md. docs: the way to that folder."""
+    """Return the answer and what to do of docs/answer.md. docs: the way to that folder."""
     text = (ROOT / "docs" / "answer.md").read_text(encoding="utf-8")
-    paragraph = text.split("\n\n")[1]
-    return texts.html(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", paragraph))
+    answer, to_do = (part.partition("\n\n")[2] for part in text.split("\n\n## ")[:2])
+    return texts.html(re.sub(r"\]\((?!\w+:|#)", f"]({docs}/", f"{answer}\n\n{to_do}"))
 
 
 def _describe(

@@ -156,12 +156,12 @@ def figure_4_17(seconds: pd.DataFrame) -> plt.Figure:
     """
     savings = thesis_tables.time_savings(seconds)
     figure, axes = style.new_figure(height=3.0)
-    together = f"the timed sequences together ({seconds['sequence'].nunique()})"
+    together = f"all {seconds['sequence'].nunique()} timed sequences together"
     axes.bar(savings.index.astype(int), savings, color=style.MASKED, label=together)
     dots = {"color": "#333333", "alpha": 0.5, "markersize": 3, "markeredgewidth": 0}
     for _, rows in seconds.groupby("sequence"):
         own = thesis_tables.time_savings(rows)
-        axes.plot(own.index.astype(int), own, "o", label="one of them", **dots)
+        axes.plot(own.index.astype(int), own, "o", label="a single timed sequence", **dots)
     least, most = REPORTED["headline_claims"]["time_savings_percent"]
     of_thesis = f"the thesis, on KITTI: {least} to {most} % saved with its best widths"
     axes.axhspan(-most, -least, color=style.GRAY, alpha=0.5, linewidth=0, zorder=3, label=of_thesis)

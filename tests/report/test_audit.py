@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis import ablations, audit, audit_rest, gap, trainings
+from thesis import ablations, audit, audit_rest, gap, thesis_tables, trainings
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.report import style
 from thesis_repro.running import results
+from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
 
@@ -54,6 +55,37 @@ def test_arithmetic_with_the_thesiss_tables(row, quantity, metric, value):
         & (table["metric"] == metric)
     ]
     assert rows["value"].item() == pytest.approx(value, abs=0.011)
+
+
+def test_alike_widths_count_as_one_and_unlike_ones_as_all():
+    random, widths = np.random.default_rng(0), 15
+    keys = pd.MultiIndex.from_product(
+        [map(str, range(400)), [0], range(1, widths + 1)],
+        names=["sequence", "repetition", "dilation_width"],
+    )
+    of_sequence = np.repeat(random.normal(size=400), widths)
+    level = pd.DataFrame({"sequence": keys.levels[0], "rmse": np.exp(2.0)})
+    for errors, expected in (
+        (of_sequence, 1),
+        (random.normal(size=len(keys)), widths),
+        (of_sequence + random.normal(size=len(keys)), widths / (1 + (widths - 1) / 2)),
+    ):
+        masked = pd.DataFrame({"rmse": np.exp(2 + errors)}, keys).reset_index()
+        _, number = thesis_tables.independent_widths(masked, level, "rmse")
+        assert number == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("folder", ["figures", "figures/kitti_excerpts"])
+def test_the_audit_has_the_times_of_the_budget_beside_it(folder):
+    rows = pd.read_csv(ROOT / folder / "audit.csv", dtype={"row": str})
+    budget = pd.read_csv(ROOT / folder / "budget.csv", index_col="stage")
+    stages = [stage for stage in budget.index if not stage.startswith(("all", "frames"))]
+    named = rows[rows["row"] == "49"].set_index("metric")["value"].add_suffix(" (ms)")
+    masked = budget["masked, width 10"]
+    assert named[stages].to_numpy() == pytest.approx(masked[stages].to_numpy(), abs=0.006)
+    (whole,) = rows.loc[rows["row"] == "16", "value"]
+    every = budget.loc[stages, "all keypoints"].sum()
+    assert whole == pytest.approx(masked[stages].sum() / every, rel=2e-3)
 
 
 def test_rows_without_a_measurement_stay_and_words_appear_once():
