@@ -32,8 +32,6 @@ REAL_CHAPTER = "Chapter 4 on real frames"
 # ids of the artefacts at the top of the page
 OPENING = ("findings", "figure_4_05", "figure-comparison")
 
-texts.LOADER.searchpath.append(str(Path(__file__).parent / "templates"))
-
 
 def update(settings: Settings, folder: Path) -> None:
     """Write the page of a run into a folder, with its figures and tables.

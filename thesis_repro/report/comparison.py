@@ -108,7 +108,7 @@ def _shown(table: pd.DataFrame) -> pd.DataFrame:
     sources_of_masks = rows.loc[rows["method"] == "masked", "source"]
     if sources_of_masks.nunique() > 1:  # controls of every source would be dozens of rows
         rows = rows[rows["method"].isin(BROUGHT)]
-    return rows.assign(label=_labels(rows))
+    return rows.assign(label=label_rows(rows))
 
 
 def _tested(rows: pd.DataFrame) -> pd.DataFrame:
@@ -120,7 +120,7 @@ def _tested(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["tested"] | ~rows["source"].isin(masked["source"])]
 
 
-def _labels(rows: pd.DataFrame) -> pd.Series:
+def label_rows(rows: pd.DataFrame) -> pd.Series:
     """Label each row with its method and the width of its masks.
 
     If there are several sources, the label begins with the row's source. Own keypoints and paths
@@ -184,7 +184,7 @@ def table_comparison(table: pd.DataFrame) -> pd.DataFrame:
     """
     rows = pd.concat([_tested(_over_all_keypoints(table)), table[table["reference"] != "baseline"]])
     numbers = rows["keypoints"].round().astype("Int64")  # missing for paths of another system
-    rows = rows.assign(label=_labels(rows), keypoints=numbers)
+    rows = rows.assign(label=label_rows(rows), keypoints=numbers)
     sequences = _sequences(table)
     keys = ["estimator", "source", "method", "dilation_width", "reference_source", "reference"]
     lines = []
@@ -246,7 +246,7 @@ def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     parts = {}
     for metric, estimator in product(compare.JUDGING_METRICS, NEUTRAL_ESTIMATORS):
         rows = runs[runs["estimator"] == estimator].dropna(subset=[metric])
-        errors = rows.groupby([_labels(rows), "sequence"])[metric]
+        errors = rows.groupby([label_rows(rows), "sequence"])[metric]
         means = errors.mean().unstack().reindex(labels)
         cells = errors.agg(_mean_and_spread).unstack().reindex(labels)
         cells = cells.mask(means == means.min(), "**" + cells + "**")
