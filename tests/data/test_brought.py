@@ -27,20 +27,30 @@ def own(tmp_path, tiny_kitti):
 @pytest.mark.parametrize(
     "stems, said",
     [
-        (["0.1", "0.15", "0.2", "10.0"], True),
-        (["1305031102.175304", "1305031102.211214", "1305031102.243211", "1305031103.0"], True),
-        (["0.10", "0.15", "0.20", "0.90"], False),
-        (["rgb.0009", "rgb.0010", "rgb.0011", "rgb.0012"], False),
+        (["0.1", "0.15", "0.2", "10.0"], "decimal numbers"),
+        (["1305031102.17", "1305031102.2", "1305031102.31", "1305031103.05"], "decimal numbers"),
+        (["0.103774", "0.20755", "0.5", "0.61132521234"], "decimal numbers"),
+        (["10.37800000", "10.141574000", "10.245347000", "11.3"], "seconds and nanoseconds"),
+        (["1.5", "2.25", "3.75", "4.0"], "decimal numbers"),  # one order
+        (["0.10", "0.15", "0.20", "0.90"], None),
+        (["rgb.0009", "rgb.0010", "rgb.0011", "rgb.0012"], None),
     ],
 )
-def test_names_that_are_decimal_numbers_are_ordered_by_value(own, caplog, stems, said):
+def test_names_that_are_numbers_are_in_their_order(own, caplog, stems, said):
     for path, stem in zip(sorted(own.glob("*.png")), stems):
         path.rename(own / f"{stem}.png")
     caplog.set_level("INFO")
     for _ in range(2):
         assert [path.stem for path in kitti.Sequence(None, own).frame_paths] == stems
-    lines = [line for line in caplog.messages if "decimal numbers" in line]
-    assert len(lines) == said
+    lines = [line for line in caplog.messages if "in the order of" in line]
+    assert len(lines) == bool(said) and all(f"names as {said}, " in line for line in lines)
+
+
+def test_names_in_two_possible_orders_are_refused(own):
+    for path, stem in zip(own.glob("*.png"), ["7.37811111", "7.141574123", "7.2453477", "8.3"]):
+        path.rename(own / f"{stem}.png")
+    with pytest.raises(InputError, match="own: 7.*png and the like may be decimal numbers, or"):
+        kitti.Sequence(None, own)
 
 
 def test_assumed_times_are_said_once(own, caplog):

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from copy import copy
 from decimal import Decimal
 from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -136,18 +137,49 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
 def frames_in(folder: Path) -> list[Path]:
     """Images of a folder in the order of their numbers.
 
-    Names such as 0.15 and 0.2 are ordered by value if they differ in their number of decimals.
+    Names such as 0.15 and 0.2, which differ in their number of decimals, are decimal numbers, or
+    seconds and nanoseconds without leading zeros. Raises InputError if they may be both, in
+    different orders.
     """
     paths = images(folder)
-    if not all(DECIMAL.fullmatch(path.stem) for path in paths):
+    parts = [path.stem.split(".") for path in paths if DECIMAL.fullmatch(path.stem)]
+    fractions = [fraction for _, fraction in parts]
+    if len(parts) < len(paths) or len(set(map(len, fractions))) < 2:
         return paths
-    if len({len(path.stem.partition(".")[2]) for path in paths}) > 1:
-        paths.sort(key=lambda path: Decimal(path.stem))
-        _say_once(
-            f"{folder}: frames are in the order of their names as decimal numbers, {paths[0].stem} to "
-            f"{paths[-1].stem}; if nanoseconds follow the dot, rename them to nine digits each"
-        )
-    return paths
+    by_value = sorted(paths, key=lambda path: Decimal(path.stem))
+    by_nanoseconds = sorted(paths, key=lambda path: _nanoseconds(path.stem))
+    form, ordered = "decimal numbers", by_value
+    if _may_be_nanoseconds(by_nanoseconds, fractions):
+        # decimals without their last zeros do not end with a zero
+        if any(len(fraction) > 1 and fraction.endswith("0") for fraction in fractions):
+            form, ordered = "seconds and nanoseconds", by_nanoseconds
+        elif by_value != by_nanoseconds:
+            raise InputError(
+                f"{folder}: {paths[0].name} and the like may be decimal numbers, or seconds and nanoseconds, "
+                "in different orders; rename the frames so that all have as many digits after the dot"
+            )
+    _say_once(
+        f"{folder}: frames are in the order of their names as {form}, {ordered[0].stem} to "
+        f"{ordered[-1].stem}"
+    )
+    return ordered
+
+
+def _nanoseconds(stem: str) -> int:
+    seconds, fraction = stem.split(".")
+    return int(seconds) * 10**9 + int(fraction)
+
+
+def _may_be_nanoseconds(ordered: list[Path], fractions: list[str]) -> bool:
+    """Whether names may be seconds and nanoseconds without leading zeros.
+
+    ordered: the frames in the order of these times, of which no camera makes more than 100,000 a
+    second.
+    """
+    times = [_nanoseconds(path.stem) for path in ordered]
+    is_slow = all(later - time >= 10_000 for time, later in pairwise(times))
+    has_no_zeros = not any(len(text) > 1 and text.startswith("0") for text in fractions)
+    return is_slow and has_no_zeros and max(map(len, fractions)) <= 9
 
 
 @cache
