@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thesis_repro import mask_files
+from thesis_repro import mask_files, odometry
 from thesis_repro.data import kitti, label_ids
 from thesis_repro.data.cityscapes import COLORS, ID, LABELS, TRAINED
 from thesis_repro.data.trajectories import read_poses, write_tum
@@ -389,3 +389,54 @@ def test_what_is_no_mask_is_named(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match="a.png: "):
         mask_files.read_mask(tmp_path / "a.png")
+
+
+def picture_frames(own, hidden, alpha):
+    """Give the frames a hidden part: transparent, or black."""
+    for path in sorted(own.glob("*.png")):
+        pixels = np.where(hidden, 0, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)).astype(np.uint8)
+        if alpha:
+            opaque = np.where(hidden, 0, 255).astype(np.uint8)
+            pixels = np.dstack([pixels, pixels, pixels, opaque])
+        cv2.imwrite(str(path), pixels)
+
+
+@pytest.mark.parametrize("alpha", [True, False])
+def test_no_keypoints_in_transparent_parts_and_black_borders(own, alpha):
+    hidden = np.zeros((48, 64), bool)
+    hidden[:5], hidden[:, 60:] = True, True
+    plain = kitti.Sequence(None, own)
+    assert plain.visible(0) is None
+    with pytest.raises(InputError, match="own: frames have no black border"):
+        plain.without_border()
+    picture_frames(own, hidden, alpha)
+    sequence = kitti.Sequence(None, own)
+    if not alpha:
+        assert sequence.visible(1) is None
+        sequence = sequence.without_border()
+    expected = np.zeros((48, 64), np.uint8)
+    expected[15:, :50] = 255  # ten pixels away
+    assert np.array_equal(sequence.subset(2).visible(1), expected)
+    detected = []
+
+    def detect(frame, settings, mask):
+        detected.append(mask)
+        return odometry.OPENCV.detect(frame, settings, mask)
+
+    calls = odometry.OPENCV._replace(detect=detect)
+    for masks, inner in ((None, expected), ([BINARY] * 4, expected & BINARY)):
+        odometry.run(sequence, masks=masks, calls=calls)
+        assert all(np.array_equal(mask, inner) for mask in detected) and len(detected) > 1
+        detected.clear()
+    alone = odometry.run(sequence, masks=[BINARY] * 4)
+    together = odometry.run_many(sequence, {1: (odometry.THESIS, [BINARY] * 4)})[1]
+    assert np.array_equal(alone.poses, together.poses)
+    assert alone.frames["detected"].equals(together.frames["detected"])
+
+
+def test_what_the_camera_did_not_see_has_no_keypoints(own):
+    (own / "camera.txt").write_text("50 50 32 24 0.4 0 0 0")
+    sequence = kitti.Sequence(None, own, calibration=own / "camera.txt")
+    black = sequence.undistorted(np.full((48, 64), 255, np.uint8)) == 0
+    visible = sequence.visible(0) > 0
+    assert black.any() and visible.any() and not visible[black].any()

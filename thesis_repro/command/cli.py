@@ -173,6 +173,7 @@ def study(options: Any) -> int:
         options.frames,
         options.scale_gate,
         {name: value for name, value in _odometry_settings(options).items() if name in OF_MASKED},
+        options.without_border,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -268,7 +269,10 @@ def _sequence(options: Any) -> Any:
         getattr(options, "truth", None),
         getattr(options, "calibration", None),
     )
-    return sequence.subset(options.frames)
+    sequence = sequence.subset(options.frames)
+    if vars(options).get("without_border"):
+        return sequence.without_border()
+    return sequence
 
 
 def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:

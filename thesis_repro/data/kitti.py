@@ -53,6 +53,10 @@ CALIBRATION_KEYS = {
 TRUE_LABELS = "labels_0"  # exact label maps beside image_0, which only the embedded world has
 DECIMAL = re.compile(r"\d+\.\d+")  # names of frames that may be seconds
 MIN_FRAME_SIDE = 16  # pixels; keypoints cannot be tracked in smaller frames
+# Pixels near a border where keypoints are left out: half a window of the tracker, which would see
+# the border's edge
+BORDER_MARGIN = 10
+BORDER_SAMPLES, BLACK = 12, 8  # frames, and the largest gray value of a border
 FRAME_TIME = 0.1  # seconds between frames, assumed for a sequence without times.txt
 
 
@@ -225,6 +229,7 @@ class Sequence:
         if truth is not None:
             self.poses_path = Path(truth)
         self.name, self.speed = self.folder.name, speed
+        self.border: np.ndarray | None = None  # see `without_border`
         frame_folder = images_of(self.folder, camera)
         self.frame_paths = frames_in(frame_folder)
         if not self.frame_paths:
@@ -387,6 +392,43 @@ class Sequence:
         """Yield the frames in order."""
         for index in range(len(self)):
             yield self.frame(index)
+
+    def visible(self, index: int) -> np.ndarray | None:
+        """Where keypoints may lie in frame `index`, (height, width) uint8: 255, elsewhere 0.
+
+        They lie neither in transparent parts, nor outside of what the camera saw if its distortion
+        is taken out, nor in the border (`without_border`), nor within BORDER_MARGIN pixels of
+        these. None: everywhere.
+        """
+        hidden = np.zeros(self.size, bool) if self.border is None else self.border.copy()
+        if self._has_alpha:
+            pixels = cv2.imread(str(self.frame_paths[index]), cv2.IMREAD_UNCHANGED)
+            if pixels.ndim == 3 and pixels.shape[2] == 4:
+                hidden |= self.undistorted((pixels[..., 3] == 0).astype(np.uint8)) > 0
+        if self.distortion.any():
+            hidden |= self.undistorted(np.full(self.size, 255, np.uint8)) == 0
+        if not hidden.any():
+            return None
+        margin = np.ones([2 * BORDER_MARGIN + 1] * 2, np.uint8)
+        return 255 - cv2.dilate(hidden * np.uint8(255), margin)
+
+    @cached_property
+    def _has_alpha(self) -> bool:
+        pixels = cv2.imread(str(self.frame_paths[0]), cv2.IMREAD_UNCHANGED)
+        return pixels is not None and pixels.ndim == 3 and pixels.shape[2] == 4
+
+    def without_border(self) -> "Sequence":
+        """Copy without keypoints in parts that are black in all frames, nor close to them.
+
+        Undistortion leaves such borders. Raises InputError if there are none.
+        """
+        sample = np.unique(np.linspace(0, len(self) - 1, BORDER_SAMPLES).astype(int))
+        border = np.max([self.frame(index) for index in sample], axis=0) <= BLACK
+        if not border.any() or border.all():
+            raise InputError(f"{self.folder}: frames have no black border; do not leave it out")
+        bordered = copy(self)
+        bordered.border = border
+        return bordered
 
     def subset(self, count: int | None) -> "Sequence":
         """Copy of the sequence with its first `count` frames; None for all frames."""
