@@ -1,5 +1,6 @@
 """Frames, poses and label maps as people bring them from other tools and data sets."""
 
+import re
 import shutil
 
 import cv2
@@ -8,6 +9,7 @@ import pytest
 from PIL import Image
 
 from thesis_repro import mask_files, odometry
+from thesis_repro.command.cli import main
 from thesis_repro.data import kitti, label_ids
 from thesis_repro.data.cityscapes import COLORS, ID, LABELS, TRAINED
 from thesis_repro.data.trajectories import read_poses, write_tum
@@ -440,3 +442,22 @@ def test_what_the_camera_did_not_see_has_no_keypoints(own):
     black = sequence.undistorted(np.full((48, 64), 255, np.uint8)) == 0
     visible = sequence.visible(0) > 0
     assert black.any() and visible.any() and not visible[black].any()
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ("--output path.txt --tum path.txt", "--output, --tum: both are path.txt"),
+        ("--tum ./path.txt --output path.txt", "--output, --tum: both are"),
+        ("--speed -3", "speed -3: must be"),
+        ("--speed 0", "speed 0: must be"),
+        ("--sequence drive.mp4", "drive.mp4: is a file; .*own-masks.md"),
+    ],
+)
+def test_names_and_numbers_that_cannot_be_are_one_line(own, options, said, monkeypatch, capsys):
+    monkeypatch.chdir(own.parent)
+    (own.parent / "drive.mp4").write_bytes(b"video")
+    assert main(["odometry", "--sequence", str(own), *options.split()]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(f"error: .*{said}", line)
+    assert not (own.parent / "path.txt").exists()

@@ -373,6 +373,11 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
+        for other in list(outputs)[: list(outputs).index(name)]:
+            if path.resolve() == outputs[other].resolve():
+                raise InputError(
+                    f"--{other}, --{name}: both are {path}; give each a name of its own"
+                )
     for path in filter(None, [vars(options).get("folder"), *outputs.values()]):
         for folder in data:
             if path.resolve().is_relative_to(folder):

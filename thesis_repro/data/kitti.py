@@ -133,6 +133,11 @@ def images_of(folder: str | Path, camera: str | None = None) -> Path:
     for name in names:
         if (folder / name / inner).is_dir():
             return folder / name / inner
+    if folder.is_file():
+        raise InputError(
+            f"{folder}: is a file; a sequence is a folder of frames (docs/own-masks.md says how to write "
+            "those of a video)"
+        )
     if camera is not None or not folder.is_dir():
         raise InputError(f"{folder / (camera or '')}: no such folder; it must hold the frames")
     return folder
@@ -291,6 +296,8 @@ class Sequence:
         self.times = self.times[first:end]
 
     def _check_speed(self, speed: float, has_times: bool) -> None:
+        if not 0 < speed < np.inf:
+            raise InputError(f"speed {speed:g}: must be a number of metres a second, above 0")
         if self.has_truth:
             raise InputError(
                 f"speed {speed}: leave it out; {self.poses_path} has the true step lengths"
