@@ -173,6 +173,7 @@ def study(options: Any) -> int:
         options.frames,
         options.scale_gate,
         {name: value for name, value in _odometry_settings(options).items() if name in OF_MASKED},
+        options.without_border,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -268,7 +269,10 @@ def _sequence(options: Any) -> Any:
         getattr(options, "truth", None),
         getattr(options, "calibration", None),
     )
-    return sequence.subset(options.frames)
+    sequence = sequence.subset(options.frames)
+    if vars(options).get("without_border"):
+        return sequence.without_border()
+    return sequence
 
 
 def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
@@ -369,6 +373,11 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
+        for other in list(outputs)[: list(outputs).index(name)]:
+            if path.resolve() == outputs[other].resolve():
+                raise InputError(
+                    f"--{other}, --{name}: both are {path}; give each a name of its own"
+                )
     for path in filter(None, [vars(options).get("folder"), *outputs.values()]):
         for folder in data:
             if path.resolve().is_relative_to(folder):

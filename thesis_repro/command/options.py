@@ -42,6 +42,11 @@ SHARED: dict[str, dict[str, Any]] = {
         metavar="METRES",
         help="a shorter step leaves the pose as it is; 0 for slow cameras and many frames a second (0.1)",
     ),
+    "--without-border": dict(
+        action="store_true",
+        help="no keypoints in and near parts that are black in all frames, as undistortion leaves them (transparent "
+        "parts never have any)",
+    ),
     "--spread": dict(
         type=settings.positive_whole_number,
         metavar="N",
@@ -179,7 +184,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
     "odometry": {
         **_shared(*SEQUENCE),
         **MASK_OPTIONS,
-        **_shared("--invert", "--scale-gate", "--spread", "--fill"),
+        **_shared("--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
         "--truth": dict(
             type=Path,
             metavar="FILE",
@@ -239,7 +244,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="NN",
             help="sequences to run (all in ROOT)",
         ),
-        **_shared("--frames", "--invert", "--scale-gate", "--spread", "--fill"),
+        **_shared("--frames", "--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
         **MASK_OPTIONS,
         **_shared("--output"),
         "--labels": _source(

@@ -24,7 +24,7 @@ class Study:
     sequences: their names. widths: pixels, for masks from label maps. tested: width of the
     controls, None for no controls. estimators: some of `jobs.ESTIMATORS`. frames: number of frames
     of each sequence, None for all. scale_gate: metres, see OdometrySettings. masked_settings: other
-    settings of the odometry, for all runs with masks.
+    settings of the odometry, for all runs with masks. without_border: of Sequence.
     """
 
     kitti: Path
@@ -37,11 +37,15 @@ class Study:
     frames: int | None = None
     scale_gate: float = THESIS.scale_gate
     masked_settings: dict[str, Any] = field(default_factory=dict)
+    without_border: bool = False
 
     @cached_property
     def opened(self) -> list[Sequence]:
         """The sequences, cut to `frames` frames."""
-        return [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
+        sequences = [Sequence(self.kitti, name).subset(self.frames) for name in self.sequences]
+        if self.without_border:
+            return [sequence.without_border() for sequence in sequences]
+        return sequences
 
     def check(self) -> None:
         """Raise InputError for the first problem with the settings, the sequences or the masks."""
@@ -78,6 +82,8 @@ class Study:
         )
         with results.claimed(folder):
             settings = {"scale_gate": self.scale_gate, **self.masked_settings}
+            if self.without_border:
+                settings["without_border"] = True
             results.stage(folder, replace=False, frames=self.frames, **settings)
             first_jobs = jobs.first_jobs(
                 self.opened,
