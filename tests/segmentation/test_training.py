@@ -145,19 +145,6 @@ def test_each_epoch_shows_each_image_once_in_another_order():
     assert seen[0] != seen[1] == seen[2]
 
 
-def test_fresh_augmentation_replaces_the_second_set_in_every_epoch():
-    sets = [SETS[:2], (np.zeros_like(SETS[0]), SETS[1])]
-    transforms = augmentation.training_augmenter(SIZE)
-    batches, changed = training.Batches(sets, 18, seed=0, transforms=transforms), []
-    for batches.epoch in (0, 1):
-        images = {image.tobytes() for image in next(iter(batches))[0]}
-        changed.append(images - {image.tobytes() for image in SETS[0]})
-    assert len(changed[0]) == len(changed[1]) == 9 and not changed[0] & changed[1]
-    seed = augmentation.image_seed(0, 3, epoch=1)
-    fresh, _ = augmentation.augment(transforms, SETS[0][3], SETS[1][3], seed)
-    assert fresh.tobytes() in changed[1]
-
-
 @pytest.mark.parametrize("at", [2, 12])
 def test_an_interrupted_training_goes_on_in_the_same_kernel(trained, tmp_path, at):
     run = fit(tmp_path, interrupted=at)

@@ -12,7 +12,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import albumentations as A
 import keras
 import numpy as np
 import pandas as pd
@@ -105,12 +104,9 @@ class Batches:
         sets: list[tuple[np.ndarray, np.ndarray]],
         batch_size: int,
         seed: Any = None,
-        transforms: A.Compose | None = None,
     ) -> None:
         """sets: (images, label maps) pairs; seed: None keeps their order.
 
-        transforms: if given, there are two sets of one length, and every epoch augments the first
-        set again and uses the result instead of the second set.
         Raises InputError for an empty set, images that are not uint8, images and label maps that do
         not match, ids above 34 and a batch size below 1.
         """
@@ -131,7 +127,6 @@ class Batches:
                         f"{N_CLASSES - 1}, or {augmentation.NOTHING} for no class"
                     )
         self.sets, self.batch_size, self.seed = sets, batch_size, seed
-        self.transforms = transforms
         self.epoch = 0
         self._places = [
             (number, index)
@@ -144,22 +139,13 @@ class Batches:
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield the batches of the current epoch: uint8 images and uint8 label maps."""
-        epoch, order = self.epoch, np.arange(len(self._places))
+        order = np.arange(len(self._places))
         if self.seed is not None:
-            order = np.random.default_rng((self.seed, epoch)).permutation(len(order))
+            order = np.random.default_rng((self.seed, self.epoch)).permutation(len(order))
         for start in range(0, len(order), self.batch_size):
-            pairs = [
-                self._pair(epoch, *self._places[place])
-                for place in order[start : start + self.batch_size]
-            ]
+            places = [self._places[place] for place in order[start : start + self.batch_size]]
+            pairs = [[array[index] for array in self.sets[number]] for number, index in places]
             yield tuple(map(np.stack, zip(*pairs)))
-
-    def _pair(self, epoch: int, number: int, index: int) -> tuple[np.ndarray, ...]:
-        if number and self.transforms:
-            images, labels = self.sets[0]
-            seed = augmentation.image_seed(self.seed, index, epoch)
-            return augmentation.augment(self.transforms, images[index], labels[index], seed)
-        return tuple(array[index] for array in self.sets[number])
 
     def dataset(self) -> tf.data.Dataset:
         """Return the batches as a `tf.data.Dataset` of float images and one-hot masks.
@@ -209,7 +195,6 @@ def made_from(model: Any, batches: Batches, validation: Batches) -> dict[str, An
         "pixels": [zlib.crc32(np.ascontiguousarray(array).data) for array in arrays],
         "batch_size": batches.batch_size,
         "seed": batches.seed,
-        "fresh_augmentation": batches.transforms and A.to_dict(batches.transforms),
     }
 
 
