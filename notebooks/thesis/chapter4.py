@@ -129,7 +129,7 @@ def figure_overview(
     figure = frames.pictures(frame, pictures, keypoints)
     for panel, points in zip(figure.axes, keypoints.values(), strict=True):
         # two thousand dots must not merge, and two hundred must be seen
-        panel.collections[0].set_sizes([np.clip(2000 / len(points), 1.2, 8)])
+        panel.collections[0].set_sizes([np.clip(2000 / len(points), 1.2, 8)])  # type: ignore[attr-defined]
     return figure
 
 
