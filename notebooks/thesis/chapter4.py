@@ -126,10 +126,11 @@ def figure_overview(
         spread_title: frame,
     }
     keypoints = {all_title: all_keypoints, kept_title: kept_keypoints, spread_title: spread}
-    figure = frames.pictures(frame, pictures, keypoints)
+    figure = frames.pictures(frame, pictures)
     for panel, points in zip(figure.axes, keypoints.values(), strict=True):
         # two thousand dots must not merge, and two hundred must be seen
-        panel.collections[0].set_sizes([np.clip(2000 / len(points), 1.2, 8)])  # type: ignore[attr-defined]
+        size = np.clip(2000 / len(points), 1.2, 8)
+        panel.scatter(*points.T, **{**KEYPOINT, "s": size})
     return figure
 
 
