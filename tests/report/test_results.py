@@ -152,6 +152,29 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
 
 
+def test_deviations_of_zero_are_a_note_below_the_table():
+    runs = runs_of(ELEVEN[:5], halved)
+    refined = runs["estimator"] == "refined"
+    runs.loc[~refined, "se3"] *= 1 + 0.1 * runs["repetition"]
+    table = comparison.table_errors(compare.comparisons(runs), runs)
+    has_deviation = table[ELEVEN[:5]].map(lambda cell: "±" in cell).all(axis=1)
+    varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "vote of all points")
+    assert has_deviation.equals(varied) and varied.any()
+    text = report_study.latex_errors(table, 3)
+    assert "0.0000" not in text and text.count(report_study.NO_DEVIATION) == 6  # of 8 tables
+    assert report_study.NO_DEVIATION not in report_study.latex_errors(table)
+
+
+def test_failures_of_the_other_estimator_stand_in_the_summary():
+    runs = runs_of(ELEVEN, halved)
+    failing = (runs["method"] == "masked") & (runs["estimator"] == "thesis")
+    runs.loc[failing & (runs["dilation_width"] == 10), "failed"] = 5.0
+    (row,) = comparison.table_summary(compare.comparisons(runs), runs).to_dict("records")
+    assert row["estimator"] == "refined estimator"
+    assert row["failed runs"] == "0 of 33; thesis's estimator 33 of 33"
+    assert row["failed runs of the reference"] == "0 of 33; thesis's estimator 0 of 33"
+
+
 def test_ratios_in_the_tables_equal_the_comparison():
     runs = runs_of(ELEVEN, halved, noise=0.2)
     table = compare.comparisons(runs)

@@ -143,14 +143,18 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each source: the answer of a study, see `compare.primary_comparison`.
 
     The columns are the mean number of keypoints that the source leaves and that of all, the ratio
-    of each judging metric, the verdict, and the control that does not use the classes in the frame
-    and has the lowest ratio of the first judging metric.
+    of each judging metric, the verdict, the estimator that these are of, failed runs (those of
+    another estimator stand behind its name), and the control that does not use the classes in the
+    frame and has the lowest ratio of the first judging metric.
     """
     estimator = compare.judging_estimator(table)
     total = compare.of_method(runs, "baseline", estimator)["mean_keypoints"].mean()
-    over_all = _over_all_keypoints(table[table["estimator"] == estimator])
-    judged = over_all[over_all["tested"] & over_all["metric"].isin(compare.JUDGING_METRICS)]
-    judged = judged[judged["method"].isin(BROUGHT)]
+    over_all = _over_all_keypoints(table)
+    is_judged = over_all["tested"] & over_all["metric"].isin(compare.JUDGING_METRICS)
+    brought = over_all[is_judged & over_all["method"].isin(BROUGHT)]
+    others = brought[brought["estimator"] != estimator].drop_duplicates(["source", "estimator"])
+    over_all = over_all[over_all["estimator"] == estimator]
+    judged = brought[brought["estimator"] == estimator]
     first_metric = next(iter(compare.JUDGING_METRICS))
     controls = _tested(over_all[over_all["metric"] == first_metric])
     controls = controls[controls["method"].isin(compare.SEGMENTATION_FREE_CONTROLS)]
@@ -162,8 +166,13 @@ def table_summary(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
             "keypoints": f"{first['keypoints']:.0f} instead of {total:.0f}",
             **{compare.METRICS[line["metric"]]: _short(line) for _, line in pair.iterrows()},
             "verdict": compare.overall(pair["verdict"]),
-            **{name: first[column] for name, column in FAILED.items()},
+            "estimator": ESTIMATORS[estimator],
         }
+        of_others = others[others["source"] == source]
+        for name, column in FAILED.items():
+            counts = zip(of_others["estimator"], of_others[column], strict=True)
+            named = [f"{ESTIMATORS[other]} {count}" for other, count in counts]
+            row[name] = "; ".join([first[column], *named])
         if first["method"] == "paths":
             row["keypoints"] = ""
         of_source = controls[controls["source"] == source]
@@ -239,8 +248,8 @@ def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Return the errors of the methods of the figure and of all keypoints, one column a sequence.
 
     There is a row for each judging metric, estimator and method. A cell has the mean and the
-    standard deviation over the repetitions, "0.0103 ± 0.0021". The lowest mean of a sequence is
-    bold, as Markdown has it: "**0.0103 ± 0.0021**".
+    standard deviation over the repetitions, "0.0103 ± 0.0021", if it is not 0. The lowest mean of a
+    sequence is bold, as Markdown has it: "**0.0103 ± 0.0021**".
     """
     labels = [compare.METHODS["baseline"], *_shown(table)["label"].unique()]
     parts = {}
@@ -258,13 +267,14 @@ def table_errors(table: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _mean_and_spread(errors: pd.Series) -> str:
-    """Return "0.0103 ± 0.0021", or only the mean of a single error."""
+    """Return "0.0103 ± 0.0021", or only the mean if the deviation is 0 in these digits."""
     mean = errors.mean()
     magnitude = max(mean, 1e-4)  # an error of 0 gets no more digits than a tenth of a millimetre
     digits = max(0, 2 - floor(log10(magnitude)))  # after the point, for three that are not 0
-    if len(errors) == 1:
+    deviation = f"{errors.std():.{digits}f}"
+    if len(errors) == 1 or float(deviation) == 0:
         return f"{mean:.{digits}f}"
-    return f"{mean:.{digits}f} ± {errors.std():.{digits}f}"
+    return f"{mean:.{digits}f} ± {deviation}"
 
 
 def table_widths(runs: pd.DataFrame) -> pd.DataFrame:

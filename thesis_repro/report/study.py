@@ -28,6 +28,7 @@ from thesis_repro.study.study import RUNS, Study
 
 PATHS = "paths"  # folder of the estimated paths
 DRAWN = ("masked", "keypoints")  # methods of what a user brings that acts on frames
+NO_DEVIATION = "Without $\\pm$: the standard deviation is 0 in these digits, or there is one run."
 FIT = 4  # columns of errors across a page, in letters that can be read
 
 
@@ -70,7 +71,7 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     for name, rows in numbers.items():
         text = latex(rows)
         if name == "errors":
-            text = latex_errors(rows)
+            text = latex_errors(rows, study.repetitions)
         if name == "summary" and len(rows):  # one column a source fits into a column of text
             text = latex(rows.set_index("source").T.rename_axis("source").reset_index())
         write_text(folder / f"{name}.tex", f"% {note}\n{text}")
@@ -122,17 +123,23 @@ def latex(table: pd.DataFrame) -> str:
     return f"\\resizebox{{{width}}}{{!}}{{%\n{text}}}\n"
 
 
-def latex_errors(table: pd.DataFrame) -> str:
+def latex_errors(table: pd.DataFrame, repetitions: int = 1) -> str:
     """Return `comparison.table_errors` as LaTeX: tables of at most FIT sequences.
 
-    Each table has one error and one estimator, which stand in a line above it.
+    Each table has one error and one estimator, which stand in a line above it. A note below it
+    tells of means without a deviation, if there are several repetitions.
     """
     parts = []
     for (error, estimator), rows in table.groupby(["error", "estimator"], sort=False):
         sequences = rows.columns.drop(["error", "estimator", "method"])
         for first in range(0, len(sequences), FIT):
             columns = ["method", *sequences[first : first + FIT]]
-            parts.append(f"\\noindent {error}, {estimator}\\par\n{latex(rows[columns])}")
+            text = f"\\noindent {error}, {estimator}\\par\n{latex(rows[columns])}"
+            if repetitions > 1 and not rows[columns[1:]].map(lambda cell: "±" in str(cell)).all(
+                axis=None
+            ):
+                text += f"\\par\\noindent {NO_DEVIATION}\\par\n"
+            parts.append(text)
     return "\n".join(parts)
 
 
