@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from thesis import chapter4, gap, tables, trainings
+from thesis import chapter4, domain_gap, tables, trainings
 from thesis_repro.data import kitti
 from thesis_repro.report import findings
 from thesis_repro.running.files import write_text
@@ -76,7 +76,7 @@ def write_findings(
         compare.comparisons(runs),
         note,
         settings.kitti_is_embedded,
-        gap.label_map_quality(settings.build),
+        domain_gap.label_map_quality(settings.build),
         other_trainings,
         tables.procedure(runs, shuffled),
     )
