@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from thesis import chapter4, gap, tables, trainings
+from thesis import chapter4, domain_gap, tables, trainings
 from thesis_repro.data import kitti
 from thesis_repro.report import findings, style, texts
 from thesis_repro.running.files import write_text
@@ -80,7 +80,7 @@ def write_findings(
         "null: middle (%)": _range(procedure, "null_low", "null_high"),
         "null: improved": procedure["null_improved"].round(1),
     }
-    quality = pd.DataFrame(gap.label_map_quality(settings.build))
+    quality = pd.DataFrame(domain_gap.label_map_quality(settings.build))
     columns = ["domain", "images", "classes", "mean_iou", "seen"]
     label_maps = [style.markdown(quality[columns].round(3))] if len(quality) else []
     of_trainings = trainings.summary() if settings.figures_in_git else None

@@ -113,7 +113,7 @@ def test_the_page_shows_every_artefact(executed):
         (f"notebooks/{named('07')}", {"07"}),
         ("thesis_repro/mask_files.py", {"05", "06", "07", "08", "09"}),
         ("street_world/street.py", {name[:2] for name in NOTEBOOKS}),
-        ("notebooks/thesis/gap.py", {"05", "06", "07", "08", "09"}),
+        ("notebooks/thesis/domain_gap.py", {"05", "06", "07", "08", "09"}),
         ("notebooks/thesis/page.py", set()),
         ("docs/answer.md", set()),  # nothing is executed twice
     ],
