@@ -39,7 +39,12 @@ def test_rows_are_numbered_and_every_measurement_has_a_row():
         ("4", "sequences with a larger error", "MAE", 7),
         ("41", "sequences improved", "RMSE", 6),
         ("41", "sequences improved on average if masks did nothing", "RMSE", 10.3125),
-        ("41", "probability of no more improved sequences if masks did nothing", "RMSE", 0.0335),
+        (
+            "41",
+            "probability of no more improved sequences if masks did nothing, 15 independent widths",
+            "RMSE",
+            0.0335,
+        ),
         ("60", "keypoints, means of Table 4.1", "", 761.7),
     ],
 )
