@@ -313,13 +313,15 @@ def measure(
     sources: Iterable[Source],
     width: int | None,
     folder: Path,
-    numbers: Iterable[int] = (DECIDING, 0),
+    numbers: Iterable[int] = (DECIDING,),
     processes: int = 1,
+    scheduler: str | None = None,
     **options: Any,
 ) -> pd.DataFrame:
     """Return the table of `worth` for the `choices` of sources; what is in the folder is kept.
 
-    width: pixels, of masks from label maps. options: of `choices`.
+    width: pixels, of masks from label maps. processes, scheduler: see `workers.open_pool`.
+    options: of `choices`.
     """
     sources, numbers = list(sources), list(numbers)
     files: dict[Path, tuple] = {}
@@ -336,7 +338,7 @@ def measure(
         for number in numbers:
             files[stage / f"{number}.csv"] = sequence, sources, width, number, options
     waiting = [(file, *call) for file, call in files.items() if not file.is_file()]
-    with open_pool(processes) as pool:
+    with open_pool(processes, scheduler) as pool:
         for _ in pool.run(_measure_one, waiting):
             pass
     return pd.concat(
