@@ -96,7 +96,7 @@ def test_simulated_scenes(capsys):
         "20 crowds": crowded,
         "twice the noise": lambda random: independent(random, 2 * NOISE),
     }
-    table = pd.DataFrame({name: variances(make, 1000) for name, make in cases.items()})
+    table = pd.DataFrame({name: variances(make, 300) for name, make in cases.items()})
     worths = table.rdiv(table["independent"], axis=0).T.round(2)
     with capsys.disabled():
         print("\n" + worths.to_string())
