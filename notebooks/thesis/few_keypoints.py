@@ -40,9 +40,9 @@ from thesis_repro.running import results
 from thesis_repro.study import compare, workers
 from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
 from thesis_repro.study.runner import CODE
+from thesis_repro.study.worth import FILL
 
 NUMBERS = (50, 100, 200, 400, 800)
-FILL = 5  # keypoints in each of 16 x 5 fields of the frame
 SEEDS = (None, 1, 2, 3)  # of the shuffles
 TIMED_RUNS = 5
 LABELS = {
@@ -191,13 +191,13 @@ def table(runs: pd.DataFrame) -> pd.DataFrame:
                     **{name: numbers[name] for name in ("ratio", "low", "high", "n", "above")},
                     "failed": int(chosen["failed"].sum()),
                     "runs": len(chosen),
-                    **_within(ratios, margin),
+                    **within(ratios, margin),
                 }
                 rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _within(ratios: pd.Series, margin: float) -> dict[str, bool]:
+def within(ratios: pd.Series, margin: float) -> dict[str, bool]:
     """Say whether one-sided tests at 5 % place the ratio within the margin (rules 4, 5)."""
     _, low, high = compare.typical_interval(np.log(ratios), level=90)  # NaN for few sequences
     is_below = bool(high < np.log(margin))

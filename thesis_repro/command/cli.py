@@ -185,14 +185,22 @@ def study(options: Any) -> int:
         warnings = []
         for sequence, masks in study.shown_masks(planned):
             warnings += _warn(_check_masks(sequence, masks))
-        outcome = planned.run(folder, options.jobs, options.dask)
+        workers = (options.jobs, options.dask)
+        if not any(sequence.has_truth for sequence in planned.opened):
+            worths = planned.worths(folder, *workers)
+            if worths is not None:  # otherwise the run below says that the ground truth is missing
+                file = study.write_worths(planned, worths, folder)
+                messages.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
+                return 0
+        outcome = planned.run(folder, *workers)
         planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
         runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
         of_runs = [
             checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
-        page = study.write(planned, outcome.table, folder, warnings)
+        worths = planned.worths(folder, *workers)
+        page = study.write(planned, outcome.table, folder, warnings, worths)
     made = f"{len(outcome.table):,} runs, {outcome.failed_jobs:,} failed"
     messages.summary(f"{made}; open {page} in a browser", outcome.kept)
     return int(outcome.failed_jobs > 0)

@@ -18,7 +18,7 @@ from thesis_repro.mask_files import LabelMasks, label_map_of
 from thesis_repro.masks import MaskSettings
 from thesis_repro.odometry import THESIS, keypoints, metrics
 from thesis_repro.odometry.runs import inside
-from thesis_repro.report import comparison, findings, page, paths, style
+from thesis_repro.report import comparison, findings, page, paths, style, worth
 from thesis_repro.running import results
 from thesis_repro.running.files import write_text
 from thesis_repro.study import compare, methods, runner
@@ -33,10 +33,16 @@ FIT = 4  # columns of errors across a page, in letters that can be read
 
 
 @style.applied()
-def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[str] = ()) -> Path:
+def write(
+    study: Study,
+    runs: pd.DataFrame,
+    folder: Path,
+    warnings: Collection[str] = (),
+    worths: pd.DataFrame | None = None,
+) -> Path:
     """Write the findings, figures, tables and page of a `Study` into a folder.
 
-    Returns the page's path. warnings: lines for the top of the page.
+    Returns the page's path. warnings: lines for the top of the page. worths: of `Study.worths`.
     """
     # `thesis-repro synthesize` leaves a record beside the KITTI folder of an embedded world
     world = results.record(study.kitti.resolve().parent) or {}
@@ -60,6 +66,8 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     table = compare.comparisons(runs)
     write_text(folder / "findings.md", findings.text(runs, table, note, embedded))
     figures = {"comparison": comparison.figure_comparison(table), **figures}
+    if worths is not None:
+        figures["worth"] = worth.figure(worths)
     for name, figure in figures.items():
         style.write_figure(figure, folder / f"{name}.pdf")
     numbers = {
@@ -68,6 +76,9 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
         "widths": comparison.table_widths(runs),
         "errors": comparison.table_errors(table, runs),
     }
+    if worths is not None:
+        numbers["worth"] = worth.table(worths)
+        results.write_table(folder / "worth_runs.csv", worths)
     for name, rows in numbers.items():
         text = latex(rows)
         if name == "errors":
@@ -92,6 +103,15 @@ def write(study: Study, runs: pd.DataFrame, folder: Path, warnings: Collection[s
     )
     write_text(folder / page.PAGE, text)
     return folder / page.PAGE
+
+
+@style.applied()
+def write_worths(study: Study, worths: pd.DataFrame, folder: Path) -> Path:
+    """Write the worths of a study without ground truth, which has no errors; return the table."""
+    note = one_line(f"KITTI folder {study.kitti.name}, without ground truth")
+    results.write_table(folder / "worth_runs.csv", worths)
+    style.save_all({"worth": worth.figure(worths)}, {"worth": worth.table(worths)}, folder, note)
+    return folder / "worth.md"
 
 
 def write_paths(study: Study, runs: pd.DataFrame, folder: Path) -> None:
@@ -143,21 +163,11 @@ def latex_errors(table: pd.DataFrame, repetitions: int = 1) -> str:
     return "\n".join(parts)
 
 
-def shown_width(study: Study) -> int | None:
-    """Return the dilation width (pixels) of the masks in figures.
-
-    It is the tested width, or else the middle one; None for only ready-made masks.
-    """
-    if study.tested or not study.widths:
-        return study.tested
-    return study.widths[len(study.widths) // 2]
-
-
 def shown_masks(study: Study) -> list[tuple[Sequence, list[FileMasks]]]:
     """Return each sequence with the masks of each source, at the `shown_width`."""
     sources = [source for source in study.sources if source.kind not in UNMASKED]
     return [
-        (sequence, [source.masks(sequence, shown_width(study)) for source in sources])
+        (sequence, [source.masks(sequence, study.shown_width) for source in sources])
         for sequence in study.opened
     ]
 
@@ -184,7 +194,7 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
             second.set_axis_off()
             points = own_calls(source.folder).detect(frame, THESIS, None)
         else:
-            masks = source.masks(sequence, shown_width(study))
+            masks = source.masks(sequence, study.shown_width)
             if isinstance(masks, LabelMasks):
                 label_maps.append(label_map_of(masks, index))
                 colors = style.label_colors(label_maps[-1], frame)
@@ -213,7 +223,7 @@ def figure_paths(study: Study, runs: pd.DataFrame, sequence: Sequence, folder: P
         & (runs["repetition"] == 0)
         & (runs["estimator"] == compare.judging_estimator(runs))
         & runs["method"].isin(["baseline", "masked", *UNMASKED])
-        & (widths.isna() | (widths == shown_width(study)))
+        & (widths.isna() | (widths == study.shown_width))
     ]
     shown = {}
     poses = runner.run_poses(rows, folder / RUNS)

@@ -11,7 +11,7 @@ from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
 from thesis_repro.odometry import THESIS, metrics
 from thesis_repro.running import messages, results
-from thesis_repro.study import compare, jobs, runner, sources
+from thesis_repro.study import compare, jobs, runner, sources, worth
 from thesis_repro.study.sources import Source
 
 RUNS = "runs"  # folder of the results of the runs
@@ -138,3 +138,34 @@ class Study:
         for line in lines.values():
             messages.log.warning(line)
         return lines
+
+    def worths(
+        self, folder: Path, processes: int = 1, scheduler: str | None = None
+    ) -> pd.DataFrame | None:
+        """Return what a keypoint of each source is worth (`worth.measure`), without ground truth.
+
+        What is in the folder is kept. None if no source has masks or keypoints. With a tested
+        width, also of the controls.
+        """
+        if all(source.kind == "paths" for source in self.sources):
+            return None
+        return worth.measure(
+            self.opened,
+            self.sources,
+            self.shown_width,
+            folder / "worth",
+            processes=processes,
+            scheduler=scheduler,
+            with_controls=self.tested is not None,
+            masked_settings=self.masked_settings,
+        )
+
+    @property
+    def shown_width(self) -> int | None:
+        """The dilation width (pixels) of the masks in figures.
+
+        It is the tested width, or else the middle one; None for only ready-made masks.
+        """
+        if self.tested or not self.widths:
+            return self.tested
+        return self.widths[len(self.widths) // 2]
