@@ -20,6 +20,7 @@ One rule was added when the results were known, because rule 4 also refuses choi
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -34,12 +35,13 @@ from thesis.ablations import FunctionMasks, random_keypoints
 from thesis_repro import odometry
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.mask_files import LabelMasks
-from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.odometry import THESIS
+from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.report import style, texts
 from thesis_repro.running import results
-from thesis_repro.study import compare, workers
-from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS
-from thesis_repro.study.runner import CODE
+from thesis_repro.study import compare
+from thesis_repro.study.jobs import CONTROL_WIDTH, ESTIMATORS, Job
+from thesis_repro.study.runner import Run, run_all
 from thesis_repro.study.worth import FILL
 
 NUMBERS = (50, 100, 200, 400, 800)
@@ -54,6 +56,17 @@ LABELS = {
     "filled": f"mask, filled to {FILL} a field",
 }
 ERRORS = {"se3": "aligned ATE", "rotation": "rotation error a frame"}
+COLUMNS = (
+    "sequence",
+    "choice",
+    "number",
+    "estimator",
+    "repetition",
+    "keypoints",
+    "se3",
+    "rotation",
+    "failed",
+)
 MARGINS = {"se3": 1.25, "rotation": 1.1}  # a ratio between 1 / margin and margin is "as good"
 NEAR = 0.8, 1.5  # of the panels that show ratios near 1 enlarged
 
@@ -64,14 +77,14 @@ def choices(sequence: Sequence, labels: Path) -> dict[tuple[str, int], tuple]:
     chosen: dict[tuple[str, int], tuple] = {
         ("all", 0): (THESIS, None),
         ("mask", 0): (THESIS, masks),
-        ("filled", 0): (replace(THESIS, fill=FILL), masks),
+        ("filled", 0): (replace(THESIS, detector=filled(FILL)), masks),
     }
     for number in NUMBERS:
         few = replace(THESIS, max_keypoints=number)
         drawn = FunctionMasks(partial(random_keypoints, sequence, number))
         chosen["strongest", number] = few, None
         chosen["random", number] = THESIS, drawn
-        chosen["spread", number] = replace(few, choice="spread"), None
+        chosen["spread", number] = replace(THESIS, detector=spread(number)), None
         chosen["mask", number] = few, masks
     return chosen
 
@@ -88,54 +101,31 @@ def measure(
     labels: a folder with one folder of label maps a sequence. folder: of the results. seeds: that
     shuffle the matched points, one run each; None leaves their order.
     """
-    opened = list(sequences)
-    files = {}
-    for sequence in opened:
-        inputs = {
-            "seeds": list(seeds),
-            "frames": results.digest_of_files(sequence.frame_paths),
-            "labels": results.digest_of_files(sorted((labels / sequence.name).glob("*.png"))),
-            "code": results.digest_of_code(*CODE),
-            **results.made_with("opencv", "numpy", "numba"),
+    runs: dict[Job, Run] = {}
+    made_from = {}
+    for sequence in sequences:
+        maps = labels / sequence.name
+        made_from[sequence.name] = {
+            "choices": results.digest_of_file(__file__),
+            "labels": results.digest_of_files(sorted(maps.glob("*.png"))),
         }
-        files[sequence.name] = results.stage(folder / sequence.name, **inputs) / "runs.csv"
-    calls = [
-        (sequence, labels, files[sequence.name], list(seeds))
-        for sequence in opened
-        if not files[sequence.name].is_file()
-    ]
-    with workers.open_pool(processes) as pool:
-        for _ in pool.run(_measure_one, calls):
-            pass
-    tables = [pd.read_csv(file, dtype={"sequence": str}) for file in files.values()]
-    return pd.concat(tables, ignore_index=True)
-
-
-def _measure_one(sequence: Sequence, labels: Path, file: Path, seeds: Iterable[int | None]) -> None:
-    """Run all choices on one sequence, and write the table of its runs."""
-    runs = {}
-    for (choice, number), (settings, masks) in choices(sequence, labels).items():
-        for estimator in ESTIMATORS:
-            for seed in seeds:
-                changed = replace(settings, estimator=estimator, shuffle_seed=seed)
-                runs[choice, number, estimator, seed or 0] = changed, masks
-    rows = []
-    for (choice, number, estimator, seed), result in odometry.run_many(sequence, runs).items():
-        errors = metrics.errors(result.poses, sequence.poses)
-        steps = metrics.step_errors(result.poses, sequence.poses)
-        row = {
-            "sequence": sequence.name,
-            "choice": choice,
-            "number": number,
-            "estimator": estimator,
-            "repetition": seed,
-            "keypoints": result.frames["detected"].mean(),
-            "se3": errors["se3"],
-            "rotation": steps["rotation"],
-            "failed": int(steps["failed"] > 0 or steps["lost"] > 0),
-        }
-        rows.append(row)
-    results.write_table(file, pd.DataFrame(rows))
+        for (choice, number), (settings, masks) in choices(sequence, labels).items():
+            for estimator, seed in product(ESTIMATORS, seeds):
+                job = Job(
+                    sequence.name,
+                    f"{choice}-{number}",
+                    estimator=estimator,
+                    repetition=seed or 0,
+                )
+                runs[job] = sequence, job.changed(settings), masks
+    table = run_all(runs, folder, made_from=made_from, processes=processes).table
+    chosen = table["method"].str.rpartition("-")
+    return table.assign(
+        choice=chosen[0],
+        number=chosen[2].astype(int),
+        keypoints=table["mean_keypoints"],
+        failed=compare.has_failed(table).astype(int),
+    )[list(COLUMNS)]
 
 
 def time_steps(sequence: Sequence, labels: Path, folder: Path, frames: int = 40) -> pd.DataFrame:

@@ -5,8 +5,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
-from dataclasses import fields, replace
-from importlib import import_module
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,6 @@ OUTPUT_FILES: dict[str, tuple[str, tuple[str, ...]]] = {
     "tum": ("poses in TUM format", ()),
     "plot": ("figure of the paths", (".png", ".svg", ".pdf", ".jpg")),
 }
-# settings of the odometry that a study changes in runs with masks only; --scale-gate is for all
-OF_MASKED = ("choice", "max_keypoints", "fill")
 
 
 # The commands, see COMMANDS. Their docstrings are shown by --help. Each imports its libraries
@@ -95,12 +92,19 @@ def masks(options: Any) -> None:
 def odometry(options: Any) -> None:
     """Run the visual odometry on one sequence; print its errors, number of keypoints and time."""
     with redirect_stdout(sys.stderr):  # evo prints a line when it first writes its own settings
-        import_module("evo.main_ape")
+        import evo.main_ape  # noqa: F401
     from thesis_repro import checks, odometry
     from thesis_repro.data.trajectories import write_kitti_poses, write_tum
     from thesis_repro.odometry import metrics
+    from thesis_repro.odometry.estimators import ESTIMATORS
 
-    settings = replace(odometry.THESIS, **_odometry_settings(options))
+    settings = replace(
+        odometry.THESIS,
+        detector=_detector(options),
+        estimator=ESTIMATORS[options.estimator].make,
+        max_keypoints=options.max_keypoints,
+        scale_gate=options.scale_gate,
+    )
     sequence = _sequence(options)
     masks = _masks(options, sequence)
     _check_outputs(options, sequence.poses_path, options.masks, options.labels, sequence.folder)
@@ -151,28 +155,27 @@ def study(options: Any) -> int:
         )
     kinds = {kind for kind, _, _ in options.sources}
     has_labels = "labels" in kinds
+    mask_settings = _mask_settings(options, has_labels)
     if options.widths and not has_labels:
         raise InputError("--widths: only masks from label maps (--labels) have a width")
     if options.invert and "masks" not in kinds:
         raise InputError("--invert: needs --masks DIR")
     widths: set[int] = set()
     if has_labels:
-        all_widths = ALL_WIDTHS
-        if options.keep == "static":
-            all_widths = (options.controls or 1,)  # one of any width, because masks have none
+        all_widths = ALL_WIDTHS if mask_settings.has_width else ()
         widths = widths.union(*options.widths or [all_widths])
     names = dict.fromkeys(kitti.locate(options.kitti, name)[1].name for name in options.sequences)
     planned = Study(
         options.kitti.absolute(),
         tuple(names or kitti.sequences(options.kitti)),
-        sources.named(options.sources, _mask_settings(options, has_labels), options.invert),
+        sources.named(options.sources, mask_settings, options.invert),
         tuple(sorted(widths)),
         options.controls,
         tuple(dict.fromkeys(options.estimator)),
         options.repetitions,
         options.frames,
         options.scale_gate,
-        {name: value for name, value in _odometry_settings(options).items() if name in OF_MASKED},
+        {"detector": detector} if (detector := _detector(options)) else {},
         options.without_border,
     )
     planned.check()
@@ -252,17 +255,19 @@ def _record(result: Any, sequence: Any) -> dict[str, Any]:
     }
 
 
-def _odometry_settings(options: Any) -> dict[str, Any]:
-    """The settings of the odometry that options of their names and --spread give."""
-    from thesis_repro.odometry import OdometrySettings
+def _detector(options: Any) -> Any:
+    """The detector that --detector, --spread and --fill choose; None for the thesis's."""
+    from thesis_repro.odometry.estimators import DETECTORS
+    from thesis_repro.odometry.keypoints import filled, spread
 
-    given = {field.name: vars(options).get(field.name) for field in fields(OdometrySettings)}
-    settings = {name: value for name, value in given.items() if value is not None}
+    detector = DETECTORS[vars(options).get("detector", "shi-tomasi")]
     if options.spread:
-        if "max_keypoints" in settings:
-            raise InputError("--spread N, --max-keypoints N: give only one of them")
-        settings |= {"choice": "spread", "max_keypoints": options.spread}
-    return settings
+        if detector or vars(options).get("max_keypoints", 2000) != 2000:
+            raise InputError("--spread N: goes without --max-keypoints and --detector")
+        detector = spread(options.spread)
+    if options.fill:
+        detector = filled(options.fill, detector)
+    return detector
 
 
 def _sequence(options: Any) -> Any:
@@ -350,17 +355,14 @@ def _masks(options: Any, sequence: Any) -> Any:
 
     settings = _mask_settings(options, options.labels)
     ready_made = vars(options).get("masks")
-    if bool(options.labels) != (options.dilation is not None or settings.keep == "static"):
+    if bool(options.labels) != (options.dilation is not None or not settings.has_width):
         raise InputError("--labels DIR, --dilation W: give both or neither")
     if options.labels and ready_made:
         raise InputError("--labels DIR, --masks DIR: give only one of them")
     if vars(options).get("invert") and not ready_made:
         raise InputError("--invert: needs --masks DIR")
     if options.labels:
-        width = options.dilation
-        if width is None:
-            width = 1  # masks of what cannot move have no width
-        return LabelMasks(options.labels, sequence, width, settings)
+        return LabelMasks(options.labels, sequence, options.dilation, settings)
     if ready_made:
         return MaskFolder(ready_made, sequence, options.invert)
     return None
@@ -408,6 +410,7 @@ def _print(options: Any, record: Any, template: str, **values: Any) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command in the arguments (default: of this process), and return its exit status."""
-    options = build_parser(COMMANDS).parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = build_parser(COMMANDS, arguments).parse_args(arguments)
     os.environ["MPLBACKEND"] = "agg"  # commands draw only into files
     return messages.run(lambda: options.function(options))

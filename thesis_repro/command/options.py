@@ -1,7 +1,7 @@
 """The options of the command line. cli.py has the commands."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
@@ -61,12 +61,59 @@ SHARED: dict[str, dict[str, Any]] = {
 }
 SEQUENCE = ("--kitti", "--sequence", "--camera", "--frames")
 DILATION = dict(type=int, metavar="W", help="dilation width, in pixels, of masks from label maps")
-MASK_OPTIONS: dict[str, dict[str, Any]] = {
-    "--boundaries": dict(
-        metavar="canny|exact",
+
+
+# Options whose names stand in a table, which takes a second to import
+
+
+def _boundaries() -> dict[str, Any]:
+    from thesis_repro.masks import BOUNDARIES
+
+    return dict(
+        metavar="|".join(BOUNDARIES),
         default="canny",
         help="edges by Canny or all changes of class (canny)",
-    ),
+    )
+
+
+def _keep() -> dict[str, Any]:
+    from thesis_repro.masks import KINDS
+
+    where = ", ".join(kind.help for kind in KINDS.values())
+    return dict(
+        metavar="|".join(KINDS), default="boundaries", help=f"keypoints {where} (boundaries)"
+    )
+
+
+def _estimator() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import ESTIMATORS
+
+    return dict(
+        choices=tuple(ESTIMATORS),
+        default="thesis",
+        help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
+    )
+
+
+def _compared_estimators() -> dict[str, Any]:
+    from thesis_repro.study.jobs import ESTIMATORS
+
+    names = list(ESTIMATORS)
+    return dict(nargs="+", choices=names, default=names, help="one or several (all)")
+
+
+def _detector() -> dict[str, Any]:
+    from thesis_repro.odometry.estimators import DETECTORS
+
+    return dict(
+        choices=tuple(DETECTORS),
+        default="shi-tomasi",
+        help="keypoint detector; the tracker stays the same (shi-tomasi)",
+    )
+
+
+MASK_OPTIONS: dict[str, dict[str, Any] | Callable] = {
+    "--boundaries": _boundaries,
     "--symmetric": dict(
         action="store_true", help="centre masks on boundaries; the thesis's are half a pixel off"
     ),
@@ -84,12 +131,7 @@ MASK_OPTIONS: dict[str, dict[str, Any]] = {
         metavar="PIXELS",
         help="no keypoints on people and vehicles, nor within PIXELS of them (0)",
     ),
-    "--keep": dict(
-        metavar="boundaries|static|inverse|static-boundaries",
-        default="boundaries",
-        help="keypoints on boundaries, on all but movable things, on all but boundaries, or on boundaries "
-        "between static classes (boundaries)",
-    ),
+    "--keep": _keep,
     "--ids": dict(
         metavar="labels|train|colors|FILE",
         default="labels",
@@ -128,8 +170,8 @@ def _name_and_folder(text: str) -> tuple[str | None, Path]:
     return name, Path(folder).expanduser()  # a shell replaces "~" only at the start of a word
 
 
-# the arguments of `add_argument` for each option of each command
-COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
+# the arguments of `add_argument` for each option of each command, or a function that returns them
+COMMANDS: dict[str, dict[str, dict[str, Any] | Callable]] = {
     "synthesize": {
         "out": dict(
             type=Path, metavar="OUT", help="new folder, or one in which this command was stopped"
@@ -213,16 +255,13 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             help="a label map for each frame, or a folder of them for each sequence; needs --dilation",
         ),
         "--dilation": DILATION,
-        "--estimator": dict(
-            metavar="thesis|inliers|refined",
-            help="motion by a vote of all matched points (PySLAM) or of RANSAC's inliers, or by least squares (thesis)",
-        ),
-        "--detector": dict(
-            metavar="shi-tomasi|orb",
-            help="keypoint detector; the tracker stays the same (shi-tomasi)",
-        ),
+        "--estimator": _estimator,
+        "--detector": _detector,
         "--max-keypoints": dict(
-            type=int, metavar="N", help="maximum number of keypoints in a frame (2000)"
+            type=int,
+            default=2000,
+            metavar="N",
+            help="maximum number of keypoints in a frame (2000)",
         ),
         "--output": dict(
             type=Path, metavar="POSES.txt", help="write the estimated poses in KITTI format"
@@ -289,12 +328,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="N",
             help="shuffles of the matched points for each run (5)",
         ),
-        "--estimator": dict(
-            nargs="+",
-            choices=("thesis", "refined"),
-            default=["thesis", "refined"],
-            help="one or both (both)",
-        ),
+        "--estimator": _compared_estimators,
         "--jobs": dict(
             type=settings.positive_whole_number,
             default=settings.cores(),
@@ -309,8 +343,14 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
-def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
-    """Return the parser. functions: of the commands, by name; their docstrings are the help."""
+def build_parser(
+    functions: dict[str, Callable], arguments: Collection[str] | None = None
+) -> argparse.ArgumentParser:
+    """Return the parser of arguments. functions: of the commands, by name.
+
+    Their docstrings are the help. Only the command in the arguments gets its options; without
+    arguments, all do.
+    """
     parser = argparse.ArgumentParser(
         prog="thesis-repro",
         description="Keypoint masks from semantic segmentation for monocular visual odometry. "
@@ -334,9 +374,11 @@ def build_parser(functions: dict[str, Callable]) -> argparse.ArgumentParser:
         )
         sub.set_defaults(function=function)
         mask_options = sub.add_argument_group("how masks are made from label maps")
-        for option, arguments in COMMANDS[name].items():
+        if arguments is not None and name not in arguments:
+            continue
+        for option, how in COMMANDS[name].items():
             group: Any = sub
             if option in MASK_OPTIONS:
                 group = mask_options
-            group.add_argument(option, **arguments)
+            group.add_argument(option, **(how if isinstance(how, dict) else how()))
     return parser

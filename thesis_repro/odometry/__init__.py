@@ -21,7 +21,7 @@ means that the pose does not change:
 - step shorter than the gate (PySLAM's rule): "stationary", kept
 - rotation larger than a car's: "too large a turn", the pose moves, as in PySLAM
 
-With estimator="refined" there are two more flags, and the pose is always moved (see
+With the refined estimator there are two more flags, and the pose is always moved (see
 refined.motion_prior):
 
 - motion inconsistent with the previous step: "ambiguous motion", the best consistent motion if

@@ -145,8 +145,8 @@ class Odometry:
         need("settings", settings, OdometrySettings)
         self.intrinsics = types.camera_matrix(intrinsics)
         self.settings = settings
-        self.calls = calls or OPENCV._replace(detect=settings.detect_function())
-        self.estimator: types.Estimator = settings.new_estimator(self.calls)
+        self.calls = calls or OPENCV._replace(detect=settings.detector or detect)
+        self.estimator: types.Estimator = (settings.estimator or VoteOfAll)(self.calls)
         self.pose = types.start_pose(start)
         self.count = 0  # of frames so far
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
@@ -200,9 +200,8 @@ class Odometry:
             step.flags.append("fewer than five correspondences")
             return
         with step.timed("essential"):
-            matrix, inliers = self.calls.find_essential_matrix(
-                current[order], previous[order], threshold
-            )
+            search = getattr(self.estimator, "search", self.calls.find_essential_matrix)
+            matrix, inliers = search(current[order], previous[order], threshold)
         if matrix is None or not np.isfinite(matrix).all():
             step.flags.append("no essential matrix")
             return

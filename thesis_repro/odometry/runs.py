@@ -10,7 +10,7 @@ import pandas as pd
 
 from thesis_repro.data.kitti import Sequence
 from thesis_repro.errors import InputError
-from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry
+from thesis_repro.odometry.odometry import PROBABILITY, STATIONARY, Calls, Odometry, detect
 from thesis_repro.odometry.settings import THESIS, OdometrySettings
 from thesis_repro.odometry.types import EQUAL, FRAME_COLUMNS, ROTATION_COLUMNS, TIMED_PARTS
 from thesis_repro.running import messages
@@ -137,7 +137,7 @@ def _faster_calls(frames: int, settings: OdometrySettings) -> Calls | None:
     def find(current: np.ndarray, previous: np.ndarray, threshold: float) -> tuple:
         return opencv_exact.find_essential_matrix(current, previous, threshold, PROBABILITY)
 
-    return Calls(settings.detect_function(), sharing.track, find, opencv_exact.recover_pose)
+    return Calls(settings.detector or detect, sharing.track, find, opencv_exact.recover_pose)
 
 
 def run_many(

@@ -69,7 +69,11 @@ def motion_of_vote(votes: int, rotation: np.ndarray, translation: np.ndarray) ->
 
 
 class Estimator(Protocol):
-    """Completes the motion of a step: an essential matrix allows four motions."""
+    """Completes the motion of a step: an essential matrix allows four motions.
+
+    With a method `search(current, previous, threshold)`, as odometry.find_essential_matrix, it
+    brings its own search in place of RANSAC. Flags such as "no agreement" follow from its inliers.
+    """
 
     def motion(self, essential: np.ndarray, matches: Matches, scale: float, moves: bool) -> Motion:
         """Return the motion of a step.
@@ -180,6 +184,7 @@ def gray_frame(
         )
     if frame.flags.writeable:  # the caller may read the next frame into the same array
         frame = frame.copy()
+        frame.setflags(write=False)
     return frame
 
 

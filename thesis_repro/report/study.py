@@ -16,7 +16,8 @@ from thesis_repro.data.trajectories import write_kitti_poses, write_tum
 from thesis_repro.errors import one_line
 from thesis_repro.mask_files import LabelMasks, label_map_of
 from thesis_repro.masks import MaskSettings
-from thesis_repro.odometry import THESIS, keypoints, metrics
+from thesis_repro.odometry import THESIS, metrics
+from thesis_repro.odometry.odometry import detect
 from thesis_repro.odometry.runs import inside
 from thesis_repro.report import comparison, findings, page, paths, style, worth
 from thesis_repro.running import results
@@ -201,7 +202,7 @@ def figure_sources(study: Study, runs: pd.DataFrame) -> Figure:
                 style.show_image(first, colors, f"{source.name}: label map")
             mask = masks[index]
             style.show_image(second, mask, f"{source.name}: mask", vmin=0, vmax=255)
-            points = keypoints.detect(frame, THESIS, inside(sequence.visible(index), mask))
+            points = detect(frame, mask=inside(sequence.visible(index), mask))
         style.show_image(third, frame, f"{source.name}: {len(points)} keypoints")
         third.scatter(*points.T, **style.KEYPOINT)
     if label_maps:

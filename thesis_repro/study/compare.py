@@ -49,8 +49,14 @@ from thesis_repro.study.methods import MASK_CONTROLS
 
 # {name: title} of the methods and errors that are compared. The judging metrics decide (see
 # `primary_comparison`).
-METHODS = {name: method.title for name, method in methods.METHODS.items() if method.is_compared}
-SEGMENTATION_FREE_CONTROLS = [name for name, method in methods.METHODS.items() if method.is_control]
+METHODS = {
+    name: method.title
+    for name, method in methods.METHODS.items()
+    if method.group != methods.THESIS_ONLY
+}
+SEGMENTATION_FREE_CONTROLS = [
+    name for name, method in methods.METHODS.items() if method.group == methods.CONTROL
+]
 METRICS = {name: error.title for name, error in ERRORS.items()}
 JUDGING_METRICS = {name: error.title for name, error in ERRORS.items() if error.decides}
 
@@ -287,7 +293,8 @@ def _variants(
             ["source", "dilation_width"], dropna=False, sort=False
         )
         for (source, width), rows in by_width:
-            tested = pd.isna(width) or width == tested_width(of_source(runs, source))
+            tested_at = tested_width(of_source(runs, source))
+            tested = pd.isna(width) or tested_at in (None, width)
             columns = {
                 "source": source,
                 "method": method,

@@ -52,17 +52,21 @@ class Source:
 
     @property
     def has_label_maps(self) -> bool:
-        """Whether masks are made from label maps, so that they have a dilation width."""
+        """Whether masks are made from label maps."""
         return self.kind == "labels"
 
+    @property
+    def has_width(self) -> bool:
+        """Whether its masks have a dilation width."""
+        return self.has_label_maps and self.settings.has_width
+
     def masks(self, sequence: Sequence, dilation_width: int | None) -> FileMasks:
-        """Return the masks of a sequence. dilation_width: pixels, for masks from label maps.
+        """Return the masks of a sequence. dilation_width: pixels, for masks with a width.
 
         Raises InputError if a frame has no file.
         """
         if not self.has_label_maps:
             return MaskFolder(self.folder, sequence, self.invert)
-        assert dilation_width is not None  # masks from label maps need a width
         return LabelMasks(self.folder, sequence, dilation_width, self.settings)
 
     def check_file(self, path: Path, size: tuple[int, int]) -> None:

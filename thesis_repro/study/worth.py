@@ -71,6 +71,7 @@ from thesis_repro.odometry import (
     metrics,
     scales,
 )
+from thesis_repro.odometry.keypoints import filled, spread
 from thesis_repro.odometry.odometry import MIN_MATCHES, PROBABILITY, normalise
 from thesis_repro.odometry.refined.fit import fit, smaller_rotation
 from thesis_repro.odometry.runs import check
@@ -284,7 +285,7 @@ def choices(
     chosen: dict[str, tuple] = {"random keypoints": (THESIS, None)}
     calls = {}
     if number:
-        chosen["spread keypoints"] = replace(THESIS, choice="spread", max_keypoints=number), None
+        chosen["spread keypoints"] = replace(THESIS, detector=spread(number)), None
         chosen["strongest keypoints"] = replace(THESIS, max_keypoints=number), None
     for source in sources:
         prefix = f"{source.name}: " if source.name else ""
@@ -293,17 +294,19 @@ def choices(
             chosen[source.name] = THESIS, None
         if source.kind in UNMASKED:
             continue
-        width_of_source = width if source.has_label_maps else None
+        width_of_source = width if source.has_width else None
         masks = source.masks(sequence, width_of_source)
         chosen[f"{prefix}masks"] = masked, masks
         if number:
             chosen[f"{prefix}strongest on the masks"] = replace(masked, max_keypoints=number), masks
         if with_controls:
-            chosen[f"{prefix}masks, filled"] = replace(masked, fill=FILL), masks
+            more = filled(FILL, masked.detector)
+            chosen[f"{prefix}masks, filled"] = replace(masked, detector=more), masks
             for method in methods.MASK_CONTROLS:
                 if not jobs.is_possible(method, source, sequence):
                     continue
-                control = methods.masks_of_method(method, source, sequence, width_of_source)
+                width_of_method = width if method in methods.OF_LABEL_MAPS else width_of_source
+                _, control = methods.METHODS[method].choose(sequence, source, width_of_method)
                 chosen[prefix + methods.METHODS[method].title] = masked, control
     return {(name, number): choice for name, choice in chosen.items()}, calls
 
