@@ -1,7 +1,6 @@
 """Figures 2.2, 2.7 to 2.9, 2.11 and 2.12, drawn from the project's network and data.
 
-Cells of the notebooks draw diagrams and plots of one formula or table (2.1, 2.3 to 2.6, 3.4, 3.5,
-4.1, 4.17, A.1).
+Diagrams are in `diagrams`; cells of the notebooks draw lines and bars of one formula or table.
 """
 
 from typing import Any, NamedTuple

@@ -49,19 +49,20 @@ def notes(settings: Settings, runs: pd.DataFrame, mask_settings: dict[str, Any])
     return f"{note}; {lengths}", "thesis, complete KITTI sequences"
 
 
-def figure_paths(settings: Settings, runs: pd.DataFrame, method: str) -> plt.Figure:
+def figure_paths(settings: Settings, methods: dict[str, pd.DataFrame], method: str) -> plt.Figure:
     """Figures 4.6, 4.11, 4.12: the paths of one method, read from the odometry's results.
 
-    Those of all three methods are read for each figure, so that errors are enlarged alike.
+    methods: {one of `chapter4.METHODS`: its runs}. The paths of all three are read for each figure,
+    so that errors are enlarged alike.
     """
-    rows = chapter4.runs_of_methods(runs)
-    poses = runner.run_poses(pd.concat(rows.values()), settings.build / "odometry")
+    runs = pd.concat(methods.values())
+    poses = runner.run_poses(runs, settings.build / "odometry")
     truths = {}
     for name, frames in runs.groupby("sequence")["frames"].first().items():
         sequence = kitti.Sequence(settings.kitti, str(name)).subset(int(frames))
         truths[str(name)] = sequence.poses[:, :3, 3]
     positions = {run: path[:, :3, 3] for run, path in poses.items()}
-    return chapter4.figure_paths(truths, rows[method], positions)
+    return chapter4.figure_paths(truths, methods[method], positions)
 
 
 def write_findings(
