@@ -19,7 +19,6 @@ from matplotlib.patches import Patch
 
 from thesis import frames
 from thesis.flicker import View
-from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import spread
 from thesis_repro.report import style
 from thesis_repro.report.style import (
