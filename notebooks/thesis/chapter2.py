@@ -1,7 +1,6 @@
 """Figures 2.2, 2.7 to 2.9, 2.11 and 2.12, drawn from the project's network and data.
 
-Cells of the notebooks draw diagrams and plots of one formula or table (2.1, 2.3 to 2.6, 3.4, 3.5,
-4.1, 4.17, A.1).
+Diagrams are in `diagrams`; cells of the notebooks draw lines and bars of one formula or table.
 """
 
 from typing import Any, NamedTuple
@@ -60,8 +59,9 @@ def figure_2_02(
     if len(terms) > 2:
         remark = " (above: the first channel)"
     shown = " + ".join(f"{term:.2f}" if term >= 0 else f"({term:.2f})" for term in terms)
-    total = f"{terms.sum():.2f}{remark}; {feature_map[row, column]:.2f} before rounding"
-    figure.supxlabel(f"y = b + Σ w x = {shown} = {total}", fontsize=9)
+    total, unrounded = f"{terms.sum():.2f}", f"{feature_map[row, column]:.2f}"
+    remark += f"; {unrounded} before rounding" if unrounded != total else ""
+    figure.supxlabel(f"y = b + Σ w x = {shown} = {total}{remark}", fontsize=9)
     return figure
 
 

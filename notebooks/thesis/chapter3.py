@@ -1,4 +1,4 @@
-"""Figures of chapter 3 and of masks: label maps, their edges and masks on a frame."""
+"""Figures of chapter 3 and of masks: label maps, their classes, edges and masks on a frame."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -7,14 +7,44 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from thesis import frames
-from thesis_repro.data.cityscapes import Label
+from thesis_repro.data import cityscapes
 from thesis_repro.masks import dilate
 from thesis_repro.report import style
 from thesis_repro.report.style import BLUE, ORANGE, RED, SKY
 
 
+def figure_3_02(
+    as_image: dict[str, np.ndarray], as_map: dict[str, np.ndarray], ids: np.ndarray, outside: int
+) -> Figure:
+    """Figure 3.2: a label map transformed as an image (above) and as a label map (below).
+
+    as_image, as_map: {title: (h, w) ids}. ids: those of the label map. outside: the id of pixels
+    from outside the image in `as_map`; in `as_image` it is 0. Ids that are not there are white.
+    """
+    figure, axes = style.new_figure(2, 4, height=3.8)
+    label_maps = []
+    for column, title in enumerate(as_image):
+        invented = ~np.isin(as_image[title], [*ids, 0])
+        colors = cityscapes.colorize(as_image[title])
+        colors[invented] = 255
+        style.show_image(
+            axes[0, column], colors, f"{title}\n{100 * invented.mean():.1f} % of no class here"
+        )
+        style.show_image(axes[1, column], cityscapes.colorize(as_map[title]), "")
+        label_maps.append(as_map[title][as_map[title] != outside])
+    texts = "transformed as an image\n(the appendix)", "as a label map\n(for training)"
+    for panel, text in zip(axes[:, 0], texts, strict=True):
+        panel.text(
+            -0.12, 0.5, text, transform=panel.transAxes, rotation=90, ha="center", va="center"
+        )
+    white = Patch(facecolor="white", edgecolor="black", label="id of no class here")
+    black = Patch(color="black", label="outside the image")
+    style.class_legend(figure, *label_maps, also=[white, black])
+    return figure
+
+
 def figure_3_03(
-    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, label: Label
+    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, label: cityscapes.Label
 ) -> Figure:
     """Figure 3.3: intersection and union of a prediction and its label map for one class.
 
@@ -53,6 +83,43 @@ def figure_3_03(
         loc="outside lower center",
         ncols=3,
     )
+    return figure
+
+
+def figure_3_05(counts: np.ndarray, title: str) -> Figure:
+    """Figure 3.5: the pixels of each label id, counts (ids,), on a logarithmic scale."""
+    present = sorted(
+        (label for label in cityscapes.LABELS[: len(counts)] if counts[label.id]),
+        key=lambda label: -counts[label.id],
+    )
+    pixels = [counts[label.id] for label in present]
+    figure, axes = style.new_figure(height=3.4)
+    # points, because the height of a bar means nothing on a logarithmic axis
+    axes.scatter(
+        [label.name for label in present],
+        pixels,
+        s=60,
+        color=[np.array(label.color) / 255 for label in present],
+        edgecolors="#555555",
+        linewidths=0.5,
+    )
+    for position, count in enumerate(pixels):
+        axes.annotate(
+            f"{100 * count / sum(pixels):.2f} %",
+            (position, count),
+            (0, 6),
+            textcoords="offset points",
+            ha="center",
+            fontsize=6.5,
+        )
+    style.ratio_axis(axes.yaxis, [min(pixels) / 2, 2 * max(pixels)])
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.set(ylabel="pixels", xlabel="category", title=title)
+    axes.tick_params(axis="x", labelrotation=45, labelsize=8)
+    for name in axes.get_xticklabels():
+        name.set(ha="right", rotation_mode="anchor")
+    axes.margins(x=0.05)
+    axes.grid(axis="x", visible=False)
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Figures 4.2 to 4.16: single frames, errors in metres, and keypoints.
+"""Figures 4.3 to 4.16: single frames, errors in metres, and keypoints.
 
 `thesis_repro.report.comparison` shows ratios of errors.
 
@@ -13,13 +13,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.container import BarContainer
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from thesis import frames, thesis_tables
+from thesis import frames
 from thesis.flicker import View
-from thesis_repro.data.cityscapes import colorize
-from thesis_repro.odometry import THESIS
 from thesis_repro.odometry.keypoints import spread
 from thesis_repro.report import style
 from thesis_repro.report.style import (
@@ -35,10 +34,12 @@ from thesis_repro.report.style import (
 from thesis_repro.study import compare
 
 METHODS = {
-    "baseline": ("all keypoints", BASELINE, "//"),
-    "masked": ("masked, best width", MASKED, ""),
-    "reduced": ("plainly reduced", REDUCED, "\\\\"),
+    "baseline": ("all keypoints", BASELINE),
+    "masked": ("masked, best width", MASKED),
+    "reduced": ("plainly reduced", REDUCED),
 }
+COLORS = [color for _, color in METHODS.values()]
+LINES = ["-o", "--s", "-.^", ":D"] * 3  # of up to twelve sequences, beside their colours
 BAND = "lowest to highest of the repetitions"
 # cross on a failed run (see `compare.has_failed`), and on a mean over runs of which one failed
 FAILED: dict[str, Any] = {
@@ -51,21 +52,6 @@ FAILED: dict[str, Any] = {
     "clip_on": False,
     "label": "failed run",
 }
-
-
-def figure_4_02(
-    image: np.ndarray, label_map: np.ndarray, prediction: np.ndarray, model_name: str
-) -> plt.Figure:
-    """Figure 4.2: an image of the Cityscapes validation split, its label map and its prediction.
-
-    Section 4.1.
-    """
-    figure, axes = style.new_figure(1, 3, height=2.5)
-    style.show_image(axes[0], image, "image")
-    style.show_image(axes[1], colorize(label_map), "label map")
-    style.show_image(axes[2], colorize(prediction), f"prediction of\n{model_name}")
-    style.class_legend(figure, label_map, prediction)
-    return figure
 
 
 def figure_4_03(
@@ -121,14 +107,18 @@ def figure_4_05(
 
 
 def figure_overview(
-    frame: np.ndarray, all_keypoints: np.ndarray, mask: np.ndarray, kept_keypoints: np.ndarray
+    frame: np.ndarray,
+    all_keypoints: np.ndarray,
+    mask: np.ndarray,
+    kept_keypoints: np.ndarray,
+    title: str,
 ) -> plt.Figure:
     """Draw all keypoints of a frame, those on its mask, and 200 that are spread over the frame.
 
-    Keypoints are (n, 2) pixels.
+    Keypoints are (n, 2) pixels. title: of the frame.
     """
     few = spread(200)(frame)
-    all_title = f"all {len(all_keypoints)} keypoints"
+    all_title = f"{title}: all {len(all_keypoints)} keypoints"
     kept_title = f"{len(kept_keypoints)} on the mask (light)"
     spread_title = f"{len(few)} spread over the frame"
     pictures = {
@@ -137,7 +127,12 @@ def figure_overview(
         spread_title: frame,
     }
     keypoints = {all_title: all_keypoints, kept_title: kept_keypoints, spread_title: few}
-    return frames.pictures(frame, pictures, keypoints, columns=3)
+    figure = frames.pictures(frame, pictures)
+    for panel, points in zip(figure.axes, keypoints.values(), strict=True):
+        # two thousand dots must not merge, and two hundred must be seen
+        size = np.clip(2000 / len(points), 1.2, 8)
+        panel.scatter(*points.T, **{**KEYPOINT, "s": size})
+    return figure
 
 
 def _two_digits(value: float) -> str:
@@ -146,7 +141,6 @@ def _two_digits(value: float) -> str:
     return f"{rounded:g}"
 
 
-MARKERS = "os^Dv"  # of lines, beside their colours and dashes
 # around a keypoint of the frame before
 RING: dict[str, Any] = {"s": 34, "facecolors": "none", "edgecolors": PINK, "linewidths": 1.1}
 
@@ -306,30 +300,13 @@ def _draw_estimates(
             below.plot(along[-1], distance[-1], **FAILED)
 
 
-def figure_4_07(runs: pd.DataFrame) -> plt.Figure:
-    """Figure 4.7: the keypoints that masks keep against dilation width.
-
-    They are shown as a part of the thesis's 2000.
-    """
-    keypoints = _by_width(compare.of_method(runs, "masked"), "mean_keypoints")
-    figure, axes = style.new_figure(height=4.0)
-    _lines(axes, keypoints / THESIS.max_keypoints)
-    axes.set(
-        xlabel="dilation width (pixels)",
-        ylabel=f"keypoints, part of {THESIS.max_keypoints}",
-        title="Keypoints kept by masks of increasing dilation width, by sequence",
-    )
-    return figure
-
-
-def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
+def figure_against_width(masked: pd.DataFrame, baseline: pd.DataFrame, metric: str) -> plt.Figure:
     """Figures 4.9, 4.10: the metric against dilation width, one line a sequence.
 
     Below, one panel a sequence has a bar at each width that was repeated, and the band of the
-    repetitions with all keypoints.
+    repetitions with all keypoints. masked, baseline: the runs with masks of each width, and with
+    all keypoints.
     """
-    masked = compare.of_method(runs, "masked")
-    baseline = compare.spread(compare.of_method(runs, "baseline"), metric)
     names = sorted(masked["sequence"].unique())
     label = f"{metric.upper()} (m)"
     rows = -(-len(names) // 4)
@@ -337,8 +314,11 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     figure: Any = plt.figure(figsize=(PAGE_WIDTH, 3.8 + 1.35 * rows), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[3.2, 1.35 * rows + 0.6])
     axes = above.subplots()
-    by_width = _by_width(masked, metric)
-    _lines(axes, by_width, logarithmic=True)
+    by_width = masked.groupby(["sequence", "dilation_width"])[metric].mean()
+    lines = by_width.unstack("sequence")
+    lines.plot(ax=axes, style=LINES, markersize=3.5, xticks=lines.index)
+    style.ratio_axis(axes.yaxis, by_width.to_numpy())
+    axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     failed = compare.has_failed(masked).groupby([masked["sequence"], masked["dilation_width"]])
     for (name, width), has_failed in failed.any().items():
         if has_failed:
@@ -352,7 +332,7 @@ def figure_against_width(runs: pd.DataFrame, metric: str) -> plt.Figure:
     for panel, name in zip(panels, names, strict=True):
         of_sequence = masked[masked["sequence"] == name]
         _draw_repetitions(panel, of_sequence, metric)
-        row = baseline.loc[name]
+        row = compare.spread(baseline[baseline["sequence"] == name], metric).iloc[0]
         panel.axhspan(
             row["lowest"],
             row["highest"],
@@ -390,136 +370,26 @@ def _draw_repetitions(panel: plt.Axes, runs: pd.DataFrame, metric: str) -> None:
         panel.plot(failed.index, failed, **FAILED)
 
 
-def figure_of_methods(runs: pd.DataFrame, metric: str) -> plt.Figure:
-    """Figures 4.13, 4.15: the metric of all sequences with the three METHODS.
+def errors_of_methods(methods: dict[str, pd.DataFrame]) -> pd.DataFrame:
+    """Return the errors of the three METHODS (Figures 4.13 to 4.16), a row a sequence and metric.
 
-    These are all keypoints, the best mask and plainly reduced keypoints.
+    methods: the runs to compare, {one of METHODS: runs}.
+    Columns: metric ("rmse" or "mae"), method (its name in figures), sequence; mean, lowest and
+    highest of the repetitions; failed, whether a run failed.
     """
-    names, tables = _spread_by_method(runs, metric)
-    figure, axes = style.new_figure(height=3.2)
-    for offset, (method, table) in enumerate(tables.items()):
-        positions = np.arange(len(names)) + (offset - 1) * 0.27
-        _bar(axes, positions, table, 0.25, method)
-    axes.set_xticks(range(len(names)), names)
-    axes.set(xlabel="sequence", ylabel=f"{metric.upper()} (m)")
-    axes.grid(axis="x", visible=False)
-    style.legend_below(figure, [axes], 4)
-    return figure
-
-
-def figure_of_sequences(runs: pd.DataFrame, metric: str) -> plt.Figure:
-    """Figures 4.14, 4.16: the bars of `figure_of_methods`, one panel a sequence.
-
-    Each panel has a scale of its own.
-    """
-    names, tables = _spread_by_method(runs, metric)
-    figure, panels = frames.small_panels(names)
-    for panel, name in zip(panels, names, strict=True):
-        for offset, (method, table) in enumerate(tables.items()):
-            _bar(panel, [offset], table.loc[[name]], 0.8, method)
-        panel.set_xticks([])
-        panel.grid(axis="x", visible=False)
-    figure.supylabel(f"{metric.upper()} (m)", fontsize=8)
-    style.legend_below(figure, panels, 4)
-    return figure
-
-
-def _by_width(runs: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return means over the repetitions, one row a sequence and one column a dilation width."""
-    return runs.groupby(["sequence", "dilation_width"])[column].mean().unstack()
-
-
-def _lines(axes: plt.Axes, table: pd.DataFrame, logarithmic: bool = False) -> None:
-    """Draw one line for each row of a table with one column for each dilation width.
-
-    logarithmic: the vertical axis, so that large rows do not hide small ones.
-    """
-    for index, (_, row) in enumerate(table.iterrows()):
-        marker = MARKERS[index % len(MARKERS)]
-        axes.plot(row.index, row, marker=marker, markersize=3.5, **style.line_style(index))
-    axes.set_xticks(table.columns.astype(int))
-    if logarithmic:
-        style.ratio_axis(axes.yaxis, table.to_numpy())
-    else:
-        axes.set_ylim(0, None)
-    _name_lines(axes, table)
-
-
-def _name_lines(axes: plt.Axes, table: pd.DataFrame) -> None:
-    """Write a line's name to the right of its end, as far from other names as is needed to read."""
-    colors = [line.get_color() for line in axes.lines]
-    lines = table.ffill(axis=1).assign(color=colors)
-    width = table.columns[-1]
-    lines = lines.sort_values(width)
-    distance = 1 / max(len(lines), 18)  # part of the panel's height
-    ends = np.column_stack([np.full(len(lines), width), lines[width]])
-    places = axes.transLimits.transform(axes.transScale.transform(ends))[:, 1]
-    for index in range(1, len(places)):
-        places[index] = max(places[index], places[index - 1] + distance)
-    highest = 1 + distance * np.arange(1 - len(places), 1)
-    for (name, line), place in zip(lines.iterrows(), np.minimum(places, highest), strict=True):
-        axes.annotate(
-            str(name),
-            (width, line[width]),
-            (1.02, place),
-            textcoords="axes fraction",
-            va="center",
-            fontsize=8,
-            arrowprops={
-                "arrowstyle": "-",
-                "relpos": (0, 0.5),
-                "shrinkA": 1,
-                "shrinkB": 3,
-                "color": line["color"],
-            },
-        )
-
-
-def runs_of_methods(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the runs of each of METHODS, with masks those of each sequence's best width."""
-    rows = {method: compare.of_method(runs, method) for method in METHODS}
-    rows["masked"] = thesis_tables.of_chosen_width(rows["masked"])
-    return rows
-
-
-def _spread_by_method(runs: pd.DataFrame, metric: str) -> tuple[list[str], dict[str, pd.DataFrame]]:
-    """Return the sequences and a table for each of METHODS.
-
-    A table has one row a sequence: mean, lowest, highest, and whether a run failed.
-    """
-    names = sorted(compare.of_method(runs, "baseline")["sequence"].unique())
-    tables = {}
-    for method, rows in runs_of_methods(runs).items():
+    tables = []
+    for method, rows in methods.items():
         failed = compare.has_failed(rows).groupby(rows["sequence"]).any()
-        tables[method] = compare.spread(rows, metric).assign(failed=failed).reindex(names)
-    return names, tables
+        for metric in ("rmse", "mae"):
+            spread = compare.spread(rows, metric).assign(failed=failed).reset_index()
+            tables.append(spread.assign(metric=metric, method=METHODS[method][0]))
+    return pd.concat(tables, ignore_index=True)
 
 
-def _bar(
-    axes: plt.Axes,
-    positions: np.ndarray | list[int],
-    table: pd.DataFrame,
-    width: float,
-    method: str,
-) -> None:
-    """Draw bars at the means of a table, with error bars from lowest to highest repetition."""
-    label, color, hatch = METHODS[method]
-    axes.bar(
-        positions,
-        table["mean"],
-        width,
-        label=label,
-        color=color,
-        hatch=hatch,
-        edgecolor="white",
-        linewidth=0,
-    )
-    failed = table["failed"].eq(True).to_numpy()
-    if failed.any():
-        axes.plot(np.array(positions)[failed], table["mean"][failed], **FAILED)
-    table = table.where(table["highest"] > table["lowest"])  # a single run has no error bar
-    mean = table["mean"]
-    errors = [mean - table["lowest"], table["highest"] - mean]
-    axes.errorbar(
-        positions, mean, yerr=errors, fmt="none", ecolor="black", elinewidth=0.9, capsize=2
-    )
+def mark_failed(axes: plt.Axes, failed: pd.DataFrame) -> None:
+    """Mark bars that stand for a failed run by a cross. failed: the shape of the table drawn."""
+    methods = [bars for bars in axes.containers if isinstance(bars, BarContainer)]
+    for bars, name in zip(methods, failed, strict=True):
+        for bar, has_failed in zip(bars, failed[name], strict=True):
+            if has_failed is True:
+                axes.plot(bar.get_x() + bar.get_width() / 2, bar.get_height(), **FAILED)

@@ -1,6 +1,5 @@
-"""Figures 2.1, 2.3 to 2.6 and A.1: diagrams, which do not depend on the data at hand."""
+"""Figures 2.1, 2.4, 2.5 and A.1: diagrams, which do not depend on the data at hand."""
 
-from collections.abc import Callable
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -60,20 +59,6 @@ def figure_2_01() -> plt.Figure:
     ):
         axes.scatter(np.full(len(heights), x), heights, s=110, color=color)
         axes.text(x, 0.45, name, ha="center", va="center", fontsize=8)
-    return figure
-
-
-def figure_2_03(x: np.ndarray, curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> plt.Figure:
-    """Figure 2.3: two activations and their derivatives, {title: (values, slopes)} at x."""
-    figure, axes = style.new_figure(1, 2, height=2.2)
-    for panel, (title, (values, slope)) in zip(axes, curves.items(), strict=True):
-        for side in (x < 0, x > 0):
-            panel.plot(x[side], values[side], color=style.BLUE, label="activation")
-            panel.plot(
-                x[side], slope[side], color=style.RED, linestyle="--", label="its derivative"
-            )
-        panel.set(title=title, xlabel="x (no unit)", ylabel="value (no unit)")
-    style.legend_below(figure, axes, 2)
     return figure
 
 
@@ -145,30 +130,6 @@ def figure_2_05(
         loc="outside lower center",
         ncols=2,
     )
-    return figure
-
-
-def figure_2_06(surface: Callable[..., np.ndarray], path: np.ndarray) -> plt.Figure:
-    """Figure 2.6: steps downhill on a loss of two weights. path: (steps + 1, 2)."""
-    x, y = np.meshgrid(np.linspace(-1.8, 1.8, 60), np.linspace(-1.2, 1.7, 50))
-    figure, axes = style.new_figure(height=3)
-    levels = axes.contourf(x, y, surface(x, y), 20, cmap="cividis")
-    axes.plot(*path.T, color="white", linewidth=1, marker="o", markersize=3)
-    for point, marker, size, label in (
-        (path[0], "s", 9, "start"),
-        (path[-1], "*", 14, f"after {len(path) - 1} steps"),
-    ):
-        axes.plot(
-            *point, marker, color=style.RED, markersize=size, markeredgecolor="white", label=label
-        )
-    for valley in (-1.28, 1.16):  # along y = 0, where the slope vanishes
-        axes.text(
-            valley, -0.9, f"loss {surface(valley, 0):.2f}", color="white", fontsize=8, ha="center"
-        )
-    axes.set(xlabel="first weight (no unit)", ylabel="second weight (no unit)")
-    axes.grid(visible=False)
-    axes.legend(loc="upper left", labelcolor="white")
-    figure.colorbar(levels, label="loss (no unit)")
     return figure
 
 

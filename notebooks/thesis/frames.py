@@ -1,6 +1,6 @@
 """Pictures of frames: masks, keypoints, tracks and lines, and the panels that show them."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -75,21 +75,6 @@ def gradients(enlarged: np.ndarray, strength: np.ndarray, edge_image: np.ndarray
     # thin lines would drop out where the picture is reduced
     wider = dilate(edge_image, 5)
     style.show_image(axes[2], wider, "edges: local maxima above the thresholds, drawn wider")
-    return figure
-
-
-def coverages(widths: Sequence[int], covered: dict[str, list[float]], title: str) -> plt.Figure:
-    """Draw the coverage of masks (%) against dilation width, {kind of boundaries: values}."""
-    figure, axes = plt.subplots(figsize=(7.2, 2.8), layout="constrained")
-    for (kind, values), line in zip(covered.items(), ("-o", "--s"), strict=True):
-        axes.plot(widths, values, line, markersize=3, label=f"{kind} boundaries")
-    axes.set(
-        xlabel="dilation width (pixels)",
-        ylabel="coverage of the frame (%)",
-        ylim=(0, None),
-        title=title,
-    )
-    axes.legend()
     return figure
 
 

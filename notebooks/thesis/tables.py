@@ -1,6 +1,6 @@
 """Tables 4.1 to 4.3 and the time of a frame, with units and few digits.
 
-`runs` is the table of `runner.run_jobs`. Equation 4.1 and the choice of a width are in
+Runs are rows of the table of `runner.run_jobs`. Equation 4.1 and the choice of a width are in
 `thesis_tables`.
 """
 
@@ -34,12 +34,12 @@ def read(path: Path) -> pd.DataFrame:
     return table.convert_dtypes()
 
 
-def table_4_1(runs: pd.DataFrame, reported_as: str) -> pd.DataFrame:
+def table_4_1(masked: pd.DataFrame, reported_as: str) -> pd.DataFrame:
     """Table 4.1: each sequence's best dilation width and mean number of keypoints.
 
-    The last columns have the thesis's numbers; reported_as: how to name them.
+    masked: the runs with masks of each width. The last columns have the thesis's numbers;
+    reported_as: how to name them.
     """
-    masked = compare.of_method(runs, "masked")
     best = thesis_tables.best_widths(masked)
     reported = pd.DataFrame(REPORTED["table_4_1"]).set_index("sequence")
     reported = reported.reindex(best.index).astype("Int64")
@@ -62,19 +62,23 @@ NULL = "change (%), one run each, if masks did nothing"
 
 
 def table_of_change(
-    runs: pd.DataFrame, shuffled: pd.DataFrame, metric: str, reported_as: str
+    masked: pd.DataFrame,
+    baseline: pd.DataFrame,
+    shuffled: pd.DataFrame,
+    metric: str,
+    reported_as: str,
 ) -> pd.DataFrame:
     """Tables 4.2 and 4.3: a metric with all keypoints and with the best mask, and Equation 4.1.
 
-    The metric ("rmse" or "mae") is in metres, Equation 4.1 in percent. The column "one run each"
-    has the thesis's literal procedure: one run of all keypoints and of each width (repetition 0),
-    also for the choice of the width. Beside it stands what this procedure gives if masks do nothing
-    (`thesis_tables.null_distribution`), simulated from `shuffled`: runs with all
-    keypoints, many repetitions.
+    masked, baseline: the runs with masks of each width, and with all keypoints. The metric ("rmse"
+    or "mae") is in metres, Equation 4.1 in percent. The column "one run each" has the thesis's
+    literal procedure: one run of all keypoints and of each width (repetition 0), also to choose the
+    width. Beside it stands what this procedure gives if masks do nothing
+    (`thesis_tables.null_distribution`), simulated from `shuffled`: runs with all keypoints, many
+    repetitions.
     The last rows have the sum of the percentages (the thesis's "aggregate"), their mean with
     Student's t interval, and their median.
     """
-    masked, baseline = compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
     best = thesis_tables.of_chosen_width(masked)
     change = thesis_tables.changes(best, baseline, metric)
     single = thesis_tables.changes_of_repetition(masked, baseline, metric)

@@ -191,8 +191,23 @@ class Changed(Street):
 
 def standing(drive):
     sequence = Changed(drive, poses=np.insert(drive.poses, 5, drive.poses[4], axis=0))
-    sequence.images.insert(5, drive.frame(4).copy())
+    image = drive.frame(4).copy()
+    image[0, 0] ^= 1
+    sequence.images.insert(5, image)
     return sequence
+
+
+def doubled(drive):
+    """Frames 0 and 3 come twice and three times, as where a camera stands."""
+    indices = np.insert(np.arange(len(drive)), [1, 4, 4], [0, 3, 3])
+    sequence = Changed(drive, poses=drive.poses[indices])
+    sequence.images = [drive.images[index] for index in indices]
+    return sequence
+
+
+def stalled(drive):
+    """The camera drives on, but gives frame 4 twice."""
+    return Changed(drive, {5: drive.frame(4).copy()})
 
 
 def cut(drive):
@@ -221,6 +236,8 @@ BAD = {
     "empty masks": (excerpt, {}, range(3), NO_POINTS),
     "an empty filter": (excerpt, {"detector": keypoints.filtered}, range(3), NO_POINTS),
     "standing": (standing, {}, (), {5: "stationary"}),
+    "equal frames": (doubled, {}, (), dict.fromkeys((1, 5, 6), "equal frame")),
+    "a stalled camera": (stalled, {}, (), {5: "equal frame"}),
     "a scene cut": (cut, {}, (), {5: "no agreement"}),
 }
 
@@ -241,7 +258,14 @@ def test_bad_frames_are_flagged_and_keep_the_pose(drive, case):
         # without new keypoints, points are tracked further
         assert moved == (expected.get(index, "") in ("", "no keypoints"))
         assert np.array_equal(result.poses[index], result.poses[index - 1]) != moved
-    if case == "black and blown out":  # the step to frame 6 is measured from frame 4
+    if case == "equal frames":  # the path is that without them
+        kept = np.delete(result.poses, [1, 5, 6], axis=0)
+        np.testing.assert_array_equal(kept, odometry.run(drive).poses)
+        assert result.failed_steps == 0
+    if case in (
+        "black and blown out",
+        "a stalled camera",
+    ):  # the step to frame 6 is measured from frame 4
         assert result.frames["scale"][6] == pytest.approx(2 * result.frames["scale"][4])
 
 

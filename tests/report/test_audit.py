@@ -10,50 +10,81 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from thesis import ablations, audit, audit_rest, gap, trainings
+from thesis import ablations, audit, audit_rows, audit_run, domain_gap, thesis_tables, trainings
 from thesis_repro.data.cityscapes import ID
 from thesis_repro.report import style
 from thesis_repro.running import results
+from thesis_repro.running.settings import ROOT
 from thesis_repro.study import compare
 
 
 def test_rows_are_numbered_and_every_measurement_has_a_row():
-    rows = audit.WORDS["rows"]
-    assert [int(row["row"]) for row in rows] == list(range(1, len(rows) + 1)) and len(rows) >= 85
-    assert all(row[key].strip() for row in rows for key in ("where", "does", "right", "switch"))
-    assert {spec["row"] for spec in audit.WORDS["measured"] + audit.WORDS["arithmetic"]} <= {
-        row["row"] for row in rows
-    }
+    assert [int(row["row"]) for row in audit.ROWS] == list(range(1, len(audit.ROWS) + 1))
+    assert len(audit.ROWS) >= 85
     assert all(
-        {*spec["metrics"]} <= {*audit.WORDS["metrics"]}
-        for spec in audit.WORDS["measured"]
-        if "unit" not in spec and "label" not in spec
+        row[key].strip() for row in audit.ROWS for key in ("where", "does", "right", "switch")
     )
+    with pytest.raises(KeyError, match="999"):
+        audit.table([audit.measurement("13", "spread", 1), audit.measurement("999", "spread", 1)])
 
 
 @pytest.mark.parametrize(
     "row, quantity, metric, value",
     [
-        ("1", "sum", "RMSE", -13.2),
-        ("1", "mean", "MAE", -2.33),
-        ("1", "median", "RMSE", -5.27),
-        ("3", "reduction", "", 2.626),
-        ("3", "reduction of each", "", 2.689),
-        ("4", "larger", "MAE", 7),
-        ("41", "improved", "RMSE", 6),
-        ("41", "by chance", "RMSE", 10.3125),
-        ("41", "sign", "RMSE", 0.0335),
-        ("60", "keypoints", "", 761.7),
+        ("1", "sum of eleven percentages", "RMSE", -13.2),
+        ("1", "mean of the percentages", "MAE", -2.33),
+        ("1", "median of the percentages", "RMSE", -5.27),
+        ("3", "reduction factor of keypoints, mean of Table 4.1", "", 2.626),
+        ("3", "reduction factor of keypoints, geometric mean over sequences", "", 2.689),
+        ("4", "sequences with a larger error", "MAE", 7),
+        ("41", "sequences improved", "RMSE", 6),
+        ("41", "sequences improved on average if masks did nothing", "RMSE", 10.3125),
+        (
+            "41",
+            "probability of no more improved sequences if masks did nothing, 15 independent widths",
+            "RMSE",
+            0.0335,
+        ),
+        ("60", "keypoints, means of Table 4.1", "", 761.7),
     ],
 )
 def test_arithmetic_with_the_thesiss_tables(row, quantity, metric, value):
-    table = audit.table(audit.of_tables(), "made up")
+    table = audit.table(audit_rows.of_reported(), "made up")
     rows = table[
-        (table["row"] == row)
-        & (table["quantity"] == audit.WORDS["quantities"][quantity])
-        & (table["metric"] == metric)
+        (table["row"] == row) & (table["quantity"] == quantity) & (table["metric"] == metric)
     ]
     assert rows["value"].item() == pytest.approx(value, abs=0.011)
+
+
+def test_alike_widths_count_as_one_and_unlike_ones_as_all():
+    random, widths = np.random.default_rng(0), 15
+    keys = pd.MultiIndex.from_product(
+        [map(str, range(400)), [0], range(1, widths + 1)],
+        names=["sequence", "repetition", "dilation_width"],
+    )
+    of_sequence = np.repeat(random.normal(size=400), widths)
+    level = pd.DataFrame({"sequence": keys.levels[0], "rmse": np.exp(2.0)})
+    for errors, expected in (
+        (of_sequence, 1),
+        (random.normal(size=len(keys)), widths),
+        (of_sequence + random.normal(size=len(keys)), widths / (1 + (widths - 1) / 2)),
+    ):
+        masked = pd.DataFrame({"rmse": np.exp(2 + errors)}, keys).reset_index()
+        _, number = thesis_tables.independent_widths(masked, level, "rmse")
+        assert number == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("folder", ["figures", "figures/kitti_excerpts"])
+def test_the_audit_has_the_times_of_the_budget_beside_it(folder):
+    rows = pd.read_csv(ROOT / folder / "audit.csv", dtype={"row": str})
+    budget = pd.read_csv(ROOT / folder / "budget.csv", index_col="stage")
+    stages = [stage for stage in budget.index if not stage.startswith(("all", "frames"))]
+    named = rows[rows["row"] == "49"].set_index("metric")["value"].add_suffix(" (ms)")
+    masked = budget["masked, width 10"]
+    assert named[stages].to_numpy() == pytest.approx(masked[stages].to_numpy(), abs=0.006)
+    (whole,) = rows.loc[rows["row"] == "16", "value"]
+    every = budget.loc[stages, "all keypoints"].sum()
+    assert whole == pytest.approx(masked[stages].sum() / every, rel=2e-3)
 
 
 def test_rows_without_a_measurement_stay_and_words_appear_once():
@@ -62,7 +93,7 @@ def test_rows_without_a_measurement_stay_and_words_appear_once():
         audit.measurement("13", "spread", 5),
     ]
     table = audit.table(measurements, "made up")
-    assert list(dict.fromkeys(table["row"])) == [row["row"] for row in audit.WORDS["rows"]]
+    assert list(dict.fromkeys(table["row"])) == [row["row"] for row in audit.ROWS]
     lines = table[table["row"] == "13"]
     assert (
         lines["value"].tolist() == [2, 5]
@@ -88,7 +119,7 @@ def test_ablations_become_ratios_of_their_reference():
         noise=0.02,
     )
     runs = runs.assign(failed=1.0, across=0.1, down=0.2, sim3=runs["rmse"])
-    measurements = pd.DataFrame(audit.of_ablations(runs))
+    measurements = pd.DataFrame(audit_rows.of_ablations(runs))
     ratios = measurements[measurements["unit"] == "ratio"].set_index(
         ["row", "metric", "estimator"]
     )["value"]
@@ -111,7 +142,7 @@ def test_other_tables_are_measured_by_sequence_with_their_number_of_frames():
             "building/fence": np.nan,
         }
     )
-    rows = audit.measured(shares, "boundaries")
+    rows = audit_rows.of_shares(shares)
     assert {(row["quantity"], row["value"], row["n"], row["frames"]) for row in rows} == {
         ("boundary pixels lost", 30, 2, 2),
         ("boundary pixels lost, road/sidewalk", 60, 1, 2),
@@ -124,7 +155,7 @@ def test_other_tables_are_measured_by_sequence_with_their_number_of_frames():
             "residual": [1.0, 2.0, 1.0, 8.0],
         }
     )
-    (row,) = audit.measured(tracks, "tracks")
+    (row,) = audit_rows.of_tracks(tracks)
     assert (row["row"], row["frames"], row["n"]) == ("32", 2, 1) and row["value"] == pytest.approx(
         4
     )
@@ -148,11 +179,11 @@ def test_right_pixels_are_counted_by_area():
     predicted = exact.copy()
     predicted[15:, :15] = ID["car"]  # half of the shadow
     predicted[5:10, 20:22] = ID["car"]  # a fifth of the pole
-    shares = audit_rest.right_shares(predicted, exact, frame)
+    shares = audit_run.right_shares(predicted, exact, frame)
     assert shares["small"] == 80 and shares["dark"] == 50 and shares["lit"] == 100
     assert shares["large"] == pytest.approx(100 * (1 - 75 / 1150))
     assert shares["inside"] > shares["rim"]
-    assert "small" not in audit_rest.right_shares(predicted, np.full_like(exact, 7), frame)
+    assert "small" not in audit_run.right_shares(predicted, np.full_like(exact, 7), frame)
 
 
 def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
@@ -167,7 +198,7 @@ def test_the_audit_and_the_comparison_answer_a_question_with_the_same_number():
     compared = table[table["tested"] & (table["reference"] == "baseline")].set_index(
         ["method", "estimator", "metric"]
     )
-    audited = pd.DataFrame(audit.of_study(runs, runs[runs["method"] == "baseline"]))
+    audited = pd.DataFrame(audit_rows.of_study(runs, runs[runs["method"] == "baseline"]))
     assert len(audited[audited["row"] == "39"]) == 3
     for row, method in (("15", "masked"), ("40", "fewer"), ("50", "corrected")):
         lines = audited[(audited["row"] == row) & (audited["metric"] == "RMSE")]
@@ -211,7 +242,7 @@ CLASSES = pd.DataFrame(
 
 
 def test_the_table_shows_each_model_and_domain():
-    table = gap.table(SimpleNamespace(scores=SCORES, classes=CLASSES)).set_index("measure")
+    table = domain_gap.table(SimpleNamespace(scores=SCORES, classes=CLASSES)).set_index("measure")
     assert list(table) == [
         f"{OWN}: {VALIDATION}",
         f"{OWN}: {STREETS}",
@@ -230,9 +261,11 @@ def test_the_table_shows_each_model_and_domain():
 
 
 def test_the_quality_of_label_maps_is_recorded(tmp_path):
-    assert gap.label_map_quality(tmp_path) == []
-    style.save_table(SCORES.assign(used=SCORES["model"] == SHIPPED), tmp_path, gap.RECORD, "note")
-    rows = gap.label_map_quality(tmp_path)
+    assert domain_gap.label_map_quality(tmp_path) == []
+    style.save_table(
+        SCORES.assign(used=SCORES["model"] == SHIPPED), tmp_path, domain_gap.RECORD, "note"
+    )
+    rows = domain_gap.label_map_quality(tmp_path)
     assert [
         (row["domain"], row["mean_iou"], row["classes"], row["images"], row["seen"]) for row in rows
     ] == [(VALIDATION, 0.5, 2, 20, False), (STREETS, 0.4, 2, 7, True)]

@@ -80,9 +80,6 @@ DRAWN = {
     "masks": lambda: chapter3.figure_masks(
         FRAME, dict.fromkeys("abc", MASK), dict.fromkeys("abc", POINTS), MASK
     ),
-    "4.2": lambda: chapter4.figure_4_02(
-        FRAME[:, :120], LABEL_MAP[:, :120], LABEL_MAP[:, 100:220], "this model"
-    ),
     "4.3": lambda: chapter4.figure_4_03(
         FRAME, LABEL_MAP[::2, ::3], "sequence 00, frame 0", LABEL_MAP
     ),

@@ -1,15 +1,18 @@
 """Figures and tables of chapter 4, the comparison and the findings show the numbers of the runs."""
 
 import html
+from types import SimpleNamespace
 
 import made_up
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from cells import cells
 from drawn import problems
+from matplotlib.container import BarContainer
 
-from thesis import chapter4, few_keypoints, tables, thesis_tables
+from thesis import chapter4, few_keypoints, frames, tables, thesis_tables
 from thesis.captions import REPORTED
 from thesis_repro.errors import one_line
 from thesis_repro.report import comparison, findings, style, texts
@@ -36,6 +39,11 @@ def runs_of(names, errors, widths=(5, 10, 15), **options):
     return made_up.runs(names, errors, methods, **options)
 
 
+def widths_of(runs):
+    """The runs with masks and with all keypoints, as notebook 8 selects them."""
+    return compare.of_method(runs, "masked"), compare.of_method(runs, "baseline")
+
+
 def halved(name, method, _):
     """Errors that masks halve and controls do not."""
     return (0.5 if method == "masked" else 1.0) * (1 + int(name) / 10)
@@ -60,7 +68,9 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
             else 2 * (1 + reported[name] / 100) + {5: 0.5, 15: 1.0}.get(width, 0)
         ),
     )
-    table = tables.table_of_change(runs, NEVER_SHUFFLED, metric, "thesis").set_index("sequence")
+    table = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, metric, "thesis").set_index(
+        "sequence"
+    )
     changes = [column for column in table if column.startswith("change")]
     assert len(changes) == 3  # no column for masks that did nothing
     for column in changes:
@@ -69,7 +79,7 @@ def test_tables_of_the_thesiss_numbers_equal_the_thesiss(
             [mean, median], abs=0.05
         )
         assert table.loc["sequences improved", column] == improved
-    widths = tables.table_4_1(runs, "thesis")
+    widths = tables.table_4_1(widths_of(runs)[0], "thesis")
     assert set(widths["dilation width (pixels)"]) == {10} and widths["width, thesis"].tolist()[
         :2
     ] == [10, 11]
@@ -81,7 +91,7 @@ def test_the_literal_procedure_is_that_of_repetition_0():
     # the mean is lowest at width 10, repetition 0 at width 5
     for width, errors in ((5, [0.6, 3, 3]), (10, [0.7, 0.1, 0.1]), (15, [1, 1, 1])):
         runs.loc[masked & (runs["dilation_width"] == width), "rmse"] = errors
-    shown = tables.table_of_change(runs, NEVER_SHUFFLED, "rmse", "thesis").iloc[0]
+    shown = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").iloc[0]
     assert shown["change (%)"] == pytest.approx(-70)
     assert shown["change (%), one run each"] == pytest.approx(-40)
 
@@ -91,7 +101,9 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     baseline = {"baseline": [None]}
     options = {"estimators": ["thesis"], "repetitions": 30, "noise": 0.2}
     shuffled = made_up.runs(ELEVEN, lambda *_: 1.0, baseline, **options)
-    table = tables.table_of_change(runs, shuffled, "rmse", "thesis").set_index("sequence")
+    table = tables.table_of_change(*widths_of(runs), shuffled, "rmse", "thesis").set_index(
+        "sequence"
+    )
     studies = thesis_tables.null_distribution(shuffled, 3, "rmse")
     null = table["change (%), one run each, if masks did nothing"]
     assert null["mean"] == pytest.approx(studies.mean(axis=1).mean(), abs=0.006)
@@ -99,8 +111,6 @@ def test_masks_that_do_nothing_are_told_beside_the_literal_procedure():
     of_rmse, _ = tables.procedure(runs, shuffled)
     assert of_rmse["null_mean"] == pytest.approx(null["mean"], abs=0.006)
     assert of_rmse["lowest"] < of_rmse["highest"] and of_rmse["repetitions"] == 3
-    text = findings.text(runs, compare.comparisons(runs), "real", False, procedure=[of_rmse])
-    assert f"{null['mean']:+.1f} %" in text
     once = runs[(runs["repetition"] == 0) | (runs["dilation_width"] != 5)]  # width 5 is run once
     assert tables.procedure(once, shuffled)[0]["repetitions"] == 1
 
@@ -109,12 +119,17 @@ def test_failed_runs_are_counted():
     runs = runs_of(ELEVEN, halved)
     failing = (runs["sequence"] == "03") & (runs["method"] == "masked")
     runs.loc[failing & (runs["repetition"] == 0), "failed"] = 5.0
-    table = tables.table_of_change(runs, NEVER_SHUFFLED, "rmse", "thesis").set_index("sequence")
+    table = tables.table_of_change(*widths_of(runs), NEVER_SHUFFLED, "rmse", "thesis").set_index(
+        "sequence"
+    )
     assert table.loc["03", "failed runs, best mask"] == "1 of 3"
     for column in ("change (%)", "change (%), one run each"):
         assert table.loc["03", column] < 0 and table.loc["sequences improved", column] == 11
     assert (
-        tables.table_4_1(runs, "thesis").set_index("sequence").loc["03", "failed runs"] == "1 of 3"
+        tables.table_4_1(widths_of(runs)[0], "thesis")
+        .set_index("sequence")
+        .loc["03", "failed runs"]
+        == "1 of 3"
     )
     compared = comparison.table_comparison(compare.comparisons(runs))
     of_masks = compared[(compared["keypoints"] == "masks, width 10")].iloc[0]
@@ -154,6 +169,29 @@ def test_errors_are_means_with_their_spread_and_the_lowest_is_bold():
     assert not single[ELEVEN].map(lambda cell: "±" in cell).any(axis=None)
 
 
+def test_deviations_of_zero_are_a_note_below_the_table():
+    runs = runs_of(ELEVEN[:5], halved)
+    refined = runs["estimator"] == "refined"
+    runs.loc[~refined, "se3"] *= 1 + 0.1 * runs["repetition"]
+    table = comparison.table_errors(compare.comparisons(runs), runs)
+    has_deviation = table[ELEVEN[:5]].map(lambda cell: "±" in cell).all(axis=1)
+    varied = (table["error"] == "aligned ATE (m)") & (table["estimator"] == "vote of all points")
+    assert has_deviation.equals(varied) and varied.any()
+    text = report_study.latex_errors(table, 3)
+    assert "0.0000" not in text and text.count(report_study.NO_DEVIATION) == 6  # of 8 tables
+    assert report_study.NO_DEVIATION not in report_study.latex_errors(table)
+
+
+def test_failures_of_the_other_estimator_stand_in_the_summary():
+    runs = runs_of(ELEVEN, halved)
+    failing = (runs["method"] == "masked") & (runs["estimator"] == "thesis")
+    runs.loc[failing & (runs["dilation_width"] == 10), "failed"] = 5.0
+    (row,) = comparison.table_summary(compare.comparisons(runs), runs).to_dict("records")
+    assert row["estimator"] == "refined estimator"
+    assert row["failed runs"] == "0 of 33; thesis's estimator 33 of 33"
+    assert row["failed runs of the reference"] == "0 of 33; thesis's estimator 0 of 33"
+
+
 def test_ratios_in_the_tables_equal_the_comparison():
     runs = runs_of(ELEVEN, halved, noise=0.2)
     table = compare.comparisons(runs)
@@ -177,11 +215,11 @@ def test_ratios_in_the_tables_equal_the_comparison():
     )
     unknown = runs_of(["77"], lambda *_: 1.0)  # a sequence that the thesis does not have
     assert np.isnan(
-        tables.table_of_change(unknown, NEVER_SHUFFLED, "rmse", "thesis").loc[
+        tables.table_of_change(*widths_of(unknown), NEVER_SHUFFLED, "rmse", "thesis").loc[
             0, "change (%), thesis"
         ]
     )
-    assert pd.isna(tables.table_4_1(unknown, "thesis").loc[0, "width, thesis"])
+    assert pd.isna(tables.table_4_1(widths_of(unknown)[0], "thesis").loc[0, "width, thesis"])
 
 
 @pytest.mark.parametrize(
@@ -207,13 +245,27 @@ def test_findings_follow_the_verdict(errors, names, verdict, sources):
     for source in sources:
         assert compare.overall(compare.primary_comparison(table, source)["verdict"]) == verdict
     text = findings.text(runs, table, "KITTI folder embedded, made up", False)
-    assert text.count("Masks help here") == (verdict == compare.LOWER) * len(sources)
-    assert text.count("do worse than all") == (verdict == compare.HIGHER) * len(sources)
-    row = compare.primary_comparison(table, sources[0]).iloc[0]
-    # the ratios of several sources stand in a table
-    summary = comparison.table_summary(table, runs).set_index("source").loc[sources[0]]
-    assert texts.ratio(row).replace("95 % CI ", "") == summary["aligned ATE"]
-    assert (texts.ratio(row) in text) == (len(sources) == 1) and summary["verdict"] == verdict
+    assert text.count(f"{findings.OUTCOMES[verdict]} here.**") == len(sources)
+    summary = comparison.table_summary(table, runs).set_index("source")
+    for source in sources:
+        for row in compare.primary_comparison(table, source).to_dict("records"):
+            assert f"| {texts.ratio(row)} |" in text
+            cell = summary.loc[source, compare.METRICS[row["metric"]]]
+            assert texts.ratio(row).replace("95 % CI ", "") == cell
+        assert summary.loc[source, "verdict"] == verdict
+
+
+def drawn_by_cells(runs):
+    """{name: figure} of the cells of notebook 8 that draw widths and methods."""
+    figures = {}
+    save = SimpleNamespace(save_figure=lambda figure, name, note: figures.update({name: figure}))
+    given = {"runs": runs, "SEQUENCES": sorted(runs["sequence"].unique()), "note": ""}
+    modules = {"np": np, "chapter4": chapter4, "frames": frames, "style": style}
+    modules["thesis_tables"] = thesis_tables
+    names = given | modules | {"artefacts": save}
+    for number in ("58", "54", "18", "55", "56", "26", "27"):
+        exec(cells("08_results.ipynb", "code")[f"08-{number}"], names)
+    return figures
 
 
 @pytest.mark.parametrize(
@@ -229,20 +281,18 @@ def test_figures_of_equal_and_of_noisy_errors_can_be_drawn(names, noise, sources
     runs = runs_of(names, lambda *_: 0.1, noise=noise, sources=sources)
     table = compare.comparisons(runs)
     if sources == ("",):
-        for draw in (
-            chapter4.figure_against_width,
-            chapter4.figure_of_methods,
-            chapter4.figure_of_sequences,
-        ):
-            assert problems(draw(runs, "rmse")) == []
-        assert problems(chapter4.figure_4_07(runs)) == []
+        assert problems(chapter4.figure_against_width(*widths_of(runs), "rmse")) == []
+        figures = drawn_by_cells(runs)
+        assert set(figures) == {f"figure_4_{number:02d}" for number in (7, 13, 14, 15, 16)}
+        assert [name for name, figure in figures.items() if problems(figure)] == []
     figure = comparison.figure_comparison(table)
     figure.draw_without_rendering()
     assert all(edge > 0 for axes in figure.axes for edge in axes.get_xlim())
 
 
 def test_the_comparison_figure_shows_ratios_and_their_interval():
-    table = compare.comparisons(runs_of(ELEVEN, halved, noise=0.1))
+    lower = runs_of(ELEVEN, lambda name, method, _: 0.7 + 0.3 * (method != "masked"), noise=0.1)
+    table = compare.comparisons(lower)
     axes = comparison.figure_comparison(table).axes[0]
     row = table[
         (table["estimator"] == "thesis")
@@ -270,9 +320,11 @@ def test_the_curve_of_few_keypoints_shows_every_ratio():
     times = pd.DataFrame({"choice": ["all"], "number": [0], "milliseconds": [50.0]})
     figure = few_keypoints.figure(pd.DataFrame(rows), times)
     assert problems(figure) == []
-    for panel in figure.axes[:4]:
+    wide, enlarged = figure.axes[0:2] + figure.axes[4:6], figure.axes[2:4] + figure.axes[6:8]
+    for panel in wide:
         low, high = panel.get_ylim()
         assert low < 0.3 and high > 90
+    assert [panel.get_ylim() for panel in enlarged] == [few_keypoints.NEAR] * 4
 
 
 def test_the_figure_of_paths_shows_repetitions_and_their_errors():
@@ -300,13 +352,23 @@ def test_a_failed_run_is_marked_where_runs_are_drawn(failed):
     truths = {"00": AHEAD, "05": AHEAD}
     for figure in (
         chapter4.figure_paths(truths, of_all, paths),
-        chapter4.figure_of_methods(runs, "rmse"),
-        chapter4.figure_of_sequences(runs, "mae"),
-        chapter4.figure_against_width(runs, "rmse"),
+        chapter4.figure_against_width(*widths_of(runs), "rmse"),
+        *(figure for name, figure in drawn_by_cells(runs).items() if name != "figure_4_07"),
     ):
         crosses = [line for line in figure.findobj(plt.Line2D) if line.get_marker() == "x"]
         words = [text.get_text() for text in figure.findobj(plt.Text)]
         assert bool(crosses) == bool(failed) and words.count("failed run") == failed
+
+
+def test_bars_show_the_mean_of_each_method_and_its_repetitions():
+    runs = runs_of(["00", "05"], lambda *_: 1.0, noise=0.3)
+    spread = compare.spread(compare.of_method(runs, "baseline"), "rmse")
+    axes = drawn_by_cells(runs)["figure_4_13"].axes[0]
+    bars = next(each for each in axes.containers if isinstance(each, BarContainer))
+    assert [bar.get_height() for bar in bars] == pytest.approx(spread["mean"].tolist())
+    whiskers = bars.errorbar.lines[2][0].get_segments()
+    ends = [segment[:, 1].tolist() for segment in whiskers]
+    assert np.array(ends) == pytest.approx(spread[["lowest", "highest"]].to_numpy())
 
 
 HOSTILE = [

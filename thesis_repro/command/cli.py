@@ -116,6 +116,9 @@ def odometry(options: Any) -> None:
         write_tum(options.tum, result.poses, sequence.times)
     steps = len(sequence), result.failed_steps, result.dropped_steps
     _warn(checks.of_run(sequence.name, *steps, settings.scale_gate))
+    if sequence.has_truth:
+        reason = metrics.foreign_truth(result.poses, sequence.poses)
+        _warn([f"{sequence.poses_path}: {reason}"] * bool(reason))
     record = _record(result, sequence)
     if options.plot:
         from thesis_repro.report import paths, style
@@ -173,6 +176,7 @@ def study(options: Any) -> int:
         options.frames,
         options.scale_gate,
         {"detector": detector} if (detector := _detector(options)) else {},
+        options.without_border,
     )
     planned.check()
     folder = options.folder.absolute()
@@ -184,13 +188,22 @@ def study(options: Any) -> int:
         warnings = []
         for sequence, masks in study.shown_masks(planned):
             warnings += _warn(_check_masks(sequence, masks))
-        outcome = planned.run(folder, options.jobs, options.dask)
+        workers = (options.jobs, options.dask)
+        if not any(sequence.has_truth for sequence in planned.opened):
+            worths = planned.worths(folder, *workers)
+            if worths is not None:  # otherwise the run below says that the ground truth is missing
+                file = study.write_worths(planned, worths, folder)
+                messages.summary(f"no ground truth, so no errors; worth of keypoints: {file}")
+                return 0
+        outcome = planned.run(folder, *workers)
+        planned = replace(planned, sequences=tuple(outcome.table["sequence"].unique()))
         runs = outcome.table[outcome.table["method"] == "baseline"].drop_duplicates("sequence")
         of_runs = [
             checks.of_run(run.sequence, run.frames, run.flagged) for run in runs.itertuples()
         ]
         warnings += outcome.warnings + _warn(chain(*of_runs))
-        page = study.write(planned, outcome.table, folder, warnings)
+        worths = planned.worths(folder, *workers)
+        page = study.write(planned, outcome.table, folder, warnings, worths)
     made = f"{len(outcome.table):,} runs, {outcome.failed_jobs:,} failed"
     messages.summary(f"{made}; open {page} in a browser", outcome.kept)
     return int(outcome.failed_jobs > 0)
@@ -269,7 +282,10 @@ def _sequence(options: Any) -> Any:
         getattr(options, "truth", None),
         getattr(options, "calibration", None),
     )
-    return sequence.subset(options.frames)
+    sequence = sequence.subset(options.frames)
+    if vars(options).get("without_border"):
+        return sequence.without_border()
+    return sequence
 
 
 def _check_masks(sequence: Any, mask_sets: Iterable) -> list[str]:
@@ -367,6 +383,11 @@ def _check_outputs(options: Any, *inputs: Path | None) -> None:
         endings = OUTPUT_FILES[name][1]
         if endings and path.suffix.lower() not in endings:
             raise InputError(f"--{name} {path}: its name must end in {' or '.join(endings)}")
+        for other in list(outputs)[: list(outputs).index(name)]:
+            if path.resolve() == outputs[other].resolve():
+                raise InputError(
+                    f"--{other}, --{name}: both are {path}; give each a name of its own"
+                )
     for path in filter(None, [vars(options).get("folder"), *outputs.values()]):
         for folder in data:
             if path.resolve().is_relative_to(folder):

@@ -42,6 +42,11 @@ SHARED: dict[str, dict[str, Any]] = {
         metavar="METRES",
         help="a shorter step leaves the pose as it is; 0 for slow cameras and many frames a second (0.1)",
     ),
+    "--without-border": dict(
+        action="store_true",
+        help="no keypoints in and near parts that are black in all frames, as undistortion leaves them (transparent "
+        "parts never have any)",
+    ),
     "--spread": dict(
         type=settings.positive_whole_number,
         metavar="N",
@@ -173,7 +178,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
     "odometry": {
         **_shared(*SEQUENCE),
         **MASK_OPTIONS,
-        **_shared("--invert", "--scale-gate", "--spread", "--fill"),
+        **_shared("--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
         "--truth": dict(
             type=Path,
             metavar="FILE",
@@ -182,8 +187,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--calibration": dict(
             type=Path,
             metavar="FILE",
-            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2, or YAML of OpenCV, "
-            "ORB-SLAM or Kalibr (calib.txt, without distortion)",
+            help="camera with distortion, which is taken out: fx fy cx cy k1 k2 p1 p2 (the first four are "
+            "enough), or YAML of OpenCV, ROS, EuRoC, Kalibr or ORB-SLAM (calib.txt, without distortion)",
         ),
         "--speed": dict(
             type=float, metavar="M_PER_S", help="speed, if there is no ground truth (1 m a frame)"
@@ -230,7 +235,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             metavar="NN",
             help="sequences to run (all in ROOT)",
         ),
-        **_shared("--frames", "--invert", "--scale-gate", "--spread", "--fill"),
+        **_shared("--frames", "--invert", "--scale-gate", "--without-border", "--spread", "--fill"),
         **MASK_OPTIONS,
         **_shared("--output"),
         "--labels": _source(
@@ -248,7 +253,7 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
             "keypoints",
             "[NAME=]FILE.py",
             "Python file, which is executed, with your function detect(frame, settings, mask), "
-            "track(previous, current, points, settings) or find_essential_matrix(current, previous, threshold)",
+            "track(previous, current, points, settings), or others of the odometry's four calls",
         ),
         "--paths": _source(
             "paths",

@@ -18,7 +18,6 @@ from thesis_repro.odometry.types import NO_POINTS, Matches, Motion, Step
 PROBABILITY = 0.999  # that RANSAC has tried a sample without wrong matches
 TERMINATION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)  # of the tracker
 MIN_MATCHES = 5  # for an essential matrix
-MIN_CONTRAST = 4.0  # standard deviation in gray levels; real frames have more than 50
 MAX_TURN = 6.0  # degrees a frame; KITTI's car turns by at most 4.8
 STATIONARY = "stationary"  # flag of a step that is shorter than the gate
 
@@ -152,7 +151,7 @@ class Odometry:
         self.count = 0  # of frames so far
         self.previous: np.ndarray | None = None  # the frame in which self.points lie
         self.points = NO_POINTS
-        self.skipped_metres = 0.0  # moved during flat frames
+        self.skipped_metres = 0.0  # moved during frames that were skipped
 
     def step(self, frame: Any, scale: Any = 0.0, mask: Any = None) -> Step:
         """Take the next frame. Returns a Step.
@@ -165,8 +164,8 @@ class Odometry:
         mask = types.allowed_pixels(mask, self.count, frame)
         step = Step(self.count, types.step_length(scale, self.count) + self.skipped_metres)
         self.count += 1
-        if frame[::8, ::8].std() < MIN_CONTRAST:
-            step.flags.append("flat frame")
+        step.flags += types.reasons_to_skip(frame, self.previous)
+        if step.flags:
             self.skipped_metres = step.scale
         else:
             self.skipped_metres = 0.0

@@ -24,6 +24,12 @@ from thesis_repro.running.files import atomic, write_text
 
 PAGE_WIDTH = 7.2  # inches
 NOTE_LETTERS = 22  # of a note, in an inch
+# Okabe and Ito's colours, distinguishable with any colour vision
+BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
+BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
+# four of Paul Tol's, for figures of more lines
+INDIGO, OLIVE, WINE, GRAY = "#332288", "#999933", "#882255", "#888888"
+LINE_COLORS = BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK, INDIGO, OLIVE, WINE, GRAY
 # of matplotlib, see `use`; what is not listed has matplotlib's default
 SETTINGS: dict[Any, Any] = {
     "font.size": 9,
@@ -36,6 +42,7 @@ SETTINGS: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
+    "axes.prop_cycle": plt.cycler(color=LINE_COLORS),
     "grid.color": "#dddddd",
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.4,
@@ -45,11 +52,6 @@ SETTINGS: dict[Any, Any] = {
     "svg.hashsalt": "thesis-repro",  # the same figure gives the same file
     "savefig.dpi": 160,
 }
-# Okabe and Ito's colours, distinguishable with any colour vision
-BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
-BLUE, RED, PINK = "#0072b2", "#d55e00", "#cc79a7"
-# four of Paul Tol's, for figures of more lines
-INDIGO, OLIVE, WINE, GRAY = "#332288", "#999933", "#882255", "#888888"
 TRUTH, BASELINE, MASKED, REDUCED = BLACK, BLUE, RED, GREEN  # ground truth and methods in chapter 4
 DATES = {".svg": "Date", ".pdf": "CreationDate"}  # matplotlib's names
 # note of figures that show no data
@@ -83,9 +85,11 @@ def line_style(index: int) -> dict[str, Any]:
 
     44 styles differ; neighbours also differ in dashes.
     """
-    colors = BLUE, RED, GREEN, ORANGE, PINK, SKY, BLACK, INDIGO, OLIVE, WINE, GRAY
     dashes = "-", "--", "-.", ":"
-    return {"color": colors[index % len(colors)], "linestyle": dashes[index % len(dashes)]}
+    return {
+        "color": LINE_COLORS[index % len(LINE_COLORS)],
+        "linestyle": dashes[index % len(dashes)],
+    }
 
 
 def interval_style(color: str, cap: str) -> dict[str, Any]:

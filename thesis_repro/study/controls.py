@@ -132,11 +132,11 @@ def min_distance(sequence: Sequence, number: float) -> float:
     of the sequence, and is never below the distance of the thesis.
     """
     sample = np.unique(np.linspace(0, len(sequence) - 1, SAMPLE).round().astype(int))
-    frames = [sequence.frame(index) for index in sample]
+    frames = [(sequence.frame(index), sequence.visible(index)) for index in sample]
 
     def mean_number(distance: float) -> float:
         settings = replace(THESIS, min_distance=distance)
-        return float(np.mean([len(detect(frame, settings)) for frame in frames]))
+        return float(np.mean([len(detect(frame, settings, visible)) for frame, visible in frames]))
 
     low, high = 0, round(min(sequence.size) / STEP)
     distances = [round(THESIS.min_distance + step * STEP, 6) for step in range(high)]

@@ -133,19 +133,21 @@ def first_jobs(
 
 def _control_jobs(sequence: Sequence, source: Source, tested: int) -> list[Job]:
     """Return the controls that are masks, as far as a source and a sequence allow them."""
-    left_out: tuple[str, ...] = ()
-    if not source.has_label_maps:
-        left_out = OF_LABEL_MAPS
-    elif not true_labels(sequence.root, sequence.name).is_dir():
-        left_out = ("true-labels",)
     width = tested if source.has_width else None
     widths: dict[str, int | None] = dict.fromkeys(MASK_CONTROLS, width)
     widths |= dict.fromkeys(OF_LABEL_MAPS, tested)
     return [
         Job(sequence.name, method, width, source=source.name)
         for method, width in widths.items()
-        if method not in left_out
+        if is_possible(method, source, sequence)
     ]
+
+
+def is_possible(method: str, source: Source, sequence: Sequence) -> bool:
+    """Return whether a source and a sequence have what a method with masks needs."""
+    if method == "true-labels" and not true_labels(sequence.root, sequence.name).is_dir():
+        return False
+    return source.has_label_maps or method not in OF_LABEL_MAPS
 
 
 def repeated(jobs: Iterable[Job], estimators: Iterable[str], repetitions: int) -> list[Job]:

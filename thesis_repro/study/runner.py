@@ -261,7 +261,7 @@ def _report(reasons: Mapping[Job, str]) -> list[str]:
         by_reason.setdefault((job.sequence, reason), []).append(job.name)
     lines = []
     for (name, reason), runs in by_reason.items():
-        shown = textwrap.shorten(", ".join(runs), 80, placeholder=", ...")
+        shown = textwrap.shorten(", ".join(runs), 80, placeholder=" ...")
         lines.append(f"sequence {name}, {shown}: failed: {reason}")
         messages.log.warning(lines[-1])
     return lines
@@ -362,7 +362,7 @@ def _run_pass(
     except Exception as error:  # report any error as the reason, and let other passes run
         reason = str(error)
         if not isinstance(error, InputError):
-            reason = f"{type(error).__name__}: {error}"
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         unfinished = [job for job in runs if not _file(folder, job).is_file()]
         reasons = dict.fromkeys(unfinished, reason) | reasons
     finally:

@@ -12,7 +12,8 @@ import numpy as np
 import pandas as pd
 from cv2 import INTER_NEAREST, resize
 
-from thesis import ablations, artefacts, audit, gap, thesis_tables, timing
+from thesis import ablations, artefacts, audit_rows, domain_gap, thesis_tables, timing
+from thesis.audit import measurement
 from thesis_repro.data import cityscapes
 from thesis_repro.data.cityscapes import ID, read_label_map
 from thesis_repro.data.kitti import Sequence
@@ -46,10 +47,10 @@ def measure(
     artefacts.write_text("ablations.csv", ablated.to_csv(index=False))
     tracks = [ablations.tracks(drive, masks_by_name(drive, labels), pairs) for drive in drives]
     measurements = [
-        *audit.measured(boundaries(drives, labels, pairs), "boundaries"),
-        *audit.of_ablations(ablated),
-        *audit.measured(pd.concat(tracks, ignore_index=True), "tracks"),
-        *audit.measured(right_pixels(settings, drives, labels), "shares"),
+        *audit_rows.of_shares(boundaries(drives, labels, pairs)),
+        *audit_rows.of_ablations(ablated),
+        *audit_rows.of_tracks(pd.concat(tracks, ignore_index=True)),
+        *audit_rows.of_shares(right_pixels(settings, drives, labels)),
         *of_earlier_notebooks(settings, len(drives)),
     ]
     if not settings.uses_shipped_model:
@@ -136,31 +137,38 @@ def of_earlier_notebooks(settings: Settings, count: int) -> list[dict[str, Any]]
         pd.read_csv(artefacts.needed(f"{name}.csv", "08_results"), dtype={"sequence": str})
         for name in ("runs", "shuffled_runs")
     )
-    measurements = audit.of_study(runs, shuffled)
+    measurements = audit_rows.of_study(runs, shuffled)
     found_again = pd.read_csv(artefacts.needed("found_again.csv", "06_keypoint_masks"))
+    text = "keypoints not found again in the next frame"
     for _, kind, _, share in found_again.itertuples():
-        measurements.append(audit.measurement("73", "found again", share, "%", metric=kind))
-    for row in gap.label_map_quality(settings.build):
-        if row["domain"] == gap.FRAMES:
+        measurements.append(measurement("73", text, share, "%", metric=kind))
+    for row in domain_gap.label_map_quality(settings.build):
+        if row["domain"] == domain_gap.FRAMES:
             recall, frames = 100 * row["sky_recall"], round(row["images"] / count)
-            measurements.append(audit.measurement("46", "sky", recall, "%", frames=frames))
-    seconds = pd.read_csv(timing.folder(settings) / "seconds.csv", dtype={"sequence": str})
+            measurements.append(measurement("46", "recall of the sky", recall, "%", frames=frames))
+    return measurements + of_times(timing.folder(settings))
+
+
+def of_times(folder: Path) -> list[dict[str, Any]]:
+    """Return rows 16, 47 and 49, from the times that notebook 08 used."""
+    seconds = pd.read_csv(folder / "seconds.csv", dtype={"sequence": str})
     savings = pd.DataFrame(
         {name: thesis_tables.time_savings(rows) for name, rows in seconds.groupby("sequence")}
     )
-    saved = savings[savings.index.isin(audit.WIDTHS)].mean()
-    stages = pd.read_csv(timing.folder(settings) / "budget.csv")
+    saved = savings[savings.index.isin(audit_rows.WIDTHS)].mean()
+    stages = pd.read_csv(folder / "budget.csv")
     totals = stages.groupby("method")["milliseconds"].sum()
-    masked = stages[stages["method"] != UNMASKED].sort_values("stage")
-    timed_on = {"data": f"timed on {stages['processor'].iloc[0]}"}
     whole = totals.drop(UNMASKED) / totals[UNMASKED]
-    measurements += [
-        audit.measurement("47", "saved", saved, "%", **timed_on),
-        audit.measurement("16", "whole frame", whole, "ratio", **timed_on),
+    timed_on = {"data": f"timed on {stages['processor'].iloc[0]}"}
+    text = "change of the time of the odometry, mean of widths 9 to 11"
+    together = "whole frame with masks and network over all keypoints"
+    measurements = [
+        measurement("47", text, saved, "%", **timed_on),
+        measurement("16", together, whole, "ratio", **timed_on),
     ]
-    for row in masked.itertuples():
-        stage = {"metric": row.stage, **timed_on}
-        measurements.append(audit.measurement("49", "stage", row.milliseconds, "ms", **stage))
+    for row in stages[stages["method"] != UNMASKED].sort_values("stage").itertuples():
+        time, stage = row.milliseconds, {"metric": row.stage, **timed_on}
+        measurements.append(measurement("49", "milliseconds a frame", time, "ms", **stage))
     return measurements
 
 
@@ -177,13 +185,18 @@ def of_training(settings: Settings) -> list[dict[str, Any]]:
     images, label_maps = (np.load(data / f"validation_{x}.npy")[:16] for x in ("images", "labels"))
     blur, full = augmentation.validation_augmenter(), augmentation.training_augmenter(len(image))
     history = pd.read_csv(settings.build / "model" / "history.csv")["val_loss"]
+    pairs = "pairs that the listings of this machine (Linux or other) would mismatch"
+    alike = "random transforms in which both give the same"
+    blurred, transformed = (
+        validation_losses(model, (images, label_maps), each) for each in (blur, full)
+    )
     return [
-        audit.measurement("8", "pairs", 100 * np.mean(mismatched), "%"),
-        audit.measurement("24", "one-hot", 100 * np.mean(equal), "%"),
-        audit.measurement("7", "loss blur", validation_losses(model, (images, label_maps), blur)),
-        audit.measurement("7", "loss all", validation_losses(model, (images, label_maps), full)),
-        audit.measurement("44", "loss last", history.iloc[-1]),
-        audit.measurement("44", "loss best", history.min()),
+        measurement("8", pairs, 100 * np.mean(mismatched), "%"),
+        measurement("24", alike, 100 * np.mean(equal), "%"),
+        measurement("7", "validation loss, blur alone", blurred),
+        measurement("7", "validation loss, all transforms", transformed),
+        measurement("44", "validation loss, last epoch", history.iloc[-1]),
+        measurement("44", "validation loss, best epoch", history.min()),
     ]
 
 
