@@ -182,7 +182,8 @@ COMMANDS: dict[str, dict[str, dict[str, Any]]] = {
         "--truth": dict(
             type=Path,
             metavar="FILE",
-            help="ground truth in KITTI's, TUM's or EuRoC's format (poses/NN.txt, or poses.txt beside the frames)",
+            help="true camera-to-world poses in KITTI's, TUM's or EuRoC's format (poses/NN.txt, or poses.txt "
+            "beside the frames)",
         ),
         "--calibration": dict(
             type=Path,
