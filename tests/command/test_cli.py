@@ -67,11 +67,7 @@ def test_written_masks_give_the_same_path_as_label_maps(small_world, small_label
     labels = ["--labels", small_labels / "00", "--dilation"]
     corrected = "--boundaries exact --symmetric --without-movable --classes road --margin 4"
     paths = []
-    for name, options in (
-        ("thesis", []),
-        ("corrected", corrected.split()),
-        ("inverse", ["--keep", "inverse"]),
-    ):
+    for name, options in (("thesis", []), ("corrected", corrected.split())):
         masks, one, two = tmp_path / name, tmp_path / "masks.txt", tmp_path / "labels.txt"
         assert run("masks", *where, *labels, 5, *options, "--output", masks) == 0
         assert run("odometry", *where, "--masks", masks, "--output", one) == 0

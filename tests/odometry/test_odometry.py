@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -29,7 +28,6 @@ from thesis_repro.odometry import (
 from thesis_repro.odometry.estimators import ESTIMATORS, refined
 from thesis_repro.odometry.odometry import VoteOfAll, detect, normalise, track
 from thesis_repro.odometry.types import ROTATION_COLUMNS
-from thesis_repro.running.settings import ROOT
 
 SMALL = replace(THESIS, max_keypoints=500)  # quicker
 COUNTS = {
@@ -538,22 +536,3 @@ def test_wrong_sequences_and_masks_are_named_before_a_frame_is_read(drive, make)
         with pytest.raises(InputError, match="sequence: "):
             make("00", *arguments)
     assert unread.read == []
-
-
-def test_the_example_in_the_docs_gives_arrays_and_a_picture(drive, tmp_path, monkeypatch):
-    text = (ROOT / "docs/own-masks.md").read_text(encoding="utf-8")
-    example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
-    (tmp_path / "frames").mkdir()
-    for index, image in enumerate(drive.images):
-        cv2.imwrite(str(tmp_path / f"frames/{index:06d}.png"), image)
-    monkeypatch.chdir(tmp_path)
-    names = {}
-    exec(example, names)
-    step, mask = names["step"], names["mask_of"](drive.images[-1])
-    u, v = step.keypoints.astype(int).T
-    assert len(step.keypoints) > 100 and mask[v, u].all()
-    assert step.inliers.dtype == bool and step.inliers.sum() > 50
-    assert step.pose.shape == (4, 4) and step.pose[2, 3] > 8  # nine steps of a metre
-    picture = cv2.imread("keypoints.png")
-    is_coloured = (picture != picture[..., :1]).any(axis=2)
-    assert is_coloured[len(mask) // 4 :].sum() > 1000
