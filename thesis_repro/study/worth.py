@@ -334,7 +334,9 @@ def measure(
             "sources": [source.record(sequence.name) for source in sources],
             "width": width,
             "options": options,
-            "code": results.digest_of_code(*CODE, "thesis_repro.study.worth"),
+            "code": results.digest_of_code(
+                *CODE, "thesis_repro.study.methods", "thesis_repro.study.worth"
+            ),
             **results.made_with("opencv", "numpy", "numba"),
         }
         stage = results.stage(folder / sequence.name, **inputs)
