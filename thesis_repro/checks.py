@@ -194,7 +194,7 @@ def _of_steps(sequence: kitti.Sequence) -> list[str]:
     if gaps.any():
         first = gaps.argmax()
         warnings.append(
-            f"sequence {sequence.name}: the times have {gaps.sum()} gaps; the first is "
+            f"sequence {sequence.name}: gaps in the times: {gaps.sum()}; the first is "
             f"{intervals[first]:.3g} s, before {sequence.frame_paths[first + 1].name}; the odometry cannot "
             "bridge them, so run the parts on their own"
         )
